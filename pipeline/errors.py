@@ -1,0 +1,48 @@
+"""What can go wrong between a plant and a published controller.
+
+LoopwrightError (serving)
++-- PipelineError
+    +-- ParamsError    params.yaml: an unknown key, a wrong type, a value out of range
+    +-- PlantError     a plant cannot do what was asked: no steady state there, wrong shape
+    +-- RecordError    a record's file: missing column, wrong unit, NaN, time not uniform, too short
+    +-- ModelError     training data or a stored model do not fit the model
+    +-- LawError       a control law cannot be designed from what it was given
+    +-- ExportError    a law cannot be written as one graph, or the graph differs from the law
+    +-- TrackingError  the MLflow store or registry cannot be read or written
+"""
+
+from __future__ import annotations
+
+from serving.errors import LoopwrightError
+
+
+class PipelineError(LoopwrightError):
+    """Base of the pipeline's errors."""
+
+
+class ParamsError(PipelineError):
+    """params.yaml does not say what it must."""
+
+
+class PlantError(PipelineError):
+    """A plant was asked for something that it cannot give."""
+
+
+class RecordError(PipelineError):
+    """A record's data or file cannot be used."""
+
+
+class ModelError(PipelineError):
+    """A model cannot be trained, stored or loaded."""
+
+
+class LawError(PipelineError):
+    """A control law cannot be designed."""
+
+
+class ExportError(PipelineError):
+    """A law cannot be exported, or its graph differs from it."""
+
+
+class TrackingError(PipelineError):
+    """The tracking store or the registry refused."""

@@ -1,0 +1,82 @@
+"""What every control law is: a torch module with explicit state, exported whole."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.models.base import Model
+from pipeline.plants.base import Plant
+from serving.manifest import Signal
+
+
+@dataclass(frozen=True, slots=True)
+class LawSignals:
+    """The signals of a law: set points, process variables, measured disturbances, MVs, and the period."""
+
+    period_s: float
+    sp: tuple[Signal, ...]
+    pv: tuple[Signal, ...]
+    dv: tuple[Signal, ...]
+    mv: tuple[Signal, ...]
+
+    @classmethod
+    def of(cls, plant: Plant) -> Self:
+        """The signals of a controller for ``plant``."""
+        return cls(plant.period_s, plant.sp_signals, plant.pv_signals, plant.dv_signals, plant.mv_signals)
+
+
+class ControlLaw(nn.Module, ABC):
+    """One step of a controller: ``(sp, pv, dv, mv_applied, state) -> (mv, state_next, info)``.
+
+    Shapes ``(..., n_sp)``, ``(..., n_pv)``, ``(..., n_dv)``, ``(..., n_mv)``, ``(..., n_state)``;
+    engineering units; float64. A state of zeros means "no past": the law handles its own first
+    step. ``mv_applied`` is what the plant received over the last period; a law that remembers its
+    MV remembers this one, which is the anti-windup and the bumpless transfer. The law limits its
+    own MV to the signal's range and to ``rate`` per sample.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    Params: ClassVar[type[Any]]  # frozen dataclass: what params.yaml may say of this law
+    n_state: int
+    info: tuple[str, ...]
+    low: Tensor  # (n_mv,)
+    high: Tensor  # (n_mv,)
+    rate: Tensor | None  # (n_mv,) largest change a sample; None where unlimited
+
+    def __init__(self, signals: LawSignals, mv_rate: float | None = None) -> None:
+        super().__init__()
+        self.signals = signals
+        self.register_buffer("low", torch.tensor([s.low for s in signals.mv], dtype=torch.float64))
+        self.register_buffer("high", torch.tensor([s.high for s in signals.mv], dtype=torch.float64))
+        rate = None if mv_rate is None else torch.full((len(signals.mv),), mv_rate, dtype=torch.float64)
+        self.register_buffer("rate", rate)
+
+    @classmethod
+    @abstractmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The law with numbers from ``params`` and models by part name; raises LawError.
+
+        ``plant`` is for laws that are tuned in simulation; a law from data alone ignores it.
+        """
+
+    @abstractmethod
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step."""
+
+    def limited(self, mv: Tensor, mv_applied: Tensor) -> Tensor:
+        """The MV within the actuator's range and, where a rate is set, within reach of the applied one.
+
+        The range comes last: an applied MV outside it (an operator's doing) is led back at once.
+        """
+        if self.rate is not None:
+            mv = torch.minimum(torch.maximum(mv, mv_applied - self.rate), mv_applied + self.rate)
+        return torch.minimum(torch.maximum(mv, self.low), self.high)

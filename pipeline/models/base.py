@@ -1,0 +1,63 @@
+"""What every model is: a float64 torch module with its scaling inside, and a file."""
+
+from __future__ import annotations
+
+import json
+import os
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pipeline.errors import ModelError
+
+
+class Model(nn.Module, ABC):
+    """A static map from engineering units to engineering units, ``(..., n_in) -> (..., n_out)``.
+
+    Every number that the map needs, scaling included, is a float64 parameter or buffer, so that a
+    law which holds the model holds all of it. ``config`` gives the constructor's arguments: with
+    the state dictionary they rebuild the model.
+    """
+
+    kind: ClassVar[str]
+
+    @abstractmethod
+    def config(self) -> dict[str, Any]:
+        """JSON-ready arguments of the constructor."""
+
+    @abstractmethod
+    def forward(self, x: Tensor) -> Tensor:
+        """Prediction, shape (..., n_out), for inputs of shape (..., n_in)."""
+
+    def save(self, path: Path) -> None:
+        """Write the model as one .npz; a temporary file is renamed, so no half-written model stays."""
+        header = json.dumps({"kind": self.kind, "config": self.config()})
+        arrays = {k: v.detach().cpu().numpy() for k, v in self.state_dict().items()}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_suffix(".draft.npz")
+        np.savez(draft, __model__=np.array(header), **arrays)
+        os.replace(draft, path)
+
+    @classmethod
+    def from_arrays(cls, config: dict[str, Any], arrays: dict[str, np.ndarray[Any, Any]]) -> Self:
+        """The model that ``save`` wrote."""
+        model = cls(**config).double()
+        model.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in arrays.items()})
+        return model.eval()
+
+
+def load_model(path: Path) -> Model:
+    """The model in ``path``, whatever its kind; raises ModelError for a foreign or damaged file."""
+    from pipeline.models import MODELS
+
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(str(file["__model__"]))
+            arrays = {k: file[k] for k in file.files if k != "__model__"}
+        return MODELS[header["kind"]].from_arrays(header["config"], arrays)
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ModelError(f"{path} is not a model that this pipeline wrote ({error}); run the fit stage again") from error

@@ -1,0 +1,40 @@
+"""What can go wrong when a controller is loaded, stepped or run.
+
+LoopwrightError
++-- ArtifactError      the file is not a controller: corrupt, truncated, foreign, changed after export
++-- ContractError      an input has the wrong name, shape or type
++-- SampleError        a value is not finite, so no manipulated variable may be computed from it
++-- OutputError        the law gave a value that is not finite or outside its signal's range
++-- LoopError          the loop was asked for something that its configuration does not allow
+    +-- EndpointError  the plant's side (server, device) cannot be read or written
+"""
+
+from __future__ import annotations
+
+
+class LoopwrightError(Exception):
+    """Base of every error that Loopwright raises on purpose; its text is one line for a person."""
+
+
+class ArtifactError(LoopwrightError):
+    """The file is not a controller that this runtime accepts."""
+
+
+class ContractError(LoopwrightError):
+    """An input does not match the controller's manifest."""
+
+
+class SampleError(LoopwrightError):
+    """A sample holds a value that is not finite."""
+
+
+class OutputError(LoopwrightError):
+    """The law's output is not finite or lies outside its signal's range."""
+
+
+class LoopError(LoopwrightError):
+    """The control loop was configured or used in a way that is not allowed."""
+
+
+class EndpointError(LoopError):
+    """The endpoint that stands for the plant cannot be read or written."""
