@@ -1,0 +1,201 @@
+"""What a case is: a plant, the tests that its controllers must pass, and the paper's figures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ParamsError, PlantError
+from pipeline.plants.base import Plant
+
+Array = NDArray[np.float64]
+
+NOISE_SUFFIX = "_noise"
+"""A scenario's name with measurement noise is its name with this at the end: ``sp_a_noise``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenario:
+    """One closed-loop test.
+
+    At sample k the PV is measured, the error sp(k) - pv(k) counted, and the law's move acts over
+    [k, k+1). ``changes`` holds plant parameters over every period, which no controller sees.
+    """
+
+    name: str
+    title: str
+    sp: Array  # (n, n_sp) set point at every sample
+    x0: Array  # (n_x,) steady state at the start
+    mv0: Array  # (n_mv,) MV applied before sample 0
+    changes: Mapping[str, Array] = field(default_factory=dict)  # plant parameter -> (n,)
+    hold: int = 0  # samples per set point; 0: it never moves
+    seed: int | None = None  # of a random sequence
+
+    def __post_init__(self) -> None:
+        if self.sp.ndim != 2 or not len(self.sp):
+            raise PlantError(f"scenario {self.name!r}: sp has shape {self.sp.shape}; give (n, n_sp) with n >= 1")
+        for key, values in self.changes.items():
+            if values.shape != (len(self.sp),):
+                raise PlantError(
+                    f"scenario {self.name!r}: {key} has shape {values.shape}; "
+                    f"give one value a period, ({len(self.sp)},)"
+                )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.sp)
+
+    def parameters(self, plant: Plant) -> Array:
+        """The plant's parameter vector over every period, shape (n, n_p).
+
+        Raises PlantError where ``changes`` names a parameter that the plant does not have.
+        """
+        table = np.tile(plant.parameters(), (self.samples, 1))
+        plant.parameters({key: float(values[0]) for key, values in self.changes.items()})
+        for key, values in self.changes.items():
+            table[:, plant.parameter_names().index(key)] = values
+        return table
+
+    def with_hold(self, hold: int) -> Self:
+        """The same set points, each held for ``hold`` samples; only for a test without disturbances."""
+        if not self.hold or self.changes:
+            raise PlantError(f"scenario {self.name!r} has no holds that could be stretched")
+        return replace(self, sp=np.repeat(self.sp[:: self.hold], hold, axis=0), hold=hold)
+
+    def digest(self) -> str:
+        """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""
+        arrays = {"sp": self.sp, "x0": self.x0, "mv0": self.mv0, **self.changes}
+        text = {key: [f"{v:.7g}" for v in np.ravel(values)] for key, values in arrays.items()}
+        return hashlib.sha256(json.dumps([text, self.hold], sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class PaperFigure:
+    """One number of the paper's tables, and the same one from an independent implementation."""
+
+    label: str
+    law: str
+    scenario: str
+    metric: str
+    paper: float
+    setting: Mapping[str, float] = field(default_factory=dict)  # of the law, such as r
+    independent: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PaperTable:
+    """A table of the paper."""
+
+    number: int
+    title: str
+    rows: tuple[PaperFigure, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One controller in a figure."""
+
+    law: str
+    setting: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The paper's way to write it: INCAD (r=2.5)."""
+        inside = ", ".join(f"{k}={v:g}" for k, v in self.setting.items())
+        return self.law.upper() + (f" ({inside})" if inside else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure of the paper: curves over a scenario; no scenario: predictions over validation data."""
+
+    number: int
+    title: str
+    curves: tuple[Curve, ...]
+    scenario: str | None = None
+    hold: int | None = None  # other than the scenario's own
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """What a law must show: low <= metric <= high, or high times a bound's figure of the same scenario."""
+
+    law: str | None  # None: the case's best controller
+    scenario: str
+    metric: str
+    high: float
+    low: float = 0.0
+    times: str | None = None  # "nmpc" or "offline"
+    setting: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Case(ABC):
+    """A plant with its tests. ``held_out_seeds`` may be changed (params.yaml); the rest is what the case is."""
+
+    held_out_seeds: tuple[int, ...]
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    plant_class: ClassVar[type[Plant]]
+    development_seeds: ClassVar[tuple[int, ...]]  # for tuning and selection, never scored
+    noise: ClassVar[Mapping[str, float]]  # PV -> standard deviation of its measurement noise
+    gate: ClassVar[Mapping[str, float]]  # scenario -> weight in the promotion gate, summing to 1
+    regions: ClassVar[Mapping[str, tuple[float, float]]]  # name -> [low, high) of the CV
+    tables: ClassVar[tuple[PaperTable, ...]] = ()
+    figures: ClassVar[tuple[Figure, ...]] = ()
+    requirements: ClassVar[tuple[Requirement, ...]] = ()
+    claims: ClassVar[Mapping[str, str]] = {}  # what the paper states -> what an independent implementation found
+
+    def __post_init__(self) -> None:
+        both = sorted(set(self.held_out_seeds) & set(self.development_seeds))
+        if both or not self.held_out_seeds or len(set(self.held_out_seeds)) < len(self.held_out_seeds):
+            raise ParamsError(
+                f"cases.{self.name}.held_out_seeds: {list(self.held_out_seeds)}; give one or more different seeds, "
+                f"none of {list(self.development_seeds)}, which serve the development"
+            )
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The nominal plant."""
+        return self.plant_class()
+
+    @property
+    def noise_std(self) -> Array:
+        """Standard deviation of each PV's measurement noise, shape (n_pv,)."""
+        return np.array([self.noise[s.name] for s in self.plant_class.pv_signals])
+
+    def with_held_out(self, seeds: tuple[int, ...]) -> Self:
+        """The case scored on other held-out sequences."""
+        return replace(self, held_out_seeds=seeds)
+
+    @abstractmethod
+    def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        """The tests by name, each as its scenarios.
+
+        A test of several random sequences has one scenario for each sequence, and its figures are
+        the means over them; the other tests have one scenario.
+        """
+
+    @abstractmethod
+    def development(self) -> tuple[Scenario, ...]:
+        """Sequences for tuning and for choosing among candidates; never scored."""
+
+
+def held(levels: list[float], hold: int) -> Array:
+    """Set points, shape (len(levels) * hold, 1), each held for ``hold`` samples."""
+    return np.repeat(np.array(levels, dtype=np.float64), hold)[:, None]
+
+
+def random_levels(seed: int, count: int, low: float, high: float) -> list[float]:
+    """``count`` set points uniform in [low, high]."""
+    return [float(v) for v in np.random.default_rng(seed).uniform(low, high, count)]
