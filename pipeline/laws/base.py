@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from pipeline.errors import LawError
 from pipeline.models.base import Model
 from pipeline.plants.base import Plant
 from serving.manifest import Signal
@@ -31,6 +32,32 @@ class LawSignals:
         return cls(plant.period_s, plant.sp_signals, plant.pv_signals, plant.dv_signals, plant.mv_signals)
 
 
+def require_part(models: Mapping[str, Model], part: str, law: str, n_in: int, n_out: int) -> Model:
+    """The model named ``part`` of a model set, checked for its numbers of inputs and outputs.
+
+    Raises LawError that says what the law needs and what the set has.
+    """
+    needs = f"law {law!r} needs a part {part!r} ({n_in} inputs, {n_out} outputs)"
+    if part not in models:
+        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
+    model = models[part]
+    try:
+        shape = tuple(model(torch.zeros(n_in, dtype=torch.float64)).shape)
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise LawError(f"{needs}; the model set's takes other inputs: {error}".replace("\n", " ")) from error
+    if shape != (n_out,):
+        raise LawError(f"{needs}; the model set's gives {shape}")
+    return model
+
+
+def require_single_loop(signals: LawSignals, law: str) -> None:
+    """Raise LawError unless there is one set point and one MV."""
+    if len(signals.sp) != 1 or len(signals.mv) != 1:
+        raise LawError(
+            f"law {law!r} controls one variable by one; got {len(signals.sp)} set points and {len(signals.mv)} MVs"
+        )
+
+
 class ControlLaw(nn.Module, ABC):
     """One step of a controller: ``(sp, pv, dv, mv_applied, state) -> (mv, state_next, info)``.
 
@@ -43,7 +70,10 @@ class ControlLaw(nn.Module, ABC):
 
     name: ClassVar[str]
     title: ClassVar[str]
-    Params: ClassVar[type[Any]]  # frozen dataclass: what params.yaml may say of this law
+    Params: ClassVar[type[Any]]  # frozen dataclass: what params.yaml may say of this law; `mv_rate` among it
+    # Does the law add a move to the applied MV? Such a law takes over from manual without a bump and, started on
+    # set point, keeps the actuator where it is; the others compute the MV afresh, whatever was applied.
+    incremental: ClassVar[bool] = False
     n_state: int
     info: tuple[str, ...]
     low: Tensor  # (n_mv,)
@@ -55,6 +85,8 @@ class ControlLaw(nn.Module, ABC):
         self.signals = signals
         self.register_buffer("low", torch.tensor([s.low for s in signals.mv], dtype=torch.float64))
         self.register_buffer("high", torch.tensor([s.high for s in signals.mv], dtype=torch.float64))
+        if mv_rate is not None and not mv_rate > 0:
+            raise LawError(f"mv_rate is {mv_rate}; give the largest MV change a sample, above 0, or leave it out")
         rate = None if mv_rate is None else torch.full((len(signals.mv),), mv_rate, dtype=torch.float64)
         self.register_buffer("rate", rate)
 
