@@ -11,53 +11,16 @@ from typing import Any, ClassVar, Self
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize
+from scipy import optimize
 
 from pipeline.errors import PlantError
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.steady import SteadyStates
 from serving.manifest import Signal
 
 Array = NDArray[np.float64]
 
-
-@dataclass(frozen=True, slots=True)
-class Linearization:
-    """dx' = A dx + B dmv, dpv = C dx around a steady state (x, mv); per unit of the plant's time."""
-
-    x: Array  # shape: (n_x,)
-    mv: Array  # shape: (n_mv,)
-    a: Array  # shape: (n_x, n_x)
-    b: Array  # shape: (n_x, n_mv)
-    c: Array  # shape: (n_pv, n_x)
-
-    @property
-    def eigenvalues(self) -> NDArray[np.complex128]:
-        """Eigenvalues of A, largest real part first."""
-        values = np.linalg.eigvals(self.a).astype(np.complex128)
-        order = np.lexsort((values.imag, -values.real))
-        return np.asarray(values[order])
-
-    def sampled(self, period_s: float) -> tuple[Array, Array]:
-        """Zero-order-hold discretization (Phi, Gamma): x(k+1) = Phi x(k) + Gamma mv(k)."""
-        n, m = self.b.shape
-        block = np.zeros((n + m, n + m))
-        block[:n, :n], block[:n, n:] = self.a, self.b
-        power = linalg.expm(block * period_s)
-        return power[:n, :n], power[:n, n:]
-
-    def sampled_zeros(self, period_s: float, pv: int = 0, mv: int = 0) -> NDArray[np.complex128]:
-        """Zeros of the sampled transfer function from one MV to one PV.
-
-        The exact one-step inverse puts a closed-loop eigenvalue on each of them.
-        """
-        phi, gamma = self.sampled(period_s)
-        n = phi.shape[0]
-        pencil = np.zeros((n + 1, n + 1))
-        pencil[:n, :n], pencil[:n, n], pencil[n, :n] = phi, gamma[:, mv], self.c[pv]
-        mass = np.zeros_like(pencil)
-        mass[:n, :n] = np.eye(n)
-        zeros = linalg.eigvals(pencil, mass)
-        # The pencil has infinite eigenvalues beside the zeros: a relative degree's worth.
-        return np.asarray(zeros[np.abs(zeros) < 1e8], dtype=np.complex128)
+__all__ = ["Array", "Linearization", "Plant"]
 
 
 @dataclass(frozen=True)
@@ -175,19 +138,19 @@ class Plant(ABC):
         span = self.period_s / self.time_unit_s
         solver = ca.integrator("exact", "cvodes", dae, 0.0, span, options)
         x0, m0, d0, p0 = (ca.MX.sym(n, s.numel()) for n, s in zip("xmdp", (x, mv, dv, p), strict=True))
-        return ca.Function(
-            "exact_transition", [x0, m0, d0, p0], [solver(x0=x0, p=ca.vertcat(m0, d0, p0))["xf"]]
-        )
+        return ca.Function("exact_transition", [x0, m0, d0, p0], [solver(x0=x0, p=ca.vertcat(m0, d0, p0))["xf"]])
 
     def stepper(self) -> Callable[[Array, Array, Array, Array], Array]:
         """``step(x, mv, dv, p) -> x`` through CasADi's buffers, which skip its argument conversion."""
+        buffer: Any  # casadi's type stubs have other signatures than its buffers
+        evaluate: Any
         buffer, evaluate = self.transition.buffer()
         args = [np.zeros(n) for n in (self.transition.numel_in(i) for i in range(4))]
         result = np.zeros(len(self.state_signals))
         for i, arg in enumerate(args):
             if arg.size:
-                buffer.set_arg(i, memoryview(arg))
-        buffer.set_res(0, memoryview(result))
+                buffer.set_arg(i, arg.data)
+        buffer.set_res(0, result.data)
 
         def step(x: Array, mv: Array, dv: Array, p: Array) -> Array:
             for arg, value in zip(args, (x, mv, dv, p), strict=True):
@@ -200,79 +163,30 @@ class Plant(ABC):
 
     # ------------------------------------------------------------------ steady states
     @cached_property
-    def _jacobians(self) -> ca.Function:
-        x, mv, dv, p, dx = self._symbols
-        return ca.Function(
-            "jacobians",
-            [x, mv, dv, p],
-            [dx, ca.jacobian(dx, x), ca.jacobian(dx, mv), ca.jacobian(ca.vertcat(self.output(x)), x)],
-        )
-
-    def _balance(self, x: Array, mv: Array) -> tuple[Array, Array, Array, Array]:
-        out = self._jacobians(x, mv, self.dv_nominal, self.parameters())
-        f, fx, fu, c = (np.array(o) for o in out)
-        return f[:, 0], fx, fu, c
+    def _steady(self) -> SteadyStates:
+        return SteadyStates(self)
 
     @cached_property
     def steady_curve(self) -> tuple[Array, Array, Array]:
         """Steady states along the controlled variable: (cv (n,), x (n, n_x), mv (n,)).
 
-        For a plant with one MV and one CV whose steady MV is a function of the CV (the converse
-        need not hold: that is what multiplicity means). Each point starts from the one before.
+        For a plant with one MV and one CV. Raises PlantError where it has none in its set-point range.
         """
-        sp = self.sp_signals[0]
-        grid = np.linspace(sp.low, sp.high, 802)[1:-1]
-        rows: list[tuple[float, Array, float]] = []
-        guess = None
-        for cv in grid[::-1]:
-            solved = self._solve_steady(float(cv), guess)
-            if solved is not None:
-                guess = solved
-                rows.append((float(cv), *solved))
-        if not rows:
+        if len(self.mv_signals) != 1:
+            raise PlantError(f"plant {self.name!r} has {len(self.mv_signals)} MVs; its steady curve needs exactly one")
+        curve = self._steady.curve()
+        if not curve[0].size:
             raise PlantError(f"plant {self.name!r} has no steady state in its set-point range")
-        rows.reverse()
-        cvs, xs, mvs = zip(*rows, strict=True)
-        return np.array(cvs), np.array(xs), np.array(mvs)
-
-    def _solve_steady(self, cv: float, guess: tuple[Array, float] | None) -> tuple[Array, float] | None:
-        """Root of [derivative; pv[0] - cv] in (x, mv), scaled by the signals' ranges."""
-        signals = (*self.state_signals, *self.mv_signals)
-        low = np.array([s.low for s in signals])
-        span = np.array([s.high - s.low for s in signals])
-
-        def residual(z: Array) -> Array:
-            v = low + span * z
-            f, _, _, _ = self._balance(v[:-1], v[-1:])
-            return np.append(f * self.time_unit_s / span[:-1], (float(self.measure(v[:-1])[0]) - cv) / span[0])
-
-        def jacobian(z: Array) -> Array:
-            v = low + span * z
-            _, fx, fu, c = self._balance(v[:-1], v[-1:])
-            top = np.hstack([fx, fu]) * self.time_unit_s * span / span[:-1, None]
-            return np.vstack([top, np.append(c[0], 0.0) * span / span[0]])
-
-        if guess is not None:
-            starts = [(np.append(*guess) - low) / span]
-        else:
-            n = len(signals)
-            starts = list(np.random.default_rng(0).uniform(0.02, 0.98, (60, n)))
-        for start in starts:
-            with np.errstate(all="ignore"):
-                found = optimize.root(residual, start, jac=jacobian, method="hybr", tol=1e-13)
-            if np.all(np.isfinite(found.x)) and np.max(np.abs(residual(found.x))) < 1e-9:
-                v = low + span * found.x
-                return v[:-1], float(v[-1])
-        return None
+        return curve
 
     def steady_state_at(self, cv: float) -> tuple[Array, Array]:
-        """(x, mv) of the steady state whose controlled variable is ``cv``.
+        """(x (n_x,), mv (1,)) of the steady state whose controlled variable is ``cv``.
 
         Raises PlantError where there is none.
         """
         cvs, xs, mvs = self.steady_curve
         i = int(np.argmin(np.abs(cvs - cv)))
-        solved = self._solve_steady(cv, (xs[i], float(mvs[i])))
+        solved = self._steady.at(cv, (xs[i], float(mvs[i])))
         if solved is None:
             sp = self.sp_signals[0]
             raise PlantError(
@@ -290,24 +204,51 @@ class Plant(ABC):
             found.append(self.steady_state_at(float(cv))[0])
         return found
 
-    def turning_points(self) -> list[tuple[Array, float]]:
-        """(x, mv) where two steady states meet: extrema of the steady MV over the CV."""
+    @cached_property
+    def _turning_points(self) -> list[tuple[Array, float]]:
         cvs, _, mvs = self.steady_curve
-        slope = np.diff(mvs)
+
+        def singular(cv: float) -> float:
+            # Where the steady MV has an extremum over the CV, dx/dt has a direction without slope.
+            return float(np.linalg.det(self.linearize(*self.steady_state_at(cv)).a))
+
         found = []
-        for i in np.nonzero(np.diff(np.sign(slope)))[0]:
-            sign = float(np.sign(slope[i + 1]))
-            best = optimize.minimize_scalar(
-                lambda c, s=sign: s * float(self.steady_state_at(float(c))[1][0]),
-                bounds=(cvs[i], cvs[i + 2]),
-                method="bounded",
-                options={"xatol": 1e-10},
-            )
-            x, mv = self.steady_state_at(float(best.x))
+        for i in np.nonzero(np.diff(np.sign(np.diff(mvs))))[0]:
+            x, mv = self.steady_state_at(float(optimize.brentq(singular, cvs[i], cvs[i + 2], xtol=1e-13)))
             found.append((x, float(mv[0])))
         return found
 
+    def turning_points(self) -> list[tuple[Array, float]]:
+        """(x, mv) where two steady states meet: extrema of the steady MV over the CV, smallest CV first."""
+        return list(self._turning_points)
+
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """Names of the operating regions that the turning points separate, smallest CV first."""
+        n = len(self._turning_points) + 1
+        known = {1: ("all",), 2: ("low", "high"), 3: ("low", "middle", "high")}
+        return known.get(n, tuple(f"region {i + 1}" for i in range(n)))
+
+    def region(self, cv: Array) -> NDArray[np.int64]:
+        """Index into ``region_names`` of each controlled variable, same shape as ``cv``.
+
+        Regions are bounded by the CVs of the turning points: within one, every steady state is of one branch.
+        """
+        bounds = np.array([float(self.measure(x)[0]) for x, _ in self._turning_points])
+        return np.asarray(np.searchsorted(bounds, np.asarray(cv, dtype=np.float64), side="right"), dtype=np.int64)
+
     def linearize(self, x: Array, mv: Array) -> Linearization:
-        """Linearization per unit of ``time_unit_s`` at (x, mv)."""
-        _, fx, fu, c = self._balance(np.asarray(x, float), np.asarray(mv, float))
-        return Linearization(np.asarray(x, float), np.asarray(mv, float), fx, fu, c)
+        """Linearization at a steady state (x, mv), per second."""
+        x, mv = np.asarray(x, dtype=np.float64), np.asarray(mv, dtype=np.float64)
+        a, b, c = (np.array(o) for o in self._jacobians(x, mv, self.dv_nominal, self.parameters()))
+        return Linearization(x, mv, a / self.time_unit_s, b / self.time_unit_s, c)
+
+    @cached_property
+    def _jacobians(self) -> ca.Function:
+        x, mv, dv, p, dx = self._symbols
+        outputs = [ca.jacobian(dx, x), ca.jacobian(dx, mv), ca.jacobian(ca.vertcat(self.output(x)), x)]
+        return ca.Function("jacobians", [x, mv, dv, p], [ca.densify(o) for o in outputs])
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The cached CasADi functions are rebuilt in the process that unpickles the plant.
+        return {f.name: getattr(self, f.name) for f in fields(self)}

@@ -1,0 +1,99 @@
+"""Steady states of a plant with one MV and one CV: every branch, and where branches meet."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+if TYPE_CHECKING:
+    from pipeline.plants.base import Plant
+
+Array = NDArray[np.float64]
+
+GRID = 800  # points of the curve over the set point's range
+STARTS = 60  # random starts for the first point of the curve
+
+
+class SteadyStates:
+    """Roots (x, mv) of [dx/dt; cv(x) - cv], with the controlled variable cv given.
+
+    Solving for the MV at a given CV, and not the other way round, finds every branch of a plant
+    with multiplicity: the steady MV is a function of the CV, while the converse need not hold.
+    Each unknown is scaled by its signal's range, the derivative by range and period.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        signals = (*plant.state_signals, *plant.mv_signals)
+        self.low = np.array([s.low for s in signals])
+        self.span = np.array([s.high - s.low for s in signals])
+        self.range = plant.sp_signals[0]
+        z, cv = ca.SX.sym("z", len(signals)), ca.SX.sym("cv")
+        v = self.low + self.span * z
+        x, mv = v[:-1], v[-1:]
+        rate = plant.rate(x, mv, plant.dv_nominal, plant.parameters()) * (plant.period_s / plant.time_unit_s)
+        miss = (plant.measure(x)[0] - cv) / (self.range.high - self.range.low)
+        balance = ca.vertcat(rate / self.span[:-1], miss)
+        self.balance = ca.Function("balance", [z, cv], [balance, ca.densify(ca.jacobian(balance, z))])
+
+    def at(self, cv: float, guess: tuple[Array, float] | None) -> tuple[Array, float] | None:
+        """(x, mv) of the steady state at ``cv`` found from a near one; None where none is found."""
+        if guess is not None:
+            start = (np.append(*guess) - self.low) / self.span
+            root = self._newton(start, cv)
+            root = self._robust(start, cv) if root is None else root
+        else:
+            starts = np.random.default_rng(0).uniform(0.02, 0.98, (STARTS, self.low.size))
+            root = next((r for r in (self._robust(s, cv) for s in starts) if r is not None), None)
+        if root is None:
+            return None
+        v = self.low + self.span * root
+        return v[:-1], float(v[-1])
+
+    def curve(self) -> tuple[Array, Array, Array]:
+        """(cv (n,), x (n, n_x), mv (n,)) over the set point's range; each point starts from its neighbour."""
+        rows: list[tuple[float, Array, float]] = []
+        guess = None
+        # From the top: where one end of the range has no steady state, the other end mostly has one.
+        for cv in np.linspace(self.range.high, self.range.low, GRID + 2)[1:-1]:
+            solved = self.at(float(cv), guess)
+            if solved is not None:
+                guess = solved
+                rows.append((float(cv), *solved))
+        rows.reverse()
+        n_x = self.low.size - 1
+        return (
+            np.array([r[0] for r in rows]),
+            np.array([r[1] for r in rows]).reshape(-1, n_x),
+            np.array([r[2] for r in rows]),
+        )
+
+    def _newton(self, z: Array, cv: float) -> Array | None:
+        for _ in range(12):
+            miss, slope = (np.array(o) for o in self.balance(z, cv))
+            try:
+                step = np.linalg.solve(slope, miss[:, 0])
+            except np.linalg.LinAlgError:
+                return None
+            z = z - step
+            size = np.max(np.abs(step))
+            if not size < 1.0:  # NaN too
+                return None
+            if size < 1e-13:
+                return z
+        return None
+
+    def _robust(self, z: Array, cv: float) -> Array | None:
+        def miss(v: Array) -> Any:
+            return np.array(self.balance(v, cv)[0])[:, 0]
+
+        def slope(v: Array) -> Any:
+            return np.array(self.balance(v, cv)[1])
+
+        with np.errstate(all="ignore"):
+            found = optimize.root(miss, z, jac=slope, method="hybr", tol=1e-13)
+        solved = np.all(np.isfinite(found.x)) and np.max(np.abs(miss(found.x))) < 1e-9
+        return np.asarray(found.x) if solved else None
