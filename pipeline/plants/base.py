@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, ClassVar, Self
 
 import casadi as ca
@@ -222,19 +223,27 @@ class Plant(ABC):
         """(x, mv) where two steady states meet: extrema of the steady MV over the CV, smallest CV first."""
         return list(self._turning_points)
 
+    @cached_property
+    def regions(self) -> dict[str, tuple[float, float]]:
+        """Operating regions by name: the range [low, high) of the CV in each, smallest CV first.
+
+        The turning points bound them: within one region every steady state is of one branch.
+        """
+        bounds = [float(self.measure(x)[0]) for x, _ in self._turning_points]
+        edges = [-np.inf, *bounds, np.inf]
+        n = len(edges) - 1
+        names = {1: ("all",), 2: ("low", "high"), 3: ("low", "middle", "high")}
+        ranges = pairwise(edges)
+        return dict(zip(names.get(n, tuple(f"region {i + 1}" for i in range(n))), ranges, strict=True))
+
     @property
     def region_names(self) -> tuple[str, ...]:
-        """Names of the operating regions that the turning points separate, smallest CV first."""
-        n = len(self._turning_points) + 1
-        known = {1: ("all",), 2: ("low", "high"), 3: ("low", "middle", "high")}
-        return known.get(n, tuple(f"region {i + 1}" for i in range(n)))
+        """Names of the operating regions, smallest CV first."""
+        return tuple(self.regions)
 
     def region(self, cv: Array) -> NDArray[np.int64]:
-        """Index into ``region_names`` of each controlled variable, same shape as ``cv``.
-
-        Regions are bounded by the CVs of the turning points: within one, every steady state is of one branch.
-        """
-        bounds = np.array([float(self.measure(x)[0]) for x, _ in self._turning_points])
+        """Index into ``region_names`` of each controlled variable, same shape as ``cv``."""
+        bounds = [low for low, _ in self.regions.values()][1:]
         return np.asarray(np.searchsorted(bounds, np.asarray(cv, dtype=np.float64), side="right"), dtype=np.int64)
 
     def linearize(self, x: Array, mv: Array) -> Linearization:
