@@ -11,6 +11,7 @@ from serving.errors import ArtifactError
 
 SCHEMA = 1
 MANIFEST_KEY = "loopwright.manifest"
+INPUTS = ("sp", "pv", "dv", "mv_applied", "state")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,31 @@ class Manifest:
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence: dict[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        for name in ("sp", "pv", "dv", "mv"):
+            names = [s.name for s in self.signals(name)]
+            if len(set(names)) < len(names):
+                raise ArtifactError(f"the manifest's {name} has a name twice: {', '.join(names)}")
+        if not self.mv:
+            raise ArtifactError("the manifest has no manipulated variable")
+        if not (math.isfinite(self.period_s) and self.period_s > 0):
+            raise ArtifactError(f"the manifest has the period {self.period_s} s; it must be positive")
+        if self.n_state < 0:
+            raise ArtifactError(f"the manifest has n_state = {self.n_state}; it must not be negative")
+        strange = [n for n in self.inputs if n not in INPUTS]
+        if strange or len(set(self.inputs)) < len(self.inputs):
+            raise ArtifactError(
+                f"the manifest's inputs are {list(self.inputs)}; allowed are {', '.join(INPUTS)}, each once"
+            )
+
+    def signals(self, name: str) -> tuple[Signal, ...]:
+        """The signals behind one of the graph's inputs; none for ``state``."""
+        return {"sp": self.sp, "pv": self.pv, "dv": self.dv, "mv_applied": self.mv, "mv": self.mv}.get(name, ())
+
+    def sizes(self) -> dict[str, int]:
+        """Length of each input, whether the graph uses it or not."""
+        return {n: self.n_state if n == "state" else len(self.signals(n)) for n in INPUTS}
+
     def to_json(self, *, indent: int | None = None) -> str:
         """The manifest as JSON, keys in the order of the fields."""
         row: dict[str, Any] = {"schema": self.schema}
@@ -91,8 +117,8 @@ class Manifest:
     def from_json(cls, text: str) -> Self:
         """The manifest in ``text``; ArtifactError names what is missing or malformed."""
         try:
-            row = json.loads(text)
-        except json.JSONDecodeError as error:
+            row = json.loads(text, parse_constant=_not_finite)
+        except (json.JSONDecodeError, RecursionError) as error:
             raise ArtifactError(f"the manifest is not JSON: {error}") from error
         if not isinstance(row, dict):
             raise ArtifactError("the manifest is not a JSON object")
@@ -121,5 +147,9 @@ class Manifest:
                 evidence=dict(row["evidence"]),
                 **signals,
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise ArtifactError(f"the manifest is malformed: {error!r}") from error
+
+
+def _not_finite(text: str) -> float:
+    raise ArtifactError(f"the manifest holds {text}, which is not a number")

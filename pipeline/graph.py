@@ -1,0 +1,177 @@
+"""A law as a plain ONNX graph: float64 to the last constant, few nodes, nothing of this machine in it."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx_ir as ir
+import torch
+from onnx_ir.passes import common as passes
+from onnxscript import optimizer
+
+from pipeline.errors import ExportError
+from pipeline.laws.base import ControlLaw
+from serving.errors import ArtifactError
+from serving.graph_audit import MAX_IR, audit
+from serving.manifest import INPUTS
+
+OPSET = 18  # the exporter's own: no version conversion, and older runtimes read it
+OUTPUTS = ("mv", "state_next", "info")
+
+
+def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
+    """The graph of one step, and the inputs that it uses, in the order of the contract.
+
+    Inputs ``sp, pv, dv, mv_applied, state`` and outputs ``mv, state_next, info``, all float64 of
+    rank 1; an input that the law does not use and an output of size zero are left out.
+
+    Raises ExportError where the law cannot be such a graph.
+    """
+    sizes = (len(law.signals.sp), len(law.signals.pv), len(law.signals.dv), len(law.signals.mv), law.n_state)
+    example = tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
+    with _quiet():
+        try:
+            program = torch.onnx.export(
+                law, example, dynamo=True, external_data=False, verbose=False, optimize=False, opset_version=OPSET
+            )
+        except Exception as error:  # torch wraps whatever went wrong in exceptions of its own
+            raise ExportError(f"law {law.name!r} cannot be traced: {_cause(error)}") from error
+    assert program is not None and program.exported_program is not None  # only another exporter leaves them out
+    model = program.model
+    _restore_floats(model, _python_floats(program.exported_program))
+    inputs = _name_ends(model, sizes)
+    _simplify(model)
+    inputs = tuple(name for name in inputs if any(v.name == name for v in model.graph.inputs))
+    proto = ir.to_proto(model)
+    proto.ir_version = MAX_IR
+    proto.producer_name, proto.producer_version = "loopwright", ""
+    del proto.graph.value_info[:], proto.metadata_props[:], proto.graph.metadata_props[:]
+    _check(law, proto)
+    return proto, inputs
+
+
+def _python_floats(program: torch.export.ExportedProgram) -> set[float]:
+    """Every Python float that stands in the traced law."""
+    found: set[float] = set()
+
+    def walk(value: Any) -> Any:
+        if isinstance(value, float):
+            found.add(value)
+        return value
+
+    for node in program.graph.nodes:
+        torch.fx.node.map_aggregate((node.args, node.kwargs), walk)
+    return found
+
+
+def _restore_floats(model: ir.Model, floats: set[float]) -> None:
+    """Give Python floats their 53 bits back: the exporter writes each as float32 and casts it.
+
+    0.1 becomes 0.100000001. Without this every ``0.1 * x`` of a law would be off by 1e-8, and ``clamp(min=finfo.tiny)`` would be 0.
+    """
+    with np.errstate(over="ignore", under="ignore"):
+        exact: dict[float, set[float]] = {}
+        for value in floats:
+            exact.setdefault(float(np.float32(value)), set()).add(value)
+    for node in model.graph:
+        if node.op_type != "Constant" or "value" not in node.attributes:
+            continue
+        tensor = node.attributes["value"].as_tensor()
+        if tensor.dtype != ir.DataType.FLOAT or tensor.shape.numpy() != ():
+            continue
+        rounded = float(tensor.numpy())
+        candidates = exact.get(rounded, {rounded})
+        if len(candidates) > 1:
+            raise ExportError(
+                f"the constants {', '.join(map(repr, sorted(candidates)))} become one number in float32; "
+                "keep one of them in a float64 buffer"
+            )
+        node.attributes["value"] = ir.AttrTensor("value", ir.tensor(np.array(next(iter(candidates)))))
+
+
+def _name_ends(model: ir.Model, sizes: tuple[int, ...]) -> tuple[str, ...]:
+    """Name inputs and outputs by the contract and drop those of size zero.
+
+    The names are given here, not to the exporter, which confuses an input with an output where a
+    law hands one through unchanged.
+    """
+    graph = model.graph
+    passes.OutputFixPass()(model)
+    for value, name in zip((*graph.inputs, *graph.outputs), (*INPUTS, *OUTPUTS), strict=True):
+        value.name = name
+    for value, size in zip(list(graph.inputs), sizes, strict=True):
+        if size == 0:
+            graph.inputs.remove(value)
+            constant = ir.Value(name=f"no_{value.name}", const_value=ir.tensor(np.zeros(0), name=f"no_{value.name}"))
+            ir.convenience.replace_all_uses_with(value, constant)
+            graph.initializers[f"no_{value.name}"] = constant
+    for value in list(graph.outputs):
+        if value.shape is not None and value.shape.numpy() == (0,):
+            graph.outputs.remove(value)
+    return tuple(name for name, size in zip(INPUTS, sizes, strict=True) if size)
+
+
+def _simplify(model: ir.Model) -> None:
+    """Fold constants and drop what nothing reads.
+
+    Not ``onnxscript.optimizer.optimize``: its rewrite rules take any constant within 1e-8 of zero
+    for zero and within 1e-5 of one for one.
+    """
+    optimizer.fold_constants(model)
+    for step in (
+        passes.IdentityEliminationPass(),
+        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        passes.DeduplicateInitializersPass(),
+        passes.CommonSubexpressionEliminationPass(),
+        passes.RemoveUnusedNodesPass(),
+        passes.ClearMetadataAndDocStringPass(),
+    ):
+        step(model)
+    unused = [v for v in model.graph.inputs if not v.uses()]
+    for value in unused:
+        model.graph.inputs.remove(value)
+
+
+def _check(law: ControlLaw, proto: onnx.ModelProto) -> None:
+    """ExportError for an operator off the list, a float32 value, or a buffer that changed on its way."""
+    try:
+        audit(proto.SerializeToString())
+    except ArtifactError as error:
+        raise ExportError(f"law {law.name!r}: {error}") from error
+    narrow = {onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16}
+    casts = [a.i for n in proto.graph.node if n.op_type == "Cast" for a in n.attribute if a.name == "to"]
+    if narrow & {*casts, *(t.data_type for t in proto.graph.initializer)}:
+        raise ExportError(f"law {law.name!r} computes in float32 somewhere; make its constants and casts float64")
+    buffers = law.state_dict()
+    for tensor in proto.graph.initializer:
+        value = onnx.numpy_helper.to_array(tensor)
+        if tensor.name in buffers and not np.array_equal(value, buffers[tensor.name].numpy(), equal_nan=True):
+            raise ExportError(f"law {law.name!r}: buffer {tensor.name!r} changed on its way into the graph")
+
+
+def _cause(error: Exception) -> str:
+    """The innermost reason's first line, past torch's banner."""
+    inner: BaseException = error
+    while inner.__cause__ is not None:
+        inner = inner.__cause__
+    return (str(inner).strip().splitlines() or [type(inner).__name__])[0]
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hold back what the exporter says of torchvision and of its own deprecated calls."""
+    log = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*", category=FutureWarning)
+            yield
+    finally:
+        log.setLevel(level)

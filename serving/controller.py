@@ -1,0 +1,272 @@
+"""Controller: load one .onnx file, check it, step it."""
+
+from __future__ import annotations
+
+from math import isfinite
+from os import PathLike
+from pathlib import Path
+from threading import Lock
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from serving.digest import DIGEST_KEY, file_digest, unseal
+from serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
+from serving.graph_audit import MAX_BYTES, audit
+from serving.manifest import MANIFEST_KEY, Manifest
+
+Array: TypeAlias = NDArray[np.float64]
+_LINE = 8  # float64 in a cache line: each vector starts on one, so that no result depends on its neighbours
+
+
+class Step(NamedTuple):
+    """One step's result: MV in engineering units, the state for the next step, and the info vector."""
+
+    mv: Array  # shape: (n_mv,)
+    state: Array  # shape: (n_state,)
+    info: Array  # shape: (n_info,)
+
+
+class Controller:
+    """A control law in one file: ``(sp, pv, dv, mv_applied, state) -> (mv, state_next, info)``.
+
+    Parameters
+    ----------
+    path
+        The .onnx file that the pipeline exported.
+    sha256
+        The file's own SHA-256, if the host wants this very file and no other. The digest inside
+        the file finds damage and careless edits; only a pinned digest finds a forged file.
+
+    Raises
+    ------
+    ArtifactError
+        The file is corrupt, truncated, foreign or changed, holds what a controller may not
+        (see ``serving.graph_audit``), or its manifest and its graph disagree.
+
+    Notes
+    -----
+    A step holds a lock, because its buffers are bound to the session once and used by every step.
+    """
+
+    def __init__(self, path: str | PathLike[str], sha256: str | None = None) -> None:
+        self.path = Path(path)
+        try:
+            data = _read(self.path, sha256)
+            self.summary = audit(data)
+            self.manifest = _manifest(self.summary.metadata)
+            self._session = _session(data)
+            _agree(self.manifest, self._session)
+        except ArtifactError as error:
+            raise ArtifactError(f"{self.path}: {error}") from error.__cause__
+        self.size_bytes = len(data)
+        self.sha256 = file_digest(data)
+        self._lock = Lock()
+        self._bind()
+
+    def cold_state(self) -> Array:
+        """State of zeros, shape (n_state,): no past. Also right after any gap."""
+        return np.zeros(self.manifest.n_state)
+
+    def step(
+        self, *, sp: ArrayLike, pv: ArrayLike, mv_applied: ArrayLike, state: ArrayLike, dv: ArrayLike | None = None
+    ) -> Step:
+        """One step of the law, in engineering units.
+
+        Parameters
+        ----------
+        sp, pv, dv
+            Set points (n_sp,), process variables (n_pv,), measured disturbances (n_dv,). A number
+            stands for a vector of one. An input that the law does not use is ignored.
+        mv_applied
+            The MV that the plant really received over the last period, shape (n_mv,).
+        state
+            ``state`` of the last step, or ``cold_state()``; shape (n_state,).
+
+        Raises
+        ------
+        ContractError
+            An input has the wrong shape or type, or is missing.
+        SampleError
+            An input is not finite: no MV is computed from it.
+        OutputError
+            The law's output is not finite or lies outside the MV's range.
+        """
+        given = {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
+        with self._lock:
+            for name, buffer, shape in self._inputs:
+                value = given[name]
+                if type(value) is np.ndarray and value.dtype is _FLOAT64 and value.shape == shape:
+                    buffer[...] = value
+                else:
+                    buffer[...] = self._vector(name, value, shape[0])
+            # A sum of finite numbers may overflow; then the exact check clears the sample.
+            if not isfinite(sum(self._in.tolist())):
+                self._check_finite()
+            try:
+                self._session.run_with_iobinding(self._binding)
+            except Exception as error:
+                raise OutputError(f"the law cannot be computed: {_first_line(error)}") from error
+            out = self._out.copy()
+        n_mv, a, b, c, d = self._cuts
+        values = out.tolist()
+        for (low, high, allowed), value in zip(self._ranges, values[:n_mv], strict=True):
+            if not low <= value <= high or (allowed is not None and value not in allowed):
+                self._refuse(values)
+        if not isfinite(sum(values)):
+            self._refuse(values)
+        return Step(out[:n_mv], out[a:b], out[c:d])
+
+    def warm(self) -> None:
+        """One discarded step on the last inputs: just before a deadline it brings code and weights into the caches.
+
+        The state is explicit, so a discarded step changes nothing.
+        """
+        last = {name: buffer.copy() for name, buffer, _ in self._inputs}
+        empty: dict[str, Any] = dict.fromkeys(("sp", "pv", "dv", "mv_applied", "state"))
+        try:
+            self.step(**{**empty, **last})
+        except LoopwrightError:
+            self._reset()
+
+    # ------------------------------------------------------------------ buffers
+    def _bind(self) -> None:
+        """One buffer for all inputs and one for all outputs, bound to the session for good."""
+        m = self.manifest
+        sizes = m.sizes()
+        self._in, parts = _vectors([sizes[name] for name in m.inputs])
+        self._inputs = [(name, part, part.shape) for name, part in zip(m.inputs, parts, strict=True)]
+        self._out, outs = _vectors([len(m.mv), m.n_state, len(m.info)])
+        starts = [(p.ctypes.data - self._out.ctypes.data) // 8 for p in outs]
+        self._cuts = (len(m.mv), starts[1], starts[1] + m.n_state, starts[2], starts[2] + len(m.info))
+        self._ranges = [(s.low, s.high, s.values) for s in m.mv]
+        self._binding = self._session.io_binding()
+        for name, part, shape in self._inputs:
+            self._binding.bind_input(name, "cpu", 0, np.float64, shape, part.ctypes.data)
+        for name, part in zip(("mv", "state_next", "info"), outs, strict=True):
+            if part.size:
+                self._binding.bind_output(name, "cpu", 0, np.float64, part.shape, part.ctypes.data)
+        self._reset()
+
+    def _reset(self) -> None:
+        """Inputs that any law can be warmed with: the middle of each range, no past."""
+        with self._lock:
+            for name, buffer, _ in self._inputs:
+                buffer[...] = [(s.low + s.high) / 2 for s in self.manifest.signals(name)] or 0.0
+
+    # ------------------------------------------------------------------ refusals
+    def _vector(self, name: str, value: object, length: int) -> Array:
+        """``value`` as float64 of shape (length,); ContractError says what is allowed."""
+        if value is None:
+            raise ContractError(f"{name} is missing; the law {self.manifest.law!r} needs {self._allowed(name)}")
+        try:
+            array = np.asarray(value)
+        except (ValueError, TypeError) as error:
+            raise ContractError(f"{name} is no vector of numbers: {error}; it needs {self._allowed(name)}") from error
+        if array.dtype.kind not in "fiu":
+            raise ContractError(f"{name} has the type {array.dtype}; it needs numbers: {self._allowed(name)}")
+        if array.ndim == 0 and length == 1:
+            array = array.reshape(1)
+        if array.shape != (length,):
+            raise ContractError(f"{name} has the shape {array.shape}; it needs {self._allowed(name)}")
+        return array.astype(np.float64)
+
+    def _allowed(self, name: str) -> str:
+        if name == "state":
+            return f"shape ({self.manifest.n_state},), from the last step or cold_state()"
+        signals = self.manifest.signals(name)
+        return f"shape ({len(signals)},): {', '.join(f'{s.name} [{s.unit}]' for s in signals)}"
+
+    def _check_finite(self) -> None:
+        for name, buffer, _ in self._inputs:
+            for i, value in enumerate(buffer.tolist()):
+                if not isfinite(value):
+                    signals = self.manifest.signals(name)
+                    label = f"{signals[i].name} [{signals[i].unit}]" if signals else f"entry {i}"
+                    raise SampleError(f"{name}: {label} is {value}; no MV is computed from a value that is not finite")
+
+    def _refuse(self, values: list[float]) -> None:
+        """Raise OutputError for the first output that is wrong; silent if only their sum overflowed."""
+        n_mv, a, b, c, d = self._cuts
+        for signal, value in zip(self.manifest.mv, values[:n_mv], strict=True):
+            if not signal.low <= value <= signal.high:
+                raise OutputError(
+                    f"the law gave {signal.name} = {value} {signal.unit}, "
+                    f"outside its range [{signal.low:g}, {signal.high:g}] {signal.unit}"
+                )
+            if signal.values is not None and value not in signal.values:
+                raise OutputError(f"the law gave {signal.name} = {value}; it may be one of {list(signal.values)}")
+        for label, part in (("state_next", values[a:b]), ("info", values[c:d])):
+            for i, value in enumerate(part):
+                if not isfinite(value):
+                    raise OutputError(f"the law gave {label}[{i}] = {value}, which is not finite")
+
+
+_FLOAT64 = np.dtype(np.float64)
+
+
+def _vectors(lengths: list[int]) -> tuple[Array, list[Array]]:
+    """One zeroed buffer and its parts, each starting on a cache line."""
+    lines = [-(-n // _LINE) for n in lengths]
+    raw = np.zeros((sum(lines) + 1) * _LINE)
+    first = (-raw.ctypes.data // 8) % _LINE
+    whole = raw[first : first + sum(lines) * _LINE]
+    starts = np.cumsum([0, *lines]) * _LINE
+    return whole, [whole[s : s + n] for s, n in zip(starts, lengths, strict=False)]
+
+
+def _read(path: Path, pinned: str | None) -> bytes:
+    """The file's bytes, read once: what is checked is what is loaded."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ArtifactError(f"the file has {path.stat().st_size} bytes; a controller has at most {MAX_BYTES}")
+        data = path.read_bytes()
+    except OSError as error:
+        raise ArtifactError(f"the file cannot be read: {error.strerror or error}") from error
+    if pinned is not None and file_digest(data) != pinned.lower():
+        raise ArtifactError(f"the file's SHA-256 is {file_digest(data)}, not the pinned {pinned}")
+    unseal(data)
+    return data
+
+
+def _manifest(metadata: dict[str, str]) -> Manifest:
+    if MANIFEST_KEY not in metadata or DIGEST_KEY not in metadata:
+        raise ArtifactError(f"the file has no {MANIFEST_KEY}: it is an ONNX model, but no Loopwright controller")
+    return Manifest.from_json(metadata[MANIFEST_KEY])
+
+
+def _session(data: bytes) -> Any:
+    """An onnxruntime session for one small graph in a control loop: one thread that never spins."""
+    import onnxruntime as ort  # here, so that `import serving` costs nothing
+
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 4  # what goes wrong is raised, not logged
+    try:
+        return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions have no public base
+        raise ArtifactError(f"onnxruntime does not load the graph: {_first_line(error)}") from error
+
+
+def _agree(manifest: Manifest, session: Any) -> None:
+    """ArtifactError unless the graph has exactly the inputs and outputs that the manifest tells."""
+    sizes = manifest.sizes()
+    wanted_in = {name: sizes[name] for name in manifest.inputs}
+    outputs = {"mv": len(manifest.mv), "state_next": manifest.n_state, "info": len(manifest.info)}
+    wanted_out = {name: n for name, n in outputs.items() if n}
+    for kind, wanted, nodes in (
+        ("inputs", wanted_in, session.get_inputs()),
+        ("outputs", wanted_out, session.get_outputs()),
+    ):
+        found = {node.name: f"{node.type}{node.shape}" for node in nodes}
+        expected = {name: f"tensor(double){[n]}" for name, n in wanted.items()}
+        if found != expected:
+            raise ArtifactError(f"the graph's {kind} are {found}, but its manifest says {expected}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
