@@ -1,0 +1,17 @@
+"""Excitations by the name they have in params.yaml (``kind``): adding one is a class and a line here."""
+
+from __future__ import annotations
+
+from pipeline.excitation.base import Excitation, OpenLoop
+from pipeline.excitation.operating_point import OperatingPoint
+from pipeline.excitation.sequences import Aprbs, Multisine, Prbs, RandomSteps
+
+EXCITATIONS: dict[str, type[Excitation]] = {
+    RandomSteps.kind: RandomSteps,
+    Prbs.kind: Prbs,
+    Aprbs.kind: Aprbs,
+    Multisine.kind: Multisine,
+    OperatingPoint.kind: OperatingPoint,
+}
+
+__all__ = ["EXCITATIONS", "Excitation", "OpenLoop"]

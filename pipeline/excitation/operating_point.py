@@ -1,0 +1,193 @@
+"""Excitation where the plant is meant to run: dither around a feedback, and held moves from there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PlantError
+from pipeline.excitation.base import Excitation
+from pipeline.plants.base import Array, Plant
+from pipeline.record import Record
+from pipeline.simulate import measured, noise_draws, simulate_batch
+from pipeline.tuning import AllPole, PidSettings, imc_pid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loop:
+    """One closed-loop run: states (n, n_x), measured PVs (n, n_pv) and MVs (n, 1) at its samples."""
+
+    x: Array
+    pv: Array
+    mv: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class OperatingPoint(Excitation):
+    """Closed-loop data around random set points, and short runs restarted from the states visited.
+
+    An unstable operating region is hardly ever visited in open loop. A PID keeps the plant there
+    while a dither on its MV excites it. From states of that run, moves of one random MV held for
+    ``move_hold`` samples then show what every MV does there. Each closed-loop run stands in the
+    record right before the short runs that start from it, so that a split in time separates states too.
+
+    Attributes
+    ----------
+    samples : int
+        Closed-loop samples in all [-].
+    run_length : int
+        Samples after which the loop is started anew, at the steady state of a random set point [-];
+        a loop that has lost its plant at a limit is thereby set free.
+    sp_low, sp_high : float, optional
+        Range of the set points [unit of the CV]; default: its signal's, less 2 % at both ends.
+    sp_hold_low, sp_hold_high : int
+        Fewest and most samples for which a set point is held [-].
+    filter_s : float
+        Time constant of the IMC filter that sets the PID for the plant linearized at ``tune_cv`` [s].
+    tune_cv : float, optional
+        CV of that steady state [unit of the CV]; default: the middle of the set points' range.
+    kc, ti_s, td_s : float, optional
+        The PID itself, instead of IMC: gain [MV/CV], integral and derivative time [s].
+    dither : float
+        The dither is uniform over +-dither [unit of the MV].
+    dither_hold : int
+        Samples for which a dither is held [-].
+    restarts : int
+        Number of short runs [-], each of move_hold + 1 rows.
+    move_hold : int
+        Samples for which the MV of a short run is held [-].
+    near : float
+        Standard deviation, around the MV that the feedback had used in that state, of the MVs that
+        are not drawn over the whole range [unit of the MV].
+    near_fraction : float
+        Fraction of the short runs with such an MV [-], 0 to 1.
+    """
+
+    kind: ClassVar[str] = "operating_point"
+    samples: int = 40_000
+    run_length: int = 1_000
+    sp_low: float | None = None
+    sp_high: float | None = None
+    sp_hold_low: int = 20
+    sp_hold_high: int = 80
+    filter_s: float = 1.7
+    tune_cv: float | None = None
+    kc: float | None = None
+    ti_s: float | None = None
+    td_s: float = 0.0
+    dither: float = 30.0
+    dither_hold: int = 3
+    restarts: int = 60_000
+    move_hold: int = 3
+    near: float = 40.0
+    near_fraction: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("run_length", "sp_hold_low", "dither_hold", "move_hold"):
+            self.require(name, 1)
+        self.require("sp_hold_high", self.sp_hold_low)
+        for name in ("restarts", "dither", "near", "td_s"):
+            self.require(name, 0)
+        self.require("near_fraction", 0, 1)
+
+    def run(self, plant: Plant, seed: int) -> Record:
+        """The record: closed-loop runs, each followed by the short runs from its states.
+
+        Raises PlantError for a plant with more than one MV.
+        """
+        if len(plant.mv_signals) != 1:
+            raise PlantError(f"plant {plant.name!r} has {len(plant.mv_signals)} MVs; {self.kind!r} excites exactly one")
+        rng = np.random.default_rng(seed)
+        lengths = np.diff(np.r_[np.arange(0, self.samples, self.run_length), self.samples])
+        pid = self.settings(plant)
+        loops = [self.closed_loop(plant, pid, int(n), rng) for n in lengths]
+        return self.with_moves(plant, loops, rng)
+
+    def set_points(self, plant: Plant) -> tuple[float, float]:
+        """Lowest and highest set point."""
+        sp = plant.sp_signals[0]
+        rim = 0.02 * (sp.high - sp.low)
+        low = sp.low + rim if self.sp_low is None else self.sp_low
+        high = sp.high - rim if self.sp_high is None else self.sp_high
+        if not sp.low <= low < high <= sp.high:
+            raise PlantError(
+                f"excitation {self.kind!r}: set points from {low:g} to {high:g} {sp.unit}; "
+                f"sp_low < sp_high within {sp.low:g} to {sp.high:g} are allowed"
+            )
+        return low, high
+
+    def settings(self, plant: Plant) -> PidSettings:
+        """The PID that holds the plant at its set points."""
+        if self.kc is not None:
+            return PidSettings(self.kc, np.inf if self.ti_s is None else self.ti_s, self.td_s)
+        cv = sum(self.set_points(plant)) / 2 if self.tune_cv is None else self.tune_cv
+        return imc_pid(AllPole.of(plant.linearize(*plant.steady_state_at(cv))), self.filter_s)
+
+    def closed_loop(self, plant: Plant, pid: PidSettings, n: int, rng: np.random.Generator) -> Loop:
+        """One run of n samples around random set points, from the steady state of a random one.
+
+            v(k) = v(k-1) + Kc [ e(k) - e(k-1) + (h/Ti) e(k) - (Td/h) (y - 2 y1 + y2) ],  mv = v + dither
+
+        v is limited to the MV's range, which is the anti-windup; mv is limited to it as well.
+        """
+        sp_low, sp_high = self.set_points(plant)
+        low, high, h = plant.mv_signals[0].low, plant.mv_signals[0].high, plant.period_s
+        step, dv, p = plant.stepper(), plant.dv_nominal, plant.parameters()
+        state, steady_mv = plant.steady_state_at(float(rng.uniform(sp_low, sp_high)))
+        noise = noise_draws(plant, n, self.noise, rng)
+        x, pv, mv = np.empty((n, len(state))), np.empty((n, noise.shape[1])), np.empty((n, 1))
+        v, past, left = float(steady_mv[0]), None, 0
+        sp = dither = 0.0
+        for k in range(n):
+            x[k] = state
+            pv[k] = measured(plant, state) + noise[k]
+            if left == 0:
+                sp, left = (
+                    float(rng.uniform(sp_low, sp_high)),
+                    int(rng.integers(self.sp_hold_low, self.sp_hold_high + 1)),
+                )
+            left -= 1
+            if k % self.dither_hold == 0:
+                dither = float(rng.uniform(-self.dither, self.dither))
+            y = float(pv[k, 0])
+            e1, y1, y2 = (sp - y, y, y) if past is None else past
+            v += pid.kc * (sp - y - e1 + h / pid.ti_s * (sp - y) - pid.td_s / h * (y - 2 * y1 + y2))
+            v = min(max(v, low), high)
+            past = (sp - y, y, y1)
+            mv[k] = min(max(v + dither, low), high)
+            state = step(state, mv[k], dv, p)
+        return Loop(x, pv, mv)
+
+    def with_moves(self, plant: Plant, loops: Sequence[Loop], rng: np.random.Generator) -> Record:
+        """The record of the loops and of held moves restarted from their states."""
+        visited = np.concatenate([loop.x for loop in loops])
+        used = np.concatenate([loop.mv for loop in loops])
+        # Sorted, so that the short runs follow the loop in which their states were visited.
+        pick = np.sort(rng.integers(len(visited), size=self.restarts))
+        move = self.moves(plant, used[pick, 0], rng)
+        rows = self.move_hold + 1
+        x = simulate_batch(plant, visited[pick], np.repeat(move[:, None, None], self.move_hold, axis=1))
+        noise = noise_draws(plant, self.restarts * rows, self.noise, rng)
+        pv = (measured(plant, x).reshape(len(noise), -1) + noise).reshape(self.restarts, rows, -1)
+        ends = np.searchsorted(pick, np.cumsum([len(loop.x) for loop in loops]))
+        pvs: list[Array] = []
+        mvs: list[Array] = []
+        lengths: list[NDArray[np.int64]] = []
+        for loop, start, end in zip(loops, np.r_[0, ends[:-1]], ends, strict=True):
+            pvs += [loop.pv, pv[start:end].reshape(-1, pv.shape[2])]
+            mvs += [loop.mv, np.repeat(move[start:end], rows)[:, None]]
+            lengths += [np.array([len(loop.x)]), np.full(end - start, rows)]
+        length = np.concatenate(lengths)
+        return Record.of(plant, np.concatenate(pvs), np.concatenate(mvs), run=np.repeat(np.arange(len(length)), length))
+
+    def moves(self, plant: Plant, used: Array, rng: np.random.Generator) -> Array:
+        """One MV for each short run, shape (restarts,): over the whole range, or near the one used."""
+        signal = plant.mv_signals[0]
+        anywhere = rng.uniform(signal.low, signal.high, len(used))
+        close = np.clip(used + self.near * rng.standard_normal(len(used)), signal.low, signal.high)
+        return np.where(rng.random(len(used)) < self.near_fraction, close, anywhere)

@@ -1,0 +1,170 @@
+"""Open-loop excitations: uniform random steps, PRBS, amplitude-modulated PRBS, multisine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ParamsError
+from pipeline.excitation.base import OpenLoop
+from pipeline.plants.base import Array
+
+TAPS: dict[int, tuple[int, ...]] = {
+    2: (2, 1),
+    3: (3, 2),
+    4: (4, 3),
+    5: (5, 3),
+    6: (6, 5),
+    7: (7, 6),
+    8: (8, 6, 5, 4),
+    9: (9, 5),
+    10: (10, 7),
+    11: (11, 9),
+    12: (12, 6, 4, 1),
+    13: (13, 4, 3, 1),
+    14: (14, 5, 3, 1),
+    15: (15, 14),
+    16: (16, 15, 13, 4),
+    17: (17, 14),
+    18: (18, 11),
+}
+"""Exponents of a primitive polynomial of each order: the register then runs through all its states."""
+
+
+def maximal_length(order: int) -> NDArray[np.int8]:
+    """One period of a shift register's output, shape (2**order - 1,), of 0 and 1.
+
+    s(k) = s(k - t1) xor s(k - t2) ..., with the taps t of a primitive polynomial over GF(2).
+    """
+    bits = np.ones(2**order - 1, dtype=np.int8)  # any state but all zeros starts it
+    for k in range(order, len(bits)):
+        bits[k] = np.bitwise_xor.reduce(bits[[k - t for t in TAPS[order]]])
+    return bits
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomSteps(OpenLoop):
+    """Levels drawn uniformly over the MV's range, each held ``hold`` samples.
+
+    Attributes
+    ----------
+    hold : int
+        Samples for which a level is held [-].
+
+    Source: seed 000_0a422d3e5d968dac.txt, section 4.2 (0..500 K, held one period, 60,000 samples).
+    """
+
+    kind: ClassVar[str] = "random_steps"
+    hold: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require("hold", 1)
+
+    def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
+        """Levels on [0, 1], shape (samples, n_mv)."""
+        return np.repeat(rng.random((-(-self.samples // self.hold), n_mv)), self.hold, axis=0)[: self.samples]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prbs(OpenLoop):
+    """Pseudo-random binary sequence of maximal length: the low and the high level, white up to its clock.
+
+    Several MVs get the same sequence, shifted by equal parts of its period, so that they are
+    nearly uncorrelated. The seed draws the start within the period.
+
+    Attributes
+    ----------
+    hold : int
+        Samples a clock of the shift register [-].
+    order : int
+        Bits of the register [-], 2 to 18; the sequence repeats after (2**order - 1) hold samples.
+    """
+
+    kind: ClassVar[str] = "prbs"
+    hold: int = 1
+    order: int = 11
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require("hold", 1)
+        self.require("order", min(TAPS), max(TAPS))
+
+    def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
+        """Zeros and ones, shape (samples, n_mv)."""
+        return self.bits(n_mv, rng).astype(np.float64)
+
+    def bits(self, n_mv: int, rng: np.random.Generator) -> NDArray[np.int8]:
+        """The register's output, each bit held, shape (samples, n_mv)."""
+        period = maximal_length(self.order)
+        clock = np.arange(-(-self.samples // self.hold))[:, None] + int(rng.integers(len(period)))
+        shift = np.arange(n_mv) * (len(period) // n_mv)
+        return np.repeat(period[(clock + shift) % len(period)], self.hold, axis=0)[: self.samples]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aprbs(Prbs):
+    """PRBS whose level is drawn anew, uniformly over the MV's range, whenever its bit flips.
+
+    It holds levels for 1 to ``order`` clocks: fast and slow motion, over the whole range, which a
+    nonlinear plant needs. Fields as in ``Prbs``.
+    """
+
+    kind: ClassVar[str] = "aprbs"
+    hold: int = 4
+
+    def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
+        """Levels on [0, 1], shape (samples, n_mv)."""
+        bits = self.bits(n_mv, rng)
+        flips = np.cumsum(np.diff(bits, axis=0, prepend=bits[:1]) != 0, axis=0)
+        levels = rng.random((int(flips.max()) + 1, n_mv))
+        return np.asarray(np.take_along_axis(levels, flips, axis=0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multisine(OpenLoop):
+    """Periodic sum of equal cosines with Schroeder's phases, which keep its peaks low.
+
+        u(k) = sum_i cos(2 pi i k / cycle - pi i (i - 1) / lines),   i = 1 .. lines
+
+    scaled so that it just fills the MV's range. Of several MVs, each has its own lines, interleaved
+    with those of the others, so that their effects can be told apart. The seed draws the start
+    within the cycle.
+
+    Attributes
+    ----------
+    cycle : int
+        Samples after which it repeats [-].
+    lines : int
+        Number of cosines of each MV [-]; the highest frequency is lines n_mv / (cycle period_s) [Hz].
+
+    Source: Schroeder, Synthesis of low-peak-factor signals and binary sequences with low
+    autocorrelation, IEEE Transactions on Information Theory 16, 1970.
+    """
+
+    kind: ClassVar[str] = "multisine"
+    cycle: int = 2_000
+    lines: int = 200
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require("cycle", 4)
+        self.require("lines", 1)
+
+    def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
+        """Values on [0, 1], shape (samples, n_mv)."""
+        if not 2 * self.lines * n_mv < self.cycle:
+            raise ParamsError(
+                f"excitation {self.kind!r}: {self.lines} lines for each of {n_mv} MVs do not fit below half of the "
+                f"sampling frequency with a cycle of {self.cycle} samples; lengthen it or take fewer lines"
+            )
+        i = np.arange(1, self.lines + 1)
+        spectrum = np.zeros((self.cycle // 2 + 1, n_mv), dtype=np.complex128)
+        for m in range(n_mv):
+            spectrum[(i - 1) * n_mv + m + 1, m] = np.exp(-1j * np.pi * i * (i - 1) / self.lines)
+        wave = np.fft.irfft(spectrum, n=self.cycle, axis=0)
+        wave = (wave - wave.min(axis=0)) / np.ptp(wave, axis=0)
+        return wave[(np.arange(self.samples) + int(rng.integers(self.cycle))) % self.cycle]
