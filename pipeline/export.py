@@ -150,8 +150,8 @@ def parity_gate(
         i = int(np.argmax(relative[k]))
         raise ExportError(
             f"law {law.name!r}: graph and module differ by {worst:.1e} (allowed {GATE_TOLERANCE:.0e}), first "
-            f"at step {k} in {names[i]}: torch {torch_side[k, i]:.17g}, onnxruntime {onnx_side[k, i]:.17g}; keep the law's "
-            "constants in float64 buffers, and avoid a transposed constant in front of a vector product"
+            f"at step {k} in {names[i]}: torch {torch_side[k, i]:.17g}, onnxruntime {onnx_side[k, i]:.17g}; keep "
+            "the law's constants in float64 buffers, and avoid a transposed constant in front of a vector product"
         )
     return worst
 

@@ -42,7 +42,8 @@ def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
             )
         except Exception as error:  # torch wraps whatever went wrong in exceptions of its own
             raise ExportError(f"law {law.name!r} cannot be traced: {_cause(error)}") from error
-    assert program is not None and program.exported_program is not None  # only another exporter leaves them out
+    assert program is not None
+    assert program.exported_program is not None
     model = program.model
     _restore_floats(model, _python_floats(program.exported_program))
     inputs = _name_ends(model, sizes)
@@ -73,7 +74,7 @@ def _python_floats(program: torch.export.ExportedProgram) -> set[float]:
 def _restore_floats(model: ir.Model, floats: set[float]) -> None:
     """Give Python floats their 53 bits back: the exporter writes each as float32 and casts it.
 
-    0.1 becomes 0.100000001. Without this every ``0.1 * x`` of a law would be off by 1e-8, and ``clamp(min=finfo.tiny)`` would be 0.
+    Without this 0.1 becomes 0.100000001, and ``clamp(min=finfo.tiny)`` clamps at 0.
     """
     with np.errstate(over="ignore", under="ignore"):
         exact: dict[float, set[float]] = {}
