@@ -1,0 +1,46 @@
+# Everything a person does with the repository; each target sets up what it needs.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.ready
+export PATH := $(CURDIR)/$(BIN):$(PATH)
+# No telemetry at import time, and no core asked to do two things at once.
+export MLFLOW_DISABLE_TELEMETRY := true
+export DVC_NO_ANALYTICS := 1
+export DO_NOT_TRACK := 1
+PORT ?= 5000
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run test check registry bench clean
+
+help: ## list the targets
+	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## make the virtual environment .venv (the others call it)
+
+$(STAMP): pyproject.toml constraints.txt tools/setup.sh
+	@PYTHON="$(PYTHON)" bash tools/setup.sh "$(VENV)"
+	@touch $@
+
+run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, publish
+	dvc repro
+	@python -m pipeline results
+
+test: check ## formatting, lint, types, import rules, tests
+	python -m pytest
+
+check: $(STAMP) ## the static part of make test
+	ruff format --check .
+	ruff check .
+	mypy
+	lint-imports
+
+registry: $(STAMP) ## open MLflow's UI on localhost:$(PORT) (publishes first what the store lacks)
+	python -m pipeline.tracking publish
+	python -m pipeline.tracking serve --port $(PORT)
+
+bench: $(STAMP) ## run the benchmarks
+	@for script in benchmarks/[a-z]*.py; do echo "== $$script"; python $$script || exit 1; done
+
+clean: ## remove what can be rebuilt (the virtual environment stays)
+	rm -rf work mlflow.db mlruns mlartifacts .pytest_cache .mypy_cache .ruff_cache build

@@ -1,0 +1,199 @@
+"""params.yaml -> frozen dataclasses; every mistake in it is one clear error."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from pipeline.errors import ParamsError
+
+T = TypeVar("T")
+PARAMS_FILE = Path("params.yaml")
+
+
+def read_section(kind: str, name: str, path: Path = PARAMS_FILE) -> dict[str, Any]:
+    """The mapping ``kind: {name: ...}`` of params.yaml; raises ParamsError where it is not there."""
+    try:
+        tree = yaml.safe_load(path.read_text())
+    except FileNotFoundError:
+        raise ParamsError(f"{path} is not here; run from the repository's root") from None
+    except yaml.YAMLError as error:
+        raise ParamsError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(tree, dict):
+        raise ParamsError(f"{path} holds no mapping; it needs the sections cases, records, models, controllers")
+    section = _entry(tree, kind, str(path))
+    entry = _entry(section, name, f"{path}: {kind}")
+    if not isinstance(entry, dict):
+        raise ParamsError(f"{path}: {kind}.{name} is {entry!r}; it must be a mapping")
+    return entry
+
+
+def _entry(tree: Mapping[str, Any], key: str, where: str) -> Any:
+    if not isinstance(tree, dict) or key not in tree:
+        raise ParamsError(f"{where} has no {key!r}{nearest(key, tree if isinstance(tree, dict) else ())}")
+    return tree[key]
+
+
+def nearest(word: object, known: Iterable[str]) -> str:
+    """The end of an error message: the nearest known word, or all of them."""
+    names = sorted(str(k) for k in known)
+    close = difflib.get_close_matches(str(word), names, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ";"
+    return f"{hint} known: {', '.join(names) or 'none'}"
+
+
+def choose(table: Mapping[str, T], word: object, what: str, where: str) -> T:
+    """``table[word]``; raises ParamsError that names the nearest known word."""
+    if not isinstance(word, str) or word not in table:
+        raise ParamsError(f"{where}: unknown {what} {word!r}{nearest(word, table)}")
+    return table[word]
+
+
+def parse(cls: type[T], values: Mapping[str, Any], where: str) -> T:
+    """``values`` as the dataclass ``cls``, types checked, nested dataclasses too.
+
+    Raises ParamsError that names ``where`` for an unknown or missing key or a wrong type, and
+    passes on a ValueError of the dataclass's own checks.
+    """
+    if not isinstance(values, Mapping):
+        raise ParamsError(f"{where} is {values!r}; it must be a mapping")
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    for key in values:
+        if key not in fields:
+            raise ParamsError(f"{where}: unknown key {key!r}{nearest(key, fields)}")
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in values:
+            raise ParamsError(f"{where}: {name!r} is missing")
+    read = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in values.items()}
+    try:
+        return cls(**read)
+    except (ValueError, TypeError) as error:
+        raise ParamsError(f"{where}: {error}") from None
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        rest = [a for a in args if a is not type(None)]
+        for option in rest[:-1]:
+            try:
+                return _convert(option, value, where)
+            except ParamsError:
+                continue
+        return _convert(rest[-1], value, where)
+    if origin is typing.Literal:
+        if value not in args:
+            raise ParamsError(f"{where} is {value!r}{nearest(value, map(str, args))}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ParamsError(f"{where} is {value!r}; it must be a list")
+        inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+        if len(inner) != len(value):
+            raise ParamsError(f"{where} has {len(value)} entries; it must have {len(inner)}")
+        return tuple(_convert(h, v, f"{where}[{i}]") for i, (h, v) in enumerate(zip(inner, value, strict=True)))
+    if origin in (dict, Mapping) or (isinstance(origin, type) and issubclass(origin, Mapping)):
+        if not isinstance(value, Mapping):
+            raise ParamsError(f"{where} is {value!r}; it must be a mapping")
+        return {str(k): _convert(args[1], v, f"{where}.{k}") for k, v in value.items()}
+    if dataclasses.is_dataclass(hint):
+        return parse(hint, value, where)  # type: ignore[arg-type]
+    if hint is Any:
+        return value
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if hint is float and isinstance(value, str):
+        # YAML 1.1 reads 5e-4 (no dot) as text.
+        try:
+            return float(value)
+        except ValueError:
+            raise ParamsError(f"{where} is {value!r}; it must be a number") from None
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
+        raise ParamsError(f"{where} is {value!r}; it must be of type {hint.__name__}")
+    return value
+
+
+def digest(values: Any) -> str:
+    """sha256 of a section, however its keys are ordered."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
+
+
+# ---------------------------------------------------------------- the sections
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class CaseParams:
+    """``cases.<case>``: what validation and report need beyond the case's own text."""
+
+    held_out_seeds: tuple[int, ...]
+    noise_seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RecordParams:
+    """``records.<name>``: whose data, which seeds, and which excitation with its own numbers."""
+
+    case: str
+    record: str
+    seeds: tuple[int, ...]
+    kind: str
+    excitation: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, name: str) -> RecordParams:
+        """The section of one record."""
+        return _with_rest(cls, read_section("records", name), "excitation", f"records.{name}")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ModelParams:
+    """``models.<name>``: a set of models learnt from the same data, one set a data seed."""
+
+    case: str
+    model: str
+    data: Path
+    parts: Mapping[str, Mapping[str, Any]]
+
+    @classmethod
+    def read(cls, name: str) -> ModelParams:
+        """The section of one model set."""
+        return parse(cls, read_section("models", name), f"models.{name}")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ControllerParams:
+    """``controllers.<name>``: a law, its models, its numbers; ``variants`` are evaluated beside it."""
+
+    case: str
+    law: str
+    model: str
+    settings: Mapping[str, Any]
+    variants: tuple[Mapping[str, Any], ...] = ()
+
+    @classmethod
+    def read(cls, name: str) -> ControllerParams:
+        """The section of one controller."""
+        return _with_rest(cls, read_section("controllers", name), "settings", f"controllers.{name}")
+
+
+def _with_rest(cls: type[T], section: Mapping[str, Any], rest: str, where: str) -> T:
+    """``section`` as ``cls``; the keys that ``cls`` does not know go into its field ``rest``."""
+    own = {f.name for f in dataclasses.fields(cls)} - {rest}  # type: ignore[arg-type]
+    common = {k: v for k, v in section.items() if k in own}
+    common[rest] = {k: v for k, v in section.items() if k not in own}
+    return parse(cls, common, where)
