@@ -1,0 +1,16 @@
+"""Control laws by name: adding one is a file in this folder and a line here."""
+
+from __future__ import annotations
+
+from pipeline.laws.base import ControlLaw, LawSignals
+from pipeline.laws.inverse import INC, INCAD, INCADEC
+from pipeline.laws.pid import PID
+
+LAWS: dict[str, type[ControlLaw]] = {
+    INC.name: INC,
+    INCAD.name: INCAD,
+    INCADEC.name: INCADEC,
+    PID.name: PID,
+}
+
+__all__ = ["LAWS", "ControlLaw", "LawSignals"]
