@@ -1,0 +1,31 @@
+"""Stage publish: ``python -m pipeline.stages.publish`` writes the store and work/publish.json."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+from pipeline.errors import PipelineError
+from pipeline.tracking.publish import publish
+
+RECEIPT = Path("work") / "publish.json"
+
+
+def main() -> int:
+    """Publish what dvc.lock records; the receipt is the stage's output."""
+    try:
+        receipt = publish(Path.cwd())
+    except PipelineError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    RECEIPT.parent.mkdir(exist_ok=True)
+    draft = RECEIPT.with_suffix(".draft")
+    draft.write_text(json.dumps(receipt, indent=1) + "\n")
+    os.replace(draft, RECEIPT)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

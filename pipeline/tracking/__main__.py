@@ -1,0 +1,74 @@
+"""The registry from the command line: ``python -m pipeline.tracking publish | list | promote | fetch``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.errors import PipelineError
+from pipeline.tracking.publish import publish
+from pipeline.tracking.registry import CHAMPION, fetch, promote, versions
+from pipeline.tracking.store import store
+
+
+def _publish(args: argparse.Namespace) -> None:
+    publish(Path.cwd())
+
+
+def _list(args: argparse.Namespace) -> None:
+    with store() as client:
+        models = client.search_registered_models(max_results=1000)
+        for model in sorted(models, key=lambda m: str(m.name)):
+            for version in versions(client, model.name):
+                aliases = " ".join(f"@{a}" for a in version.aliases)
+                score = version.tags.get("gate_score", "-")
+                print(f"{model.name:40} {version.version:>4}  gate {score:10} {aliases}")
+        if not models:
+            print("the registry is empty; run `dvc repro`, or `python -m pipeline.tracking publish`")
+
+
+def _promote(args: argparse.Namespace) -> None:
+    with store() as client:
+        print(promote(client, args.name, args.version, args.alias))
+
+
+def _fetch(args: argparse.Namespace) -> None:
+    with store() as client:
+        for path in fetch(client, args.controller, args.folder):
+            print(path)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("python -m pipeline.tracking", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    one = commands.add_parser("publish", help="write the cached results that the store lacks")
+    one.set_defaults(run=_publish)
+    one = commands.add_parser("list", help="controllers, versions, gate scores and aliases")
+    one.set_defaults(run=_list)
+    one = commands.add_parser("promote", help="move an alias by hand")
+    one.add_argument("name", help="registered controller: CASE-LAW")
+    one.add_argument("version", help="its version, a number")
+    one.add_argument("--alias", default=CHAMPION, help="default: %(default)s")
+    one.set_defaults(run=_promote)
+    one = commands.add_parser("fetch", help="write a controller and its manifest into a folder")
+    one.add_argument("controller", help="CASE-LAW (its champion), CASE-LAW@ALIAS, CASE-LAW/VERSION, or CASE")
+    one.add_argument("folder", type=Path)
+    one.set_defaults(run=_fetch)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns 2 after printing one line for an error on purpose."""
+    args = _parser().parse_args(argv)
+    try:
+        args.run(args)
+    except PipelineError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

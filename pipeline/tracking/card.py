@@ -1,0 +1,81 @@
+"""What a person reads in MLflow's registry: HTML, because its Markdown has no tables.
+
+Pictures are linked relative to the server's root, through its get-artifact route: the registry
+strips ``data:`` images and every size or style, so pictures are drawn in the size they are shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+from pipeline.cases.base import NOISE_SUFFIX
+from pipeline.tracking.gate import BASELINE, Gate
+
+GAP = "&nbsp;" * 4
+"""Cells have no padding there and may not be styled."""
+
+
+def model_description(case: str, law: str, validation: Mapping[str, Any]) -> str:
+    """The registered model's description: what the controller is and what the aliases mean."""
+    titles = validation.get("titles") or {}
+    title = (titles.get("laws") or {}).get(law, law)
+    return (
+        f"<p><b>{escape(str(title))}</b> for {escape(str(titles.get('case', case)))}.</p>"
+        "<p>Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup. "
+        "<b>candidate</b>: the newest version. <b>champion</b>: the best version that beat the PID in closed loop "
+        "without a lock-up. <b>case_champion</b>: on the best controller of the case only.</p>"
+        f"<p>Take it: <code>python -m pipeline.tracking fetch {escape(case)}-{escape(law)} FOLDER</code></p>"
+    )
+
+
+def version_description(validation: Mapping[str, Any], gate: Gate, run_id: str, picture: str | None) -> str:
+    """A version's description: verdict, closed-loop evidence per scenario, picture of the loop."""
+    parts = [_verdict(gate), _table(validation, gate.law)]
+    if picture:
+        alt = "Closed loop on a held-out sequence beside the PID and the perfect-model NMPC"
+        parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
+    return "\n".join(filter(None, parts))
+
+
+def _verdict(gate: Gate) -> str:
+    if gate.score is None:
+        return "<p>No closed-loop evidence yet: the report stage of its case has not run.</p>"
+    beside = f", PID {gate.baseline:.3f}" if gate.baseline is not None and gate.law != BASELINE else ""
+    locks = "no lock-up" if not gate.lock_ups else f"{gate.lock_ups} lock-ups"
+    return f"<p><b>Gate score {gate.score:.3f}</b> (1 = perfect-model NMPC{beside}), {locks}.</p>"
+
+
+def _table(validation: Mapping[str, Any], law: str) -> str:
+    scenarios = validation.get("scenarios") or {}
+    bounds = validation.get("bounds") or {}
+    titles = (validation.get("titles") or {}).get("scenarios") or {}
+    heads = ["Scenario (mean absolute error)", "this law", "range over seeds", "with noise", "PID", "NMPC", "ratio"]
+    rows = []
+    for name, laws in scenarios.items():
+        own = laws.get(law)
+        if name.endswith(NOISE_SUFFIX) or not own:
+            continue
+        bound = ((bounds.get(name) or {}).get("nmpc") or {}).get("mae")
+        spread = [own.get("mae_min"), own.get("mae_max")]
+        rows.append(
+            [
+                escape(str(titles.get(name, name))),
+                _figure(own.get("mae")),
+                "" if None in spread else " … ".join(map(_figure, spread)),
+                _figure((scenarios.get(name + NOISE_SUFFIX) or {}).get(law, {}).get("mae")),
+                _figure((laws.get(BASELINE) or {}).get("mae")),
+                _figure(bound),
+                f"{own['mae'] / bound:.2f}" if bound and own.get("mae") is not None else "",
+            ]
+        )
+    if not rows:
+        return ""
+    head = "".join(f"<th>{cell}{GAP}</th>" for cell in heads)
+    body = "".join("<tr>" + "".join(f"<td>{cell}{GAP}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"

@@ -1,0 +1,87 @@
+"""The promotion gate: what a version must show before an alias moves to it.
+
+The report stage writes into validation.json, for each law of a case, its gate score: the weighted
+mean over the gate's scenarios of MAE / MAE of the perfect-model NMPC, so lower is better and 1 is
+the bound. ``Gate.id`` is a digest of scenarios, weights and bounds: scores of different ids were
+measured on different tests and are never compared.
+
+Aliases:
+
+``candidate``
+    the newest version of a controller.
+``champion``
+    of one registered model: the best version that beat the PID. It moves only to a version that
+    did not lock up in any run, whose score is below the PID's of the same validation, and below
+    the present champion's. The PID has nobody else to beat than its own former version.
+``case_champion``
+    one in a case: the champion with the lowest score among the case's registered models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+BASELINE = "pid"
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """The gate's figures of one law, from the case's validation.json."""
+
+    law: str
+    id: str
+    score: float | None
+    baseline: float | None  # the PID's score on the same test
+    lock_ups: int | None
+    ratios: dict[str, float]
+
+    @classmethod
+    def of(cls, validation: Mapping[str, Any], law: str) -> Self:
+        """The figures of ``law``; scores are None where the validation has none."""
+        gate = validation.get("gate") or {}
+        laws = gate.get("laws") or {}
+        own = laws.get(law) or {}
+        return cls(
+            law=law,
+            id=str(gate.get("id", "")),
+            score=own.get("score"),
+            baseline=(laws.get(BASELINE) or {}).get("score"),
+            lock_ups=own.get("lock_ups"),
+            ratios=dict(own.get("ratios") or {}),
+        )
+
+    def tags(self) -> dict[str, str]:
+        """The gate as tags of a model version."""
+        rows: dict[str, Any] = {
+            "gate_id": self.id,
+            "gate_score": self.score,
+            "gate_pid_score": self.baseline,
+            "lock_ups": self.lock_ups,
+            **{f"gate_{scenario}": ratio for scenario, ratio in self.ratios.items()},
+        }
+        return {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in rows.items() if v is not None}
+
+    def refusal(self) -> str | None:
+        """Why no version with these figures may become champion, whoever holds the title; None if one may."""
+        if self.score is None or self.lock_ups is None:
+            return "its validation has no gate score"
+        if self.lock_ups:
+            return f"it locked up in {self.lock_ups} of its closed loops"
+        if self.law == BASELINE:
+            return None
+        if self.baseline is None:
+            return "no PID was validated beside it"
+        if self.score >= self.baseline:
+            return f"its gate score {self.score:.4g} does not beat the PID's {self.baseline:.4g}"
+        return None
+
+    def refusal_against(self, champion: Mapping[str, str]) -> str | None:
+        """Why the title stays with the champion that has these version tags; None if it moves."""
+        if champion.get("gate_id") != self.id:
+            return "the champion was measured on another gate; compare them and promote by hand"
+        held = float(champion.get("gate_score", "inf"))
+        if self.score is None or self.score >= held:
+            return f"its gate score {self.score} does not beat the champion's {held:.4g}"
+        return None

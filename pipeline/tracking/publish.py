@@ -1,0 +1,94 @@
+"""From DVC's cached results to the store: what it lacks is written, the rest is left alone."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from mlflow import MlflowClient
+
+from pipeline.tracking.lock import StageResult, dataset_hash, is_current, read_lock
+from pipeline.tracking.registry import elect_case_champion, file_digest, register
+from pipeline.tracking.runs import git_commit, published, write_run
+from pipeline.tracking.store import experiment_id, store
+
+
+def publish(root: Path) -> dict[str, Any]:
+    """Publish every stage result of ``root/dvc.lock`` that the store lacks; returns the receipt.
+
+    The receipt names what the store now holds by content (stage keys, controller digests), not by
+    run ids, so it is the same after a deleted store was rebuilt. A result whose files on disk are
+    not those of dvc.lock (a stage that was killed) is left out, with a line saying so.
+
+    Raises
+    ------
+    TrackingError
+        Where there is no dvc.lock or the store does not answer.
+    """
+    results = read_lock(root)
+    by_case: dict[str, list[StageResult]] = {}
+    for result in results:
+        if result.case is None:
+            continue
+        if is_current(result, root):
+            by_case.setdefault(result.case, []).append(result)
+        else:
+            _say(f"left out {result.name}: its files are not those of dvc.lock; run `dvc repro`")
+    with store() as client:
+        receipt: dict[str, Any] = {"stages": {}, "controllers": {}}
+        for case, own in by_case.items():
+            _publish_case(client, case, own, results, root, receipt)
+    return receipt
+
+
+def _publish_case(
+    client: MlflowClient,
+    case: str,
+    own: list[StageResult],
+    results: list[StageResult],
+    root: Path,
+    receipt: dict[str, Any],
+) -> None:
+    experiment = experiment_id(client, case)
+    runs = {key: str(run.info.run_id) for key, run in published(client, experiment).items()}
+    commit = git_commit(root)
+    new = 0
+    for number, result in enumerate(own, 1):
+        if result.key not in runs:
+            tags = {"case": case, "git_commit": commit, "dataset_sha256": dataset_hash(result, results)}
+            runs[result.key] = write_run(client, experiment, result, root, tags)
+            new += 1
+            _say(f"[{number}/{len(own)}] {case}: run {result.name}")
+        receipt["stages"][result.name] = result.key
+    evidence = root / "artifacts" / case / "validation.json"
+    validation = json.loads(evidence.read_text()) if evidence.exists() else {}
+    made = 0
+    for result in own:
+        for path in sorted(root / out for out in result.outs if result.kind == "validate" and out.endswith(".onnx")):
+            run_id = runs[result.key]
+            picture = _add_picture(client, run_id, evidence.parent / "figures" / f"closed_loop_{path.stem}.png")
+            tags = {"git_commit": commit, "dataset_sha256": dataset_hash(result, results), "stage_key": result.key}
+            line, is_new = register(client, case, path, run_id, validation, picture, tags)
+            made += is_new
+            _say(line)
+            receipt["controllers"][f"{case}-{path.stem}"] = file_digest(path)
+    best = elect_case_champion(client, case)
+    _say(f"{case}: {new} new runs of {len(own)}, {made} new versions; case champion: {best or 'none'}")
+
+
+def _add_picture(client: MlflowClient, run_id: str, picture: Path) -> str | None:
+    """The law's closed loop, drawn by the report, beside the controller that its run made."""
+    if not picture.exists():
+        return None
+    with TemporaryDirectory() as draft:
+        target = Path(draft) / "closed_loop.png"
+        target.write_bytes(picture.read_bytes())
+        client.log_artifact(run_id, str(target))
+    return target.name
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

@@ -1,0 +1,90 @@
+"""Where the tracking store is, and what to say when it does not answer."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import mlflow
+import requests
+from mlflow import MlflowClient
+from mlflow.exceptions import MlflowException
+from mlflow.store.db import utils as database
+from sqlalchemy.exc import SQLAlchemyError
+
+from pipeline.errors import TrackingError
+
+LOCAL = "mlflow.db"
+
+
+def store_uri() -> str:
+    """MLFLOW_TRACKING_URI, or the file mlflow.db of the current folder.
+
+    The path is absolute, because mlflow keeps one open store for each different text.
+    """
+    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{Path(LOCAL).resolve().as_posix()}"
+
+
+@contextmanager
+def store() -> Iterator[MlflowClient]:
+    """A client of the store, created or migrated before its first use.
+
+    Raises
+    ------
+    TrackingError
+        In one line, whatever mlflow, its database or the network raised inside.
+    """
+    uri = store_uri()
+    try:
+        if uri.startswith("sqlite:"):
+            _migrate(uri)
+        mlflow.set_tracking_uri(uri)
+        mlflow.set_registry_uri(uri)
+        client = MlflowClient(uri)
+        client.search_experiments(max_results=1)
+        yield client
+    except (MlflowException, SQLAlchemyError, sqlite3.Error, requests.RequestException) as error:
+        reason = " ".join(str(error).split())
+        raise TrackingError(f"the tracking store {uri} refused: {reason[:300]}; {_remedy(uri)}") from error
+
+
+def _remedy(uri: str) -> str:
+    if uri.startswith("http"):
+        return "is its server running? Start it, or unset MLFLOW_TRACKING_URI to use mlflow.db"
+    if uri.startswith("sqlite:"):
+        return "if the file is damaged, move it away: `make registry` rebuilds it from the cached results"
+    return "use a server's http address or sqlite:///FILE"
+
+
+def _migrate(uri: str) -> None:
+    """Bring the database of an earlier mlflow to this one's schema; mlflow itself creates a missing one.
+
+    mlflow retries for a minute on a file that is no database, so that is found out here.
+    """
+    path = Path(uri.removeprefix("sqlite:///"))
+    if not path.exists() or path.stat().st_size == 0:
+        return
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA schema_version")
+    connection.close()
+    engine = database.create_sqlalchemy_engine_with_retry(uri)
+    if database._get_schema_version(engine) not in {None, database._get_latest_schema_revision()}:
+        database._upgrade_db(engine)
+    engine.dispose()
+
+
+def experiment_id(client: MlflowClient, case: str) -> str:
+    """The experiment named after the case; its artifacts lie in mlruns/<case> where the store is a file.
+
+    An experiment that somebody deleted in the UI is brought back: its name cannot be used again.
+    """
+    experiment = client.get_experiment_by_name(case)
+    if experiment is None:
+        local = store_uri().startswith("sqlite:")
+        return str(client.create_experiment(case, (Path("mlruns") / case).resolve().as_uri() if local else None))
+    if experiment.lifecycle_stage == "deleted":
+        client.restore_experiment(experiment.experiment_id)
+    return str(experiment.experiment_id)
