@@ -1,5 +1,6 @@
 """Loopwright's runtime: one .onnx file stepped as a controller. Needs numpy and onnxruntime, nothing else."""
 
+from serving.clock import Clock, MonotonicClock, VirtualClock
 from serving.controller import Controller, Step
 from serving.errors import (
     ArtifactError,
@@ -10,18 +11,37 @@ from serving.errors import (
     OutputError,
     SampleError,
 )
+from serving.guard import Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
+from serving.loop import Command, ControlLoop, Endpoint, Mode, RunReport, SimulatedEndpoint
 from serving.manifest import Manifest, Signal
 
 __all__ = [
     "ArtifactError",
+    "Clock",
+    "Command",
+    "Complete",
     "ContractError",
+    "ControlLoop",
     "Controller",
+    "Endpoint",
     "EndpointError",
+    "Fresh",
+    "Frozen",
+    "Guard",
+    "InRange",
     "LoopError",
     "LoopwrightError",
     "Manifest",
+    "Mode",
+    "MonotonicClock",
     "OutputError",
+    "Rate",
+    "RunReport",
+    "Sample",
     "SampleError",
     "Signal",
+    "SimulatedEndpoint",
     "Step",
+    "VirtualClock",
+    "default_guards",
 ]

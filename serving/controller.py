@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from serving.digest import DIGEST_KEY, file_digest, unseal
 from serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
 from serving.graph_audit import MAX_BYTES, audit
-from serving.manifest import MANIFEST_KEY, Manifest
+from serving.manifest import INPUTS, MANIFEST_KEY, Manifest
 
 Array: TypeAlias = NDArray[np.float64]
 _LINE = 8  # float64 in a cache line: each vector starts on one, so that no result depends on its neighbours
@@ -93,10 +93,10 @@ class Controller:
         OutputError
             The law's output is not finite or lies outside the MV's range.
         """
-        given = {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
+        given = (sp, pv, dv, mv_applied, state)
         with self._lock:
-            for name, buffer, shape in self._inputs:
-                value = given[name]
+            for place, name, buffer, shape in self._inputs:
+                value = given[place]
                 if type(value) is np.ndarray and value.dtype is _FLOAT64 and value.shape == shape:
                     buffer[...] = value
                 else:
@@ -111,7 +111,7 @@ class Controller:
             out = self._out.copy()
         n_mv, a, b, c, d = self._cuts
         values = out.tolist()
-        for (low, high, allowed), value in zip(self._ranges, values[:n_mv], strict=True):
+        for value, (low, high, allowed) in zip(values, self._ranges, strict=False):
             if not low <= value <= high or (allowed is not None and value not in allowed):
                 self._refuse(values)
         if not isfinite(sum(values)):
@@ -123,8 +123,8 @@ class Controller:
 
         The state is explicit, so a discarded step changes nothing.
         """
-        last = {name: buffer.copy() for name, buffer, _ in self._inputs}
-        empty: dict[str, Any] = dict.fromkeys(("sp", "pv", "dv", "mv_applied", "state"))
+        last = {name: buffer.copy() for _, name, buffer, _ in self._inputs}
+        empty: dict[str, Any] = dict.fromkeys(INPUTS)
         try:
             self.step(**{**empty, **last})
         except LoopwrightError:
@@ -136,13 +136,13 @@ class Controller:
         m = self.manifest
         sizes = m.sizes()
         self._in, parts = _vectors([sizes[name] for name in m.inputs])
-        self._inputs = [(name, part, part.shape) for name, part in zip(m.inputs, parts, strict=True)]
+        self._inputs = [(INPUTS.index(n), n, part, part.shape) for n, part in zip(m.inputs, parts, strict=True)]
         self._out, outs = _vectors([len(m.mv), m.n_state, len(m.info)])
         starts = [(p.ctypes.data - self._out.ctypes.data) // 8 for p in outs]
         self._cuts = (len(m.mv), starts[1], starts[1] + m.n_state, starts[2], starts[2] + len(m.info))
         self._ranges = [(s.low, s.high, s.values) for s in m.mv]
         self._binding = self._session.io_binding()
-        for name, part, shape in self._inputs:
+        for _, name, part, shape in self._inputs:
             self._binding.bind_input(name, "cpu", 0, np.float64, shape, part.ctypes.data)
         for name, part in zip(("mv", "state_next", "info"), outs, strict=True):
             if part.size:
@@ -152,7 +152,7 @@ class Controller:
     def _reset(self) -> None:
         """Inputs that any law can be warmed with: the middle of each range, no past."""
         with self._lock:
-            for name, buffer, _ in self._inputs:
+            for _, name, buffer, _ in self._inputs:
                 buffer[...] = [(s.low + s.high) / 2 for s in self.manifest.signals(name)] or 0.0
 
     # ------------------------------------------------------------------ refusals
@@ -179,7 +179,7 @@ class Controller:
         return f"shape ({len(signals)},): {', '.join(f'{s.name} [{s.unit}]' for s in signals)}"
 
     def _check_finite(self) -> None:
-        for name, buffer, _ in self._inputs:
+        for _, name, buffer, _ in self._inputs:
             for i, value in enumerate(buffer.tolist()):
                 if not isfinite(value):
                     signals = self.manifest.signals(name)

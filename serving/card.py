@@ -1,0 +1,77 @@
+"""A controller described for a person, in plain text."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from serving.controller import Controller
+from serving.manifest import Signal
+
+
+def card(controller: Controller) -> str:
+    """What the controller is, what goes in and out, where it comes from and how its validation went."""
+    m, graph = controller.manifest, controller.summary
+    lines = [
+        f"{m.law} for {m.case}",
+        f"  file      {controller.path} ({controller.size_bytes / 1024:.1f} KiB)",
+        f"  sha256    {controller.sha256}",
+        f"  period    {m.period_s:g} s",
+        f"  graph     {graph.nodes} operators, opset {graph.opset}, IR {graph.ir_version}",
+    ]
+    for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
+        lines += _signals(title, m.signals(name))
+    lines += _signals("manipulated variables", m.mv)
+    outputs = ["mv"] + ["state_next"] * bool(m.n_state) + ["info"] * bool(m.info)
+    lines += ["", f"inputs      {', '.join(m.inputs)}", f"outputs     {', '.join(outputs)}"]
+    lines += [f"state       {m.n_state} numbers, all zero: no past", f"info        {', '.join(m.info) or '-'}"]
+    lines += ["", "provenance"] + (_tree(m.provenance) or ["  -"])
+    lines += ["", "evidence"] + (_evidence(m.evidence) or ["  none yet: this controller was not validated"])
+    return "\n".join(lines)
+
+
+def card_json(controller: Controller) -> str:
+    """The manifest and the file's own figures as JSON."""
+    graph = controller.summary
+    file = {"path": str(controller.path), "bytes": controller.size_bytes, "sha256": controller.sha256}
+    versions = {"opset": graph.opset, "ir_version": graph.ir_version, "ops": graph.ops}
+    return json.dumps({**json.loads(controller.manifest.to_json()), "file": file, "graph": versions}, indent=2)
+
+
+def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
+    if not signals:
+        return []
+    width = max(len(s.name) for s in signals)
+    rows = []
+    for s in signals:
+        allowed = f"{s.low:g} .. {s.high:g}" if s.values is None else f"one of {', '.join(f'{v:g}' for v in s.values)}"
+        rows.append(f"  {s.name:<{width}}  {allowed} {s.unit}")
+    return ["", title, *rows]
+
+
+def _evidence(evidence: dict[str, Any]) -> list[str]:
+    """A table where the evidence is figures by scenario, else an indented list."""
+    rows = evidence.get("scenarios", evidence)
+    if not rows or not all(isinstance(row, dict) for row in rows.values()):
+        return _tree(evidence)
+    columns = list(dict.fromkeys(key for row in rows.values() for key, v in row.items() if isinstance(v, int | float)))
+    if not columns:
+        return _tree(evidence)
+    first = max(len(name) for name in rows)
+    widths = [max(10, len(c)) for c in columns]
+    lines = ["  " + " " * first + "".join(f"  {c:>{w}}" for c, w in zip(columns, widths, strict=True))]
+    for name, row in rows.items():
+        cells = (f"{row[c]:.4g}" if isinstance(row.get(c), int | float) else "-" for c in columns)
+        lines.append(f"  {name:<{first}}" + "".join(f"  {c:>{w}}" for c, w in zip(cells, widths, strict=True)))
+    return lines + _tree({k: v for k, v in evidence.items() if rows is not evidence and k != "scenarios"})
+
+
+def _tree(values: dict[str, Any], indent: int = 2) -> list[str]:
+    lines = []
+    for key, value in values.items():
+        if isinstance(value, dict):
+            lines += [f"{' ' * indent}{key}", *_tree(value, indent + 2)]
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            lines.append(f"{' ' * indent}{key}: {text}")
+    return lines

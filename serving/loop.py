@@ -1,0 +1,328 @@
+"""The loop around a controller: modes, faults, and an absolute time grid."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from serving.clock import Clock, MonotonicClock
+from serving.controller import Controller
+from serving.errors import EndpointError, LoopError
+from serving.guard import Guard, Sample, default_guards
+from serving.manifest import Signal
+
+Array: TypeAlias = NDArray[np.float64]
+
+WARM_LEAD_S = 3e-4  # within the clock's spin, so that the processor does not sleep between warm-up and deadline
+
+
+class Mode(StrEnum):
+    """Who decides on the MV: the operator, the law, or nobody (it stays where it is)."""
+
+    MANUAL = "MANUAL"
+    AUTO = "AUTO"
+    HOLD = "HOLD"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What one scan decided. ``reason`` is empty unless something was wrong."""
+
+    scan: int
+    mode: Mode
+    sp: Array  # shape: (n_sp,)
+    mv: Array  # shape: (n_mv,), to be written
+    law_mv: Array | None  # what the law asked for, also in MANUAL; None where it was not or could not be stepped
+    info: Array | None  # shape: (n_info,)
+    reason: str = ""
+
+
+class Endpoint(Protocol):
+    """The plant's side. Both calls raise EndpointError (or OSError) when the plant cannot be reached."""
+
+    def read(self) -> Sample:
+        """The present sample."""
+
+    def write(self, mv: Array) -> None:
+        """Send an MV, shape (n_mv,)."""
+
+
+class SimulatedEndpoint:
+    """A plant in memory: ``step(mv) -> pv`` is called at each write and gives the PV one period later.
+
+    Parameters
+    ----------
+    step
+        (n_mv,) -> (n_pv,)
+    pv, mv
+        PV at the start, and the MV that was applied before it.
+    """
+
+    def __init__(self, step: Callable[[Array], Array], *, pv: ArrayLike, mv: ArrayLike) -> None:
+        self._step = step
+        self._pv = np.array(pv, dtype=np.float64, ndmin=1)
+        self._mv = np.array(mv, dtype=np.float64, ndmin=1)
+
+    def read(self) -> Sample:
+        """PV and applied MV."""
+        return Sample(pv=self._pv, mv_applied=self._mv)
+
+    def write(self, mv: Array) -> None:
+        """Apply the MV for one period."""
+        self._mv = np.array(mv, dtype=np.float64)
+        self._pv = np.asarray(self._step(self._mv), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """How a run went: scans done, periods skipped because the machine was late, scans with a fault."""
+
+    scans: int
+    missed: int
+    faults: int
+    latest_s: float  # largest lateness of a scan against its place on the grid [s]
+
+
+class ControlLoop:
+    """One controller on one plant.
+
+    AUTO: the law's MV is commanded. MANUAL: the operator's; the law is still stepped with the
+    applied MV and its output ignored, so the transfer to AUTO does not bump. HOLD: the MV stays
+    at its last applied value; a fault in AUTO leads there by itself, with the reason in the
+    command, and ``recover_after`` good samples lead back. A law that had a gap starts cold
+    (state = 0).
+
+    Parameters
+    ----------
+    controller
+        The law.
+    endpoint
+        The plant's side; only ``run`` needs it.
+    sp
+        Set points (n_sp,).
+    mv
+        The MV that the plant has now (n_mv,): what HOLD and MANUAL start from.
+    mode
+        Mode at the start.
+    guards
+        Reasons not to act; ``default_guards`` unless given.
+    recover_after
+        Good samples after which a fault's HOLD returns to AUTO; None: an operator must.
+    clock
+        Time for ``run``; the machine's unless given.
+    warm_lead_s
+        How long before each deadline one discarded step is done [s]; 0: none.
+    max_gap
+        Missed periods in a row after which the law starts cold.
+
+    Raises
+    ------
+    LoopError
+        A set point or MV outside its range, or of the wrong length.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        endpoint: Endpoint | None = None,
+        *,
+        sp: ArrayLike,
+        mv: ArrayLike,
+        mode: Mode = Mode.MANUAL,
+        guards: Sequence[Guard] | None = None,
+        recover_after: int | None = None,
+        clock: Clock | None = None,
+        warm_lead_s: float = WARM_LEAD_S,
+        max_gap: int = 3,
+    ) -> None:
+        if recover_after is not None and recover_after < 1:
+            raise LoopError(f"recover_after is {recover_after}; it must be at least 1, or None")
+        manifest = controller.manifest
+        self.controller = controller
+        self.endpoint = endpoint
+        self.guards = tuple(default_guards(manifest) if guards is None else guards)
+        self.recover_after = recover_after
+        self.clock: Clock = clock or MonotonicClock()
+        self.warm_lead_s = min(warm_lead_s, manifest.period_s / 4)
+        self.max_gap = max_gap
+        self._sp = _within(sp, manifest.sp, "set point")
+        self._mv = _within(mv, manifest.mv, "MV")
+        self._mode = mode
+        self._fault = ""  # why the loop itself went to HOLD; empty while it did not
+        self._good = 0
+        self._scan = 0
+        self._state = controller.cold_state()
+        self._past: deque[Sample] = deque(maxlen=max((g.memory for g in self.guards), default=0))
+
+    # ------------------------------------------------------------------ operator
+    @property
+    def mode(self) -> Mode:
+        """Present mode."""
+        return self._mode
+
+    @property
+    def sp(self) -> Array:
+        """Present set points, shape (n_sp,)."""
+        return self._sp.copy()
+
+    @property
+    def mv(self) -> Array:
+        """Last commanded MV, shape (n_mv,)."""
+        return self._mv.copy()
+
+    @property
+    def fault(self) -> str:
+        """Why the loop went to HOLD by itself; empty if it did not."""
+        return self._fault
+
+    def set_mode(self, mode: Mode) -> None:
+        """Change the mode by hand; effective at the next scan."""
+        self._mode, self._fault, self._good = mode, "", 0
+
+    def set_sp(self, sp: ArrayLike) -> None:
+        """Change the set points (n_sp,); LoopError outside their ranges."""
+        self._sp = _within(sp, self.controller.manifest.sp, "set point")
+
+    def set_mv(self, mv: ArrayLike) -> None:
+        """Change the MV by hand (n_mv,); LoopError outside its range or when the law decides."""
+        if self._mode is not Mode.MANUAL:
+            raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self._mode}")
+        self._mv = _within(mv, self.controller.manifest.mv, "MV")
+
+    # ------------------------------------------------------------------ one scan
+    def scan(self, sample: Sample) -> Command:
+        """Decide on the MV of the next period. No I/O, no clock; never an exception for what a sample holds."""
+        reason = self._refusal(sample)
+        if reason:
+            return self.miss(reason)
+        applied = self._mv if sample.mv_applied is None else np.array(sample.mv_applied, dtype=np.float64)
+        try:
+            step = self.controller.step(sp=self._sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
+        except Exception as error:  # whatever it is, the plant needs an MV
+            if self._mode is Mode.AUTO:
+                self._mv = applied
+            return self.miss(str(error))
+        self._past.append(sample)
+        self._state = step.state
+        if self._fault:
+            self._good += 1
+            if self.recover_after is not None and self._good >= self.recover_after:
+                self.set_mode(Mode.AUTO)
+        if self._mode is Mode.AUTO:
+            self._mv = step.mv
+        return self._command(step.mv, step.info, self._fault)
+
+    def miss(self, reason: str) -> Command:
+        """The command for a scan without a usable sample: the MV stays, the law starts cold afterwards."""
+        self._state = self.controller.cold_state()
+        self._past.clear()
+        self._good = 0
+        if self._mode is Mode.AUTO or self._fault:
+            self._mode, self._fault = Mode.HOLD, reason
+        return self._command(None, None, reason)
+
+    def _refusal(self, sample: Sample) -> str | None:
+        for guard in self.guards:
+            try:
+                reason = guard.check(sample, self._past)
+            except Exception as error:  # a guard that fails has not cleared the sample
+                reason = f"{type(guard).__name__} failed: {error}"
+            if reason:
+                return reason
+        return None
+
+    def _command(self, law_mv: Array | None, info: Array | None, reason: str) -> Command:
+        self._scan += 1
+        return Command(self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason)
+
+    # ------------------------------------------------------------------ running
+    def run(
+        self,
+        n: int | None = None,
+        *,
+        until: Callable[[Command], bool] | None = None,
+        before: Callable[[int], None] | None = None,
+        observe: Callable[[Sample | None, Command], None] | None = None,
+    ) -> RunReport:
+        """Scan once a period until ``n`` periods have passed or ``until`` says so.
+
+        Deadlines are t0 + k period, so lateness never becomes drift; a period that has wholly
+        passed is skipped and counted. ``before(k)`` is called ahead of the scan on grid place k (a
+        schedule of set points), ``observe`` after it. An unreachable endpoint is a fault like any
+        other: the loop holds and tries again.
+
+        Raises LoopError without an endpoint.
+        """
+        if self.endpoint is None:
+            raise LoopError("run needs an endpoint; without one call scan with your own samples")
+        period = self.controller.manifest.period_s
+        start = self.clock.now()
+        k = scans = missed = faults = 0
+        latest = 0.0
+        while n is None or k < n:
+            deadline = start + k * period
+            if self.warm_lead_s:
+                self.clock.sleep_until(deadline - self.warm_lead_s)
+                self.controller.warm()
+            self.clock.sleep_until(deadline)
+            late = max(0.0, self.clock.now() - deadline)
+            gap = int(late // period)
+            if gap:
+                k, missed, late = k + gap, missed + gap, late - gap * period
+                if n is not None and k >= n:
+                    break
+                if gap > self.max_gap:
+                    self._state = self.controller.cold_state()
+            latest = max(latest, late)
+            if before is not None:
+                before(k)
+            sample, command = self._exchange(self.endpoint)
+            scans += 1
+            faults += bool(command.reason)
+            if observe is not None:
+                observe(sample, command)
+            if until is not None and until(command):
+                break
+            k += 1
+        return RunReport(scans, missed, faults, latest)
+
+    def _exchange(self, endpoint: Endpoint) -> tuple[Sample | None, Command]:
+        """Read, scan, write; an endpoint that fails gives a held command with the reason."""
+        sample, applied = None, self._mv
+        try:
+            sample = endpoint.read()
+        except (EndpointError, OSError) as error:
+            command = self.miss(f"the endpoint cannot be read: {error}")
+        else:
+            command = self.scan(sample)
+        try:
+            endpoint.write(command.mv)
+        except (EndpointError, OSError) as error:
+            if self._mode is Mode.AUTO:
+                self._mv = applied  # what was decided never arrived
+            self._scan -= 1
+            command = self.miss(f"the endpoint cannot be written: {error}")
+        return sample, command
+
+
+def _within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
+    """``values`` as (n,); LoopError outside the signals' ranges."""
+    try:
+        vector = np.array(values, dtype=np.float64, ndmin=1)
+    except (TypeError, ValueError) as error:
+        raise LoopError(f"the {what} is no vector of numbers: {error}") from error
+    if vector.shape != (len(signals),):
+        names = ", ".join(f"{s.name} [{s.unit}]" for s in signals)
+        raise LoopError(f"the {what} has the shape {vector.shape}; it needs ({len(signals)},): {names}")
+    for s, value in zip(signals, vector.tolist(), strict=True):
+        if not s.low <= value <= s.high:
+            raise LoopError(f"the {what} {s.name} = {value} {s.unit} is outside [{s.low:g}, {s.high:g}] {s.unit}")
+        if s.values is not None and value not in s.values:
+            raise LoopError(f"the {what} {s.name} = {value} is none of {list(s.values)}")
+    return vector
