@@ -1,0 +1,91 @@
+"""Fixtures that run over PLANTS and LAWS, so that a new member is covered by the contract tests at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.models import Model
+from pipeline.models.fuzzy_means import FuzzyMeansRBF
+from pipeline.models.leverage_domain import LeverageDomain
+from pipeline.plants import PLANTS, Plant
+from pipeline.simulate import simulate_batch
+
+# What a law's params need other than their defaults to be designed quickly; a law not named here is designed as it is.
+QUICK: dict[str, dict[str, Any]] = {
+    "pid": {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613},
+}
+HORIZON = 3
+
+LawFactory = Callable[..., ControlLaw]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_thread() -> None:
+    """The models of the tests are small: threads only add their own cost."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def plant() -> Plant:
+    """The plant of the first case."""
+    return PLANTS["thiosulfate_cstr"]()
+
+
+@pytest.fixture(scope="session")
+def signals(plant: Plant) -> LawSignals:
+    return LawSignals.of(plant)
+
+
+@pytest.fixture(scope="session")
+def parts(plant: Plant) -> dict[str, Model]:
+    """A model set with every part that a law may ask for: small networks over short random runs.
+
+    Good enough to be smooth and finite; nothing is asserted of their accuracy.
+    """
+    rng = np.random.default_rng(0)
+    cvs, xs, _ = plant.steady_curve
+    start = rng.integers(0, len(cvs), 400)
+    mv = plant.mv_signals[0]
+    runs = np.repeat(rng.uniform(mv.low, mv.high, (400, 4, 1)), HORIZON, axis=1)
+    x = simulate_batch(plant, xs[start], runs)
+    now, moves = x[:, :-HORIZON].reshape(-1, x.shape[2]), runs[:, : 1 - HORIZON].reshape(-1, 1)
+    held = np.tile(np.arange(x.shape[1] - HORIZON) % HORIZON == 0, len(x))
+
+    def ahead(h: int) -> np.ndarray:
+        return x[:, h : x.shape[1] - HORIZON + h].reshape(-1, x.shape[2])
+
+    def network(inputs: np.ndarray, target: np.ndarray) -> Model:
+        return FuzzyMeansRBF(8).fit(inputs, target).to_torch()
+
+    one, long = np.column_stack([now, ahead(1)[:, 0]]), np.column_stack([now, ahead(HORIZON)[:, 0]])[held]
+    forward = np.column_stack([now, moves])
+    return {
+        "inverse": network(one, moves),
+        "domain": LeverageDomain.fit(one),
+        "inverse_3": network(long, moves[held]),
+        "forward": network(forward[held], ahead(HORIZON)[held, 0]),
+        "next_temperature": network(forward, ahead(1)[:, 1]),
+    }
+
+
+@pytest.fixture(scope="session")
+def make_law(parts: dict[str, Model], signals: LawSignals, plant: Plant) -> LawFactory:
+    """``make_law(name, **params)``: a law of LAWS over the quick model set."""
+
+    def make(name: str, **params: Any) -> ControlLaw:
+        cls = LAWS[name]
+        return cls.design(cls.Params(**{**QUICK.get(name, {}), **params}), parts, signals, plant).eval()
+
+    return make
+
+
+@pytest.fixture(scope="session", params=sorted(LAWS))
+def law(request: pytest.FixtureRequest, make_law: LawFactory) -> ControlLaw:
+    """Every law in turn."""
+    return make_law(request.param)
