@@ -1,0 +1,184 @@
+"""Multilayer perceptron with its scaling inside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from pipeline.errors import ModelError
+from pipeline.models.base import Model
+
+Array = NDArray[np.float64]
+
+
+class MLP(Model):
+    """Feed-forward network with tanh hidden layers and a linear output.
+
+        a_0 = (x - x_center) / x_scale,   a_l = tanh(a_{l-1} W_l + b_l),   l = 1..L
+        y   = y_center + y_scale (a_L W_{L+1} + b_{L+1})  [+ x_residual]
+
+    With ``residual`` the network predicts the change of one input column per output, which is what
+    a model of one or a few sampling periods needs: its error is then relative to the change.
+    ``bounded`` limits the output to [y_low, y_high].
+
+    Parameters
+    ----------
+    n_in, n_out
+        Number of inputs and outputs.
+    hidden
+        Width of each hidden layer.
+    residual
+        For each output, the input column to which the network adds; empty for none.
+    bounded
+        Whether ``forward`` limits the output.
+
+    Raises
+    ------
+    ModelError
+        No hidden unit, or ``residual`` does not name one input column per output.
+    """
+
+    kind: ClassVar[str] = "mlp"
+    x_center: Tensor  # (n_in,)
+    x_scale: Tensor  # (n_in,)
+    y_center: Tensor  # (n_out,)
+    y_scale: Tensor  # (n_out,)
+    y_low: Tensor  # (n_out,)
+    y_high: Tensor  # (n_out,)
+
+    def __init__(
+        self,
+        n_in: int,
+        n_out: int = 1,
+        hidden: Sequence[int] = (20,),
+        residual: Sequence[int] = (),
+        bounded: bool = False,
+    ) -> None:
+        super().__init__()
+        if not hidden or min(hidden) < 1:
+            raise ModelError(f"hidden layers {tuple(hidden)} of an MLP: give at least one, each of at least one unit")
+        if residual and (len(residual) != n_out or not all(0 <= i < n_in for i in residual)):
+            raise ModelError(
+                f"residual columns {tuple(residual)} of an MLP with {n_in} inputs and {n_out} outputs: "
+                f"give one column of 0..{n_in - 1} per output, or none"
+            )
+        self.n_in, self.n_out, self.hidden = n_in, n_out, tuple(hidden)
+        self.residual, self.bounded = tuple(residual), bounded
+        widths = (n_in, *hidden, n_out)
+        # Weights are (n_in, n_out) and used as x @ W: onnxruntime 1.31.1 computes wrong results
+        # where a transposed 2-D constant meets a 1-D MatMul (its MatmulTransposeFusion).
+        shapes = list(pairwise(widths))
+        self.weights = nn.ParameterList([nn.Parameter(torch.zeros(i, o, dtype=torch.float64)) for i, o in shapes])
+        self.biases = nn.ParameterList([nn.Parameter(torch.zeros(o, dtype=torch.float64)) for _, o in shapes])
+        for name, size, value in (
+            ("x_center", n_in, 0.0),
+            ("x_scale", n_in, 1.0),
+            ("y_center", n_out, 0.0),
+            ("y_scale", n_out, 1.0),
+            ("y_low", n_out, -math.inf),
+            ("y_high", n_out, math.inf),
+        ):
+            self.register_buffer(name, torch.full((size,), value, dtype=torch.float64))
+
+    def config(self) -> dict[str, Any]:
+        """JSON-ready arguments of the constructor."""
+        return {
+            "n_in": self.n_in,
+            "n_out": self.n_out,
+            "hidden": list(self.hidden),
+            "residual": list(self.residual),
+            "bounded": self.bounded,
+        }
+
+    @classmethod
+    def scaled_to(
+        cls,
+        x: Array,
+        y: Array,
+        *,
+        hidden: Sequence[int] = (20,),
+        residual: Sequence[int] = (),
+        bounds: tuple[Sequence[float], Sequence[float]] | None = None,
+    ) -> Self:
+        """An untrained network whose scaling is taken from data x (N, n_in), y (N, n_out).
+
+        Inputs go to [-1, 1], outputs (changes, with ``residual``) to mean 0 and deviation 1.
+        ``bounds`` gives low and high of every output. Raises ModelError for a constant column.
+        """
+        if x.ndim != 2 or y.ndim != 2 or len(x) != len(y):
+            raise ModelError(
+                f"training data of an MLP have shapes {x.shape} and {y.shape}; give (N, n_in) and (N, n_out)"
+            )
+        model = cls(x.shape[1], y.shape[1], hidden, residual, bounds is not None)
+        change = y - x[:, list(residual)] if residual else y
+        spans = {"input": np.ptp(x, axis=0) / 2, "output": change.std(axis=0)}
+        for what, span in spans.items():
+            flat = np.nonzero(~(span > 0))[0]  # ~(>) catches NaN too
+            if flat.size:
+                raise ModelError(
+                    f"{what} column {flat[0]} of an MLP's training data does not vary or is not finite: "
+                    "leave it out, or excite it"
+                )
+        with torch.no_grad():
+            model.x_center.copy_(torch.from_numpy((x.max(axis=0) + x.min(axis=0)) / 2))
+            model.x_scale.copy_(torch.from_numpy(spans["input"]))
+            model.y_center.copy_(torch.from_numpy(change.mean(axis=0)))
+            model.y_scale.copy_(torch.from_numpy(spans["output"]))
+            if bounds is not None:
+                model.y_low.copy_(torch.tensor(bounds[0], dtype=torch.float64))
+                model.y_high.copy_(torch.tensor(bounds[1], dtype=torch.float64))
+        return model
+
+    @torch.no_grad()
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw new weights: the hidden units' slopes spread over the inputs' box (Nguyen and Widrow, 1990)."""
+        last = len(self.hidden)
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            n_in, n_out = weight.shape
+            draw = 2 * torch.rand(n_in, n_out, generator=generator, dtype=torch.float64) - 1
+            if layer == last:
+                weight.copy_(draw / math.sqrt(n_in))
+                bias.zero_()
+                continue
+            length = 0.7 * n_out ** (1 / n_in)
+            weight.copy_(draw / draw.norm(dim=0) * length)
+            bias.copy_(length * (2 * torch.rand(n_out, generator=generator, dtype=torch.float64) - 1))
+
+    def unlimited(self, x: Tensor) -> Tensor:
+        """Prediction (..., n_out) without the output's bounds: what training fits."""
+        return self._after_first_layer(x, ((x - self.x_center) / self.x_scale) @ self.weights[0] + self.biases[0])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Prediction, shape (..., n_out), for inputs of shape (..., n_in)."""
+        return self._limited(self.unlimited(x))
+
+    def sections(self, x: Tensor, candidates: Tensor) -> Tensor:
+        """Prediction (..., K, n_out) at one point x (..., n) for K candidates (..., K, n_in - n) of the last inputs.
+
+        The first layer's share of ``x`` is computed once. A law that searches its MV uses this.
+        ``residual`` columns must lie within ``x``.
+        """
+        n = x.shape[-1]
+        known = ((x - self.x_center[:n]) / self.x_scale[:n]) @ self.weights[0][:n] + self.biases[0]
+        varied = ((candidates - self.x_center[n:]) / self.x_scale[n:]) @ self.weights[0][n:]
+        return self._limited(self._after_first_layer(x.unsqueeze(-2), known.unsqueeze(-2) + varied))
+
+    def _after_first_layer(self, x: Tensor, preactivation: Tensor) -> Tensor:
+        a = torch.tanh(preactivation)
+        for weight, bias in zip(list(self.weights)[1:-1], list(self.biases)[1:-1], strict=True):
+            a = torch.tanh(a @ weight + bias)
+        y = self.y_center + self.y_scale * (a @ self.weights[-1] + self.biases[-1])
+        if self.residual:
+            # A narrow instead of a gather: one cheap node in the exported graph.
+            y = y + torch.cat([x[..., i : i + 1] for i in self.residual], dim=-1)
+        return y
+
+    def _limited(self, y: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(y, self.y_low), self.y_high) if self.bounded else y
