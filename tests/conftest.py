@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -89,3 +90,25 @@ def make_law(parts: dict[str, Model], signals: LawSignals, plant: Plant) -> LawF
 def law(request: pytest.FixtureRequest, make_law: LawFactory) -> ControlLaw:
     """Every law in turn."""
     return make_law(request.param)
+
+
+@dataclass(frozen=True)
+class LoopTest:
+    """A closed-loop test as ``simulate_closed`` reads it."""
+
+    sp: np.ndarray
+    x0: np.ndarray
+    mv0: np.ndarray
+    changes: dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="session")
+def loop_test() -> Callable[..., LoopTest]:
+    """``loop_test(plant, levels (n,), start, NAME=value)``: from the steady state at ``start``, parameters changed."""
+
+    def make(plant: Plant, levels: np.ndarray, start: float, **changed: float) -> LoopTest:
+        x0, mv0 = plant.steady_state_at(start)
+        changes = {name: np.full(len(levels), value) for name, value in changed.items()}
+        return LoopTest(levels[:, None], x0, mv0, changes)
+
+    return make
