@@ -150,7 +150,6 @@ class Case(ABC):
     development_seeds: ClassVar[tuple[int, ...]]  # for tuning and selection, never scored
     noise: ClassVar[Mapping[str, float]]  # PV -> standard deviation of its measurement noise
     gate: ClassVar[Mapping[str, float]]  # scenario -> weight in the promotion gate, summing to 1
-    regions: ClassVar[Mapping[str, tuple[float, float]]]  # name -> [low, high) of the CV
     tables: ClassVar[tuple[PaperTable, ...]] = ()
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = ()
@@ -168,6 +167,11 @@ class Case(ABC):
     def plant(self) -> Plant:
         """The nominal plant."""
         return self.plant_class()
+
+    @property
+    def regions(self) -> Mapping[str, tuple[float, float]]:
+        """Operating regions, name -> [low, high) of the CV; the plant's own unless the case has better names."""
+        return self.plant.regions
 
     @property
     def noise_std(self) -> Array:

@@ -1,0 +1,243 @@
+"""One optimal-control problem over a horizon, from a plant's own equations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.plants.base import Plant
+from serving.manifest import Signal
+
+Array = NDArray[np.float64]
+
+# The plan is never allowed to leave the states' ranges by more than this fraction of them.
+MARGIN = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A solution: the moves, the states that they lead to, and what a next solve starts from."""
+
+    mv: Array  # (n, n_mv)
+    x: Array  # (n + 1, n_x) states at the samples, the first one given
+    cost: float  # of the controlled variables' errors alone, in fractions of their ranges
+    solved: bool
+    iterations: int
+    values: Array  # all variables of the problem, (per period, n)
+    multipliers: tuple[Array, Array] | None  # of bounds and constraints
+
+
+class Horizon:
+    r"""Best moves over ``n`` periods for a plant that is known exactly.
+
+        min  sum_k sum_i |r_i(k) - y_i(k)| / span_i  +  w sum_k ((u(k) - u(k-1)) / span_u)^2,   k = 1..n
+
+    over u(0)..u(n-1) within the MVs' ranges, each held for one period. The plant's ``derivative``
+    enters by Radau collocation (``elements`` of ``degree`` a period): implicit, so that neither
+    the hot branch's stiffness nor an ignition within one period costs accuracy or stability, and
+    cheap to differentiate twice. The absolute value enters through slacks, s >= +-(r - y).
+
+    The small weight w chooses among equal tracking errors: an MV that rings between samples, on
+    the sampled plant's zero outside the unit circle, costs no error at the samples.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        n: int,
+        *,
+        elements: int = 3,
+        degree: int = 3,
+        move_weight: float = 1e-3,
+        tolerance: float = 1e-7,
+        max_iterations: int = 150,
+    ) -> None:
+        self.plant, self.n = plant, n
+        self._n_x, self._n_mv, self._n_cv = len(plant.state_signals), len(plant.mv_signals), len(plant.sp_signals)
+        self._points = elements * degree
+        self._x_low, self._x_span = _range(plant.state_signals)
+        self._mv_low, self._mv_span = _range(plant.mv_signals)
+        self._cv_span = _range(plant.sp_signals)[1]
+        n_z = self._n_x * self._points
+        rows = self._rows = n_z + self._n_mv + self._n_cv
+
+        w = ca.MX.sym("w", rows * n)
+        table = ca.reshape(w, rows, n)
+        z, u, s = table[:n_z, :], table[n_z : n_z + self._n_mv, :], table[n_z + self._n_mv :, :]
+        x0 = ca.MX.sym("x0", self._n_x)
+        sp = ca.MX.sym("sp", self._n_cv, n)
+        p = ca.MX.sym("p", len(plant.parameter_names()), n)
+        ends = z[n_z - self._n_x :, :]
+        starts = ca.horzcat(x0, ends[:, :-1])
+        self._trace = self._dense(elements, degree)
+        defects = self._collocation(elements, degree).map(n)(starts, z, u, p)
+        error = sp - self._controlled().map(n)(ends)
+        moves = u[:, 1:] - u[:, :-1]
+        problem: Any = {
+            "x": w,
+            "p": ca.vertcat(x0, ca.vec(sp), ca.vec(p)),
+            "f": ca.sum1(ca.vec(s)) + move_weight * ca.sumsqr(moves),
+            "g": ca.vertcat(ca.vec(defects), ca.vec(s - error), ca.vec(s + error)),
+        }
+        options: Any = {
+            "expand": True,  # one flat expression evaluates several times faster than the map
+            "print_time": False,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "ipopt.linear_solver": "mumps",
+            "ipopt.tol": tolerance,
+            "ipopt.max_iter": max_iterations,
+            "ipopt.mu_init": 1e-5,
+            "ipopt.warm_start_init_point": "yes",
+            "ipopt.warm_start_bound_push": 1e-6,
+            "ipopt.warm_start_slack_bound_push": 1e-6,
+            "ipopt.warm_start_mult_bound_push": 1e-6,
+        }
+        self._solver = ca.nlpsol("horizon", "ipopt", problem, options)
+        low, high = np.zeros((rows, n)), np.ones((rows, n))
+        low[:n_z], high[:n_z] = -MARGIN, 1 + MARGIN
+        high[n_z + self._n_mv :] = np.inf
+        self._bounds = {"lbx": low.ravel("F"), "ubx": high.ravel("F")}
+        n_g = n_z * n
+        upper = np.concatenate([np.zeros(n_g), np.full(2 * self._n_cv * n, np.inf)])
+        self._bounds |= {"lbg": np.zeros(upper.size), "ubg": upper}
+
+    def _collocation(self, elements: int, degree: int) -> ca.Function:
+        """Defects of one period, scaled: (x, z, u, p) -> (n_x * points,)."""
+        plant = self.plant
+        x = ca.SX.sym("x", self._n_x)
+        z = ca.SX.sym("z", self._n_x, self._points)
+        u = ca.SX.sym("u", self._n_mv)
+        p = ca.SX.sym("p", len(plant.parameter_names()))
+        differentiate, _, _ = ca.collocation_coeff(ca.collocation_points(degree, "radau"))
+        h = plant.period_s / plant.time_unit_s / elements
+        mv = self._mv_low + self._mv_span * u
+        defects, start = [], x
+        for element in range(elements):
+            inside = z[:, element * degree : (element + 1) * degree]
+            rate = ca.horzcat(
+                *(
+                    plant.rate(self._x_low + self._x_span * inside[:, j], mv, plant.dv_nominal, p) / self._x_span
+                    for j in range(degree)
+                )
+            )
+            defects.append(ca.vec(ca.horzcat(start, inside) @ differentiate - h * rate))
+            start = inside[:, -1]
+        return ca.Function("collocation", [x, ca.vec(z), u, p], [ca.vertcat(*defects)])
+
+    def _dense(self, elements: int, degree: int) -> ca.Function:
+        """States at the collocation points of one period by RK4: (x, mv, p) -> (n_x, points)."""
+        plant = self.plant
+        x = ca.SX.sym("x", self._n_x)
+        mv = ca.SX.sym("mv", self._n_mv)
+        p = ca.SX.sym("p", len(plant.parameter_names()))
+        points = np.array(ca.collocation_points(degree, "radau"))
+        times = np.concatenate([e + points for e in range(elements)]) / elements
+        period = plant.period_s / plant.time_unit_s
+        state, found = x, []
+        for span in np.diff(times, prepend=0.0):
+            substeps = int(np.ceil(span * plant.substeps))
+            h = span * period / substeps
+            for _ in range(substeps):
+                k1 = plant.rate(state, mv, plant.dv_nominal, p)
+                k2 = plant.rate(state + h / 2 * k1, mv, plant.dv_nominal, p)
+                k3 = plant.rate(state + h / 2 * k2, mv, plant.dv_nominal, p)
+                k4 = plant.rate(state + h * k3, mv, plant.dv_nominal, p)
+                state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            found.append(state)
+        return ca.Function("trace", [x, mv, p], [ca.horzcat(*found)])
+
+    def _controlled(self) -> ca.Function:
+        """Controlled variables in fractions of their ranges, from a scaled state."""
+        x = ca.SX.sym("x", self._n_x)
+        pv = self.plant.measure(self._x_low + self._x_span * x)
+        return ca.Function("controlled", [x], [pv[: self._n_cv] / self._cv_span])
+
+    def solve(self, x0: Array, sp: Array, p: Array, start: Plan) -> Plan:
+        """The plan from state ``x0``, begun from ``start``.
+
+        ``x0`` (n_x,); set points ``sp`` (n, n_sp) at samples 1..n; plant parameters ``p`` (n, n_p)
+        over periods 0..n-1.
+
+        Not being solved is told by the plan, not raised: the caller has an older plan to go on with.
+        """
+        given = np.concatenate([(x0 - self._x_low) / self._x_span, (sp / self._cv_span).ravel(), p.ravel()])
+        arguments = {"x0": start.values.ravel("F"), "p": given, **self._bounds}
+        if start.multipliers is not None:
+            arguments |= {"lam_x0": start.multipliers[0], "lam_g0": start.multipliers[1]}
+        found = self._solver(**arguments)
+        stats = self._solver.stats()
+        values = np.array(found["x"]).reshape(self._rows, self.n, order="F")
+        multipliers = (np.array(found["lam_x"]), np.array(found["lam_g"]))
+        return self._plan(x0, sp, values, bool(stats["success"]), int(stats["iter_count"]), multipliers)
+
+    def _plan(
+        self,
+        x0: Array,
+        sp: Array,
+        values: Array,
+        solved: bool = False,
+        iterations: int = 0,
+        multipliers: tuple[Array, Array] | None = None,
+    ) -> Plan:
+        n_z = self._n_x * self._points
+        x = np.vstack([x0, self._x_low + self._x_span * values[n_z - self._n_x : n_z].T])
+        mv = self._mv_low + self._mv_span * np.clip(values[n_z : n_z + self._n_mv].T, 0.0, 1.0)
+        cv = np.array(self.plant.measure(x[1:].T)).T[:, : self._n_cv]
+        cost = float(np.sum(np.abs(sp - cv) / self._cv_span))
+        return Plan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), iterations, values, multipliers)
+
+    def shifted(self, plan: Plan) -> Plan:
+        """The rest of a plan, its last period repeated: where the next sample's solve starts."""
+        values = np.hstack([plan.values[:, 1:], plan.values[:, -1:]])
+        x = np.vstack([plan.x[1:], plan.x[-1:]])
+        mv = np.vstack([plan.mv[1:], plan.mv[-1:]])
+        return Plan(mv, x, plan.cost, plan.solved, 0, values, plan.multipliers)
+
+    def rollout(self, x0: Array, sp: Array, p: Array, reach: int, step: Callable[..., Array]) -> Plan:
+        """A start for ``solve``: the exact inverse over ``reach`` periods, simulated by ``step``.
+
+        Each move is the MV that, held for ``reach`` periods, brings the first CV to its set point;
+        bisection, so an unreachable one saturates. A plant that ignites has several locally best
+        plans, and which one a solver finds depends on when the start ignites: short reaches go
+        fast and overshoot, long ones creep.
+        """
+        x, dv = np.asarray(x0, dtype=np.float64), self.plant.dv_nominal
+        mv = self._mv_low + 0.5 * self._mv_span
+        values = np.zeros((self._rows, self.n))
+        n_z = self._n_x * self._points
+        for k in range(self.n):
+
+            def miss(fraction: float, x: Array = x, k: int = k) -> float:
+                trial = mv.copy()
+                trial[0] = self._mv_low[0] + fraction * self._mv_span[0]
+                for _ in range(reach):
+                    x = step(x, trial, dv, p[k])
+                return float(sp[k, 0]) - float(np.array(self.plant.measure(x))[0, 0])
+
+            low, high = 0.0, 1.0
+            at_low, at_high = miss(low), miss(high)
+            if at_low * at_high > 0:
+                low = high = 0.0 if abs(at_low) < abs(at_high) else 1.0
+            for _ in range(12 if low < high else 0):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if miss(middle) * at_low > 0 else (low, middle)
+            fraction = 0.5 * (low + high)
+            mv[0] = self._mv_low[0] + fraction * self._mv_span[0]
+            trace = np.array(self._trace(x, mv, p[k])).T
+            x = trace[-1]
+            values[:n_z, k] = ((trace - self._x_low) / self._x_span).ravel()
+            values[n_z : n_z + self._n_mv, k] = (mv - self._mv_low) / self._mv_span
+            error = sp[k] - np.array(self.plant.measure(x))[: self._n_cv, 0]
+            values[n_z + self._n_mv :, k] = np.abs(error) / self._cv_span
+        return self._plan(np.asarray(x0), sp, values)
+
+
+def _range(signals: tuple[Signal, ...]) -> tuple[Array, Array]:
+    low = np.array([s.low for s in signals])
+    return low, np.array([s.high for s in signals]) - low
