@@ -27,12 +27,8 @@ def draw(result: SweepResult, path: Path) -> None:
         values = [row.validation.regions.get(name, float("nan")) for row in result.rows]
         error.plot(c, values, color=f"C{i}", lw=1, label=f"validation, {name}")
     error.plot([best.partitions], [best.validation.rmse], "o", color="C3", ms=7)
-    error.annotate(
-        f"c = {best.partitions}: {best.centres} centres, RMSE {best.validation.rmse:.3g}",
-        (best.partitions, best.validation.rmse),
-        xytext=(0, -18),
-        textcoords="offset points",
-        ha="right" if best.partitions > (c[0] + c[-1]) / 2 else "left",
+    error.set_title(
+        f"best: c = {best.partitions}, {best.centres} centres, RMSE {best.validation.rmse:.3g} {result.unit}"
     )
     error.set_yscale("log")
     error.set_ylabel("RMSE" + (f" [{result.unit}]" if result.unit else ""))
