@@ -19,11 +19,11 @@ class Clock(Protocol):
 class MonotonicClock:
     """The machine's monotonic clock, ``speed`` times as fast.
 
-    The last 0.3 ms before a deadline are spent spinning: a sleeping processor wakes up late and
+    The last 0.4 ms before a deadline are spent spinning: a sleeping processor wakes up late and
     with cold caches, and that costs more than the step itself.
     """
 
-    spin_s = 3e-4
+    spin_s = 4e-4
 
     def __init__(self, speed: float = 1.0) -> None:
         self.speed = speed

@@ -19,7 +19,7 @@ from serving.manifest import Signal
 
 Array: TypeAlias = NDArray[np.float64]
 
-WARM_LEAD_S = 3e-4  # within the clock's spin, so that the processor does not sleep between warm-up and deadline
+WARM_LEAD_S = 4e-4  # within the clock's spin, so that the processor does not sleep between warm-up and deadline
 
 
 class Mode(StrEnum):
@@ -117,7 +117,7 @@ class ControlLoop:
     clock
         Time for ``run``; the machine's unless given.
     warm_lead_s
-        How long before each deadline one discarded step is done [s]; 0: none.
+        How long before each deadline the controller is warmed [s]; 0: none.
     max_gap
         Missed periods in a row after which the law starts cold.
 

@@ -1,0 +1,80 @@
+"""Laws of the serving tests' own, exported once a session. Loaded by ``pytest_plugins``, not imported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+import torch
+from torch import Tensor
+
+from pipeline.export import export
+from pipeline.laws import ControlLaw, LawSignals
+from serving import Controller, Signal
+
+SIGNALS = LawSignals(
+    period_s=0.5,
+    sp=(Signal("level", "m", 0.0, 2.0),),
+    pv=(Signal("level", "m", 0.0, 2.0), Signal("T", "K", 250.0, 400.0)),
+    dv=(Signal("inflow", "l/s", 0.0, 3.0),),
+    mv=(Signal("valve", "%", 0.0, 100.0),),
+)
+Formula = Callable[..., tuple[Tensor, Tensor, Tensor]]
+
+
+class FormulaLaw(ControlLaw):
+    """A law whose forward is a function: ``formula(law, sp, pv, dv, mv_applied, state)``."""
+
+    name = "formula"
+    title = "Formula"
+    Params = type(None)
+
+    def __init__(self, formula: Formula, n_state: int, info: tuple[str, ...], signals: LawSignals) -> None:
+        super().__init__(signals)
+        self.formula, self.n_state, self.info = formula, n_state, info
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Any], signals: LawSignals, plant: Any) -> Self:
+        raise NotImplementedError
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.formula(self, *inputs)
+
+
+def pi(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
+    """Velocity-form PI: state = (started, last error)."""
+    error = sp - pv[..., :1]
+    last = torch.where(state[..., :1] > 0, state[..., 1:], error)
+    mv = law.limited(mv_applied + 20.1 * (error - last) + 1.3 * error, mv_applied)
+    return mv, torch.cat([torch.ones_like(error), error], dim=-1), torch.cat([error, mv - mv_applied], dim=-1)
+
+
+@pytest.fixture(scope="session")
+def make_formula() -> Callable[..., ControlLaw]:
+    """``make_formula(formula, n_state=0, info=(), signals=SIGNALS)``: a law from a function."""
+
+    def make(
+        formula: Formula, n_state: int = 0, info: tuple[str, ...] = (), signals: LawSignals = SIGNALS
+    ) -> ControlLaw:
+        return FormulaLaw(formula, n_state, info, signals).eval()
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def pi_law(make_formula: Callable[..., ControlLaw]) -> ControlLaw:
+    return make_formula(pi, 2, ("error", "move"))
+
+
+@pytest.fixture(scope="session")
+def pi_file(pi_law: ControlLaw, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("controller") / "pi.onnx"
+    export(pi_law, path, case="tank", provenance={"git": "0123abc"}, evidence={"step": {"mae": 0.25, "ise": 0.5}})
+    return path
+
+
+@pytest.fixture
+def controller(pi_file: Path) -> Controller:
+    return Controller(pi_file)
