@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pipeline.errors import LawError
+from pipeline.export import export
 from pipeline.laws import LAWS, ControlLaw, LawSignals
 from pipeline.params import parse
 from pipeline.plants import Plant
+from serving import Controller
 
 # A law is the same for all examples: nothing of it changes from one to the next.
 repeated = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -197,3 +199,21 @@ def test_missing_parts_are_named(name: str, parts, signals: LawSignals, plant: P
         pytest.skip("designed from the plant")
     with pytest.raises(LawError, match=f"law '{name}' needs a part"):
         cls.design(cls.Params(), {}, signals, plant)
+
+
+def test_exported_graph_equals_the_module(law: ControlLaw, tmp_path) -> None:
+    """A loop through the runtime that will serve the file, each side on its own state and MV."""
+    manifest = export(law, tmp_path / "law.onnx", case="contract", provenance={})
+    assert (manifest.law, manifest.n_state, manifest.info) == (law.name, law.n_state, law.info)
+    controller = Controller(tmp_path / "law.onnx")
+    rng = np.random.default_rng(7)
+    state, mv = torch.zeros(law.n_state, dtype=torch.float64), 0.5 * (law.low + law.high)
+    served, served_mv = controller.cold_state(), mv.numpy()
+    for _ in range(50):
+        inputs = drawn(law, rng)
+        out = step(law, inputs._replace(mv_applied=mv), state)
+        sp, pv, dv = (t.numpy() for t in inputs[:3])
+        got = controller.step(sp=sp, pv=pv, mv_applied=served_mv, state=served, dv=dv if dv.size else None)
+        np.testing.assert_allclose(got.mv, out.mv.numpy(), rtol=1e-9, atol=1e-9 * span(law))
+        np.testing.assert_allclose(got.info, out.info.numpy(), rtol=1e-7, atol=1e-7)
+        state, mv, served, served_mv = out.state, out.mv, got.state, got.mv

@@ -41,12 +41,10 @@ def _bounds(domain: LeverageDomain, pv: Tensor, narrowing: Tensor) -> tuple[Inte
     return (at, *domain.bounds(at, pv[..., :1], narrowing))
 
 
-def _request_info(domain: LeverageDomain, at: Interval, w: Tensor, w_min: Tensor, w_max: Tensor) -> Tensor:
-    """REQUEST_INFO of the request w that the network is given, shape (..., 5)."""
+def _request_info(domain: LeverageDomain, at: Interval, w: Tensor, w_min: Tensor, w_max: Tensor) -> list[Tensor]:
+    """REQUEST_INFO of the request w that the network is given, (..., 1) each."""
     leverage = domain.leverage(at, w)
-    # A request at the bound itself lies on either side of it by rounding.
-    in_domain = (leverage <= domain.threshold * (1 + 1e-9)).to(w.dtype)
-    return torch.cat([w, w_min, w_max, leverage, in_domain], dim=-1)
+    return [w, w_min, w_max, leverage, domain.inside(leverage)]
 
 
 class INC(ControlLaw):
@@ -138,7 +136,7 @@ class INCAD(ControlLaw):
         at, w_min, w_max = _bounds(self.domain, pv, self.narrowing)
         w_re = torch.minimum(torch.maximum(sp, w_min), w_max)
         requested = self.inverse(torch.cat([pv, w_re], dim=-1))
-        info = torch.cat([_request_info(self.domain, at, w_re, w_min, w_max), requested], dim=-1)
+        info = torch.cat([*_request_info(self.domain, at, w_re, w_min, w_max), requested], dim=-1)
         return self.limited(requested, mv_applied), state, info
 
 
@@ -219,7 +217,7 @@ class INCADEC(ControlLaw):
         else:
             requested = self.inverse(torch.cat([pv, w_ec], dim=-1))
             state_next = torch.cat([started, w_ec], dim=-1)
-        info = torch.cat([_request_info(self.domain, at, w_ec, w_min, w_max), error, requested], dim=-1)
+        info = torch.cat([*_request_info(self.domain, at, w_ec, w_min, w_max), error, requested], dim=-1)
         return self.limited(requested, mv_applied), state_next, info
 
     def _remembered(self, mv_applied: Tensor, state: Tensor) -> Tensor:

@@ -40,12 +40,13 @@ class LeverageDomain(Model):
     scale: Tensor  # (1,)
     free: Tensor  # (1,) h* - 1/K
     threshold: Tensor  # (1,) h*
+    edge: Tensor  # (1,) h* and a little: a value of w at its bound lies on either side of h* by rounding
 
     def __init__(self, n_in: int) -> None:
         super().__init__()
         self.n_in = n_in
         shapes = {"mean_x": (n_in - 1,), "mean_w": (1,), "project": (n_in - 1, n_in)}
-        shapes |= {"scale": (1,), "free": (1,), "threshold": (1,)}
+        shapes |= {"scale": (1,), "free": (1,), "threshold": (1,), "edge": (1,)}
         for name, shape in shapes.items():
             self.register_buffer(name, torch.ones(shape, dtype=torch.float64))
 
@@ -60,6 +61,7 @@ class LeverageDomain(Model):
             "scale": np.array([fitted.scale]),
             "free": np.array([fitted.threshold - fitted.offset]),
             "threshold": np.array([fitted.threshold]),
+            "edge": np.array([fitted.threshold * (1 + 1e-9)]),
         }
         return cls.from_arrays({"n_in": u.shape[1]}, numbers)
 
@@ -78,6 +80,10 @@ class LeverageDomain(Model):
         """Leverage (..., 1) of w, shape (..., 1), at the state of an interval."""
         away = (w - at.centre) / self.scale
         return self.threshold - at.room + away * away
+
+    def inside(self, leverage: Tensor) -> Tensor:
+        """1.0 where a leverage (..., 1) is that of an input inside the domain, else 0.0."""
+        return (leverage <= self.edge).to(leverage.dtype)
 
     def forward(self, x: Tensor) -> Tensor:
         """Leverage, shape (..., 1), of inputs [state, w], shape (..., N)."""
