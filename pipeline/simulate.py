@@ -112,7 +112,7 @@ def simulate_batch(plant: Plant, x0: Array, mv: Array, parameters: Mapping[str, 
 
 
 def simulate_closed(
-    plant: Plant, step: Step, test: LoopTest, *, noise: Sequence[float] | None = None, seed: int = 0
+    plant: Plant, step: Step, test: LoopTest, *, noise: Sequence[float] | Array | None = None, seed: int = 0
 ) -> Trajectory:
     """Close the loop of a controller over a plant.
 
@@ -167,13 +167,13 @@ def simulate_closed(
     )
 
 
-def noise_draws(plant: Plant, n: int, noise: Sequence[float] | None, rng: np.random.Generator) -> Array:
+def noise_draws(plant: Plant, n: int, noise: Sequence[float] | Array | None, rng: np.random.Generator) -> Array:
     """Measurement noise, shape (n, n_pv), Gaussian with one standard deviation a PV; zeros where there is none.
 
     Raises PlantError unless there is one finite standard deviation >= 0 a PV.
     """
     names = [s.name for s in plant.pv_signals]
-    if not noise:
+    if noise is None or not len(noise):
         return np.zeros((n, len(names)))
     std = np.asarray(noise, dtype=np.float64)
     if std.shape != (len(names),) or not np.all(np.isfinite(std) & (std >= 0)):

@@ -238,11 +238,11 @@ def test_operating_point_feeds_pairs_over_its_hold(around):
 def test_share_of_moves_near_the_feedback(cstr):
     plant_range = 500.0
     used = np.full(4000, 250.0)
-    near = OperatingPoint(near=10.0, near_fraction=1.0).moves(cstr, used, np.random.default_rng(0))
+    near = OperatingPoint(near=10.0, near_fraction=1.0).sequence(cstr, used, np.random.default_rng(0))[:, 0]
     assert near.std() == pytest.approx(10.0, rel=0.1)
-    anywhere = OperatingPoint(near_fraction=0.0).moves(cstr, used, np.random.default_rng(0))
+    anywhere = OperatingPoint(near_fraction=0.0).sequence(cstr, used, np.random.default_rng(0))[:, 0]
     assert anywhere.std() == pytest.approx(plant_range / np.sqrt(12), rel=0.05)
-    assert OperatingPoint(near=1e3, near_fraction=1.0).moves(cstr, used, np.random.default_rng(0)).min() == 0.0
+    assert OperatingPoint(near=1e3, near_fraction=1.0).sequence(cstr, used, np.random.default_rng(0))[:, 0].min() == 0.0
 
 
 def test_feedback_holds_its_set_point_without_dither(cstr):
@@ -264,3 +264,13 @@ def test_a_pid_may_be_given_and_other_plants_are_served(cstr):
         OperatingPoint(sp_low=0.5, sp_high=0.4).set_points(cstr)
     with pytest.raises(ParamsError, match="sp_hold_high is 5; it must be at least 20"):
         OperatingPoint(sp_hold_high=5)
+
+
+def test_short_runs_of_several_moves_hold_each_and_go_to_the_ends(cstr: ThiosulfateCstr) -> None:
+    excitation = OperatingPoint(samples=500, restarts=200, moves=3, move_hold=4, near_fraction=0.0, end_fraction=0.5)
+    record = excitation.run(cstr, 0)
+    short = record.run >= 1
+    mv = record.mv[short, 0].reshape(200, 13)
+    assert (mv[:, :12].reshape(200, 3, 4) == mv[:, :12:4, None]).all()
+    assert (mv[:, -1] == mv[:, -2]).all()
+    assert np.isin(mv[:, :12], (0.0, 500.0)).mean() == pytest.approx(0.5, abs=0.1)

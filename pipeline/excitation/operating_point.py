@@ -57,14 +57,19 @@ class OperatingPoint(Excitation):
     dither_hold : int
         Samples for which a dither is held [-].
     restarts : int
-        Number of short runs [-], each of move_hold + 1 rows.
+        Number of short runs [-], each of moves * move_hold + 1 rows.
+    moves : int
+        Moves of a short run, one after the other [-]. Several lead on from the states that the feedback
+        visits to those which a controller meets that uses the whole MV.
     move_hold : int
-        Samples for which the MV of a short run is held [-].
+        Samples for which each MV of a short run is held [-].
     near : float
         Standard deviation, around the MV that the feedback had used in that state, of the MVs that
         are not drawn over the whole range [unit of the MV].
     near_fraction : float
-        Fraction of the short runs with such an MV [-], 0 to 1.
+        Fraction of the short runs whose first MV is such a one [-], 0 to 1.
+    end_fraction : float
+        Fraction of the other moves that go to an end of the MV's range [-], 0 to 1.
     """
 
     kind: ClassVar[str] = "operating_point"
@@ -82,18 +87,21 @@ class OperatingPoint(Excitation):
     dither: float = 30.0
     dither_hold: int = 3
     restarts: int = 60_000
+    moves: int = 1
     move_hold: int = 3
     near: float = 40.0
     near_fraction: float = 0.5
+    end_fraction: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("run_length", "sp_hold_low", "dither_hold", "move_hold"):
+        for name in ("run_length", "sp_hold_low", "dither_hold", "moves", "move_hold"):
             self.require(name, 1)
         self.require("sp_hold_high", self.sp_hold_low)
         for name in ("restarts", "dither", "near", "td_s"):
             self.require(name, 0)
-        self.require("near_fraction", 0, 1)
+        for name in ("near_fraction", "end_fraction"):
+            self.require(name, 0, 1)
 
     def run(self, plant: Plant, seed: int) -> Record:
         """The record: closed-loop runs, each followed by the short runs from its states.
@@ -169,9 +177,11 @@ class OperatingPoint(Excitation):
         used = np.concatenate([loop.mv for loop in loops])
         # Sorted, so that the short runs follow the loop in which their states were visited.
         pick = np.sort(rng.integers(len(visited), size=self.restarts))
-        move = self.moves(plant, used[pick, 0], rng)
-        rows = self.move_hold + 1
-        x = simulate_batch(plant, visited[pick], np.repeat(move[:, None, None], self.move_hold, axis=1))
+        move = np.repeat(self.sequence(plant, used[pick, 0], rng), self.move_hold, axis=1)
+        rows = move.shape[1] + 1
+        x = simulate_batch(plant, visited[pick], move[:, :, None])
+        # The last row shows where the last move led; its MV acts on nothing any more.
+        move = np.hstack([move, move[:, -1:]])
         noise = noise_draws(plant, self.restarts * rows, self.noise, rng)
         pv = (measured(plant, x).reshape(len(noise), -1) + noise).reshape(self.restarts, rows, -1)
         ends = np.searchsorted(pick, np.cumsum([len(loop.x) for loop in loops]))
@@ -180,14 +190,18 @@ class OperatingPoint(Excitation):
         lengths: list[NDArray[np.int64]] = []
         for loop, start, end in zip(loops, np.r_[0, ends[:-1]], ends, strict=True):
             pvs += [loop.pv, pv[start:end].reshape(-1, pv.shape[2])]
-            mvs += [loop.mv, np.repeat(move[start:end], rows)[:, None]]
+            mvs += [loop.mv, move[start:end].reshape(-1, 1)]
             lengths += [np.array([len(loop.x)]), np.full(end - start, rows)]
         length = np.concatenate(lengths)
         return Record.of(plant, np.concatenate(pvs), np.concatenate(mvs), run=np.repeat(np.arange(len(length)), length))
 
-    def moves(self, plant: Plant, used: Array, rng: np.random.Generator) -> Array:
-        """One MV for each short run, shape (restarts,): over the whole range, or near the one used."""
+    def sequence(self, plant: Plant, used: Array, rng: np.random.Generator) -> Array:
+        """The MVs of each short run, shape (restarts, moves): over the whole range, the first maybe near ``used``."""
         signal = plant.mv_signals[0]
-        anywhere = rng.uniform(signal.low, signal.high, len(used))
+        shape = (len(used), self.moves)
+        anywhere = rng.uniform(signal.low, signal.high, shape)
+        end = np.where(rng.random(shape) < 0.5, signal.low, signal.high)
+        found = np.where(rng.random(shape) < self.end_fraction, end, anywhere)
         close = np.clip(used + self.near * rng.standard_normal(len(used)), signal.low, signal.high)
-        return np.where(rng.random(len(used)) < self.near_fraction, close, anywhere)
+        found[:, 0] = np.where(rng.random(len(used)) < self.near_fraction, close, found[:, 0])
+        return found

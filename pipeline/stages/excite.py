@@ -1,0 +1,41 @@
+"""Stage excite: one record a data seed."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+
+from pipeline.cases import CASES
+from pipeline.command import run_stage
+from pipeline.excitation import EXCITATIONS, Excitation
+from pipeline.parallel import parallel_map
+from pipeline.params import RecordParams, choose, parse
+from pipeline.plants.base import Plant
+from pipeline.stages import record_folder, write_json
+
+
+def excite(name: str) -> None:
+    """Write the records of ``records.<name>``: seed<k>.parquet each, and metrics.json."""
+    params = RecordParams.read(name)
+    where = f"records.{name}"
+    case = choose(CASES, params.case, "case", where)
+    kind = choose(EXCITATIONS, params.kind, "excitation", where)
+    excitation = parse(kind, params.excitation, where)
+    folder = record_folder(params.case, params.record)
+    shutil.rmtree(folder, ignore_errors=True)
+    rows = parallel_map(partial(_record, excitation, case.plant, folder), params.seeds, f"excite {name}")
+    write_json(folder / "metrics.json", {"record": params.record, "per_seed": dict(rows)})
+
+
+def _record(excitation: Excitation, plant: Plant, folder: Path, seed: int) -> tuple[str, dict[str, object]]:
+    record = excitation.run(plant, seed)
+    record.write(folder / f"seed{seed}.parquet")
+    where = plant.region(record.pv[:, 0])
+    share = {name: float((where == i).mean()) for i, name in enumerate(plant.region_names)}
+    return str(seed), {"rows": len(record), "regions": share, "digest": record.digest()}
+
+
+if __name__ == "__main__":
+    sys.exit(run_stage(excite, sys.argv, "RECORD"))

@@ -1,0 +1,94 @@
+"""Stage fit: a set of models a data seed."""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+import sys
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.cases import CASES, Case
+from pipeline.command import run_stage
+from pipeline.errors import ParamsError
+from pipeline.models.parts import PARTS, Part
+from pipeline.parallel import parallel_map
+from pipeline.params import ModelParams, choose, parse
+from pipeline.record import Record
+from pipeline.stages import model_folder, write_json
+
+
+def fit(name: str) -> None:
+    """Train the parts of ``models.<name>`` on each data seed; write them, metrics.json and the sweep."""
+    params = ModelParams.read(name)
+    case = choose(CASES, params.case, "case", f"models.{name}")
+    parts = {part: _part(values, f"models.{name}.parts.{part}") for part, values in params.parts.items()}
+    folder = model_folder(params.case, params.model)
+    shutil.rmtree(folder, ignore_errors=True)
+    data = data_files(params.data)
+    results = parallel_map(partial(_learn, parts, case, folder), list(data.items()), f"fit {name}")
+    metrics: dict[str, Any] = {"model": params.model, "parts": {}}
+    for part, description in parts.items():
+        per_seed = {str(seed): found[part] for seed, found in zip(data, results, strict=True)}
+        fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
+        metrics["parts"][part] = {"kind": description.kind, **fields, "per_seed": per_seed, "median": _median(per_seed)}
+    write_json(folder / "metrics.json", metrics)
+
+
+def _part(values: Mapping[str, Any], where: str) -> Part:
+    options = dict(values)
+    kind = choose(PARTS, options.pop("kind", None), "kind of part", f"{where}.kind")
+    return parse(kind, options, where)
+
+
+def data_files(data: Path) -> dict[int, Path | None]:
+    """Data seed -> its file: a folder of seed<k>.parquet, one record of a plant, or a plant's text (no file)."""
+    if data.suffix == ".py":
+        return {0: None}
+    if data.suffix in {".csv", ".parquet"}:
+        return {0: data}
+    files = {int(p.stem.removeprefix("seed")): p for p in data.glob("seed*.parquet")}
+    if not files:
+        raise ParamsError(
+            f"data is {data}, which holds no seed<k>.parquet; give the folder of a record, a .csv or .parquet file, "
+            "or a plant's .py"
+        )
+    return dict(sorted(files.items()))
+
+
+def _learn(parts: Mapping[str, Part], case: Case, folder: Path, item: tuple[int, Path | None]) -> dict[str, Any]:
+    seed, path = item
+    plant = case.plant
+    signals = {"pv": plant.pv_signals, "mv": plant.mv_signals, "dv": plant.dv_signals}
+    record = None if path is None else Record.read(path, **signals, period_s=plant.period_s)
+    found = {}
+    for name, part in parts.items():
+        learnt = part.learn(record, plant, case.regions, seed)
+        learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
+        found[name] = learnt.metrics
+        if learnt.sweep is not None:
+            learnt.sweep.save(folder / "sweep.json")
+            learnt.sweep.plot(folder / "sweep.png")
+        if learnt.predictions is not None and seed == 0:
+            np.savez(folder / "predictions.npz", **learnt.predictions)  # type: ignore[arg-type]
+    return found
+
+
+def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Median over the seeds of every number, nested mappings kept; lists and texts are left out."""
+    rows = list(per_seed.values())
+    found: dict[str, Any] = {}
+    for key, value in rows[0].items():
+        if isinstance(value, Mapping):
+            found[key] = _median({str(i): row[key] for i, row in enumerate(rows) if key in row})
+        elif isinstance(value, (int, float)):
+            found[key] = statistics.median(row[key] for row in rows if key in row)
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(run_stage(fit, sys.argv, "MODEL"))
