@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pipeline.laws.base import ControlLaw, LawSignals
 from pipeline.laws.inverse import INC, INCAD, INCADEC
+from pipeline.laws.inverse_dob import ForwardDob, InverseDob
 from pipeline.laws.pid import PID
 
 LAWS: dict[str, type[ControlLaw]] = {
@@ -11,6 +12,8 @@ LAWS: dict[str, type[ControlLaw]] = {
     INCAD.name: INCAD,
     INCADEC.name: INCADEC,
     PID.name: PID,
+    InverseDob.name: InverseDob,
+    ForwardDob.name: ForwardDob,
 }
 
 __all__ = ["LAWS", "ControlLaw", "LawSignals"]
