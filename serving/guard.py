@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import Protocol, TypeAlias
@@ -36,7 +36,7 @@ class Guard(Protocol):
     def memory(self) -> int:
         """How many past samples the guard looks at."""
 
-    def check(self, sample: Sample, past: Sequence[Sample]) -> str | None:
+    def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not to act on ``sample``, or None; ``past`` ends with the sample before it."""
 
 
@@ -47,7 +47,7 @@ class Complete:
     manifest: Manifest
     memory: int = field(default=0, init=False)
 
-    def check(self, sample: Sample, past: Sequence[Sample]) -> str | None:
+    def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not: a vector has the wrong length, or a value is NaN or infinite."""
         m = self.manifest
         for label, signals, values in (
@@ -73,7 +73,7 @@ class InRange:
     margin: float = 0.05
     memory: int = field(default=0, init=False)
 
-    def check(self, sample: Sample, past: Sequence[Sample]) -> str | None:
+    def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not: a sensor beyond its range is broken, or the plant is where the law was never tested."""
         for s, value in zip(self.signals, sample.pv.tolist(), strict=True):
             slack = self.margin * (s.high - s.low)
@@ -97,9 +97,9 @@ class Frozen:
         """All samples that must not be equal, less the present one."""
         return self.samples - 1
 
-    def check(self, sample: Sample, past: Sequence[Sample]) -> str | None:
+    def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not: the transmitter or the gateway repeats an old value."""
-        recent = past[-self.memory :]
+        recent = list(past)[-self.memory :]
         if len(recent) < self.memory:
             return None
         for i, s in enumerate(self.signals):
@@ -115,7 +115,7 @@ class Fresh:
     max_age_s: float
     memory: int = field(default=0, init=False)
 
-    def check(self, sample: Sample, past: Sequence[Sample]) -> str | None:
+    def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not: the measurement belongs to another period."""
         if not sample.age_s <= self.max_age_s:
             return f"the sample is {sample.age_s:.3g} s old; allowed are {self.max_age_s:.3g} s"
@@ -130,11 +130,11 @@ class Rate:
     largest: tuple[float, ...]
     memory: int = field(default=1, init=False)
 
-    def check(self, sample: Sample, past: Sequence[Sample]) -> str | None:
+    def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not: faster than the process can, so it is the sensor."""
         if not past:
             return None
-        moves = np.abs(sample.pv - past[-1].pv).tolist()
+        moves = np.abs(sample.pv - list(past)[-1].pv).tolist()
         for s, move, largest in zip(self.signals, moves, self.largest, strict=True):
             if not move <= largest:
                 return f"PV {s.name} moved by {move:.6g} {s.unit} in one sample; allowed are {largest:g} {s.unit}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Protocol, TypeAlias
 
@@ -208,7 +208,7 @@ class ControlLoop:
             if self._mode is Mode.AUTO:
                 self._mv = applied
             return self.miss(str(error))
-        self._past.append(sample)
+        self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may use its array again
         self._state = step.state
         if self._fault:
             self._good += 1

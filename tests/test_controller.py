@@ -127,7 +127,7 @@ def test_wrong_shape_or_type_is_named(controller: Controller, changed: dict[str,
 
 def test_wrong_name_is_pythons_own_error(controller: Controller) -> None:
     with pytest.raises(TypeError, match="setpoint"):
-        controller.step(**FEED, setpoint=1.0)
+        controller.step(**{**FEED, "setpoint": 1.0})
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -370,7 +370,7 @@ signals = st.builds(Signal, names, names, st.floats(-1e9, -1), st.floats(0, 1e9)
 vectors = st.lists(signals, max_size=3, unique_by=lambda s: s.name).map(tuple)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=25)
 @given(
     st.builds(
         Manifest,

@@ -1,0 +1,333 @@
+"""The loop's promises: no bump, no drift, no exception, and an MV at every scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from serving import (
+    Command,
+    Controller,
+    ControlLoop,
+    EndpointError,
+    LoopError,
+    Mode,
+    MonotonicClock,
+    Rate,
+    Sample,
+    SimulatedEndpoint,
+    VirtualClock,
+)
+
+pytest_plugins = ["small_laws"]
+PERIOD = 0.5
+
+
+@pytest.fixture(scope="module")
+def shared(pi_file: Path) -> Controller:
+    return Controller(pi_file)
+
+
+@pytest.fixture
+def make_loop(shared: Controller) -> Callable[..., ControlLoop]:
+    def make(endpoint: Any = None, **options: Any) -> ControlLoop:
+        values = {"sp": 1.0, "mv": 40.0, "mode": Mode.AUTO, "clock": VirtualClock(100.0), "warm_lead_s": 0, **options}
+        return ControlLoop(shared, endpoint, **values)
+
+    return make
+
+
+def sample(level: float = 0.8, mv: float | None = 40.0, **changed: Any) -> Sample:
+    values = {"pv": np.array([level, 300.0]), "dv": np.zeros(1), **changed}
+    return Sample(mv_applied=None if mv is None else np.array([mv]), **values)
+
+
+class Tank:
+    """level' = 0.95 level + 0.001 valve + 0.01, and everything that a test wants to go wrong."""
+
+    def __init__(self, level: float = 0.8, mv: float = 40.0) -> None:
+        self.level, self.mv, self.written = level, mv, [mv]
+        self.read_fails: set[int] = set()
+        self.write_fails: set[int] = set()
+        self.reads = self.writes = 0
+
+    def read(self) -> Sample:
+        self.reads += 1
+        if self.reads - 1 in self.read_fails:
+            raise EndpointError("no route to the tank")
+        return sample(self.level, self.mv)
+
+    def write(self, mv: np.ndarray) -> None:
+        self.writes += 1
+        if self.writes - 1 in self.write_fails:
+            raise TimeoutError("the tank does not answer")
+        self.mv = float(mv[0])
+        self.written.append(self.mv)
+        self.level = 0.95 * self.level + 0.001 * self.mv + 0.01
+
+
+# ---------------------------------------------------------------------- modes
+def test_auto_reaches_the_set_point(make_loop: Callable[..., ControlLoop]) -> None:
+    tank = Tank()
+    report = make_loop(tank).run(800)
+    assert (report.scans, report.missed, report.faults) == (800, 0, 0)
+    assert tank.level == pytest.approx(1.0, abs=1e-9)
+
+
+def test_the_loop_is_the_law_and_nothing_else(shared: Controller, make_loop: Callable[..., ControlLoop]) -> None:
+    loop, state, rng = make_loop(), shared.cold_state(), np.random.default_rng(0)
+    for _ in range(50):
+        s = sample(rng.uniform(0, 2), rng.uniform(0, 100))
+        step = shared.step(sp=1.0, pv=s.pv, mv_applied=s.mv_applied, state=state)
+        command = loop.scan(s)
+        assert np.array_equal(command.mv, step.mv)
+        assert np.array_equal(command.info, step.info)
+        state = step.state
+
+
+def test_manual_to_auto_does_not_bump(make_loop: Callable[..., ControlLoop]) -> None:
+    """In MANUAL the law sees the applied MV, so AUTO starts from there: at rest on set point it stays."""
+    loop = make_loop(mode=Mode.MANUAL, sp=0.8)
+    loop.set_mv(63.0)
+    for _ in range(20):
+        command = loop.scan(sample(0.8, 63.0))
+        assert command.mode is Mode.MANUAL
+        assert command.mv.tolist() == [63.0]
+        assert command.law_mv is not None
+    loop.set_mode(Mode.AUTO)
+    assert loop.scan(sample(0.8, 63.0)).mv.tolist() == [63.0]
+
+
+def test_without_read_back_the_last_command_counts_as_applied(make_loop: Callable[..., ControlLoop]) -> None:
+    blind, seeing = make_loop(), make_loop()
+    for level in (0.8, 0.85, 0.9):
+        expected = seeing.scan(sample(level, float(seeing.mv[0])))
+        assert np.array_equal(blind.scan(sample(level, None)).mv, expected.mv)
+
+
+def test_operator_hold_stays(make_loop: Callable[..., ControlLoop]) -> None:
+    loop = make_loop(recover_after=1)
+    loop.scan(sample())
+    held = loop.mv
+    loop.set_mode(Mode.HOLD)
+    for level in (0.1, math.nan, 1.9, 1.9, 1.9):
+        assert np.array_equal(loop.scan(sample(level)).mv, held)
+    assert loop.mode is Mode.HOLD
+
+
+@pytest.mark.parametrize(
+    ("act", "message"),
+    [
+        (lambda loop: loop.set_sp(2.5), r"set point level = 2.5 m is outside \[0, 2\] m"),
+        (lambda loop: loop.set_sp(math.nan), "set point level = nan"),
+        (lambda loop: loop.set_sp([1, 1]), r"shape \(2,\); it needs \(1,\): level \[m\]"),
+        (lambda loop: loop.set_sp("high"), "no vector of numbers"),
+        (lambda loop: loop.set_mv(50), "in MANUAL only; the loop is in AUTO"),
+        (lambda loop: loop.run(1), "run needs an endpoint"),
+    ],
+)
+def test_orders_outside_the_configuration_are_refused(
+    make_loop: Callable[..., ControlLoop], act: Callable[[ControlLoop], Any], message: str
+) -> None:
+    loop = make_loop()
+    with pytest.raises(LoopError, match=message):
+        act(loop)
+    assert loop.sp.tolist() == [1.0]
+    assert loop.mv.tolist() == [40.0]
+
+
+@pytest.mark.parametrize("options", [{"sp": 3.0}, {"mv": -1.0}, {"recover_after": 0}])
+def test_a_loop_that_cannot_work_is_not_made(make_loop: Callable[..., ControlLoop], options: dict[str, Any]) -> None:
+    with pytest.raises(LoopError):
+        make_loop(**options)
+
+
+# ---------------------------------------------------------------------- faults
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (sample(math.nan), "PV level is nan"),
+        (sample(5.0), "outside its range"),
+        (sample(age_s=9.0), "9 s old"),
+        (sample(0.8, math.nan), "applied MV valve is nan"),
+        (sample(pv=np.zeros(5)), "shape"),
+    ],
+)
+def test_a_bad_sample_holds_with_its_reason(make_loop: Callable[..., ControlLoop], bad: Sample, reason: str) -> None:
+    loop = make_loop()
+    before = loop.scan(sample()).mv
+    command = loop.scan(bad)
+    assert command.mode is Mode.HOLD
+    assert reason in command.reason
+    assert np.array_equal(command.mv, before)
+    assert command.law_mv is None
+    # Good samples alone do not end it: an operator must, unless recover_after says otherwise.
+    for _ in range(10):
+        command = loop.scan(sample())
+        assert (command.mode, np.array_equal(command.mv, before)) == (Mode.HOLD, True)
+        assert reason in command.reason
+    loop.set_mode(Mode.AUTO)
+    assert loop.scan(sample()).reason == ""
+
+
+def test_recovery_needs_good_samples_in_a_row_and_starts_cold(make_loop: Callable[..., ControlLoop]) -> None:
+    loop = make_loop(recover_after=3)
+    modes = [loop.scan(sample(v)).mode for v in (0.8, math.nan, 0.8, 0.8, math.nan, 0.8, 0.8, 0.8)]
+    assert modes == [Mode.AUTO, *[Mode.HOLD] * 6, Mode.AUTO]
+    assert loop.fault == ""
+
+
+def test_a_law_error_holds_the_applied_mv(make_loop: Callable[..., ControlLoop], monkeypatch: Any) -> None:
+    loop = make_loop(guards=(), recover_after=2)
+    loop.scan(sample())
+    command = loop.scan(sample(math.nan, 37.0))  # no guard: the controller itself refuses
+    assert (command.mode, command.mv.tolist()) == (Mode.HOLD, [37.0])
+    assert "level [m] is nan" in command.reason
+
+    def explode(**_: Any) -> None:
+        raise RuntimeError("out of memory")
+
+    loop.set_mode(Mode.AUTO)
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.controller, "step", explode)
+        assert loop.scan(sample()).reason == "out of memory"
+
+
+def test_a_guard_that_fails_does_not_clear_the_sample(make_loop: Callable[..., ControlLoop]) -> None:
+    loop = make_loop(guards=(Rate((), (0.1,)),))
+    assert loop.scan(sample()).mode is Mode.AUTO
+    assert "Rate failed" in loop.scan(sample()).reason
+
+
+def test_manual_survives_faults(make_loop: Callable[..., ControlLoop]) -> None:
+    loop = make_loop(mode=Mode.MANUAL)
+    command = loop.scan(sample(math.nan))
+    assert (command.mode, command.mv.tolist()) == (Mode.MANUAL, [40.0])
+    assert "nan" in command.reason
+    assert loop.scan(sample()).reason == ""
+
+
+@settings(deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(width=64),
+            st.none() | st.floats(width=64),
+            st.floats(0, 2),
+            st.sampled_from([None, Mode.AUTO, Mode.MANUAL, Mode.HOLD]),
+        ),
+        max_size=30,
+    )
+)
+def test_whatever_the_samples_hold_every_scan_gives_an_mv(
+    shared: Controller, events: list[tuple[float, float | None, float, Mode | None]]
+) -> None:
+    loop = ControlLoop(shared, sp=1.0, mv=40.0, mode=Mode.AUTO, recover_after=2)
+    applied = 40.0
+    for level, mv, age, mode in events:
+        if mode is not None:
+            loop.set_mode(mode)
+        command = loop.scan(sample(level, mv, age_s=age))
+        assert np.isfinite(command.mv).all()
+        assert command.mode is not Mode.AUTO or 0 <= command.mv[0] <= 100
+        assert command.mode is not Mode.MANUAL or command.mv[0] == applied
+        applied = float(command.mv[0])
+
+
+# ---------------------------------------------------------------------- endpoint
+def test_an_unreachable_plant_is_a_fault_and_no_exception(make_loop: Callable[..., ControlLoop]) -> None:
+    tank = Tank()
+    tank.read_fails, tank.write_fails = {5, 6}, {12}
+    commands: list[Command] = []
+    report = make_loop(tank, recover_after=2).run(20, observe=lambda _, c: commands.append(c))
+    assert [c.scan for c in commands] == list(range(20))
+    assert [bool(c.reason) for c in commands] == [k in (5, 6, 7, 12, 13) for k in range(20)]
+    assert "no route" in commands[5].reason
+    assert "does not answer" in commands[12].reason
+    assert np.array_equal(commands[12].mv, commands[11].mv)  # what was decided never arrived
+    assert report.faults == 5
+    assert commands[-1].mode is Mode.AUTO
+
+
+def test_simulated_endpoint_steps_the_plant_at_each_write() -> None:
+    endpoint = SimulatedEndpoint(lambda mv: np.array([mv[0] / 2]), pv=1.0, mv=10.0)
+    first = endpoint.read()
+    assert (first.pv.tolist(), first.mv_applied.tolist()) == ([1.0], [10.0])  # type: ignore[union-attr]
+    endpoint.write(np.array([30.0]))
+    assert endpoint.read().pv.tolist() == [15.0]
+
+
+# ---------------------------------------------------------------------- time
+class SlowTank(Tank):
+    """A tank whose reading takes time."""
+
+    def __init__(self, clock: VirtualClock, delays: dict[int, float]) -> None:
+        super().__init__()
+        self.clock, self.delays, self.times = clock, delays, []
+
+    def read(self) -> Sample:
+        self.times.append(round((self.clock.now() - 100.0) / PERIOD, 9))
+        self.clock.advance(self.delays.get(self.reads, 0.01))
+        return super().read()
+
+
+def test_lateness_is_no_drift_and_missed_periods_are_counted(make_loop: Callable[..., ControlLoop]) -> None:
+    clock = VirtualClock(100.0)
+    tank = SlowTank(clock, {2: 0.7, 5: 1.3})
+    report = make_loop(tank, clock=clock).run(12)
+    # scan 2 takes 1.4 periods: the next is late by 0.4 and the one after on time again; scan 5 takes 2.6
+    assert tank.times == [0, 1, 2, 3.4, 4, 5, 7.6, 8, 9, 10, 11]
+    assert (report.scans, report.missed) == (11, 1)
+    assert report.latest_s == pytest.approx(0.3)
+
+
+def test_the_grid_has_no_drift_over_many_periods(make_loop: Callable[..., ControlLoop]) -> None:
+    clock = VirtualClock(100.0)
+    tank = SlowTank(clock, {k: 0.1 * (k % 4) for k in range(2000)})
+    make_loop(tank, clock=clock).run(2000)
+    assert tank.times == list(range(2000))
+
+
+@pytest.mark.parametrize(("delay", "cold"), [(1.2, False), (3.1, True)])
+def test_a_long_gap_starts_the_law_cold(
+    shared: Controller, make_loop: Callable[..., ControlLoop], delay: float, cold: bool
+) -> None:
+    clock = VirtualClock(100.0)
+    tank = SlowTank(clock, {3: delay})
+    seen: list[tuple[Any, Command]] = []
+    make_loop(tank, clock=clock, max_gap=3).run(12, observe=lambda s, c: seen.append((s, c)))
+    s, command = seen[4]
+    fresh = shared.step(sp=1.0, pv=s.pv, mv_applied=s.mv_applied, state=shared.cold_state())
+    assert np.array_equal(command.mv, fresh.mv) is cold
+
+
+def test_run_ends_when_told(make_loop: Callable[..., ControlLoop]) -> None:
+    places: list[int] = []
+    report = make_loop(Tank()).run(until=lambda c: c.scan == 7, before=places.append)
+    assert report.scans == 8
+    assert places == list(range(8))
+
+
+def test_the_law_is_warmed_just_before_each_deadline(make_loop: Callable[..., ControlLoop], monkeypatch: Any) -> None:
+    clock = VirtualClock(100.0)
+    loop = make_loop(Tank(), clock=clock, warm_lead_s=1e-3)
+    warmed: list[float] = []
+    monkeypatch.setattr(loop.controller, "warm", lambda: warmed.append(clock.now() - 100.0))
+    loop.run(3)
+    assert warmed == pytest.approx([0.0, PERIOD - 1e-3, 2 * PERIOD - 1e-3])
+
+
+def test_the_machines_clock_keeps_its_word() -> None:
+    for speed in (1.0, 50.0):
+        clock = MonotonicClock(speed)
+        until = clock.now() + 2e-3 * speed
+        clock.sleep_until(until)
+        assert clock.now() >= until
+        clock.sleep_until(until - 10)  # long ago: at once
