@@ -78,7 +78,7 @@ def test_inc_with_an_exact_inverse_is_dead_beat(exact, signals, plant) -> None:
 
 
 def test_incad_requests_no_more_than_the_domain_holds(parts, signals, plant) -> None:
-    law = design(INCAD, parts, signals, plant, narrowing=1.0)
+    law = design(INCAD, parts, signals, plant, r=1.0)
     rng = np.random.default_rng(1)
     cvs, xs, _ = plant.steady_curve
     pv = torch.from_numpy(xs[rng.integers(0, len(cvs), 300)])
@@ -102,14 +102,14 @@ def test_incad_requests_no_more_than_the_domain_holds(parts, signals, plant) -> 
 def test_more_narrowing_is_slower(exact, signals, plant) -> None:
     times = []
     for r in (1.0, 2.0, 4.0):
-        ys, _ = run(design(INCAD, exact, signals, plant, narrowing=r), 0.0, -0.45)
+        ys, _ = run(design(INCAD, exact, signals, plant, r=r), 0.0, -0.45)
         times.append(int(np.argmax(np.abs(ys + 0.45) < 0.01)))
     assert times == sorted(times)
     assert times[0] < times[-1]
 
 
 def test_incadec_as_printed_follows_equations_21_to_23(parts, signals, plant) -> None:
-    incad, law = (design(c, parts, signals, plant, narrowing=5.5) for c in (INCAD, INCADEC))
+    incad, law = (design(c, parts, signals, plant, r=5.5) for c in (INCAD, INCADEC))
     rng = np.random.default_rng(2)
     state, w_ec = torch.zeros(2, dtype=torch.float64), None
     for _ in range(10):
@@ -127,8 +127,8 @@ def test_incadec_as_printed_follows_equations_21_to_23(parts, signals, plant) ->
 @pytest.mark.parametrize("correction", ["as_printed", "back_calculation"])
 def test_error_correction_leaves_no_offset(exact, signals, plant, correction: str) -> None:
     """A constant disturbance is the constant model error that eqs 21 and 22 assume."""
-    plain, _ = run(design(INCAD, exact, signals, plant, narrowing=3.0), -0.02, -0.3, 200)
-    ys, mvs = run(design(INCADEC, exact, signals, plant, narrowing=3.0, correction=correction), -0.02, -0.3, 200)
+    plain, _ = run(design(INCAD, exact, signals, plant, r=3.0), -0.02, -0.3, 200)
+    ys, mvs = run(design(INCADEC, exact, signals, plant, r=3.0, correction=correction), -0.02, -0.3, 200)
     assert abs(plain[-1] + 0.3) > 0.015
     assert abs(ys[-1] + 0.3) < 1e-6
     assert 0 < mvs[-1] < 500
@@ -138,7 +138,7 @@ def test_back_calculation_does_not_wind_up(exact, signals, plant) -> None:
     """A set point that a disturbance puts out of the actuator's reach for long, then one within it."""
     delays = {}
     for correction in ("as_printed", "back_calculation"):
-        law = design(INCADEC, exact, signals, plant, narrowing=3.0, correction=correction)
+        law = design(INCADEC, exact, signals, plant, r=3.0, correction=correction)
         state, mv, y, course = torch.zeros(law.n_state, dtype=torch.float64), tensor(250.0), 0.0, []
         for k in range(500):
             sp = 0.5 if k < 300 else 0.1
@@ -154,7 +154,7 @@ def test_back_calculation_does_not_wind_up(exact, signals, plant) -> None:
 def test_back_calculation_equals_the_printed_law_within_limits(exact, signals, plant) -> None:
     """Nothing is calculated back while the actuator gives what was asked."""
     runs = [
-        run(design(INCADEC, exact, signals, plant, narrowing=3.0, correction=c), -0.02, -0.1, 80)
+        run(design(INCADEC, exact, signals, plant, r=3.0, correction=c), -0.02, -0.1, 80)
         for c in ("as_printed", "back_calculation")
     ]
     assert all(0 < mv < 500 for mv in runs[0][1])
@@ -163,7 +163,7 @@ def test_back_calculation_equals_the_printed_law_within_limits(exact, signals, p
 
 def test_back_calculation_is_exact_for_a_straight_inverse(exact, signals, plant) -> None:
     """On a chord the w' of an applied MV is its own one-step prediction, in manual too."""
-    law = design(INCADEC, exact, signals, plant, narrowing=1.0, correction="back_calculation")
+    law = design(INCADEC, exact, signals, plant, r=1.0, correction="back_calculation")
     y, sp = -0.28, tensor(0.5)
     _, state, info = law(sp, tensor(y, 300.0), DV, tensor(250.0), torch.zeros(5, dtype=torch.float64))
     asked, anchor = info[-1].item(), state[3].item()
@@ -177,8 +177,8 @@ def test_back_calculation_is_exact_for_a_straight_inverse(exact, signals, plant)
 @pytest.mark.parametrize("r", [0.99, 0.0, float("inf"), float("nan")])
 def test_wrong_narrowing_is_named(parts, signals, plant, r: float) -> None:
     for cls in (INCAD, INCADEC):
-        with pytest.raises(LawError, match="narrowing is"):
-            design(cls, parts, signals, plant, narrowing=r)
+        with pytest.raises(LawError, match="r is"):
+            design(cls, parts, signals, plant, r=r)
 
 
 def test_wrong_parts_are_named(parts, signals, plant) -> None:

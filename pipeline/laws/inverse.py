@@ -31,7 +31,7 @@ def _parts(models: Mapping[str, Model], signals: LawSignals, law: str) -> tuple[
 def _narrowing(r: float) -> Tensor:
     """The buffer of a narrowing parameter; raises LawError unless it is at least 1."""
     if not 1 <= r < float("inf"):
-        raise LawError(f"narrowing is {r}; it divides the width of the domain and must be at least 1")
+        raise LawError(f"r is {r}; it divides the width of the domain and must be at least 1")
     return torch.tensor([r], dtype=torch.float64)
 
 
@@ -103,9 +103,9 @@ class INCAD(ControlLaw):
 
     @dataclass(frozen=True, slots=True)
     class Params:
-        """``narrowing`` is r >= 1; ``mv_rate`` [mv] the largest change a sample, None unlimited."""
+        """``r`` >= 1 is the narrowing; ``mv_rate`` [mv] the largest change a sample, None unlimited."""
 
-        narrowing: float = 1.5
+        r: float = 1.5
         mv_rate: float | None = None
 
     narrowing: Tensor  # (1,)
@@ -115,19 +115,19 @@ class INCAD(ControlLaw):
         signals: LawSignals,
         inverse: Model,
         domain: LeverageDomain,
-        narrowing: float = 1.5,
+        r: float = 1.5,
         mv_rate: float | None = None,
     ) -> None:
         super().__init__(signals, mv_rate)
         self.inverse, self.domain = inverse, domain
-        self.register_buffer("narrowing", _narrowing(narrowing))
+        self.register_buffer("narrowing", _narrowing(r))
         self.n_state = 0
         self.info = (*REQUEST_INFO, "mv_requested")
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         """The law over parts ``inverse`` and ``domain``; raises LawError."""
-        return cls(signals, *_parts(models, signals, cls.name), params.narrowing, params.mv_rate)
+        return cls(signals, *_parts(models, signals, cls.name), params.r, params.mv_rate)
 
     def forward(
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
@@ -164,9 +164,9 @@ class INCADEC(ControlLaw):
 
     @dataclass(frozen=True, slots=True)
     class Params:
-        """``narrowing`` is r >= 1; ``correction`` as in the class; ``mv_rate`` [mv] a sample, None unlimited."""
+        """``r`` >= 1 is the narrowing; ``correction`` as in the class; ``mv_rate`` [mv] a sample, None unlimited."""
 
-        narrowing: float = 5.5
+        r: float = 5.5
         correction: Literal["as_printed", "back_calculation"] = "as_printed"
         mv_rate: float | None = None
 
@@ -178,7 +178,7 @@ class INCADEC(ControlLaw):
         signals: LawSignals,
         inverse: Model,
         domain: LeverageDomain,
-        narrowing: float = 5.5,
+        r: float = 5.5,
         correction: str = "as_printed",
         mv_rate: float | None = None,
     ) -> None:
@@ -186,7 +186,7 @@ class INCADEC(ControlLaw):
         if correction not in {"as_printed", "back_calculation"}:
             raise LawError(f"correction is {correction!r}; allowed are 'as_printed' and 'back_calculation'")
         self.inverse, self.domain = inverse, domain
-        self.register_buffer("narrowing", _narrowing(narrowing))
+        self.register_buffer("narrowing", _narrowing(r))
         self.register_buffer("flat", ((self.high - self.low) * 1e-6) ** 2)
         self.back_calculation = correction == "back_calculation"
         # started, w_EC; for back-calculation also m_EC, w_a, m_a
@@ -197,7 +197,7 @@ class INCADEC(ControlLaw):
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         """The law over parts ``inverse`` and ``domain``; raises LawError."""
         parts = _parts(models, signals, cls.name)
-        return cls(signals, *parts, params.narrowing, params.correction, params.mv_rate)
+        return cls(signals, *parts, params.r, params.correction, params.mv_rate)
 
     def forward(
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
