@@ -6,40 +6,38 @@ NMPC sees the set point of now and no later one, and thinks that it stays; likew
 The offline optimum takes each hold by itself, from the state where it left the one before, with the
 hold's whole course of parameters and ``TAIL`` samples more of the same set point, so that a hold
 ends at rest. It does not see the next set point either: with that preview a test of steps gets
-another, much lower bound, which no controller of the tests has. It is the best of several locally
+a lower bound, which no controller of the tests could use. It is the best of several locally
 best plans, and its figures are those of its own prediction.
 
 ``python -m pipeline.oracle CASE`` computes both for every scenario of a case, NMPC also with
 measurement noise, and stores them in ``pipeline/cases/<case>.bounds.json``, from where
-``load_bounds`` gives them as long as neither the plant nor the scenario has changed.
+``pipeline.bounds.load_bounds`` gives them as long as neither the plant nor the scenario has changed.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import hashlib
-import inspect
 import json
 import os
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from pipeline.cases import CASES, NOISE_SUFFIX, Case, Scenario
-from pipeline.errors import LawError, PlantError
+from pipeline.bounds import SCHEMA, bounds_path, load_bounds, plant_digest, read_stored
+from pipeline.cases import CASES, Case, Scenario
+from pipeline.errors import PlantError
 from pipeline.horizon import Horizon, Plan
 from pipeline.metrics import closed_loop_metrics
 from pipeline.plants.base import Plant
 from pipeline.simulate import noise_draws
+
+__all__ = ["Job", "PerfectNmpc", "compute", "load_bounds", "main", "run_nmpc", "run_offline", "search"]
 
 Array = NDArray[np.float64]
 
@@ -47,7 +45,6 @@ HORIZON = 40  # periods that the NMPC looks ahead; with 20 it does 2 % worse, wi
 REACHES = (1, 2, 3)  # of the rollouts that a fresh search starts from
 TAIL = 20
 NOISE_SEED = 20_000  # plus the index of the sequence
-SCHEMA = 1
 
 
 class PerfectNmpc:
@@ -157,70 +154,13 @@ def run_offline(plant: Plant, scenario: Scenario, elements: int = 6) -> dict[str
     return found | {"failures": float(failures)}
 
 
-# ---------------------------------------------------------------------- the stored figures
-def bounds_path(case: Case) -> Path:
-    """Where the figures of a case are stored."""
-    return Path(__file__).parent / "cases" / f"{case.name}.bounds.json"
-
-
-def plant_digest(plant: Plant) -> str:
-    """sha256 of the plant's equations, parameters and sampling; comments and layout do not count."""
-    source = ast.parse(textwrap.dedent(inspect.getsource(type(plant).derivative)))
-    function = source.body[0]
-    if isinstance(function, ast.FunctionDef) and ast.get_docstring(function) is not None:
-        function.body = function.body[1:]
-    names = dict(zip(plant.parameter_names(), plant.parameters().tolist(), strict=True))
-    what = [ast.unparse(source), names, plant.period_s, plant.time_unit_s, plant.substeps]
-    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return stored if isinstance(stored, dict) and stored.get("schema") == SCHEMA else {}
-
-
-def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dict[str, float]]]:
-    """The bounds by scenario: ``{"sp_a": {"nmpc": {"mae": ...}, "offline": {...}}, "sp_a_noise": {"nmpc": ...}}``.
-
-    Figures of several sequences are their means, ``max_asse`` and ``step_ms_p99`` their largest,
-    ``failures`` their sum. Raises LawError where figures are missing or belong to another plant
-    or scenario than the case has now.
-    """
-    path = path or bounds_path(case)
-    stored = _read(path)
-    remedy = f"run `python -m pipeline.oracle {case.name}` (some minutes)"
-    if not stored:
-        raise LawError(f"{path} holds no bounds of case {case.name!r}; {remedy}")
-    if stored.get("plant") != plant_digest(case.plant):
-        raise LawError(f"the bounds in {path} belong to other equations or parameters of the plant; {remedy}")
-    found: dict[str, dict[str, dict[str, float]]] = {}
-    for name, scenarios in case.scenarios().items():
-        for kind in ("nmpc", "offline", "nmpc_noise"):
-            rows = [stored["figures"].get(name, {}).get(s.digest(), {}).get(kind) for s in scenarios]
-            missing = [s.seed for s, row in zip(scenarios, rows, strict=True) if row is None]
-            if missing:
-                which = f" (seeds {missing})" if missing[0] is not None else ""
-                raise LawError(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
-            key = name + NOISE_SUFFIX if kind == "nmpc_noise" else name
-            found.setdefault(key, {})[kind.removesuffix("_noise")] = _together(rows)
-    return found
-
-
-def _together(rows: list[dict[str, float]]) -> dict[str, float]:
-    how: dict[str, Callable[[list[float]], float]] = {"max_asse": max, "step_ms_p99": max, "failures": sum}
-    return {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0]}
-
-
 def _compute(case: Case, job: Job) -> tuple[Job, dict[str, float], float]:
     begun = time.perf_counter()
     if job.kind == "offline":
         figures = run_offline(case.plant, job.scenario)
     else:
         noise = case.noise_std.tolist() if job.kind == "nmpc_noise" else None
-        figures = run_nmpc(PerfectNmpc(case.plant), job.scenario, noise, NOISE_SEED + job.index)
+        figures = run_nmpc(PerfectNmpc(case.plant, HORIZON), job.scenario, noise, NOISE_SEED + job.index)
     return job, figures, time.perf_counter() - begun
 
 
@@ -230,9 +170,9 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
     Every figure is stored at once, so an interruption loses only the figure in work.
     """
     path = path or bounds_path(case)
-    stored = _read(path)
+    stored = read_stored(path)
     digest = plant_digest(case.plant)
-    if stored.get("plant") != digest:
+    if stored.get("plant") != digest or stored.get("horizon") != HORIZON:
         stored = {"schema": SCHEMA, "case": case.name, "plant": digest, "horizon": HORIZON, "figures": {}}
     scenarios = case.scenarios()
     work = [
