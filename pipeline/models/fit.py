@@ -54,12 +54,16 @@ class Trainer(ABC):
     restarts
         Fits from new random weights, of which the best by validation stays; 0 continues from the
         network's present weights.
+    rows
+        Train on so many rows drawn at random, 0 for all: a smooth map of few inputs learns nothing
+        more from 100,000 rows than from 10,000, and the time is proportional to the rows.
     """
 
     iterations: int = 200
     patience: int = 20
     gain: float = 1e-3
     restarts: int = 1
+    rows: int = 0
     name: ClassVar[str]
 
     def fit(
@@ -76,6 +80,8 @@ class Trainer(ABC):
         An NNARX is trained through its ``net``, on ``Samples`` or ``Windows``. Raises ModelError
         if no restart gives a finite error.
         """
+        if 0 < self.rows < len(train):
+            train = train.part(np.random.default_rng(seed).permutation(len(train))[: self.rows])
         best: tuple[float, Tensor, FitHistory] | None = None
         for restart in range(max(1, self.restarts)):
             generator = torch.Generator().manual_seed(seed * 1_000 + restart)
@@ -216,7 +222,7 @@ class LBFGS(Trainer):
             optimizer.zero_grad()
             loss = train.loss(net)
             loss.backward()  # type: ignore[no-untyped-call]
-            return float(loss)
+            return float(loss.detach())
 
         before = math.inf
         while True:

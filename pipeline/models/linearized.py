@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.errors import ModelError
 from pipeline.models.base import Model
-from pipeline.plants.base import Linearization, Plant
+from pipeline.plants.base import Array, Linearization, Plant
 
 
 class Linearized(Model):
@@ -63,15 +63,18 @@ class Linearized(Model):
         return {"n_x": self.n_x, "n_mv": self.n_mv, "n_pv": self.n_pv, "period_s": self.period_s}
 
     @classmethod
-    def of(cls, plant: Plant, at: Linearization) -> Self:
-        """The model of ``plant`` from its linearization."""
+    def of(cls, at: Linearization, period_s: float, *, time_unit_s: float = 1.0, pv: Array | None = None) -> Self:
+        """The model of a linearization whose time runs in units of ``time_unit_s`` seconds.
+
+        ``pv`` (n_pv,) is the steady PV; None takes C x0, right where the PVs are linear in the state.
+        """
         (n_x, n_mv), n_pv = at.b.shape, at.c.shape[0]
-        model = cls(n_x, n_mv, n_pv, plant.period_s)
-        phi, gamma = at.sampled(plant.period_s / plant.time_unit_s)
+        model = cls(n_x, n_mv, n_pv, period_s)
+        phi, gamma = at.sampled(period_s / time_unit_s)
         values = {
             "x": at.x,
             "mv": at.mv,
-            "pv": np.array(plant.measure(at.x), float).ravel(),
+            "pv": at.c @ at.x if pv is None else pv,
             "a": at.a,
             "b": at.b,
             "c": at.c,
@@ -84,9 +87,10 @@ class Linearized(Model):
     @classmethod
     def at_set_point(cls, plant: Plant, cv: float) -> Self:
         """The model at the steady state with controlled variable ``cv``; raises PlantError where there is none."""
-        return cls.of(plant, plant.linearize(*plant.steady_state_at(cv)))
+        x, mv = plant.steady_state_at(cv)
+        pv = np.array(plant.measure(x), float).ravel()
+        return cls.of(plant.linearize(x, mv), plant.period_s, time_unit_s=plant.time_unit_s, pv=pv)
 
-    @property
     def linearization(self) -> Linearization:
         """The continuous model, per unit of the plant's time."""
         return Linearization(*(t.numpy().copy() for t in (self.x, self.mv, self.a, self.b, self.c)))

@@ -153,7 +153,8 @@ class MLP(Model):
 
     def unlimited(self, x: Tensor) -> Tensor:
         """Prediction (..., n_out) without the output's bounds: what training fits."""
-        return self._after_first_layer(x, ((x - self.x_center) / self.x_scale) @ self.weights[0] + self.biases[0])
+        slope, offset = self._first_layer()
+        return self._after_first_layer(x, x @ slope + offset)
 
     def forward(self, x: Tensor) -> Tensor:
         """Prediction, shape (..., n_out), for inputs of shape (..., n_in)."""
@@ -166,15 +167,22 @@ class MLP(Model):
         ``residual`` columns must lie within ``x``.
         """
         n = x.shape[-1]
-        known = ((x - self.x_center[:n]) / self.x_scale[:n]) @ self.weights[0][:n] + self.biases[0]
-        varied = ((candidates - self.x_center[n:]) / self.x_scale[n:]) @ self.weights[0][n:]
-        return self._limited(self._after_first_layer(x.unsqueeze(-2), known.unsqueeze(-2) + varied))
+        slope, offset = self._first_layer()
+        known = x @ slope[:n] + offset
+        return self._limited(self._after_first_layer(x.unsqueeze(-2), known.unsqueeze(-2) + candidates @ slope[n:]))
+
+    # The scaling is multiplied into the first and last weights: all constants, which onnxruntime
+    # folds when it loads the graph. Left as a node of its own, a scalar factor beside a MatMul
+    # becomes FusedMatMul's alpha, which is float32 and costs half the digits (onnxruntime 1.31.1).
+    def _first_layer(self) -> tuple[Tensor, Tensor]:
+        slope = self.weights[0] / self.x_scale[:, None]
+        return slope, self.biases[0] - self.x_center @ slope
 
     def _after_first_layer(self, x: Tensor, preactivation: Tensor) -> Tensor:
         a = torch.tanh(preactivation)
         for weight, bias in zip(list(self.weights)[1:-1], list(self.biases)[1:-1], strict=True):
             a = torch.tanh(a @ weight + bias)
-        y = self.y_center + self.y_scale * (a @ self.weights[-1] + self.biases[-1])
+        y = a @ (self.weights[-1] * self.y_scale) + (self.biases[-1] * self.y_scale + self.y_center)
         if self.residual:
             # A narrow instead of a gather: one cheap node in the exported graph.
             y = y + torch.cat([x[..., i : i + 1] for i in self.residual], dim=-1)
