@@ -21,8 +21,11 @@ CASE = "thiosulfate_cstr"
 QUALITY = {"inc": 2.7, "incad": 1.8, "incadec": 3.9, "pid": 1.35, "inverse_dob": 1.12, "forward_dob": 1.16}
 """Of each law: MAE as a multiple of the bound's."""
 BOUND = {"sp_a": 0.064, "sp_b": 0.0073, "tin": 0.0002, "ua": 0.0004, "ua_gradual": 0.0001, "held_out": 0.036}
-SETTING = {"incad": {"r": 1.5}, "incadec": {"r": 5.5}}
-VARIANTS = {"incad": ("r=2.5", "r=3.5", "r=4.5", "r=10"), "incadec": ("r=10", "r=10, back")}
+SETTING = {"incad": {"r": 1.5}, "incadec": {"r": 5.5, "correction": "as_printed"}}
+VARIANTS = {
+    "incad": ("r=2.5", "r=3.5", "r=4.5", "r=10"),
+    "incadec": ("r=10", "correction=back_calculation", "r=10, correction=back_calculation"),
+}
 SEEDS = (0, 1, 2)
 
 
@@ -82,7 +85,7 @@ def write_controller(path: Path, law: str, gain: float) -> None:
 
 def write_models(root: Path) -> None:
     folder = root / "work" / CASE / "models" / "one_step"
-    rows = {
+    seeds = {
         str(s): {
             "rmse": 18.0 + s,
             "r2": 0.98,
@@ -92,15 +95,14 @@ def write_models(root: Path) -> None:
         }
         for s in SEEDS
     }
-    part = {"kind": "rbf", "task": "inverse", "horizon": 1, "unit": "K", "per_seed": rows, "median": rows["1"]}
+    part = {"kind": "rbf", "task": "inverse", "horizon": 1, "unit": "K", "per_seed": seeds, "median": seeds["1"]}
     write_json(folder / "metrics.json", {"model": "one_step", "parts": {"inverse": part}})
-    c = list(range(4, 101, 8))
-    rmse = [60 * np.exp(-v / 20) + 18 + 0.05 * abs(v - 84) for v in c]
-    regions = {"hot": [v / 5 for v in rmse], "middle": [v * 4 for v in rmse]}
-    best = {"c": 84, "centres": 690, "rmse": min(rmse)}
-    centres = [int(v**1.4) for v in c]
-    sweep = {"part": "inverse", "c": c, "centres": centres, "rmse": rmse, "regions": regions, "best": best}
-    write_json(folder / "sweep.json", sweep)
+    rows = []
+    for c in range(4, 101, 8):
+        rmse = 60 * np.exp(-c / 20) + 18 + 0.05 * abs(c - 84)
+        score = {"rmse": rmse, "r2": 0.97, "regions": {"hot": rmse / 5, "middle": rmse * 4}}
+        rows.append({"partitions": c, "centres": int(c**1.4), "train": score, "validation": score, "seconds": 1.0})
+    write_json(folder / "sweep.json", {"chosen": 84, "unit": "K", "rows": rows})
     actual = np.random.default_rng(0).uniform(0, 500, 200)
     np.savez(folder / "predictions.npz", time_s=np.arange(200) * 0.5, actual=actual, predicted=actual * 0.97 + 5)
 

@@ -83,7 +83,7 @@ def test_a_store_is_filled_once_and_rebuilt_from_nothing(root, empty_store, monk
         fit = runs[f"fit@{CASE}-one_step"]
         assert fit.data.params == {f"models.{CASE}-one_step.kind": "rbf", f"models.{CASE}-one_step.c": "88"}
         assert fit.data.metrics["parts.inverse.median.centres"] == 725
-        sweep = client.get_metric_history(fit.info.run_id, "sweep.rmse")
+        sweep = client.get_metric_history(fit.info.run_id, "sweep.validation.rmse")
         assert [m.step for m in sweep] == list(range(4, 101, 8))
         history = client.get_metric_history(fit.info.run_id, "parts.inverse.per_seed.0.history")
         assert [m.value for m in history] == [30.0, 22.0, 18.0]

@@ -42,7 +42,7 @@ def versions(client: MlflowClient, name: str) -> list[ModelVersion]:
     for alias, number in (client.get_registered_model(name).aliases if found else {}).items():
         aliases.setdefault(str(number), []).append(alias)
     for version in found:
-        version._aliases = sorted(aliases.get(str(version.version), []))
+        version.aliases = sorted(aliases.get(str(version.version), []))
     return sorted(found, key=lambda v: -int(v.version))
 
 

@@ -103,7 +103,7 @@ def _artifacts(result: StageResult, root: Path) -> Iterator[tuple[Path, str | No
 
 
 def _metrics(result: StageResult, root: Path) -> Iterator[Metric]:
-    """metrics.json and validation.json flat; lists of numbers as series; sweep.json over its ``c``."""
+    """metrics.json and validation.json flat, lists of numbers as series; sweep.json over its partitions."""
     now = get_current_time_millis()
 
     def metric(name: str, value: Any, step: int = 0) -> Iterator[Metric]:
@@ -111,15 +111,15 @@ def _metrics(result: StageResult, root: Path) -> Iterator[Metric]:
             yield Metric(_name(name), float(value), now, step)
 
     for path, folder in _files(result, root):
-        if path.name not in {"metrics.json", "validation.json", "sweep.json"}:
+        if path.name == "sweep.json":
+            for row in json.loads(path.read_text())["rows"]:
+                for name, value in flat(row, "sweep").items():
+                    yield from metric(name, value, int(row["partitions"]))
+        if path.name not in {"metrics.json", "validation.json"}:
             continue
-        tree = json.loads(path.read_text())
-        steps = tree.get("c") if path.name == "sweep.json" else None
-        top = ".".join(filter(None, [folder, "sweep" if steps else None]))
-        for name, value in flat(tree, top).items():
-            if not isinstance(value, list):
-                if not DETAIL.search(name):
-                    yield from metric(name, value)
-                continue
-            for k, entry in enumerate(value):
-                yield from metric(name, entry, int(steps[k]) if steps and len(steps) == len(value) else k)
+        for name, value in flat(json.loads(path.read_text()), folder or "").items():
+            if isinstance(value, list):
+                for step, entry in enumerate(value):
+                    yield from metric(name, entry, step)
+            elif not DETAIL.search(name):
+                yield from metric(name, value)

@@ -1,0 +1,5 @@
+"""The report: the paper's tables beside ours, verdicts, pictures, and validation.json for programs.
+
+Everything is computed from what the stages left in work/<case>/ and from the case itself; no model,
+no store and no runtime is loaded. ``pipeline.stages.report`` writes it to artifacts/<case>/.
+"""

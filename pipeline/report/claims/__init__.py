@@ -1,0 +1,13 @@
+"""What is known of a case beyond its figures; a case without a file here gets plain words."""
+
+from __future__ import annotations
+
+from pipeline.report.claims import thiosulfate_cstr
+from pipeline.report.verdicts import Claims, plain_reason
+
+CLAIMS: dict[str, Claims] = {
+    "thiosulfate_cstr": thiosulfate_cstr.CLAIMS,
+}
+PLAIN = Claims(plain_reason)
+
+__all__ = ["CLAIMS", "PLAIN", "Claims"]

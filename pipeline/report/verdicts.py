@@ -1,0 +1,164 @@
+"""Does it reproduce? The paper's figures, the requirements and the claims against what was measured.
+
+A figure reproduces when it lies within ``RELATIVE`` of the paper's, or within ``ABSOLUTE`` of it.
+What a row says when it does not is chosen by what was measured, never written down beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from pipeline.cases.base import PaperFigure, Requirement
+from pipeline.report.evidence import Evidence
+
+RELATIVE = 0.25
+ABSOLUTE = 5e-4
+NAMES = {"mae": "MAE", "masse": "MASSE", "max_asse": "MaxASSE"}
+"""How the paper writes a metric."""
+RULE = (
+    f"A figure reproduces when it lies within {100 * RELATIVE:g} % of the paper's or within {ABSOLUTE:g} of it "
+    "(in the unit of the controlled variable). Ours are medians over the data seeds."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A statement, what was measured, and whether that holds; None: nothing was measured."""
+
+    what: str
+    limit: str
+    measured: str
+    holds: bool | None
+    because: str = ""
+
+
+Reason = Callable[[PaperFigure, float, Evidence], str]
+Check = Callable[[Evidence], Verdict]
+
+
+@dataclass(frozen=True, slots=True)
+class Claims:
+    """What only somebody who knows the case can say: reasons for differences, and further checks.
+
+    ``reason`` gives the words for a table's figure that does not reproduce; ``statements`` maps
+    each of ``Case.claims`` to its check; ``acceptance`` are checks beyond ``Case.requirements``.
+    """
+
+    reason: Reason
+    statements: dict[str, Check] = field(default_factory=dict)
+    acceptance: tuple[Check, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of one of the paper's tables beside ours."""
+
+    label: str
+    metric: str
+    paper: float
+    ours: float | None
+    low: float | None
+    high: float | None
+    independent: float | None
+    verdict: str
+    holds: bool | None
+
+
+def close(ours: float, paper: float) -> bool:
+    """Whether a figure reproduces the paper's."""
+    return abs(ours - paper) <= max(RELATIVE * abs(paper), ABSOLUTE)
+
+
+def plain_reason(row: PaperFigure, ours: float, evidence: Evidence) -> str:
+    """The words where nobody knows more than the two numbers."""
+    return f"it is {_times(ours, row.paper)} the paper's"
+
+
+def _times(ours: float, paper: float) -> str:
+    return f"{ours / paper:.2g} times" if paper else "above"
+
+
+def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Row:
+    """One row of a paper's table, judged."""
+
+    def ours(how: str) -> float | None:
+        return evidence.figure(row.law, row.scenario, row.metric, row.setting, how)
+
+    median = ours("median")
+    if median is None:
+        verdict, holds = "not measured: this setting was not validated", None
+    elif close(median, row.paper):
+        verdict, holds = "reproduces", True
+    else:
+        verdict, holds = f"does not, because {reason(row, median, evidence)}", False
+        if row.independent is not None and close(median, row.independent):
+            verdict += f"; an independent implementation found {row.independent:g} too"
+    metric = NAMES.get(row.metric, row.metric)
+    return Row(row.label, metric, row.paper, median, ours("min"), ours("max"), row.independent, verdict, holds)
+
+
+def requirement(need: Requirement, evidence: Evidence) -> Verdict:
+    """One row of the acceptance list; the limit of a ratio is its factor times the bound's figure."""
+    law = need.law or evidence.best
+    who = _who(need, law)
+    value = None if law is None else evidence.figure(law, need.scenario, need.metric, need.setting)
+    high, metric = need.high, NAMES.get(need.metric, need.metric)
+    limit = f"{metric} ≤ {need.high:g}" if not need.low else f"{need.low:g} ≤ {metric} ≤ {need.high:g}"
+    if need.times is not None:
+        bound = evidence.bound(need.scenario, need.metric, need.times)
+        limit = f"{metric} ≤ {need.high:g} × {_bound_name(need.times)}"
+        if bound is None:
+            return Verdict(f"{who}, {need.scenario}", limit, "the bound is missing", None)
+        high *= bound
+        limit += f" = {high:.4g}"
+    if value is None:
+        return Verdict(f"{who}, {need.scenario}", limit, "not measured", None)
+    measured = f"{value:.4g}"
+    if need.times is not None and high:
+        measured += f" ({value / high * need.high:.3f} ×)"
+    return Verdict(f"{who}, {need.scenario}", limit, measured, need.low <= value <= high)
+
+
+def _bound_name(kind: str) -> str:
+    return {"nmpc": "perfect NMPC", "offline": "offline optimum"}.get(kind, kind)
+
+
+def _who(need: Requirement, law: str | None) -> str:
+    """Who is meant: a law with its setting, or the best controller by name."""
+    inside = ", ".join(f"{k}={v:g}" for k, v in need.setting.items())
+    name = (law or "?").upper() + (f" ({inside})" if inside else "")
+    return name if need.law else f"best controller ({law or 'none'})"
+
+
+def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict]:
+    """The whole acceptance list: the case's requirements, what every case must show, and its own checks."""
+    best = evidence.laws[evidence.best] if evidence.best else None
+    locked = {name: law.lock_ups for name, law in evidence.laws.items()}
+    common = [
+        Verdict(
+            "best controller, data seeds",
+            "≥ 5",
+            "none is without a lock-up" if best is None else str(best.seeds),
+            best is not None and best.seeds >= 5,
+        ),
+        Verdict(
+            "best controller, lock-ups over all seeds and scenarios",
+            "0",
+            "every law locks up" if best is None else str(best.lock_ups),
+            best is not None and best.lock_ups == 0,
+            "lock-ups of all laws: " + ", ".join(f"{n} {v}" for n, v in locked.items()),
+        ),
+    ]
+    rows = [requirement(need, evidence) for need in evidence.case.requirements]
+    return [*rows, *common, *(check(evidence) for check in claims.acceptance)]
+
+
+def statements(evidence: Evidence, claims: Claims) -> list[Verdict]:
+    """The paper's claims in words, each with its check's outcome; ``limit`` holds the independent finding."""
+    rows = []
+    for text, independent in evidence.case.claims.items():
+        check = claims.statements.get(text)
+        found = check(evidence) if check else Verdict(text, "", "no check is written for it", None)
+        rows.append(Verdict(text, independent, found.measured, found.holds, found.because))
+    return rows

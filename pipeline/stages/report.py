@@ -1,0 +1,26 @@
+"""Stage report: the paper's figures beside ours, for people and for programs."""
+
+from __future__ import annotations
+
+import sys
+
+from pipeline.bounds import load_bounds
+from pipeline.cases import CASES
+from pipeline.command import run_stage
+from pipeline.params import CaseParams, choose, parse, read_section
+from pipeline.report.evidence import Evidence
+from pipeline.report.page import write_report
+from pipeline.stages import ARTIFACTS, WORK
+
+
+def report(name: str) -> None:
+    """Write artifacts/<case>/{validation.json,report.html,report.md,figures/} from work/<case>."""
+    params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
+    case = choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+    evidence = Evidence.load(case, load_bounds(case), WORK / name)
+    for path in write_report(evidence, WORK / name / "models", ARTIFACTS / name):
+        print(path)
+
+
+if __name__ == "__main__":
+    sys.exit(run_stage(report, sys.argv, "CASE"))
