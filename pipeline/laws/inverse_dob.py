@@ -26,6 +26,18 @@ def _at(pv: Tensor, mv: Tensor) -> Tensor:
     return torch.cat([states, mv.unsqueeze(-1)], dim=-1)
 
 
+def _direction(forward: Model, signals: LawSignals) -> float:
+    """Sign of the MV's effect on a forward model, over states all over the PVs' ranges."""
+    rng = torch.Generator().manual_seed(0)
+    low, high = (torch.tensor([getattr(s, end) for s in signals.pv], dtype=torch.float64) for end in ("low", "high"))
+    states = low + (high - low) * torch.rand(1000, len(signals.pv), generator=rng, dtype=torch.float64)
+    mv = signals.mv[0]
+    ends = torch.tensor([mv.low, mv.high], dtype=torch.float64).expand(1000, 2)
+    with torch.no_grad():
+        at = forward(_at(states, ends)).squeeze(-1)
+    return -1.0 if float((at[:, 1] - at[:, 0]).sum()) < 0 else 1.0
+
+
 class ObserverLaw(ControlLaw):
     """What both forms share: everything but the inversion.
 
@@ -72,9 +84,11 @@ class ObserverLaw(ControlLaw):
     integral_gain: Tensor
     band: Tensor
     span: Tensor
+    direction: Tensor  # (1,) sign of the MV's effect on the controlled variable
+    least: Tensor  # (1,) [cv] a reach narrower than this tells nothing but the models' errors
     ends: Tensor  # (2,) least and greatest MV
 
-    def __init__(self, signals: LawSignals, observer: Model, params: Params) -> None:
+    def __init__(self, signals: LawSignals, forward: Model, observer: Model, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
         names = [s.name for s in signals.pv]
         if params.observed is not None and params.observed not in names:
@@ -87,6 +101,8 @@ class ObserverLaw(ControlLaw):
         self.register_buffer("band", _column(params.band))
         self.register_buffer("span", self.high - self.low)
         self.register_buffer("ends", torch.cat([self.low, self.high]))
+        self.register_buffer("direction", _column(_direction(forward, signals)))
+        self.register_buffer("least", _column(1e-3 * (signals.sp[0].high - signals.sp[0].low)))
         self.n_state = self.n_pv + 3  # started, x(k-1), d, I
         self.info = ("sp_requested", "sp_min", "sp_max", "disturbance", "integral")
 
@@ -115,6 +131,18 @@ class ObserverLaw(ControlLaw):
         state_next = torch.cat([torch.ones_like(error), pv, disturbance, integral_next], dim=-1)
         return mv, state_next, torch.cat([w, w_min, w_max, disturbance, integral], dim=-1)
 
+    def within_reach(self, w: Tensor, at_low: Tensor, at_high: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(w within reach, [mv] to go on beyond the MV's range, least and greatest reachable w), each (..., 1).
+
+        ``at_low`` and ``at_high`` are the forward model's answers to the ends of the MV's range. Where the
+        plant hardly answers, their difference is the model's error and may have the wrong sign: the push
+        takes the sign from the plant as a whole, or the loop would lock at the wrong end.
+        """
+        w_min, w_max = torch.minimum(at_low, at_high), torch.maximum(at_low, at_high)
+        within = torch.minimum(torch.maximum(w, w_min), w_max)
+        push = (w - within) * self.direction * self.span / torch.maximum(w_max - w_min, self.least)
+        return within, push, w_min, w_max
+
     def _disturbance(self, pv: Tensor, mv_applied: Tensor, state: Tensor) -> Tensor:
         """d(k) [mv], shape (..., 1); zero at the first step."""
         past, d = state[..., 1 : 1 + self.n_pv], state[..., 1 + self.n_pv : 2 + self.n_pv]
@@ -131,7 +159,7 @@ class ObserverLaw(ControlLaw):
 class InverseDob(ObserverLaw):
     """The form with a learnt inverse: v = RBF(x, w) over h periods.
 
-        v = RBF(x, w_c) + (w - w_c) range / (g(x, mv_max) - g(x, mv_min)),   w_c = w limited to g's range
+        v = RBF(x, w_c) + (w - w_c) range / (g(x, mv_max) - g(x, mv_min)),   w_c = w limited to g(x, [mv_min, mv_max])
 
     g is a forward model over the same h periods. The reach clip keeps the network off requests that
     no MV can meet, where it extrapolates and can lock the loop at an end; beyond reach the slope
@@ -147,7 +175,7 @@ class InverseDob(ObserverLaw):
     def __init__(
         self, signals: LawSignals, inverse: Model, reach: Model, observer: Model, params: ObserverLaw.Params
     ) -> None:
-        super().__init__(signals, observer, params)
+        super().__init__(signals, reach, observer, params)
         self.inverse, self.reach = inverse, reach
 
     @classmethod
@@ -161,11 +189,8 @@ class InverseDob(ObserverLaw):
     def invert(self, pv: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As in ObserverLaw."""
         ends = self.reach(_at(pv, self.ends.expand(*pv.shape[:-1], 2))).squeeze(-1)
-        at_low, at_high = ends[..., 0:1], ends[..., 1:2]
-        w_min, w_max = torch.minimum(at_low, at_high), torch.maximum(at_low, at_high)
-        within = torch.minimum(torch.maximum(w, w_min), w_max)
-        v = self.inverse(torch.cat([pv, within], dim=-1))
-        return v + (w - within) * self.span / (at_high - at_low), within, w_min, w_max
+        within, push, w_min, w_max = self.within_reach(w, ends[..., 0:1], ends[..., 1:2])
+        return self.inverse(torch.cat([pv, within], dim=-1)) + push, within, w_min, w_max
 
 
 class ForwardDob(ObserverLaw):
@@ -184,12 +209,14 @@ class ForwardDob(ObserverLaw):
     model: Model
     cuts: Tensor  # (SECTIONS + 1,) 0 .. 1
     share: Tensor  # (1,) 1/SECTIONS
+    flat: Tensor  # (1,) [cv] a rise below which a chord has no slope
 
     def __init__(self, signals: LawSignals, model: Model, observer: Model, params: ObserverLaw.Params) -> None:
-        super().__init__(signals, observer, params)
+        super().__init__(signals, model, observer, params)
         self.model = model
         self.register_buffer("cuts", torch.linspace(0.0, 1.0, self.SECTIONS + 1, dtype=torch.float64))
         self.register_buffer("share", _column(1.0 / self.SECTIONS))
+        self.register_buffer("flat", _column(1e-12))
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
@@ -202,22 +229,16 @@ class ForwardDob(ObserverLaw):
     def invert(self, pv: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As in ObserverLaw."""
         start, width = self.low, self.span
-        reach = None
-        for _ in range(self.ROUNDS):
+        for i in range(self.ROUNDS):
             g = self.model(_at(pv, (start + width * self.cuts).expand(*pv.shape[:-1], self.SECTIONS + 1))).squeeze(-1)
-            if reach is None:
-                reach = g[..., 0:1], g[..., -1:]
-                direction = (reach[1] - reach[0]).sign()
-            # Inner cuts that the crossing lies beyond; outside reach this stays in an end's section.
-            beyond = ((w - g[..., 1:-1]) * direction > 0).to(g.dtype).sum(dim=-1, keepdim=True)
+            if i == 0:
+                within, push, w_min, w_max = self.within_reach(w, g[..., 0:1], g[..., -1:])
+            # Inner cuts that the crossing lies beyond.
+            beyond = ((within - g[..., 1:-1]) * self.direction > 0).to(g.dtype).sum(dim=-1, keepdim=True)
             width = width * self.share
             start = start + width * beyond
-        assert reach is not None
         ends = self.model(_at(pv, torch.cat([start, start + width], dim=-1))).squeeze(-1)
-        at_low, at_high = reach
-        w_min, w_max = torch.minimum(at_low, at_high), torch.maximum(at_low, at_high)
-        within = torch.minimum(torch.maximum(w, w_min), w_max)
-        chord = (within - ends[..., 0:1]) / (ends[..., 1:2] - ends[..., 0:1])
+        rise = (ends[..., 1:2] - ends[..., 0:1]) * self.direction
+        chord = (within - ends[..., 0:1]) * self.direction / torch.maximum(rise, self.flat)
         chord = torch.minimum(torch.maximum(chord, self.cuts[:1]), self.cuts[-1:])
-        v = start + width * chord + (w - within) * self.span / (at_high - at_low)
-        return v, within, w_min, w_max
+        return start + width * chord + push, within, w_min, w_max

@@ -151,10 +151,6 @@ class RbfPart(StaticPart):
         return model, metrics | {"centres": len(estimator.centres_), "c": self.partitions, "n_train": len(train)}
 
     def _sweep(self, train: Pairs, validation: Pairs, plant: Plant, regions: Regions) -> SweepResult:
-        inside = {
-            name: (lambda x, low=low, high=high: (x[:, 0] >= low) & (x[:, 0] < high))
-            for name, (low, high) in regions.items()
-        }
         return sweep(
             train.x,
             train.y,
@@ -162,7 +158,7 @@ class RbfPart(StaticPart):
             validation.y,
             partitions=range(self.sweep[0], self.sweep[1] + 1),
             limits=self.limits(plant),
-            regions=inside,
+            regions=regions,
             basis=self.basis,
             width=self.width,
             ridge=self.ridge,
@@ -175,14 +171,16 @@ class MlpPart(StaticPart):
     """A multilayer perceptron.
 
     ``hidden`` widths; ``residual``: the network gives the change of the target, not the target;
-    ``balance`` 0..1: 0 weighs all rows alike, 1 all regions of the controlled variable;
-    ``trainer`` {kind: lm | lbfgs | adam, and its options}.
+    ``balance`` 0..1: 0 weighs all rows alike, 1 all regions of the controlled variable; ``rows``
+    at most that many training pairs, drawn at random, None for all; ``trainer`` {kind: lm | lbfgs | adam,
+    and its options}.
     """
 
     kind: ClassVar[str] = "mlp"
     hidden: tuple[int, ...] = (20,)
     residual: bool = True
     balance: float = 0.0
+    rows: int | None = None
     train_fraction: float = 0.85
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
@@ -190,6 +188,8 @@ class MlpPart(StaticPart):
         """Train with early stopping on the validation pairs."""
         pairs = self.pairs(record, plant)
         train, validation = pairs.split(self.train_fraction, self.split, seed)
+        if self.rows is not None and self.rows < len(train):
+            train = train.take(np.sort(np.random.default_rng(seed).choice(len(train), self.rows, replace=False)))
         options = dict(self.trainer)
         kind = choose(TRAINERS, options.pop("kind", "lm"), "trainer", "trainer.kind")
         trainer = parse(kind, options, "trainer")
@@ -256,12 +256,12 @@ class LinearizedPart(Part):
             "sampled_zeros": [[float(v.real), float(v.imag)] for v in zeros],
             "mv": [float(v) for v in mv],
         }
-        return Learnt(Linearized.of(lin, plant.period_s), metrics)
+        return Learnt(Linearized.at_set_point(plant, self.at), metrics)
 
 
 def _predict(model: Model, x: Array) -> Array:
     with torch.no_grad():
-        return np.concatenate([model(rows).numpy() for rows in torch.from_numpy(x).split(CHUNK)])
+        return np.concatenate([model(rows).numpy() for rows in torch.split(torch.from_numpy(x), CHUNK)])
 
 
 PARTS: dict[str, type[Part]] = {p.kind: p for p in (RbfPart, MlpPart, DomainPart, LinearizedPart)}
