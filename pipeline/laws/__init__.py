@@ -5,7 +5,6 @@ from __future__ import annotations
 from pipeline.laws.base import ControlLaw, LawSignals
 from pipeline.laws.inverse import INC, INCAD, INCADEC
 from pipeline.laws.inverse_dob import ForwardDob, InverseDob
-from pipeline.laws.inverse_dob import ForwardDob, InverseDob
 from pipeline.laws.pid import PID
 
 LAWS: dict[str, type[ControlLaw]] = {
@@ -13,8 +12,6 @@ LAWS: dict[str, type[ControlLaw]] = {
     INCAD.name: INCAD,
     INCADEC.name: INCADEC,
     PID.name: PID,
-    InverseDob.name: InverseDob,
-    ForwardDob.name: ForwardDob,
     InverseDob.name: InverseDob,
     ForwardDob.name: ForwardDob,
 }
