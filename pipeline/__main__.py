@@ -1,0 +1,198 @@
+"""``python -m pipeline simulate FILE``: a controller file in the real loop over its plant, live."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NoReturn
+
+from pipeline.cases import CASES, Case
+from pipeline.errors import ParamsError
+from pipeline.live import SimulatedPlant, view_of
+from pipeline.loop_picture import History, draw, summary, write_csv
+from pipeline.params import nearest
+from pipeline.plants import PLANTS, Plant
+from pipeline.timetable import Timetable, parse_event, parse_manual, timetable
+from serving.clock import MonotonicClock, VirtualClock
+from serving.controller import Controller
+from serving.errors import LoopwrightError
+from serving.guard import Sample
+from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
+from serving.manifest import Manifest
+
+RECOVER_AFTER = 5
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; 0 if it went well, 2 after one line on standard error."""
+    parser = _Parser(prog="python -m pipeline", description="Try a controller on its plant.")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    _simulate_options(commands.add_parser("simulate", help="close the loop of a controller file over its plant"))
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help()
+        return 0
+    try:
+        _simulate(options)
+    except LoopwrightError as error:
+        print(f"python -m pipeline simulate: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def _simulate_options(parser: argparse.ArgumentParser) -> None:
+    event = partial(_argument, partial(parse_event, named=False))
+    named = partial(_argument, partial(parse_event, named=True))
+    add = parser.add_argument
+    add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
+    add("--sp", metavar="VALUE[@S]", type=event, action="append", default=[], help="set point from time S on")
+    add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
+    add(
+        "--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this controlled variable"
+    )
+    add("--disturbance", metavar="NAME=VALUE[@S]", type=named, action="append", default=[], help="plant parameter")
+    add("--noise", metavar="PV=STD", type=named, action="append", default=[], help="measurement noise")
+    add("--manual", metavar="S..S[=MV]", type=partial(_argument, parse_manual), action="append", default=[],
+        help="MANUAL between two times")  # fmt: skip
+    add("--duration", metavar="S", type=_positive, help="length of the run")
+    add("--speed", metavar="X", type=_positive, help="times real time, 1 is real time (default: as fast as possible)")
+    add("--seed", metavar="N", type=int, default=0, help="of the noise (0)")
+    add("--picture", metavar="FILE", type=Path, help="where the picture goes (<law>-simulation.png)")
+    add("--csv", metavar="FILE", type=Path, help="write every sample there")
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    controller = Controller(options.file)
+    plant, case = _plant_of(controller.manifest)
+    run = timetable(
+        plant,
+        case,
+        set_points=options.sp,
+        scenario=options.scenario,
+        disturbances=options.disturbance,
+        noise=options.noise,
+        manual=options.manual,
+        start_cv=options.start,
+        duration_s=options.duration,
+        seed=options.seed,
+    )
+    title = f"{controller.manifest.law} on {plant.title}"
+    history = close_loop(controller, plant, run, title=title, speed=options.speed)
+    print(summary(plant, history))
+    picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
+    draw(picture, plant, history, title, run.marks)
+    print(f"picture: {picture}")
+    if options.csv:
+        write_csv(options.csv, plant, history)
+        print(f"samples: {options.csv}")
+
+
+def close_loop(
+    controller: Controller, plant: Plant, run: Timetable, *, title: str, speed: float | None = None
+) -> History:
+    """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible."""
+    endpoint, history = SimulatedPlant(plant, run), History()
+    loop = ControlLoop(
+        controller,
+        endpoint,
+        sp=run.sp[0],
+        mv=run.mv0,
+        mode=Mode.AUTO,
+        recover_after=RECOVER_AFTER,
+        clock=VirtualClock() if speed is None else MonotonicClock(speed),
+        warm_lead_s=0.0 if speed is None else WARM_LEAD_S * speed,
+    )
+    period, n = plant.period_s, len(run.sp)
+    marks = {round(at / period): text for at, text in run.marks.items()}
+
+    def before(k: int) -> None:
+        # A period that a slow machine missed passed in the plant too, with the MV held.
+        while endpoint.k < k:
+            endpoint.write(endpoint.mv)
+        loop.set_sp(run.sp[k])
+        span = run.manual_at(k * period)
+        if span is not None and loop.mode is not Mode.MANUAL:
+            loop.set_mode(Mode.MANUAL)
+            if span.mv is not None:
+                loop.set_mv(span.mv)
+        elif span is None and loop.mode is Mode.MANUAL:
+            loop.set_mode(Mode.AUTO)
+        history.pv.append(endpoint.pv)
+
+    def observe(sample: Sample | None, command: Command) -> None:
+        k = endpoint.k - 1
+        assert sample is not None  # a simulated plant can always be read
+        history.time_s.append(k * period)
+        history.mode.append(command.mode.value)
+        history.sp.append(command.sp)
+        history.measured.append(sample.pv)
+        history.mv.append(command.mv)
+        history.reason.append(command.reason)
+        view.show(k * period, sample.pv, command, marks.get(k))
+
+    with view_of(plant, title, n * period, sys.stdout) as view:
+        loop.run(n, before=before, observe=observe)
+    return history
+
+
+def _plant_of(manifest: Manifest) -> tuple[Plant, Case | None]:
+    """The plant that the controller was made for, and its case if it has one."""
+    case = CASES.get(manifest.case)
+    if case is None and manifest.case not in PLANTS:
+        raise ParamsError(
+            f"the controller is for {manifest.case!r}, which is neither a case nor a plant here"
+            f"{nearest(manifest.case, {*CASES, *PLANTS})}"
+        )
+    plant = PLANTS[manifest.case]() if case is None else case.plant
+    for name in ("sp", "pv", "dv", "mv"):
+        ours = [(s.name, s.unit) for s in getattr(plant, f"{name}_signals")]
+        theirs = [(s.name, s.unit) for s in manifest.signals(name)]
+        if ours != theirs:
+            raise ParamsError(f"the controller's {name} are {theirs}, but plant {plant.name!r} has {ours}")
+    if manifest.period_s != plant.period_s:
+        raise ParamsError(
+            f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
+        )
+    return plant, case
+
+
+def _argument(parse: Callable[[str], object], text: str) -> object:
+    """A parser of this package as argparse wants it."""
+    try:
+        return parse(text)
+    except ParamsError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+    return value
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

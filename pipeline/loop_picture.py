@@ -1,0 +1,125 @@
+"""What a simulated run leaves behind: a picture, a table of samples, a line of figures."""
+
+from __future__ import annotations
+
+import csv
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PipelineError
+from pipeline.metrics import mae, mv_travel
+from pipeline.plants.base import Plant
+
+Array = NDArray[np.float64]
+
+
+@dataclass(slots=True, eq=False)
+class History:
+    """A run, one entry a scan."""
+
+    time_s: list[float] = field(default_factory=list)
+    mode: list[str] = field(default_factory=list)
+    sp: list[Array] = field(default_factory=list)
+    pv: list[Array] = field(default_factory=list)  # true
+    measured: list[Array] = field(default_factory=list)
+    mv: list[Array] = field(default_factory=list)
+    reason: list[str] = field(default_factory=list)
+
+
+def summary(plant: Plant, history: History) -> str:
+    """MAE and final error of each controlled variable, MV travel, faults; one line each."""
+    sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
+    lines = []
+    for i, s in enumerate(plant.sp_signals):
+        lines.append(
+            f"MAE {s.name} {mae(sp[:, i], pv[:, i]):.4g} {s.unit}, final error {sp[-1, i] - pv[-1, i]:.3g} {s.unit}"
+        )
+    for i, s in enumerate(plant.mv_signals):
+        lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g} {s.unit}")
+    faults = sum(map(bool, history.reason))
+    if faults:
+        lines.append(f"{faults} scans with a fault, the last one: {next(r for r in reversed(history.reason) if r)}")
+    return "\n".join(lines)
+
+
+def write_csv(path: Path, plant: Plant, history: History) -> None:
+    """One row a sample, columns ``NAME [unit]``; PipelineError where the file cannot be written."""
+    header = ["time_s", "mode"]
+    header += [f"SP {s.name} [{s.unit}]" for s in plant.sp_signals]
+    header += [f"{s.name} [{s.unit}]" for s in plant.pv_signals]
+    header += [f"measured {s.name} [{s.unit}]" for s in plant.pv_signals]
+    header += [*(f"{s.name} [{s.unit}]" for s in plant.mv_signals), "reason"]
+
+    def write(draft: Path) -> None:
+        with draft.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            for i, time_s in enumerate(history.time_s):
+                numbers = np.concatenate([history.sp[i], history.pv[i], history.measured[i], history.mv[i]])
+                writer.writerow([f"{time_s:.9g}", history.mode[i], *(f"{v:.9g}" for v in numbers), history.reason[i]])
+
+    _replace(path, write)
+
+
+def draw(path: Path, plant: Plant, history: History, title: str, marks: Mapping[float, str]) -> None:
+    """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    time_s = np.array(history.time_s)
+    sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
+    rows = len(plant.sp_signals) + len(plant.mv_signals)
+    figure = Figure(figsize=(9, 1.0 + 2.4 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    figure.suptitle(title)
+    for i, (ax, s) in enumerate(zip(axes, plant.sp_signals, strict=False)):
+        ax.step(time_s, sp[:, i], where="post", color="0.35", linestyle="--", linewidth=1, label="set point")
+        ax.plot(time_s, pv[:, i], color="C0", linewidth=1.3, label=s.name)
+        ax.set_ylabel(f"{s.name} [{s.unit}]")
+        ax.legend(loc="upper right", fontsize="small")
+    for i, s in enumerate(plant.mv_signals):
+        ax = axes[len(plant.sp_signals) + i]
+        ax.step(time_s, mv[:, i], where="post", color="C3", linewidth=1)
+        ax.set_ylabel(f"{s.name} [{s.unit}]")
+    for ax in axes:
+        ax.grid(alpha=0.3)
+        for at in marks:
+            ax.axvline(at, color="C1", linestyle=":", linewidth=1)
+        for mode, color in (("MANUAL", "gold"), ("HOLD", "red")):
+            inside = np.array([m == mode for m in history.mode])
+            if inside.any():
+                ax.fill_between(
+                    time_s, 0, 1, where=inside, step="post", color=color, alpha=0.15, transform=ax.get_xaxis_transform()
+                )
+    for at, text in marks.items():
+        axes[0].annotate(
+            text, (at, 1), xycoords=("data", "axes fraction"), xytext=(3, -3), textcoords="offset points",
+            va="top", fontsize="x-small", color="C1",
+        )  # fmt: skip
+    axes[-1].set_xlabel("time [s]")
+    _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=120))
+
+
+def _replace(path: Path, write: Callable[[Path], None]) -> None:
+    """Write a draft beside ``path`` and rename it."""
+    draft = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        os.close(handle)
+        draft = Path(name)
+        write(draft)
+        draft.chmod(0o644)
+        os.replace(draft, path)
+    except (OSError, ValueError) as error:
+        raise PipelineError(f"{path} cannot be written: {' '.join(str(error).split())}") from error
+    finally:
+        if draft is not None:
+            draft.unlink(missing_ok=True)
