@@ -183,7 +183,7 @@ class ControllerParams:
     law: str
     model: str
     settings: Mapping[str, Any]
-    variants: tuple[Mapping[str, Any], ...] = ()
+    variants: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def read(cls, name: str) -> ControllerParams:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
+from pipeline.errors import PipelineError
+
 WORK = Path("work")
 ARTIFACTS = Path("artifacts")
+BASE = "base"  # the form of a controller that is shipped; the others are its variants
 
 
 def record_folder(case: str, record: str) -> Path:
@@ -21,9 +25,14 @@ def model_folder(case: str, model: str) -> Path:
     return WORK / case / "models" / model
 
 
-def controller_folder(case: str, law: str) -> Path:
-    """Folder of a controller's files before validation: seed<k>.onnx."""
+def design_folder(case: str, law: str) -> Path:
+    """Folder of a controller's files before validation, one folder a form inside."""
     return WORK / case / "controllers" / law
+
+
+def controller_file(case: str, law: str, form: str, seed: int) -> Path:
+    """The exported file of one form (``base`` or a variant's name) and data seed."""
+    return design_folder(case, law) / re.sub(r"[^\w.=]+", "_", form) / f"seed{seed}.onnx"
 
 
 def validation_folder(case: str, law: str) -> Path:
@@ -37,3 +46,11 @@ def write_json(path: Path, content: Any) -> None:
     draft = path.with_name(path.name + ".draft")
     draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     os.replace(draft, path)
+
+
+def read_json(path: Path) -> Any:
+    """What ``write_json`` wrote; PipelineError where an earlier stage has not run."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise PipelineError(f"{path} cannot be read ({error}); run the stages before this one: dvc repro") from None

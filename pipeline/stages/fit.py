@@ -31,9 +31,10 @@ def fit(name: str) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     data = data_files(params.data)
     results = parallel_map(partial(_learn, parts, case, folder), list(data.items()), f"fit {name}")
-    metrics: dict[str, Any] = {"model": params.model, "parts": {}}
+    digests = {str(seed): digest for seed, (digest, _) in zip(data, results, strict=True)}
+    metrics: dict[str, Any] = {"model": params.model, "data": digests, "parts": {}}
     for part, description in parts.items():
-        per_seed = {str(seed): found[part] for seed, found in zip(data, results, strict=True)}
+        per_seed = {str(seed): found[part] for seed, (_, found) in zip(data, results, strict=True)}
         fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
         metrics["parts"][part] = {"kind": description.kind, **fields, "per_seed": per_seed, "median": _median(per_seed)}
     write_json(folder / "metrics.json", metrics)
@@ -60,7 +61,9 @@ def data_files(data: Path) -> dict[int, Path | None]:
     return dict(sorted(files.items()))
 
 
-def _learn(parts: Mapping[str, Part], case: Case, folder: Path, item: tuple[int, Path | None]) -> dict[str, Any]:
+def _learn(
+    parts: Mapping[str, Part], case: Case, folder: Path, item: tuple[int, Path | None]
+) -> tuple[str | None, dict[str, Any]]:
     seed, path = item
     plant = case.plant
     signals = {"pv": plant.pv_signals, "mv": plant.mv_signals, "dv": plant.dv_signals}
@@ -75,7 +78,7 @@ def _learn(parts: Mapping[str, Part], case: Case, folder: Path, item: tuple[int,
             learnt.sweep.plot(folder / "sweep.png")
         if learnt.predictions is not None and seed == 0:
             np.savez(folder / "predictions.npz", **learnt.predictions)  # type: ignore[arg-type]
-    return found
+    return None if record is None else record.digest(), found
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,0 +1,97 @@
+"""Stage design: one exported controller a data seed, and one for every variant of its numbers."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.cases import CASES
+from pipeline.command import run_stage
+from pipeline.errors import LawError
+from pipeline.export import export
+from pipeline.laws import LAWS, LawSignals
+from pipeline.models import load_model
+from pipeline.parallel import parallel_map
+from pipeline.params import ControllerParams, choose, digest, parse
+from pipeline.plants.base import Array, Plant
+from pipeline.simulate import measured
+from pipeline.stages import BASE, controller_file, design_folder, model_folder, read_json, write_json
+
+
+def design(name: str) -> None:
+    """Export ``controllers.<name>`` for each seed of its model set, its variants too."""
+    params = ControllerParams.read(name)
+    where = f"controllers.{name}"
+    case, law = choose(CASES, params.case, "case", where), choose(LAWS, params.law, "law", where)
+    forms = {BASE: params.settings, **{v: {**params.settings, **s} for v, s in params.variants.items()}}
+    read = {form: parse(law.Params, settings, where) for form, settings in forms.items()}
+    models = model_folder(params.case, params.model)
+    seeds = sorted(int(p.name.removeprefix("seed")) for p in models.glob("seed*"))
+    if not seeds:
+        raise LawError(f"{where}: {models} holds no models; run the fit stage of that model set first")
+    data = read_json(models / "metrics.json").get("data", {})
+    folder = design_folder(params.case, params.law)
+    shutil.rmtree(folder, ignore_errors=True)
+    provenance = {"params_sha256": digest(forms), "commit": _commit(), "versions": _versions()}
+    work = [(form, seed) for form in forms for seed in seeds]
+    arguments = (params, read, models, case.plant, provenance, data)
+    rows = parallel_map(partial(_export, *arguments), work, f"design {name}")
+    write_json(folder / "metrics.json", {"law": params.law, "controllers": rows})
+
+
+def _export(
+    params: ControllerParams,
+    forms: Mapping[str, Any],
+    models: Path,
+    plant: Plant,
+    provenance: Mapping[str, Any],
+    data: Mapping[str, str],
+    item: tuple[str, int],
+) -> dict[str, Any]:
+    form, seed = item
+    parts = {p.stem: load_model(p) for p in sorted((models / f"seed{seed}").glob("*.npz"))}
+    law = LAWS[params.law].design(forms[form], parts, LawSignals.of(plant), plant).eval()
+    path = controller_file(params.case, params.law, form, seed)
+    origin = {**provenance, "data_seed": seed, "record_sha256": data.get(str(seed))}
+    export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
+    return {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
+
+
+def _closed_loop(plant: Plant) -> Callable[[Array], Array]:
+    """The plant as the parity gate drives it: one period further with each MV."""
+    cvs, xs, _ = plant.steady_curve
+    state = xs[len(cvs) // 2]
+    step, dv, p = plant.stepper(), plant.dv_nominal, plant.parameters()
+
+    def drive(mv: Array) -> Array:
+        nonlocal state
+        state = step(state, mv, dv, p)
+        return measured(plant, state)
+
+    return drive
+
+
+def _commit() -> str:
+    try:
+        run = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return run.stdout.strip()
+
+
+def _versions() -> dict[str, str]:
+    names = ("loopwright", "torch", "onnx", "onnxruntime")
+    return {"python": platform.python_version(), "numpy": np.__version__, **{n: version(n) for n in names}}
+
+
+if __name__ == "__main__":
+    sys.exit(run_stage(design, sys.argv, "CONTROLLER"))
