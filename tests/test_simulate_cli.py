@@ -1,0 +1,203 @@
+"""``python -m pipeline simulate``: what is asked for happens, and what cannot be is told in one line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pipeline.__main__ import main
+from pipeline.cases import CASES
+from pipeline.export import export
+from pipeline.laws import LAWS, LawSignals
+from pipeline.live import TerminalView, sparkline
+from pipeline.metrics import mae
+from pipeline.plants import Plant
+from pipeline.simulate import simulate_closed
+from serving import Command, Controller, Mode
+
+CASE = "thiosulfate_cstr"
+pytest_plugins = ["small_laws"]
+
+
+@pytest.fixture(scope="session")
+def pid_file(plant: Plant, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    cls = LAWS["pid"]
+    params = cls.Params(tuning="imc", lambda_s=1.6, operating_cv=0.66613)
+    path = tmp_path_factory.mktemp("controllers") / "pid.onnx"
+    export(cls.design(params, {}, LawSignals.of(plant), plant), path, case=CASE, provenance={})
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def simulate(file: Path, *options: str) -> list[dict[str, str]]:
+    """Run and return the samples."""
+    assert main(["simulate", str(file), "--csv", "out.csv", *options]) == 0
+    with Path("out.csv").open(encoding="utf-8") as text:
+        return list(csv.DictReader(text))
+
+
+def column(rows: list[dict[str, str]], name: str) -> np.ndarray:
+    return np.array([float(row[name]) for row in rows])
+
+
+def test_a_scenario_is_the_one_that_validation_runs(pid_file: Path, plant: Plant) -> None:
+    """The loop, its guards and modes add nothing: the same trajectory as the bare controller's."""
+    rows = simulate(pid_file, "--scenario", "sp_b")
+    (scenario,) = CASES[CASE].scenarios()["sp_b"]
+    controller = Controller(pid_file)
+    state = [controller.cold_state()]
+
+    def step(sp: np.ndarray, pv: np.ndarray, mv: np.ndarray) -> Any:
+        result = controller.step(sp=sp, pv=pv, mv_applied=mv, state=state[0])
+        state[0] = result.state
+        return result.mv, result.info
+
+    expected = simulate_closed(plant, step, scenario)
+    np.testing.assert_allclose(column(rows, "C_A [mol/l]"), expected.pv[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(column(rows, "T_j [K]"), expected.mv[:, 0], rtol=1e-6, atol=1e-4)
+
+
+def test_set_points_disturbance_and_manual_happen_when_asked(
+    pid_file: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = simulate(
+        pid_file, "--from", "0.6", "--sp", "0.7@5", "--sp", "0.65@30", "--disturbance", "T_in=285@60",
+        "--manual", "80..81.5=240", "--duration", "90",
+    )  # fmt: skip
+    assert len(rows) == 180
+    sp, mv = column(rows, "SP C_A [mol/l]"), column(rows, "T_j [K]")
+    np.testing.assert_array_equal(sp, np.repeat([0.6, 0.7, 0.65], [10, 50, 120]))
+    _, steady = plant.steady_state_at(0.6)
+    np.testing.assert_allclose(mv[:10], steady[0], rtol=1e-6)  # at rest until the set point moves
+    assert [row["mode"] for row in rows] == ["AUTO"] * 160 + ["MANUAL"] * 3 + ["AUTO"] * 17
+    assert set(mv[160:163]) == {240.0}
+    cv = column(rows, "C_A [mol/l]")
+    assert abs(cv[120] - 0.65) < 1e-2 < np.ptp(cv[120:160])
+    out = capsys.readouterr().out
+    assert f"MAE C_A {mae(sp, cv):.4g} mol/l" in out
+    assert "T_in = 285 K" in out
+    assert Path("pid-simulation.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_noise_has_its_seed_and_its_size(pid_file: Path) -> None:
+    asked = ("--sp", "0.5", "--noise", "C_A=5e-4", "--noise", "T=0.1", "--duration", "150")
+    first, again, other = (simulate(pid_file, *asked, "--seed", seed) for seed in ("1", "1", "2"))
+    assert first == again != other
+    for name, std in (("C_A [mol/l]", 5e-4), ("T [K]", 0.1)):
+        noise = column(first, f"measured {name}") - column(first, name)
+        assert np.std(noise) == pytest.approx(std, rel=0.15)
+
+
+def test_a_fault_is_shown_and_recovered_from(pid_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Noise beyond the sensor's range: the loop holds, and goes on when the sensor is back."""
+    rows = simulate(pid_file, "--from", "0.95", "--sp", "0.9", "--noise", "C_A=0.05", "--duration", "200")
+    held = [k for k, row in enumerate(rows) if row["mode"] == "HOLD"]
+    assert held
+    for k in held:
+        if rows[k - 1]["mode"] == "HOLD":
+            assert rows[k]["T_j [K]"] == rows[k - 1]["T_j [K]"]
+    assert rows[held[-1]]["reason"].startswith("PV C_A is ")
+    assert f"{len(held)} scans with a fault, the last one: PV C_A" in capsys.readouterr().out
+
+
+def test_real_time_takes_its_time_and_gives_the_same(pid_file: Path) -> None:
+    """250 times real time: 25 s in 0.1 s, on the machine's clock."""
+    asked = ("--sp", "0.6", "--duration", "25")
+    fast = simulate(pid_file, *asked)
+    timed = simulate(pid_file, *asked, "--speed", "250")
+    by_time = {row["time_s"]: row for row in fast}
+    assert timed
+    assert timed[0] == by_time[timed[0]["time_s"]]  # a busy machine may miss periods later on, and says so
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--sp", "high"], "'high' is no number; the form is VALUE or VALUE@TIME_S"),
+        (["--sp", "0.5@-1"], "must not be negative"),
+        (["--sp", "1.5"], "set point C_A = 1.5 mol/l is outside [0, 1] mol/l"),
+        (["--sp", "0.5@900", "--duration", "10"], "time 900 s lies beyond the run, which ends at 10 s"),
+        (["--sp", "0.5", "--scenario", "sp_a"], "not both"),
+        (["--scenario", "sp_c"], "did you mean 'sp_"),
+        (["--sp", "0.5", "--from", "1.2"], "no steady state"),
+        (["--disturbance", "UA"], "'UA' is not of the form NAME=VALUE@TIME_S"),
+        (["--disturbance", "T_inn=3"], "has no parameter 'T_inn'; did you mean 'T_in'?"),
+        (["--noise", "CA=1"], "has no process variable 'CA'; did you mean 'C_A'?"),
+        (["--noise", "C_A=-1"], "must not be negative"),
+        (["--noise", "C_A=nan"], "not finite"),
+        (["--manual", "9..3"], "end after that"),
+        (["--manual", "3..9=900"], "manual T_j = 900 K is outside [0, 500] K"),
+        (["--duration", "0"], "not above zero"),
+        (["--speed", "fast"], "no finite number"),
+        (["--picture", "/dev/null/x.png"], "/dev/null/x.png cannot be written"),
+        (["--picture", "x.docx"], "cannot be written: Format 'docx' is not supported"),
+        (["--nose", "C_A=1"], "unrecognized arguments"),
+    ],
+)
+def test_bad_options_give_one_line(
+    pid_file: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    try:
+        status = main(["simulate", str(pid_file), "--duration", "5", *options])
+    except SystemExit as exit_:
+        status = exit_.code
+    assert status == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_controller_of_another_plant_is_refused(
+    pi_file: Path, pid_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", str(pi_file)]) == 2
+    assert "for 'tank', which is neither a case nor a plant" in capsys.readouterr().err
+    assert main(["simulate", str(pid_file.with_suffix(".json"))]) == 2
+    assert "not a controller" in capsys.readouterr().err
+
+
+def test_as_a_program(pid_file: Path) -> None:
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-W", "error", "-m", "pipeline", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+    done = run("simulate", str(pid_file), "--sp", "0.6", "--duration", "10", "--picture", "loop.svg")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == "picture: loop.svg"
+    assert Path("loop.svg").exists()
+    failed = run("simulate", "none.onnx")
+    assert failed.returncode == 2
+    assert failed.stderr == (
+        "python -m pipeline simulate: none.onnx: the file cannot be read: No such file or directory\n"
+    )
+    assert "simulate" in run().stdout
+
+
+def test_the_live_view_shows_mode_values_and_faults(plant: Plant) -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=120, height=30)
+    with TerminalView(plant, "pid", 10.0, console) as view:
+        for k in range(20):
+            mode, reason = (Mode.HOLD, "PV C_A is nan") if k > 10 else (Mode.AUTO, "")
+            command = Command(k, mode, np.array([0.5]), np.array([250.0 + k]), None, None, reason)
+            view.show(k * 0.5, np.array([0.4, 310.0]), command, "UA = 1" if k == 3 else None)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    for part in ("HOLD", "SP C_A", "269", "1.5 s  UA = 1", "5.5 s  fault: PV C_A is nan", "9.5 of 10.0 s"):
+        assert part in text
+
+
+def test_sparkline() -> None:
+    assert sparkline(np.linspace(0, 1, 8), 0, 1) == "▁▂▃▄▅▆▇█"
+    assert sparkline(np.array([-9.0, 9.0, np.nan]), 0, 1) == "▁█▁"
+    assert len(sparkline(np.zeros(500), 0, 1, width=60)) == 60
