@@ -22,10 +22,7 @@ QUALITY = {"inc": 2.7, "incad": 1.8, "incadec": 3.9, "pid": 1.35, "inverse_dob":
 """Of each law: MAE as a multiple of the bound's."""
 BOUND = {"sp_a": 0.064, "sp_b": 0.0073, "tin": 0.0002, "ua": 0.0004, "ua_gradual": 0.0001, "held_out": 0.036}
 SETTING = {"incad": {"r": 1.5}, "incadec": {"r": 5.5, "correction": "as_printed"}}
-VARIANTS = {
-    "incad": ("r=2.5", "r=3.5", "r=4.5", "r=10"),
-    "incadec": ("r=10", "correction=back_calculation", "r=10, correction=back_calculation"),
-}
+VARIANTS = {"incad": ("r=2.5", "r=3.5", "r=4.5", "r=10"), "incadec": ("r=10", "r=5.5, back", "r=10, back")}
 SEEDS = (0, 1, 2)
 
 

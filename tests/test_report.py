@@ -191,13 +191,15 @@ def test_what_reproduces(ours, paper, same):
 
 def test_settings_find_their_variant(root):
     evidence = load(root)
-    assert parse_setting("r=10, correction=back_calculation") == {"r": 10.0, "correction": "back_calculation"}
+    assert parse_setting("r=10, back") == {"r": 10.0, "back": True}
+    assert parse_setting("correction=back_calculation") == {"correction": "back_calculation"}
     incad, incadec = evidence.laws["incad"], evidence.laws["incadec"]
     assert incad.variant_of({}) == incad.variant_of({"r": 1.5}) == ""
     assert incad.variant_of({"r": 10}) == "r=10"
     assert incad.variant_of({"r": 7}) is None
     assert incadec.variant_of({"r": 10}) == "r=10"
-    assert incadec.variant_of({"correction": "back_calculation"}) == "correction=back_calculation"
+    assert incadec.variant_of({"back": True}) == "r=5.5, back"
+    assert incadec.variant_of({"r": 10, "back": True}) == "r=10, back"
     loop = evidence.loop(Curve("incad", {"r": 2.5}), "sp_a", 160)
     assert loop is not None
     assert loop["pv"].shape == (1120, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -176,6 +177,9 @@ def test_the_champion_falls_only_to_better_evidence(root, capsys):
     assert "has no version 9" in refused("promote", name, "9")
     assert "has no alias 'best'" in refused("fetch", f"{name}@best", "out")
     assert "refused" in refused("promote", name, "1", "--alias", "latest")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert f"port {port} of 127.0.0.1 is taken" in refused("serve", "--port", port)
     with store() as client:
         run = client.get_model_version(name, "6").run_id
     stored = root / "mlruns" / CASE / run / "artifacts" / "inverse_dob.onnx"

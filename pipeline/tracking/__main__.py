@@ -1,16 +1,20 @@
-"""The registry from the command line: ``python -m pipeline.tracking publish | list | promote | fetch``."""
+"""The registry from the command line: ``python -m pipeline.tracking publish | list | promote | fetch | serve``."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, TrackingError
 from pipeline.tracking.publish import publish
 from pipeline.tracking.registry import CHAMPION, fetch, promote, versions
-from pipeline.tracking.store import store
+from pipeline.tracking.store import store, store_uri
+
+HOST = "127.0.0.1"
 
 
 def _publish(args: argparse.Namespace) -> None:
@@ -40,6 +44,21 @@ def _fetch(args: argparse.Namespace) -> None:
             print(path)
 
 
+def _serve(args: argparse.Namespace) -> None:
+    uri = store_uri()
+    if uri.startswith("http"):
+        print(f"the registry is served already: {uri}/#/models")
+        return
+    with store(), socket.socket() as probe:
+        if probe.connect_ex((HOST, args.port)) == 0:
+            raise TrackingError(f"port {args.port} of {HOST} is taken; give another one with --port")
+    print(f"registry: http://{HOST}:{args.port}/#/models (the sidebar hides it; Ctrl-C ends)", flush=True)
+    # mlflow's server would otherwise run jobs that its users submit
+    environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+    options = ["--host", HOST, "--port", str(args.port), "--backend-store-uri", uri, "--workers", "1"]
+    os.execve(sys.executable, [sys.executable, "-m", "mlflow", "server", *options], environment)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("python -m pipeline.tracking", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -56,6 +75,9 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("controller", help="CASE-LAW (its champion), CASE-LAW@ALIAS, CASE-LAW/VERSION, or CASE")
     one.add_argument("folder", type=Path)
     one.set_defaults(run=_fetch)
+    one = commands.add_parser("serve", help="open MLflow's UI on this machine only, its job execution off")
+    one.add_argument("--port", type=int, default=5000, help="default: %(default)s")
+    one.set_defaults(run=_serve)
     return parser
 
 

@@ -40,11 +40,12 @@ def version_description(validation: Mapping[str, Any], gate: Gate, run_id: str, 
 
 
 def _verdict(gate: Gate) -> str:
+    """The first line, without markup: lists of versions show it as it is."""
     if gate.score is None:
-        return "<p>No closed-loop evidence yet: the report stage of its case has not run.</p>"
+        return "No closed-loop evidence yet: the report stage of its case has not run.\n"
     beside = f", PID {gate.baseline:.3f}" if gate.baseline is not None and gate.law != BASELINE else ""
     locks = "no lock-up" if not gate.lock_ups else f"{gate.lock_ups} lock-ups"
-    return f"<p><b>Gate score {gate.score:.3f}</b> (1 = perfect-model NMPC{beside}), {locks}.</p>"
+    return f"Gate score {gate.score:.3f} (1 = perfect-model NMPC{beside}), {locks}.\n"
 
 
 def _table(validation: Mapping[str, Any], law: str) -> str:
@@ -78,4 +79,4 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
 
 
 def _figure(value: float | None) -> str:
-    return "" if value is None else f"{value:.4g}"
+    return "" if value is None else f"{value:.3g}"

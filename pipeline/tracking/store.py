@@ -47,7 +47,8 @@ def store() -> Iterator[MlflowClient]:
         client.search_experiments(max_results=1)
         yield client
     except (MlflowException, SQLAlchemyError, sqlite3.Error, requests.RequestException) as error:
-        reason = " ".join(str(error).split())
+        # mlflow quotes the whole stack of the HTTP library, several lines of it
+        reason = " ".join(str(error).split()).partition(" failed with exception")[0]
         raise TrackingError(f"the tracking store {uri} refused: {reason[:300]}; {_remedy(uri)}") from error
 
 

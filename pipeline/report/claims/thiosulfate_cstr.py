@@ -25,7 +25,8 @@ MIDDLE_EIGENVALUES = (0.4548, -0.1854)  # 1/s
 MIDDLE_ZERO = -1.046  # of the plant sampled every 0.5 s
 CENTRES, RMSE = (680, 800), 22.0  # K
 STEADY_ERROR = 1e-3  # mol/l: smaller is no offset
-RANGE = {"T": 400.0, "Tj": 500.0}
+T_RANGE = 400.0  # K
+BACK = {"back": True}  # how params.yaml names INCADEC's variants with back-calculation: "r=10, back"
 
 
 # ---------------------------------------------------------------- why a figure differs
@@ -76,8 +77,7 @@ def _pid(row: PaperFigure, ours: float, evidence: Evidence) -> str:
 
 
 def _with_back_calculation(row: PaperFigure, evidence: Evidence) -> str:
-    setting = {**row.setting, "correction": "back_calculation"}
-    value = evidence.figure(row.law, row.scenario, row.metric, setting)
+    value = evidence.figure(row.law, row.scenario, row.metric, {**row.setting, **BACK})
     return "" if value is None else f"; with back-calculation {value:.3g}"
 
 
@@ -169,7 +169,7 @@ def _no_offset(evidence: Evidence) -> Verdict:
     steady = evidence.figure("incadec", "sp_a", "max_asse")
     if steady is None:
         return Verdict("", "", "not measured", None)
-    back = evidence.figure("incadec", "sp_a", "max_asse", {"correction": "back_calculation"})
+    back = evidence.figure("incadec", "sp_a", "max_asse", BACK)
     because = "" if back is None else f"with back-calculation {back:.2g}"
     return Verdict("", "", f"steady error on SP-A up to {steady:.2g}", steady <= STEADY_ERROR, because)
 
@@ -181,7 +181,7 @@ def _steady_states(evidence: Evidence) -> Verdict:
     what, limit = f"steady states at Tj = {TJ:g} K", "three, within 1e-4 of their range"
     if len(found) != len(expected):
         return Verdict(what, limit, f"{len(found)} found", False)
-    error = float(np.max(np.abs(np.array(found) - expected) / [1.0, RANGE["T"]]))
+    error = float(np.max(np.abs(np.array(found) - expected) / [1.0, T_RANGE]))
     return Verdict(what, limit, f"largest difference {error:.1e}", error <= 1e-4)
 
 
