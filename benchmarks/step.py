@@ -1,0 +1,81 @@
+"""A controller's step beside the perfect-model NMPC's, on this machine and in this run.
+
+``python benchmarks/step.py [FILE.onnx ...]``; without files, every controller in artifacts/.
+Hot: called again at once. Every 10 ms: as the control loop calls it, warmed just before the
+deadline; and cold, as a host that does not warm it would.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.cases import CASES
+from pipeline.oracle import PerfectNmpc
+from serving import Controller, LoopwrightError
+from serving.bench import bench
+
+ALLOWED_HOT_US, ALLOWED_LOOP_US, REQUIRED_RATIO = 40.0, 80.0, 100.0
+
+
+def nmpc_median_us(case_name: str, samples: int) -> float:
+    """Median step [us] of the NMPC in closed loop over the first samples of the case's first scenario."""
+    case = CASES[case_name]
+    scenario = next(iter(case.scenarios().values()))[0]
+    nmpc, plant = PerfectNmpc(case.plant), case.plant
+    simulate, p, x, times = plant.stepper(), plant.parameters(), scenario.x0, []
+    for sp in scenario.sp[:samples]:
+        begun = time.perf_counter_ns()
+        mv = nmpc.step(x, sp)
+        times.append((time.perf_counter_ns() - begun) / 1e3)
+        x = simulate(x, mv, plant.dv_nominal, p)
+    return float(np.median(times))
+
+
+def main() -> int:
+    """Print the table; 1 if a figure is not what it must be."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="*", type=Path, metavar="FILE")
+    parser.add_argument("--nmpc-samples", type=int, default=160)
+    parser.add_argument("--steps", type=int, default=5_000)
+    parser.add_argument("--loop-steps", type=int, default=500)
+    options = parser.parse_args()
+    files = options.files or sorted(Path("artifacts").glob("*/*.onnx"))
+    if not files:
+        print("no controllers in artifacts/; name some files", file=sys.stderr)
+        return 2
+    try:
+        controllers = [Controller(file) for file in files]
+    except LoopwrightError as error:
+        print(error, file=sys.stderr)
+        return 2
+    names = dict.fromkeys(c.manifest.case for c in controllers if c.manifest.case in CASES)
+    nmpc = {name: nmpc_median_us(name, options.nmpc_samples) for name in names}
+    for name, median in nmpc.items():
+        print(f"{name}: perfect-model NMPC, median step {median / 1e3:.2f} ms")
+    print(f"{'step p50 [us]':<28}{'hot':>8}{'10 ms loop':>12}{'unwarmed':>10}{'NMPC / hot':>12}")
+    good = True
+    for c in controllers:
+        hot, warmed, cold = bench(c, steps=options.steps, loop_steps=options.loop_steps)
+        ratio = nmpc.get(c.manifest.case, np.nan) / hot.p50
+        verdict = []
+        if hot.p50 > ALLOWED_HOT_US:
+            verdict.append(f"hot over {ALLOWED_HOT_US:g}")
+        if warmed.p50 > ALLOWED_LOOP_US:
+            verdict.append(f"loop over {ALLOWED_LOOP_US:g}")
+        if ratio < REQUIRED_RATIO:
+            verdict.append(f"less than {REQUIRED_RATIO:g} times faster")
+        good = good and not verdict
+        label = f"{c.manifest.case}/{c.manifest.law}"
+        print(
+            f"{label:<28}{hot.p50:>8.1f}{warmed.p50:>12.1f}{cold.p50:>10.1f}{ratio:>11.0f}x  {', '.join(verdict)}".rstrip()
+        )
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,23 @@
+"""The same without Loopwright: ``python plain_onnxruntime.py FILE.onnx`` (numpy and onnxruntime alone)."""
+
+import json
+import sys
+
+import numpy as np
+import onnxruntime as ort
+
+options = ort.SessionOptions()
+options.intra_op_num_threads = 1
+session = ort.InferenceSession(sys.argv[1], options, providers=["CPUExecutionProvider"])
+m = json.loads(session.get_modelmeta().custom_metadata_map["loopwright.manifest"])
+names = [output.name for output in session.get_outputs()]
+state, mv = np.zeros(m["n_state"]), np.array([s["low"] for s in m["mv"]])
+for k in range(100):  # once every m["period_s"] seconds
+    sp = np.array([(s["low"] + s["high"]) / 2 for s in m["sp"]])
+    pv = np.array([s["low"] + (s["high"] - s["low"]) * (k % 10) / 10 for s in m["pv"]])
+    given = {"sp": sp, "pv": pv, "mv_applied": mv, "state": state}
+    result = dict(zip(names, session.run(None, {n: given[n] for n in m["inputs"]}), strict=True))
+    mv, state, info = result["mv"], result.get("state_next", state), result.get("info", np.zeros(0))
+    if not np.isfinite(mv).all():  # the runtime also checks ranges, inputs and the file itself
+        sys.exit("no MV")
+    print(mv.tolist(), dict(zip(m["info"], info.tolist(), strict=True)))

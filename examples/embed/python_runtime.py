@@ -1,0 +1,14 @@
+"""A controller in ten lines: ``python python_runtime.py FILE.onnx`` (numpy, onnxruntime and this package)."""
+
+import sys
+
+from serving import Controller
+
+controller = Controller(sys.argv[1])  # digest, graph and manifest are checked here
+m, state = controller.manifest, controller.cold_state()  # zeros: no past
+mv = [s.low for s in m.mv]  # what the plant has now
+for k in range(100):  # once every m.period_s seconds
+    sp = [(s.low + s.high) / 2 for s in m.sp]  # your set points
+    pv = [s.low + (s.high - s.low) * (k % 10) / 10 for s in m.pv]  # your measurements
+    mv, state, info = controller.step(sp=sp, pv=pv, mv_applied=mv, state=state)
+    print(mv.tolist(), dict(zip(m.info, info.tolist(), strict=True)))  # to your actuators
