@@ -71,9 +71,8 @@ def main() -> int:
             verdict.append(f"less than {REQUIRED_RATIO:g} times faster")
         good = good and not verdict
         label = f"{c.manifest.case}/{c.manifest.law}"
-        print(
-            f"{label:<28}{hot.p50:>8.1f}{warmed.p50:>12.1f}{cold.p50:>10.1f}{ratio:>11.0f}x  {', '.join(verdict)}".rstrip()
-        )
+        row = f"{label:<28}{hot.p50:>8.1f}{warmed.p50:>12.1f}{cold.p50:>10.1f}{ratio:>11.0f}x  {', '.join(verdict)}"
+        print(row.rstrip())
     return 0 if good else 1
 
 
