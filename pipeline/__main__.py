@@ -16,6 +16,7 @@ from pipeline.live import SimulatedPlant, view_of
 from pipeline.loop_picture import History, draw, summary, write_csv
 from pipeline.params import nearest
 from pipeline.plants import PLANTS, Plant
+from pipeline.results import show_results
 from pipeline.timetable import Timetable, parse_event, parse_manual, timetable
 from serving.clock import MonotonicClock, VirtualClock
 from serving.controller import Controller
@@ -36,17 +37,22 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 if it went well, 2 after one line on standard error."""
-    parser = _Parser(prog="python -m pipeline", description="Try a controller on its plant.")
+    parser = _Parser(prog="python -m pipeline", description="Try a controller on its plant, or see how all of them did.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     _simulate_options(commands.add_parser("simulate", help="close the loop of a controller file over its plant"))
+    results = commands.add_parser("results", help="the figures of every controller, and where to look")
+    results.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="folder of the controllers")
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
         return 0
     try:
-        _simulate(options)
+        if options.command == "results":
+            show_results(options.artifacts)
+        else:
+            _simulate(options)
     except LoopwrightError as error:
-        print(f"python -m pipeline simulate: {error}", file=sys.stderr)
+        print(f"python -m pipeline {options.command}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
