@@ -37,7 +37,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 if it went well, 2 after one line on standard error."""
-    parser = _Parser(prog="python -m pipeline", description="Try a controller on its plant, or see how all of them did.")
+    parser = _Parser(prog="python -m pipeline", description="Try a controller on its plant; see how all did.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     _simulate_options(commands.add_parser("simulate", help="close the loop of a controller file over its plant"))
     results = commands.add_parser("results", help="the figures of every controller, and where to look")

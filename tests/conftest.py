@@ -69,12 +69,10 @@ def parts(plant: Plant) -> dict[str, Model]:
         return FuzzyMeansRBF(8).fit(inputs, target).to_torch()
 
     one, forward = np.column_stack([now, ahead(1)[:, 0]]), np.column_stack([now, moves])
-    over_horizon = network(forward[held], ahead(HORIZON)[held, 0])
     return {
         "inverse": network(one, moves),
         "domain": LeverageDomain.fit(one),
-        "forward": over_horizon,
-        "reach": over_horizon,
+        "forward": network(forward[held], ahead(HORIZON)[held, 0]),
         "observer": network(forward, ahead(1)[:, 1]),
     }
 

@@ -170,25 +170,27 @@ class InverseDob(ObserverLaw):
     title: ClassVar[str] = "RBF inverse over several periods, disturbance observer, integral"
 
     inverse: Model
-    reach: Model
+    model: Model
 
     def __init__(
-        self, signals: LawSignals, inverse: Model, reach: Model, observer: Model, params: ObserverLaw.Params
+        self, signals: LawSignals, inverse: Model, forward: Model, observer: Model, params: ObserverLaw.Params
     ) -> None:
-        super().__init__(signals, reach, observer, params)
-        self.inverse, self.reach = inverse, reach
+        super().__init__(signals, forward, observer, params)
+        self.inverse, self.model = inverse, forward
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
-        """The law over parts ``inverse``, ``reach`` and ``observer``; raises LawError."""
+        """The law over parts ``inverse``, ``forward`` and ``observer``; raises LawError."""
         require_single_loop(signals, cls.name)
         n = len(signals.pv) + 1
-        inverse, reach, observer = (require_part(models, p, cls.name, n, 1) for p in ("inverse", "reach", "observer"))
-        return cls(signals, inverse, reach, observer, params)
+        inverse, forward, observer = (
+            require_part(models, p, cls.name, n, 1) for p in ("inverse", "forward", "observer")
+        )
+        return cls(signals, inverse, forward, observer, params)
 
     def invert(self, pv: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As in ObserverLaw."""
-        ends = self.reach(_at(pv, self.ends.expand(*pv.shape[:-1], 2))).squeeze(-1)
+        ends = self.model(_at(pv, self.ends.expand(*pv.shape[:-1], 2))).squeeze(-1)
         within, push, w_min, w_max = self.within_reach(w, ends[..., 0:1], ends[..., 1:2])
         return self.inverse(torch.cat([pv, within], dim=-1)) + push, within, w_min, w_max
 
