@@ -168,14 +168,27 @@ class Evidence:
         value = self.bounds.get(scenario, {}).get(kind, {}).get(metric)
         return None if value is None else float(value)
 
+    @cached_property
+    def floor(self) -> float:
+        """Error below which a loop is as good as perfect: the measurement noise of the controlled variable.
+
+        An NMPC that is told of a disturbance before it acts leaves an error of 1e-11: no yardstick.
+        """
+        return float(self.case.noise[self.case.plant_class.sp_signals[0].name])
+
     def ratio(self, law: str, scenario: str, kind: str = "nmpc") -> float | None:
-        """MAE of the law over that of the bound."""
+        """MAE of the law over that of the bound; None also where the bound lies below ``floor``."""
         own, bound = self.figure(law, scenario), self.bound(scenario, "mae", kind)
-        return None if own is None or not bound else own / bound
+        return None if own is None or bound is None or bound < self.floor else own / bound
+
+    def gate_ratio(self, law: str, scenario: str) -> float | None:
+        """MAE over the NMPC's, both at least ``floor``: 1 is the bound, or an error that noise would hide."""
+        own, bound = self.figure(law, scenario), self.bound(scenario)
+        return None if own is None or bound is None else max(own, self.floor) / max(bound, self.floor)
 
     def score(self, law: str) -> float | None:
-        """Gate score: weighted mean over the gate's scenarios of MAE / NMPC's MAE; lower is better, 1 the bound."""
-        ratios = {s: self.ratio(law, s) for s in self.case.gate}
+        """Gate score: weighted mean of ``gate_ratio`` over the gate's scenarios; lower is better, 1 the bound."""
+        ratios = {s: self.gate_ratio(law, s) for s in self.case.gate}
         known = {s: r for s, r in ratios.items() if r is not None}
         if not known or len(known) < len(ratios):
             return None
@@ -209,11 +222,12 @@ class Evidence:
             "gate": {
                 "id": self._gate_id(),
                 "weights": dict(self.case.gate),
+                "floor": self.floor,
                 "laws": {
                     law: {
                         "score": self.score(law),
                         "lock_ups": found.lock_ups,
-                        "ratios": {s: r for s in self.case.gate if (r := self.ratio(law, s)) is not None},
+                        "ratios": {s: r for s in self.case.gate if (r := self.gate_ratio(law, s)) is not None},
                     }
                     for law, found in self.laws.items()
                 },
@@ -235,5 +249,8 @@ class Evidence:
     def _gate_id(self) -> str:
         """Digest of what the gate measures: scores of different ids may not be compared."""
         tests = self.case.scenarios()
-        what = {s: [w, self.bound(s), [t.digest() for t in tests.get(s, ())]] for s, w in self.case.gate.items()}
+        what: dict[str, Any] = {
+            s: [w, self.bound(s), [t.digest() for t in tests.get(s, ())]] for s, w in self.case.gate.items()
+        }
+        what["floor"] = self.floor
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:12]

@@ -13,7 +13,7 @@ from pipeline.cases.base import PaperFigure, Requirement
 from pipeline.report.evidence import Evidence
 
 RELATIVE = 0.25
-ABSOLUTE = 5e-4
+ABSOLUTE = 1e-4
 NAMES = {"mae": "MAE", "masse": "MASSE", "max_asse": "MaxASSE"}
 """How the paper writes a metric."""
 RULE = (

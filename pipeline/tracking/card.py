@@ -52,6 +52,7 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
     scenarios = validation.get("scenarios") or {}
     bounds = validation.get("bounds") or {}
     titles = (validation.get("titles") or {}).get("scenarios") or {}
+    floor = (validation.get("gate") or {}).get("floor", 0.0)
     heads = ["Scenario (mean absolute error)", "this law", "range over seeds", "with noise", "PID", "NMPC", "ratio"]
     rows = []
     for name, laws in scenarios.items():
@@ -68,7 +69,7 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
                 _figure((scenarios.get(name + NOISE_SUFFIX) or {}).get(law, {}).get("mae")),
                 _figure((laws.get(BASELINE) or {}).get("mae")),
                 _figure(bound),
-                f"{own['mae'] / bound:.2f}" if bound and own.get("mae") is not None else "",
+                f"{own['mae'] / bound:.2f}" if bound and bound >= floor and own.get("mae") is not None else "",
             ]
         )
     if not rows:
