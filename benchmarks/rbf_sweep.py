@@ -105,7 +105,8 @@ def main() -> int:
         # Starting the process and importing torch is nobody's sweep.
         fast.submit(ours, *samples, [4]).result()
         plain.submit(straightforward.sweep, *samples, [4], LIMITS).result()
-        for turn in range(min(TURNS, len(counts))):
+        turns = min(TURNS, len(counts))
+        for turn in range(turns):
             part = counts[turn::TURNS]
             # Submitted one after the other: each has the machine to itself.
             rows, spent = fast.submit(ours, *samples, part).result()
@@ -114,6 +115,8 @@ def main() -> int:
             rows, spent = plain.submit(straightforward.sweep, *samples, part, LIMITS).result()
             found["straightforward"] += rows
             seconds["straightforward"] += spent
+            spent_so_far = ", ".join(f"{name} {total:.1f} s" for name, total in seconds.items())
+            print(f"turn {turn + 1} of {turns}: {spent_so_far}", flush=True)
     best = {name: min(rows, key=lambda row: row[3]) for name, rows in found.items()}
     print(f"\n{'sweep':<18}{'seconds':>9}{'best c':>8}{'centres':>9}{'RMSE train [K]':>16}{'validation [K]':>16}")
     for name, (c, n, train, validation) in best.items():

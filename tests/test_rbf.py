@@ -201,8 +201,7 @@ def test_limits_and_shapes_that_make_no_sense_are_refused() -> None:
         RBF(3, 4, basis="cubic")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("basis", BASES)
-@pytest.mark.parametrize("n_out", [1, 2])
+@pytest.mark.parametrize(("basis", "n_out"), [("thin_plate", 1), ("thin_plate", 2), ("gaussian", 1)])
 def test_the_graph_equals_the_module_under_full_optimization(tmp_path: Path, basis: str, n_out: int) -> None:
     x, y = curved(n_out=n_out)
     net = FuzzyMeansRBF(8, basis=basis).fit(x, y).to_torch(limits=(0.0, 150.0))

@@ -171,16 +171,14 @@ class MlpPart(StaticPart):
     """A multilayer perceptron.
 
     ``hidden`` widths; ``residual``: the network gives the change of the target, not the target;
-    ``balance`` 0..1: 0 weighs all rows alike, 1 all regions of the controlled variable; ``rows``
-    at most that many training pairs, drawn at random, None for all; ``trainer`` {kind: lm | lbfgs | adam,
-    and its options}.
+    ``balance`` 0..1: 0 weighs all rows alike, 1 all regions of the controlled variable;
+    ``trainer`` {kind: lm | lbfgs | adam, and its options}.
     """
 
     kind: ClassVar[str] = "mlp"
     hidden: tuple[int, ...] = (20,)
     residual: bool = True
     balance: float = 0.0
-    rows: int | None = None
     train_fraction: float = 0.85
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
@@ -188,8 +186,6 @@ class MlpPart(StaticPart):
         """Train with early stopping on the validation pairs."""
         pairs = self.pairs(record, plant)
         train, validation = pairs.split(self.train_fraction, self.split, seed)
-        if self.rows is not None and self.rows < len(train):
-            train = train.take(np.sort(np.random.default_rng(seed).choice(len(train), self.rows, replace=False)))
         options = dict(self.trainer)
         kind = choose(TRAINERS, options.pop("kind", "lm"), "trainer", "trainer.kind")
         trainer = parse(kind, options, "trainer")
