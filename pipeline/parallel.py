@@ -34,7 +34,7 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item], labe
     if address:
         from distributed import Client
 
-        client = Client(address)  # type: ignore[no-untyped-call]
+        client = Client(address)
         context = joblib.parallel_config(backend="dask", client=client)
     jobs = min(len(work), os.cpu_count() or 1) if not address else -1
     with context, progress_bar() as bar:

@@ -45,7 +45,7 @@ def design(name: str) -> None:
     work = [(form, seed) for form in forms for seed in seeds]
     arguments = (params, read, models, case.plant, provenance, data)
     rows = parallel_map(partial(_export, *arguments), work, f"design {name}")
-    write_json(folder / "metrics.json", {"law": params.law, "controllers": rows})
+    write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "controllers": rows})
 
 
 def _export(

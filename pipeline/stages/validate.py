@@ -22,7 +22,7 @@ from pipeline.parallel import parallel_map
 from pipeline.params import CaseParams, ControllerParams, choose, parse, read_section
 from pipeline.plants.base import Array
 from pipeline.simulate import Trajectory, simulate_closed
-from pipeline.stages import ARTIFACTS, BASE, controller_file, design_folder, validation_folder, write_json
+from pipeline.stages import ARTIFACTS, BASE, controller_file, design_folder, read_json, validation_folder, write_json
 from serving.controller import Controller
 from serving.errors import LoopwrightError
 
@@ -61,7 +61,8 @@ def validate(name: str) -> None:
     shipped = min(base, key=lambda t: (t.lock_ups, t.development))
     folder = validation_folder(params.case, params.law)
     shutil.rmtree(folder, ignore_errors=True)
-    write_json(folder / "metrics.json", _summary(params, base, trials, shipped))
+    title = read_json(design_folder(params.case, params.law) / "metrics.json")["title"]
+    write_json(folder / "metrics.json", {"law": params.law, "title": title, **_summary(params, base, trials, shipped)})
     curves = {f"{s}/{t.form}/{t.seed}": c for t in trials if t.seed == shipped.seed for s, c in t.curves.items()}
     fields = {f"{key}/{f}": getattr(c, f) for key, c in curves.items() for f in ("time_s", "sp", "pv", "mv")}
     np.savez_compressed(folder / "trajectories.npz", **fields)
@@ -154,7 +155,6 @@ def _summary(params: ControllerParams, base: list[Trial], trials: list[Trial], s
     clean = [name for name in base[0].metrics if not name.endswith(NOISE_SUFFIX)]
     forms = {t.form: [u for u in trials if u.form == t.form] for t in trials if t.form != BASE}
     return {
-        "law": params.law,
         "setting": {k: v for k, v in params.settings.items() if isinstance(v, (int, float, str))},
         "seeds": [t.seed for t in base],
         "shipped_seed": shipped.seed,
