@@ -1,0 +1,1 @@
+"""From plants and plant data to published controllers."""

@@ -163,4 +163,4 @@ def test_linearized_keeps_the_steady_state_and_the_plant_s_slope(plant: Plant, t
 
 def test_kinds_are_registered() -> None:
     assert {"mlp", "nnarx", "linearized"} <= set(MODELS)
-    assert all(cls.kind == kind for kind, cls in MODELS.items())
+    assert all(part.model.kind == kind for kind, part in MODELS.items())

@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ModelError, RecordError
 from pipeline.models import load_model
+from pipeline.models.network_parts import NnarxPart
 from pipeline.models.nnarx import NNARX
 from pipeline.models.objectives import Windows
 from pipeline.models.regressors import nnarx_pairs
+from pipeline.plants.thiosulfate_cstr import ThiosulfateCstr
 from pipeline.record import Record
 from serving.manifest import Signal
 
@@ -100,3 +102,18 @@ def test_wrong_arguments_are_one_clear_line() -> None:
         Windows.of(made_up_record((4, 4)), 2, 2, 10)
     with pytest.raises(ModelError, match="windows have shapes"):
         Windows(np.zeros((3, 2)), np.zeros((4, 2, 1)), np.zeros((3, 1)))
+
+
+def test_part_learns_from_a_record_one_step_and_free_run() -> None:
+    """A linear first-order plant is learnt to rounding of the noise-free data, and runs free as well."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0, 500, 200), 4)
+    y = np.zeros(len(u))
+    for k in range(len(u) - 1):
+        y[k + 1] = 0.8 * y[k] + 0.2 * u[k] / 500
+    plant = ThiosulfateCstr()
+    record = Record.of(plant, np.column_stack([y, 300 + y]), u[:, None])
+    part = NnarxPart(n_y=1, n_u=1, hidden=(4,), steps=5, trainer={"kind": "lm", "iterations": 60})
+    learnt = part.learn(record, plant, {}, 0)
+    assert learnt.metrics["fit_percent"] > 99
+    assert learnt.metrics["free_run_rmse"] < 0.01

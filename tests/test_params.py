@@ -12,7 +12,7 @@ from pipeline.cases import CASES
 from pipeline.errors import ParamsError
 from pipeline.excitation import EXCITATIONS
 from pipeline.laws import LAWS
-from pipeline.models.parts import PARTS
+from pipeline.models import MODELS
 from pipeline.params import ControllerParams, ModelParams, RecordParams, choose, digest, parse, read_section
 
 
@@ -103,7 +103,7 @@ def test_the_shipped_file_is_read_whole(monkeypatch: pytest.MonkeyPatch) -> None
         model = ModelParams.read(name)
         for part in model.parts.values():
             options = dict(part)
-            parse(PARTS[options.pop("kind")], options, name)
+            parse(MODELS[options.pop("kind")], options, name)
         models.add((model.case, model.model))
         assert name == f"{model.case}-{model.model}"
     for name in tree["controllers"]:

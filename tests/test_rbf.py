@@ -186,7 +186,7 @@ def test_a_saved_network_is_the_same_network(tmp_path: Path, limits: tuple[float
     net = FuzzyMeansRBF(6, basis="gaussian", width=0.3).fit(x, y).to_torch(limits)
     net.save(tmp_path / "a" / "rbf.npz")
     again = load_model(tmp_path / "a" / "rbf.npz")
-    assert type(again) is MODELS["rbf"] is RBF
+    assert type(again) is MODELS["rbf"].model is RBF
     assert torch.equal(net(torch.from_numpy(x)), again(torch.from_numpy(x)))
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["rbf.npz"]
 

@@ -1,20 +1,20 @@
-"""Models by kind: adding one is a file in this folder and a line here."""
+"""Models by kind: adding one is a file in this folder (the model and its Part) and a line here."""
 
 from __future__ import annotations
 
 from pipeline.models.base import Model, load_model
-from pipeline.models.leverage_domain import LeverageDomain
-from pipeline.models.linearized import Linearized
-from pipeline.models.mlp import MLP
-from pipeline.models.nnarx import NNARX
-from pipeline.models.rbf import RBF
+from pipeline.models.leverage_domain import DomainPart
+from pipeline.models.linearized import LinearizedPart
+from pipeline.models.network_parts import MlpPart, NnarxPart
+from pipeline.models.parts import Learnt, Part
+from pipeline.models.rbf_part import RbfPart
 
-MODELS: dict[str, type[Model]] = {
-    RBF.kind: RBF,
-    LeverageDomain.kind: LeverageDomain,
-    MLP.kind: MLP,
-    NNARX.kind: NNARX,
-    Linearized.kind: Linearized,
+MODELS: dict[str, type[Part]] = {
+    RbfPart.model.kind: RbfPart,
+    MlpPart.model.kind: MlpPart,
+    NnarxPart.model.kind: NnarxPart,
+    DomainPart.model.kind: DomainPart,
+    LinearizedPart.model.kind: LinearizedPart,
 }
 
-__all__ = ["MODELS", "Model", "load_model"]
+__all__ = ["MODELS", "Learnt", "Model", "Part", "load_model"]

@@ -58,6 +58,8 @@ def load_model(path: Path) -> Model:
         with np.load(path, allow_pickle=False) as file:
             header = json.loads(str(file["__model__"]))
             arrays = {k: file[k] for k in file.files if k != "__model__"}
-        return MODELS[header["kind"]].from_arrays(header["config"], arrays)
+        return MODELS[header["kind"]].model.from_arrays(header["config"], arrays)
     except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise ModelError(f"{path} is not a model that this pipeline wrote ({error}); run the fit stage again") from error
+        raise ModelError(
+            f"{path} is not a model that this pipeline wrote ({error}); run the fit stage again"
+        ) from error

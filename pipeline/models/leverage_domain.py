@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Self
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -11,6 +12,9 @@ from torch import Tensor
 
 from pipeline.applicability import Leverage
 from pipeline.models.base import Model
+from pipeline.models.parts import Learnt, Regions, StaticPart, predict
+from pipeline.plants.base import Plant
+from pipeline.record import Record
 
 
 class Interval(NamedTuple):
@@ -98,3 +102,18 @@ class LeverageDomain(Model):
         centre = torch.where(at.room > 0, at.centre, y)
         reach = at.half / r
         return centre - reach, centre + reach
+
+
+@dataclass(frozen=True, kw_only=True)
+class DomainPart(StaticPart):
+    """The leverage domain of a static part's training inputs: give it that part's task, horizon and split."""
+
+    model: ClassVar[type[Model]] = LeverageDomain
+    task: Literal["inverse", "forward"] = "inverse"
+
+    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+        """The domain of the training pairs' inputs."""
+        train, validation = self.pairs(record, plant).split(self.train_fraction, self.split, seed)
+        domain = LeverageDomain.fit(train.x)
+        inside = predict(domain, validation.x) <= domain.threshold.numpy()
+        return Learnt(domain, {"threshold": float(domain.threshold), "inside": float(inside.mean())})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -10,7 +11,9 @@ from torch import Tensor
 
 from pipeline.errors import ModelError
 from pipeline.models.base import Model
+from pipeline.models.parts import Learnt, Part, Regions
 from pipeline.plants.base import Array, Linearization, Plant
+from pipeline.record import Record
 
 
 class Linearized(Model):
@@ -98,3 +101,23 @@ class Linearized(Model):
     def forward(self, x: Tensor) -> Tensor:
         """PVs one period later, shape (..., n_pv), for [x, mv], shape (..., n_x + n_mv)."""
         return self.pv + (x - torch.cat([self.x, self.mv])) @ self.one_period
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearizedPart(Part):
+    """The plant's own equations, linearized at the steady state with controlled variable ``at``."""
+
+    model: ClassVar[type[Model]] = Linearized
+    at: float
+
+    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+        """The linearization; needs no data."""
+        x, mv = plant.steady_state_at(self.at)
+        lin = plant.linearize(x, mv)
+        zeros = lin.sampled_zeros(plant.period_s)
+        metrics = {
+            "eigenvalues": [[float(v.real), float(v.imag)] for v in lin.eigenvalues],
+            "sampled_zeros": [[float(v.real), float(v.imag)] for v in zeros],
+            "mv": [float(v) for v in mv],
+        }
+        return Learnt(Linearized.at_set_point(plant, self.at), metrics)

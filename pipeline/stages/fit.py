@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.cases import CASES, Case
 from pipeline.command import run_stage
 from pipeline.errors import ParamsError
-from pipeline.models.parts import PARTS, Part
+from pipeline.models import MODELS, Part
 from pipeline.parallel import parallel_map
 from pipeline.params import ModelParams, choose, parse
 from pipeline.record import Record
@@ -36,13 +36,18 @@ def fit(name: str) -> None:
     for part, description in parts.items():
         per_seed = {str(seed): found[part] for seed, (_, found) in zip(data, results, strict=True)}
         fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
-        metrics["parts"][part] = {"kind": description.kind, **fields, "per_seed": per_seed, "median": _median(per_seed)}
+        metrics["parts"][part] = {
+            "kind": description.model.kind,
+            **fields,
+            "per_seed": per_seed,
+            "median": _median(per_seed),
+        }
     write_json(folder / "metrics.json", metrics)
 
 
 def _part(values: Mapping[str, Any], where: str) -> Part:
     options = dict(values)
-    kind = choose(PARTS, options.pop("kind", None), "kind of part", f"{where}.kind")
+    kind = choose(MODELS, options.pop("kind", None), "kind of part", f"{where}.kind")
     return parse(kind, options, where)
 
 
