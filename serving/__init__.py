@@ -2,6 +2,7 @@
 
 from serving.clock import Clock, MonotonicClock, VirtualClock
 from serving.controller import Controller, Step
+from serving.endpoint import Endpoint, SimulatedEndpoint
 from serving.errors import (
     ArtifactError,
     ContractError,
@@ -12,7 +13,7 @@ from serving.errors import (
     SampleError,
 )
 from serving.guard import Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
-from serving.loop import Command, ControlLoop, Endpoint, Mode, RunReport, SimulatedEndpoint
+from serving.loop import Command, ControlLoop, Mode, RunReport
 from serving.manifest import Manifest, Signal
 
 __all__ = [

@@ -6,13 +6,14 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from serving.clock import Clock, MonotonicClock
 from serving.controller import Controller
+from serving.endpoint import Endpoint
 from serving.errors import EndpointError, LoopError
 from serving.guard import Guard, Sample, default_guards
 from serving.manifest import Signal
@@ -41,42 +42,6 @@ class Command:
     law_mv: Array | None  # what the law asked for, also in MANUAL; None where it was not or could not be stepped
     info: Array | None  # shape: (n_info,)
     reason: str = ""
-
-
-class Endpoint(Protocol):
-    """The plant's side. Both calls raise EndpointError (or OSError) when the plant cannot be reached."""
-
-    def read(self) -> Sample:
-        """The present sample."""
-
-    def write(self, mv: Array) -> None:
-        """Send an MV, shape (n_mv,)."""
-
-
-class SimulatedEndpoint:
-    """A plant in memory: ``step(mv) -> pv`` is called at each write and gives the PV one period later.
-
-    Parameters
-    ----------
-    step
-        (n_mv,) -> (n_pv,)
-    pv, mv
-        PV at the start, and the MV that was applied before it.
-    """
-
-    def __init__(self, step: Callable[[Array], Array], *, pv: ArrayLike, mv: ArrayLike) -> None:
-        self._step = step
-        self._pv = np.array(pv, dtype=np.float64, ndmin=1)
-        self._mv = np.array(mv, dtype=np.float64, ndmin=1)
-
-    def read(self) -> Sample:
-        """PV and applied MV."""
-        return Sample(pv=self._pv, mv_applied=self._mv)
-
-    def write(self, mv: Array) -> None:
-        """Apply the MV for one period."""
-        self._mv = np.array(mv, dtype=np.float64)
-        self._pv = np.asarray(self._step(self._mv), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
