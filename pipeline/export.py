@@ -57,7 +57,8 @@ def export(
         JSON-ready values for the manifest.
     drive
         ``mv (n_mv,) -> pv (n_pv,)``: the plant in the loop, one period further with each call.
-        Both sides see its process variables, so that a loop that rings does not amplify rounding.
+        Both sides see its process variables and the MV that it received, so that a loop that rings
+        does not amplify rounding; the state is each side's own.
         Without it the process variables walk at random over their ranges.
 
     Raises
@@ -133,7 +134,8 @@ def parity_gate(
         if drive is not None:
             pv = np.asarray(drive(theirs[0]), dtype=np.float64)
         with torch.no_grad():
-            ours = tuple(o.numpy() for o in law(*(torch.from_numpy(v) for v in (sp, pv, dv, ours[0], ours[1]))))
+            applied = ours[0] if drive is None else theirs[0]
+            ours = tuple(o.numpy() for o in law(*(torch.from_numpy(v) for v in (sp, pv, dv, applied, ours[1]))))
         try:
             theirs = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=theirs[0], state=theirs[1])
         except LoopwrightError as error:

@@ -13,6 +13,7 @@ from torch import Tensor
 from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw, LawSignals, require_part, require_single_loop
 from pipeline.models.base import Model
+from pipeline.models.pair import Layout, Pair, candidates
 from pipeline.plants.base import Plant
 
 
@@ -20,22 +21,16 @@ def _column(value: float) -> Tensor:
     return torch.tensor([value], dtype=torch.float64)
 
 
-def _at(pv: Tensor, mv: Tensor) -> Tensor:
-    """Model inputs (..., K, n_pv + 1) for K candidate MVs (..., K) at one state (..., n_pv)."""
-    states = pv.unsqueeze(-2).expand(*mv.shape, pv.shape[-1])
-    return torch.cat([states, mv.unsqueeze(-1)], dim=-1)
-
-
-def _direction(forward: Model, signals: LawSignals) -> float:
-    """Sign of the MV's effect on a forward model, over states all over the PVs' ranges."""
+def _rising(forward: Model, signals: LawSignals) -> bool:
+    """Whether more MV means more of the controlled variable, over states all over the PVs' ranges."""
     rng = torch.Generator().manual_seed(0)
     low, high = (torch.tensor([getattr(s, end) for s in signals.pv], dtype=torch.float64) for end in ("low", "high"))
     states = low + (high - low) * torch.rand(1000, len(signals.pv), generator=rng, dtype=torch.float64)
     mv = signals.mv[0]
     ends = torch.tensor([mv.low, mv.high], dtype=torch.float64).expand(1000, 2)
     with torch.no_grad():
-        at = forward(_at(states, ends)).squeeze(-1)
-    return -1.0 if float((at[:, 1] - at[:, 0]).sum()) < 0 else 1.0
+        at = candidates(forward, states, ends)
+    return float((at[:, 1] - at[:, 0]).sum()) >= 0
 
 
 class ObserverLaw(ControlLaw):
@@ -79,81 +74,77 @@ class ObserverLaw(ControlLaw):
                     f"integral_gain is {self.integral_gain} and band {self.band}; they must be >= 0 and > 0"
                 )
 
-    observer: Model
-    gain: Tensor
-    integral_gain: Tensor
-    band: Tensor
     span: Tensor
-    direction: Tensor  # (1,) sign of the MV's effect on the controlled variable
-    least: Tensor  # (1,) [cv] a reach narrower than this tells nothing but the models' errors
-    ends: Tensor  # (2,) least and greatest MV
+    band: Tensor
+    least: Tensor  # (1,) share of the set point's range below which a reach is nothing but the models' errors
 
-    def __init__(self, signals: LawSignals, forward: Model, observer: Model, params: Params) -> None:
+    def __init__(self, signals: LawSignals, forward: Model, observer: Model, params: Params, sections: int = 1) -> None:
         super().__init__(signals, params.mv_rate)
         names = [s.name for s in signals.pv]
         if params.observed is not None and params.observed not in names:
             raise LawError(f"observed is {params.observed!r}; the process variables are {', '.join(names)}")
-        self.observer = observer
+        self.params = params
         self.observed = len(names) - 1 if params.observed is None else names.index(params.observed)
-        self.n_pv = len(names)
-        self.register_buffer("gain", _column(params.observer_gain))
-        self.register_buffer("integral_gain", _column(params.integral_gain))
-        self.register_buffer("band", _column(params.band))
-        self.register_buffer("span", self.high - self.low)
-        self.register_buffer("ends", torch.cat([self.low, self.high]))
-        self.register_buffer("direction", _column(_direction(forward, signals)))
-        self.register_buffer("least", _column(1e-3 * (signals.sp[0].high - signals.sp[0].low)))
-        self.n_state = self.n_pv + 3  # started, x(k-1), d, I
+        self.n_pv = n = len(names)
+        self.n_state = n + 3  # started, x(k-1), d, I
         self.info = ("sp_requested", "sp_min", "sp_max", "disturbance", "integral")
+        self.rising = _rising(forward, signals)
+        self.register_buffer("span", self.high - self.low)
+        self.register_buffer("band", _column(params.band))
+        self.register_buffer("least", 1e-3 * (signals.sp[0].high - signals.sp[0].low) / self.span)
+        grid = self.low + self.span * torch.linspace(0, 1, sections + 1, dtype=torch.float64)
+        layout = Layout(n_z=2 * n + 5, n=n, first=1, second=n + 3, mv=2 * n + 3)
+        self.models = Pair(observer, forward, grid, layout, self._combine)
+
+    def _combine(self, f: Tensor, g: Tensor, z: Tensor) -> Tensor:
+        """All that a step needs of the one-step model f at x(k-1) and the forward model g at x(k), linear in both.
+
+        f and g stand for [mv_applied, grid], z is [state, pv, mv_applied, sp].
+        """
+        _, _, d, integral, pv, _, sp = torch.split(z, [1, self.n_pv, 1, 1, self.n_pv, 1, 1], dim=-1)
+        surprise = pv[..., self.observed : self.observed + 1] - f[..., :1]
+        w_min, w_max = (g[..., 1:2], g[..., -1:]) if self.rising else (g[..., -1:], g[..., 1:2])
+        error = sp - pv[..., :1]
+        rows = [
+            (1 - self.params.observer_gain) * d,
+            self.params.observer_gain * surprise,
+            (f[..., -1:] - f[..., 1:2]) / self.span,
+            w_min,
+            w_max,
+            (w_max - w_min) / self.span,
+            sp + integral,
+            error,
+            integral,
+            integral + self.params.integral_gain * error,
+            g[..., 1:],
+        ]
+        return torch.cat(rows, dim=-1)
 
     @abstractmethod
-    def invert(self, pv: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(v, w within reach, least and greatest reachable w), each (..., 1), for a request w (..., 1).
-
-        v goes on beyond the MV's range, at the slope of the reach, for a request beyond it.
-        """
+    def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
+        """The MV v (..., 1) for a request w (..., 1) within reach, given g (..., n_grid) over the grid."""
 
     def forward(
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
-        disturbance = self._disturbance(pv, mv_applied, state)
-        integral = state[..., -1:]
-        v, w, w_min, w_max = self.invert(pv, sp + integral)
-        wanted = v - disturbance
-        mv = self.limited(wanted, mv_applied)
-        error = sp - pv[..., :1]
-        free = (mv == wanted).to(error.dtype) * (error.abs() < self.band).to(error.dtype)
-        # The integral takes what the observer leaves: no more than the band in which it acts.
-        integral_next = torch.minimum(
-            torch.maximum(integral + self.integral_gain * error * free, -self.band), self.band
-        )
-        state_next = torch.cat([torch.ones_like(error), pv, disturbance, integral_next], dim=-1)
-        return mv, state_next, torch.cat([w, w_min, w_max, disturbance, integral], dim=-1)
-
-    def within_reach(self, w: Tensor, at_low: Tensor, at_high: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(w within reach, [mv] to go on beyond the MV's range, least and greatest reachable w), each (..., 1).
-
-        ``at_low`` and ``at_high`` are the forward model's answers to the ends of the MV's range. Where the
-        plant hardly answers, their difference is the model's error and may have the wrong sign: the push
-        takes the sign from the plant as a whole, or the loop would lock at the wrong end.
-        """
-        w_min, w_max = torch.minimum(at_low, at_high), torch.maximum(at_low, at_high)
-        within = torch.minimum(torch.maximum(w, w_min), w_max)
-        push = (w - within) * self.direction * self.span / torch.maximum(w_max - w_min, self.least)
-        return within, push, w_min, w_max
-
-    def _disturbance(self, pv: Tensor, mv_applied: Tensor, state: Tensor) -> Tensor:
-        """d(k) [mv], shape (..., 1); zero at the first step."""
-        past, d = state[..., 1 : 1 + self.n_pv], state[..., 1 + self.n_pv : 2 + self.n_pv]
-        ends = self.ends.expand(*past.shape[:-1], 2)
-        rows = self.observer(_at(past, torch.cat([mv_applied, ends], dim=-1))).squeeze(-1)
-        slope = (rows[..., 2:3] - rows[..., 1:2]) / self.span
-        surprise = pv[..., self.observed : self.observed + 1] - rows[..., 0:1]
-        found = d + self.gain * (surprise / slope - d)
+        found = self.models(torch.cat([state, pv, mv_applied, sp], dim=-1))
+        parts = torch.split(found, [1] * 10 + [found.shape[-1] - 10], dim=-1)
+        kept, surprise, slope, w_min, w_max, width, request, error, integral, moved, g = parts
         # More than the whole actuator can never be acted on, and a bad sample must not be remembered for long.
-        found = torch.minimum(torch.maximum(found, -self.span), self.span)
-        return torch.where(state[..., :1] > 0, found, torch.zeros_like(found))
+        disturbance = torch.minimum(torch.maximum(kept + surprise / slope, -self.span), self.span)
+        disturbance = torch.where(state[..., :1] > 0, disturbance, torch.zeros_like(disturbance))
+        within = torch.minimum(torch.maximum(request, w_min), w_max)
+        # Where the plant hardly answers, the reach is the model's error and may have the wrong sign: the way to
+        # go on comes from the plant as a whole, or the loop would lock at the wrong end.
+        beyond = (request - within if self.rising else within - request) / torch.maximum(width, self.least)
+        wanted = self.invert(pv, within, g) + beyond - disturbance
+        mv = self.limited(wanted, mv_applied)
+        free = (mv == wanted) & (error.abs() < self.band)
+        # The integral takes what the observer leaves: no more than the band in which it acts.
+        integral_next = torch.where(free, torch.minimum(torch.maximum(moved, -self.band), self.band), integral)
+        state_next = torch.cat([torch.ones_like(error), pv, disturbance, integral_next], dim=-1)
+        return mv, state_next, torch.cat([within, w_min, w_max, disturbance, integral], dim=-1)
 
 
 class InverseDob(ObserverLaw):
@@ -169,14 +160,11 @@ class InverseDob(ObserverLaw):
     name: ClassVar[str] = "inverse_dob"
     title: ClassVar[str] = "RBF inverse over several periods, disturbance observer, integral"
 
-    inverse: Model
-    model: Model
-
     def __init__(
         self, signals: LawSignals, inverse: Model, forward: Model, observer: Model, params: ObserverLaw.Params
     ) -> None:
         super().__init__(signals, forward, observer, params)
-        self.inverse, self.model = inverse, forward
+        self.inverse = inverse
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
@@ -188,36 +176,35 @@ class InverseDob(ObserverLaw):
         )
         return cls(signals, inverse, forward, observer, params)
 
-    def invert(self, pv: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
         """As in ObserverLaw."""
-        ends = self.model(_at(pv, self.ends.expand(*pv.shape[:-1], 2))).squeeze(-1)
-        within, push, w_min, w_max = self.within_reach(w, ends[..., 0:1], ends[..., 1:2])
-        return self.inverse(torch.cat([pv, within], dim=-1)) + push, within, w_min, w_max
+        v: Tensor = self.inverse(torch.cat([pv, w], dim=-1))
+        return v
 
 
 class ForwardDob(ObserverLaw):
     """The form with a forward model g over h periods, inverted at every sample by sectioning.
 
-    The MV's range is cut into ``SECTIONS`` equal parts, the one in which g crosses w is cut again,
-    ``ROUNDS`` times in all (so many bisections at once), and the crossing taken on the chord of the
-    last part. g must be monotone in the MV. Beyond reach v goes on at the slope of the whole range.
+    The MV's range is cut into ``SECTIONS`` equal parts, the one in which g crosses w is cut again
+    (so many bisections at once), and the crossing taken on the chord of the last part. g must be
+    monotone in the MV. Beyond reach v goes on at the slope of the whole range.
     """
 
     name: ClassVar[str] = "forward_dob"
     title: ClassVar[str] = "Forward network inverted online, disturbance observer, integral"
     SECTIONS: ClassVar[int] = 16
-    ROUNDS: ClassVar[int] = 2
 
-    model: Model
-    cuts: Tensor  # (SECTIONS + 1,) 0 .. 1
-    share: Tensor  # (1,) 1/SECTIONS
+    cuts: Tensor  # (SECTIONS + 1,) [mv] cuts of one part, from its start
+    part: Tensor  # (1,) [mv] width of one part of the range
+    chord: Tensor  # (1,) [mv] width of one part of a part
     flat: Tensor  # (1,) [cv] a rise below which a chord has no slope
 
     def __init__(self, signals: LawSignals, model: Model, observer: Model, params: ObserverLaw.Params) -> None:
-        super().__init__(signals, model, observer, params)
+        super().__init__(signals, model, observer, params, sections=self.SECTIONS)
         self.model = model
-        self.register_buffer("cuts", torch.linspace(0.0, 1.0, self.SECTIONS + 1, dtype=torch.float64))
-        self.register_buffer("share", _column(1.0 / self.SECTIONS))
+        self.register_buffer("part", self.span / self.SECTIONS)
+        self.register_buffer("chord", self.part / self.SECTIONS)
+        self.register_buffer("cuts", self.part * torch.linspace(0, 1, self.SECTIONS + 1, dtype=torch.float64))
         self.register_buffer("flat", _column(1e-12))
 
     @classmethod
@@ -228,19 +215,22 @@ class ForwardDob(ObserverLaw):
         forward, observer = (require_part(models, p, cls.name, n, 1) for p in ("forward", "observer"))
         return cls(signals, forward, observer, params)
 
-    def invert(self, pv: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
         """As in ObserverLaw."""
-        start, width = self.low, self.span
-        for i in range(self.ROUNDS):
-            g = self.model(_at(pv, (start + width * self.cuts).expand(*pv.shape[:-1], self.SECTIONS + 1))).squeeze(-1)
-            if i == 0:
-                within, push, w_min, w_max = self.within_reach(w, g[..., 0:1], g[..., -1:])
-            # Inner cuts that the crossing lies beyond.
-            beyond = ((within - g[..., 1:-1]) * self.direction > 0).to(g.dtype).sum(dim=-1, keepdim=True)
-            width = width * self.share
-            start = start + width * beyond
-        ends = self.model(_at(pv, torch.cat([start, start + width], dim=-1))).squeeze(-1)
-        rise = (ends[..., 1:2] - ends[..., 0:1]) * self.direction
-        chord = (within - ends[..., 0:1]) * self.direction / torch.maximum(rise, self.flat)
-        chord = torch.minimum(torch.maximum(chord, self.cuts[:1]), self.cuts[-1:])
-        return start + width * chord + push, within, w_min, w_max
+        start = self.low + self.part * self._before(w, g)
+        g = candidates(self.model, pv, start + self.cuts)
+        inside = self._before(w, g)
+        # The chord of the part in which the crossing lies: its ends are the two cuts around it.
+        at = start + self.chord * inside
+        ends = candidates(self.model, pv, torch.cat([at, at + self.chord], dim=-1))
+        rise = ends[..., 1:] - ends[..., :1]
+        flat = self.flat if self.rising else -self.flat
+        steep = torch.maximum(rise, flat) if self.rising else torch.minimum(rise, flat)
+        share = ((w - ends[..., :1]) / steep).clamp(0, 1)
+        return at + self.chord * share
+
+    def _before(self, w: Tensor, g: Tensor) -> Tensor:
+        """Number (..., 1) of inner cuts before the crossing of g (..., SECTIONS + 1) with w."""
+        inner = g[..., 1:-1]
+        before = inner < w if self.rising else inner > w
+        return before.to(w.dtype).sum(dim=-1, keepdim=True)
