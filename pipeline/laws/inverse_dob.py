@@ -101,11 +101,12 @@ class ObserverLaw(ControlLaw):
 
         f and g stand for [mv_applied, grid], z is [state, pv, mv_applied, sp].
         """
-        _, _, d, integral, pv, _, sp = torch.split(z, [1, self.n_pv, 1, 1, self.n_pv, 1, 1], dim=-1)
+        started, _, d, integral, pv, _, sp = torch.split(z, [1, self.n_pv, 1, 1, self.n_pv, 1, 1], dim=-1)
         surprise = pv[..., self.observed : self.observed + 1] - f[..., :1]
         w_min, w_max = (g[..., 1:2], g[..., -1:]) if self.rising else (g[..., -1:], g[..., 1:2])
         error = sp - pv[..., :1]
         rows = [
+            started,
             (1 - self.params.observer_gain) * d,
             self.params.observer_gain * surprise,
             (f[..., -1:] - f[..., 1:2]) / self.span,
@@ -129,11 +130,11 @@ class ObserverLaw(ControlLaw):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
         found = self.models(torch.cat([state, pv, mv_applied, sp], dim=-1))
-        parts = torch.split(found, [1] * 10 + [found.shape[-1] - 10], dim=-1)
-        kept, surprise, slope, w_min, w_max, width, request, error, integral, moved, g = parts
+        parts = torch.split(found, [1] * 11 + [found.shape[-1] - 11], dim=-1)
+        started, kept, surprise, slope, w_min, w_max, width, request, error, integral, moved, g = parts
         # More than the whole actuator can never be acted on, and a bad sample must not be remembered for long.
         disturbance = torch.minimum(torch.maximum(kept + surprise / slope, -self.span), self.span)
-        disturbance = torch.where(state[..., :1] > 0, disturbance, torch.zeros_like(disturbance))
+        disturbance = started * disturbance
         within = torch.minimum(torch.maximum(request, w_min), w_max)
         # Where the plant hardly answers, the reach is the model's error and may have the wrong sign: the way to
         # go on comes from the plant as a whole, or the loop would lock at the wrong end.

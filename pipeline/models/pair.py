@@ -77,56 +77,63 @@ def _alike(first: MLP, second: MLP) -> bool:
     return same and inside and not first.bounded and not second.bounded
 
 
+# tanh(SATURATED) is 1 to the last bit: a hidden unit that carries the biases, so that no node adds them.
+SATURATED = 30.0
+
+
 class _Fused(nn.Module):
     """The products; every buffer is made once from the nets' weights, in float64."""
 
-    into: Tensor  # (n_z, 2 K H) of the first layer
-    offset: Tensor  # (2 K H,)
-    out: Tensor  # (2 K H, n_out) of the last layer, combined
-    past: Tensor  # (n_z, n_out) what z gives directly
-    bias: Tensor  # (n_out,)
+    one: Tensor  # (1,)
+    into: Tensor  # (n_z + 1, 2 K (H + 1)) of the first layer
+    out: Tensor  # (2 K (H + 1) + n_z + 1, n_out) of the last layer and of z itself, combined
 
     @torch.no_grad()
     def __init__(self, nets: tuple[MLP, MLP], grid: Tensor, at: Layout, combine: Combine) -> None:
         super().__init__()
         k, h, h_last = len(grid) + 1, nets[0].hidden[0], nets[0].hidden[-1]
-        self.shape = (2, k, h)
+        self.shape = (2, k, h + 1)
         layers = [_scaled_layers(net) for net in nets]
-        into = torch.zeros(at.n_z, 2, k, h, dtype=torch.float64)
-        offset = torch.zeros(2, k, h, dtype=torch.float64)
-        out = torch.zeros(2, k, h_last, 2, k, dtype=torch.float64)
-        residual = torch.zeros(at.n_z, 2, k, dtype=torch.float64)
-        bias = torch.zeros(2, k, dtype=torch.float64)
+        self.depth = len(layers[0]) - 1
+        into = torch.zeros(at.n_z + 1, 2, k, h + 1, dtype=torch.float64)
+        into[-1, :, :, -1] = SATURATED
+        out = torch.zeros(2, k, h_last + 1, 2, k, dtype=torch.float64)
+        direct = torch.zeros(at.n_z + 1, 2, k, dtype=torch.float64)
         for i, (net, start) in enumerate(zip(nets, (at.first, at.second), strict=True)):
-            weight, b = layers[i][0]
-            into[start : start + at.n, i] = weight[: at.n, None, :]
-            into[at.mv, i, 0] = weight[at.n]
-            offset[i] = b
-            offset[i, 1:] += grid[:, None] * weight[at.n]
-            weight, b = layers[i][-1]
+            weight, bias = layers[i][0]
+            into[start : start + at.n, i, :, :-1] = weight[: at.n, None, :]
+            into[at.mv, i, 0, :-1] = weight[at.n]
+            into[-1, i, :, :-1] = bias
+            into[-1, i, 1:, :-1] += grid[:, None] * weight[at.n]
+            weight, bias = layers[i][-1]
             for j in range(k):
-                out[i, j, :, i, j] = weight[:, 0]
-            bias[i] = b
+                out[i, j, :-1, i, j], out[i, j, -1, i, j] = weight[:, 0], bias[0]
             for column in net.residual:
-                residual[start + column, i] = 1.0
+                direct[start + column, i] = 1.0
         eye = torch.eye(2 * k + at.n_z, dtype=torch.float64)
         combined = combine(eye[:, :k], eye[:, k : 2 * k], eye[:, 2 * k :])
-        of_models, of_z = combined[: 2 * k], combined[2 * k :]
-        self.register_buffer("into", into.reshape(at.n_z, -1))
-        self.register_buffer("offset", offset.reshape(-1))
-        self.register_buffer("out", out.reshape(2 * k * h_last, 2 * k) @ of_models)
-        self.register_buffer("past", residual.reshape(at.n_z, 2 * k) @ of_models + of_z)
-        self.register_buffer("bias", bias.reshape(-1) @ of_models)
-        self.depth = len(layers[0]) - 1
+        of_models = combined[: 2 * k]
+        of_z = direct.reshape(at.n_z + 1, 2 * k) @ of_models
+        of_z[:-1] += combined[2 * k :]
+        self.register_buffer("one", torch.ones(1, dtype=torch.float64))
+        self.register_buffer("into", into.reshape(at.n_z + 1, -1))
+        self.register_buffer("out", torch.cat([out.reshape(-1, 2 * k) @ of_models, of_z]))
         for i in range(1, self.depth):
-            self.register_buffer(f"weight{i}", torch.stack([rows[i][0] for rows in layers]))
-            self.register_buffer(f"bias{i}", torch.stack([rows[i][1] for rows in layers]).unsqueeze(-2))
+            self.register_buffer(f"hidden{i}", torch.stack([_with_bias_unit(*rows[i]) for rows in layers]))
 
     def forward(self, z: Tensor) -> Tensor:
-        a = torch.tanh(z @ self.into + self.offset).reshape(*z.shape[:-1], *self.shape)
+        z = torch.cat([z, self.one.expand(*z.shape[:-1], 1)], dim=-1)
+        a = torch.tanh(z @ self.into).reshape(*z.shape[:-1], *self.shape)
         for i in range(1, self.depth):
-            a = torch.tanh(a @ getattr(self, f"weight{i}") + getattr(self, f"bias{i}"))
-        return a.reshape(*z.shape[:-1], -1) @ self.out + (z @ self.past + self.bias)
+            a = torch.tanh(a @ getattr(self, f"hidden{i}"))
+        return torch.cat([a.reshape(*z.shape[:-1], -1), z], dim=-1) @ self.out
+
+
+def _with_bias_unit(weight: Tensor, bias: Tensor) -> Tensor:
+    """The layer (H, H') with its bias as the weights of one more unit, which hands itself on."""
+    full = torch.zeros(weight.shape[0] + 1, weight.shape[1] + 1, dtype=torch.float64)
+    full[:-1, :-1], full[-1, :-1], full[-1, -1] = weight, bias, SATURATED
+    return full
 
 
 def _scaled_layers(net: MLP) -> list[tuple[Tensor, Tensor]]:
