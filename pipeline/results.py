@@ -7,17 +7,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from pipeline.errors import PipelineError
 
 Validation = Mapping[str, Any]
+WIDTH = 120
 
 
 def show_results(artifacts: Path, console: Console | None = None) -> None:
     """Print a table for each artifacts/<case>/validation.json; raises PipelineError where there is none."""
     console = console or Console()
+    if not console.is_terminal:
+        # A log has no width of its own; the table is not worth cutting for one.
+        console = Console(file=console.file, width=WIDTH)
     files = sorted(artifacts.glob("*/validation.json"))
     if not files:
         raise PipelineError(f"{artifacts} holds no validation.json yet; run the pipeline first: make run")
@@ -36,12 +41,13 @@ def show_results(artifacts: Path, console: Console | None = None) -> None:
 def _table(validation: Validation, folder: Path) -> Table:
     scenarios, bounds = validation["scenarios"], validation.get("bounds", {})
     names = [name for name in scenarios if not name.endswith("_noise")]
-    table = Table(title=f"{validation['case']}: mean absolute error, median over data seeds", title_justify="left")
-    table.add_column("law")
+    title = f"{validation['case']}: mean absolute error, median over data seeds; held_out / NMPC: the bound is 1"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE)
+    table.add_column("law", no_wrap=True)
     for name in names:
-        table.add_column(name, justify="right")
-    table.add_column("held_out / NMPC", justify="right")
-    table.add_column("size", justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("held_out / NMPC", justify="right", no_wrap=True)
+    table.add_column("size", justify="right", no_wrap=True)
     laws = sorted({law for name in names for law in scenarios[name]}, key=lambda law: _sort_key(scenarios, names, law))
     for law in laws:
         figures = [scenarios[name].get(law, {}).get("mae") for name in names]
@@ -67,4 +73,4 @@ def _ratio(scenarios: Validation, bounds: Validation, law: str) -> str:
 
 
 def _figure(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}" if value >= 1e-3 else f"{value:.1e}"
+    return "-" if value is None else f"{value:.4f}" if value >= 1e-3 else f"{value:.0e}"

@@ -143,6 +143,8 @@ class ThiosulfateCstrCase(Case):
         Requirement(None, "held_out", "mae", 1.20, times="nmpc"),
         Requirement(None, "sp_a", "max_asse", 1e-3),
         Requirement(None, "sp_b", "max_asse", 1e-3),
+        Requirement(None, "held_out", "masse", 1e-3),
+        Requirement(None, "held_out", "max_asse", 1e-3),
         Requirement(None, "tin", "max_asse", 1e-3),
         Requirement(None, "ua", "max_asse", 1e-3),
         Requirement(None, "ua_gradual", "max_asse", 1e-3),
