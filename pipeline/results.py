@@ -33,7 +33,7 @@ def show_results(artifacts: Path, console: Console | None = None) -> None:
         except (OSError, ValueError, KeyError, AttributeError) as error:
             raise PipelineError(f"{path} cannot be read ({error!r}); run `dvc repro`") from error
         console.print(f"report     {path.parent / 'report.html'} (and .md, figures/, validation.json)")
-        console.print(f"try one    python -m pipeline simulate {path.parent / '<law>.onnx'} --scenario sp_b")
+        console.print(f"try one    python -m pipeline simulate {path.parent / '<law>.onnx'}")
         console.print(f"read one   python -m serving inspect {path.parent / '<law>.onnx'}")
     console.print("registry   make registry, then /#/models in the browser")
 

@@ -72,7 +72,8 @@ class StaticPart(Part):
         if self.task == "inverse":
             return inverse_pairs(record, self.horizon)
         names = {s.name: i for i, s in enumerate(plant.pv_signals)}
-        return forward_pairs(record, self.horizon, choose(names, self.target, "process variable", "target"))
+        target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
+        return forward_pairs(record, self.horizon, target)
 
     def limits(self, plant: Plant) -> tuple[float, float] | None:
         """Range of an inverse's output, the MV's; a forward model's is not limited."""

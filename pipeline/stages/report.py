@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from pipeline.bounds import load_bounds
+from pipeline.bounds import bounds_path, load_bounds
 from pipeline.cases import CASES
 from pipeline.command import run_stage
 from pipeline.params import CaseParams, choose, parse, read_section
@@ -17,7 +17,11 @@ def report(name: str) -> None:
     """Write artifacts/<case>/{validation.json,report.html,report.md,figures/} from work/<case>."""
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
     case = choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
-    evidence = Evidence.load(case, load_bounds(case), WORK / name)
+    # A new case has no bounds until the oracle has run; stale ones are an error, never shown.
+    bounds = load_bounds(case) if bounds_path(case).exists() else {}
+    if not bounds:
+        print(f"report {name}: no bounds yet; `python -m pipeline.oracle {name}` computes them", file=sys.stderr)
+    evidence = Evidence.load(case, bounds, WORK / name)
     for path in write_report(evidence, WORK / name / "models", ARTIFACTS / name):
         print(path)
 

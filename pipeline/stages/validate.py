@@ -27,7 +27,6 @@ from serving.controller import Controller
 from serving.errors import LoopwrightError
 
 Metrics = dict[str, float]
-NOT_SCORED = "held_out"  # of variants, which are there for the paper's tables
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Trial:
     form: str
     seed: int
     metrics: dict[str, Metrics]
-    sequences: dict[str, Metrics]  # of a test with several sequences, by their seed
+    sequences: dict[str, dict[str, Metrics]]  # of the tests with several sequences, by their seeds
     development: float  # mean MAE over the development sequences
     lock_ups: int
     curves: dict[str, Trajectory]
@@ -75,12 +74,12 @@ def _trial(case: Case, law: str, noise_seed: int, item: tuple[str, int]) -> Tria
     controller = Controller(controller_file(case.name, law, form, seed))
     loop = partial(_loop, controller, case)
     metrics: dict[str, Metrics] = {}
-    sequences: dict[str, Metrics] = {}
+    sequences: dict[str, dict[str, Metrics]] = {}
     curves: dict[str, Trajectory] = {}
     lock_ups = 0
     for name, tests in case.scenarios().items():
-        if form != BASE and name == NOT_SCORED:
-            continue
+        if form != BASE and len(tests) > 1:
+            continue  # variants are there for the paper's tables, which have no random sequences
         for suffix, noise in (("", None), (NOISE_SUFFIX, case.noise_std)):
             if suffix and form != BASE:
                 continue
@@ -90,7 +89,7 @@ def _trial(case: Case, law: str, noise_seed: int, item: tuple[str, int]) -> Tria
             curves[name + suffix] = loops[0]
             lock_ups += sum(_stuck(case, test, found) for test, found in zip(tests, loops, strict=True))
             if len(tests) > 1 and not suffix:
-                sequences |= {str(test.seed): row for test, row in zip(tests, rows, strict=True)}
+                sequences[name] = {str(test.seed): row for test, row in zip(tests, rows, strict=True)}
     development = []
     if form == BASE:
         for test in case.development():
@@ -102,7 +101,9 @@ def _trial(case: Case, law: str, noise_seed: int, item: tuple[str, int]) -> Tria
             (test,) = case.scenarios()[figure.scenario]
             curves[f"{figure.scenario}_hold{figure.hold}"] = loop(test.with_hold(figure.hold), None, 0)
     mean = statistics.fmean(development) if development else float("nan")
-    return Trial(form, seed, metrics, sequences, mean, lock_ups, curves, _step_us(controller, curves["sp_a"]))
+    return Trial(
+        form, seed, metrics, sequences, mean, lock_ups, curves, _step_us(controller, next(iter(curves.values())))
+    )
 
 
 def _loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
@@ -164,9 +165,8 @@ def _summary(params: ControllerParams, base: list[Trial], trials: list[Trial], s
         "scenarios": {name: _over_seeds({t.seed: t.metrics[name] for t in base}) for name in clean},
         "noise": {name: _over_seeds({t.seed: t.metrics[name + NOISE_SUFFIX] for t in base}) for name in clean},
         "sequences": {
-            NOT_SCORED: {
-                seed: _over_seeds({t.seed: t.sequences[seed] for t in base})["median"] for seed in base[0].sequences
-            }
+            name: {seed: _over_seeds({t.seed: t.sequences[name][seed] for t in base})["median"] for seed in rows}
+            for name, rows in base[0].sequences.items()
         },
         "variants": {
             form: {name: _over_seeds({t.seed: t.metrics[name] for t in rows}) for name in rows[0].metrics}
