@@ -148,8 +148,8 @@ def _colour(law: str) -> str:
 
 
 def _overview(evidence: Evidence, law: str) -> Canvas | None:
-    """A law beside the PID on the first held-out sequence, with the figures over all of them."""
-    scenario = "held_out"
+    """A law beside the PID on the test that weighs most in the gate (its first sequence), with the figures over all."""
+    scenario = max(evidence.case.gate, key=lambda name: evidence.case.gate[name])
     own = evidence.loop(Curve(law), scenario)
     if own is None:
         return None
