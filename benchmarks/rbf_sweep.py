@@ -19,8 +19,8 @@ from io import StringIO
 from multiprocessing import get_context
 from typing import Any
 
+import _straightforward as straightforward
 import numpy as np
-import straightforward
 
 LIMITS = (0.0, 500.0)
 SHARE, NEAR, AGREE = 1 / 3, 2, 0.01

@@ -19,6 +19,7 @@ from pipeline.oracle import PerfectNmpc
 from serving import Controller, LoopwrightError
 from serving.bench import bench
 
+RBF_LAWS = {"inc", "incad", "incadec", "inverse_dob"}
 ALLOWED_HOT_US, ALLOWED_LOOP_US, REQUIRED_RATIO = 40.0, 80.0, 100.0
 
 
@@ -63,7 +64,8 @@ def main() -> int:
         hot, warmed, cold = bench(c, steps=options.steps, loop_steps=options.loop_steps)
         ratio = nmpc.get(c.manifest.case, np.nan) / hot.p50
         verdict = []
-        if hot.p50 > ALLOWED_HOT_US:
+        # The limit is for the laws that hold an RBF network alone; a law that searches online takes longer.
+        if c.manifest.law in RBF_LAWS and hot.p50 > ALLOWED_HOT_US:
             verdict.append(f"hot over {ALLOWED_HOT_US:g}")
         if warmed.p50 > ALLOWED_LOOP_US:
             verdict.append(f"loop over {ALLOWED_LOOP_US:g}")

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             show_results(options.artifacts)
         else:
             _simulate(options)
-    except LoopwrightError as error:
+    except (LoopwrightError, OSError) as error:
         print(f"python -m pipeline {options.command}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -75,7 +75,7 @@ def _simulate_options(parser: argparse.ArgumentParser) -> None:
         help="MANUAL between two times")  # fmt: skip
     add("--duration", metavar="S", type=_positive, help="length of the run")
     add("--speed", metavar="X", type=_positive, help="times real time, 1 is real time (default: as fast as possible)")
-    add("--seed", metavar="N", type=int, default=0, help="of the noise (0)")
+    add("--seed", metavar="N", type=_seed, default=0, help="of the noise (0)")
     add("--picture", metavar="FILE", type=Path, help="where the picture goes (<law>-simulation.png)")
     add("--csv", metavar="FILE", type=Path, help="write every sample there")
 
@@ -191,6 +191,12 @@ def _number(text: str) -> float:
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
     return value
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is no seed; give a whole number of at least 0")
+    return int(text)
 
 
 def _positive(text: str) -> float:

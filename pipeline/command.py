@@ -16,7 +16,7 @@ def run_stage(stage: Callable[[str], None], argv: Sequence[str], what: str) -> i
         return 2
     try:
         stage(argv[1])
-    except LoopwrightError as error:
+    except (LoopwrightError, OSError) as error:
         print(f"{program} {argv[1]}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     return 0

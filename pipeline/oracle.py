@@ -37,6 +37,7 @@ from pipeline.horizon import Horizon, Plan
 from pipeline.metrics import closed_loop_metrics
 from pipeline.plants.base import Plant
 from pipeline.simulate import noise_draws
+from serving.errors import LoopwrightError
 
 __all__ = ["Job", "PerfectNmpc", "compute", "load_bounds", "main", "run_nmpc", "run_offline", "search"]
 
@@ -207,8 +208,12 @@ def main(arguments: list[str] | None = None) -> int:
     unknown = sorted(set(names) - set(case.scenarios()))
     if unknown:
         parser.error(f"case {case.name!r} has no scenario {unknown[0]!r}; it has {', '.join(case.scenarios())}")
-    for line in compute(case, names, given.jobs):
-        print(line, flush=True)
+    try:
+        for line in compute(case, names, given.jobs):
+            print(line, flush=True)
+    except (LoopwrightError, OSError) as error:
+        print(f"python -m pipeline.oracle: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

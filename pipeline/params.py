@@ -37,6 +37,12 @@ def read_section(kind: str, name: str, path: Path = PARAMS_FILE) -> dict[str, An
     return entry
 
 
+def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
+    """What the section ``kind`` lists for ``case``: the values of ``field`` of its entries, in their order."""
+    tree = yaml.safe_load(path.read_text())
+    return tuple(str(e[field]) for e in (tree.get(kind) or {}).values() if e.get("case") == case)
+
+
 def _entry(tree: Mapping[str, Any], key: str, where: str) -> Any:
     if not isinstance(tree, dict) or key not in tree:
         raise ParamsError(f"{where} has no {key!r}{nearest(key, tree if isinstance(tree, dict) else ())}")

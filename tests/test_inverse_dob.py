@@ -138,10 +138,13 @@ def test_saturation_does_not_wind_up(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["inverse", "forward"])
 def test_manual_operation_is_no_disturbance(kind: str) -> None:
-    """The observer is fed the MV that the plant received, whatever the law had asked for."""
-    applied = np.where(np.arange(60) < 30, -0.5, np.nan)
-    _, _, infos = run(make(kind), np.full(60, 1.0), np.zeros(60), applied=applied)
+    """The observer is fed the MV that the plant received, whatever the law had asked for; the integral waits."""
+    applied = np.full(150, -0.5)
+    y_manual = -0.5 * B / (1 - A) / (1 - 0.7)  # where that MV leads: the set point lies within the band of it
+    _, _, infos = run(make(kind), np.full(150, y_manual + 0.02), np.zeros(150), applied=applied)
     assert np.abs(infos[:, 3]).max() < 1e-9
+    # 100 samples of an error of 0.02 would wind it up to its limit, 0.03; the law may ask for -0.5 in passing.
+    assert np.abs(infos[:, 4]).max() < 5e-4
 
 
 @pytest.mark.parametrize("kind", ["inverse", "forward"])

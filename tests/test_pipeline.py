@@ -87,7 +87,7 @@ def test_every_output_is_there(copy: Copy) -> None:
     artifacts = copy.path / "artifacts" / CASE
     for name in ("incad.onnx", "incad.json", "pid.onnx", "pid.json", "validation.json", "report.html", "report.md"):
         assert (artifacts / name).is_file(), name
-    assert (copy.path / "work" / "publish.json").is_file()
+    assert (copy.path / "published.json").is_file()
     assert "incad" in copy.run("python", "-m", "pipeline", "results")
     assert "perfect NMPC" in copy.run("python", "-m", "pipeline", "results")
 

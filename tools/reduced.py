@@ -22,7 +22,6 @@ SMALL: dict[str, Any] = {
     "partitions": 10,
     "sweep": [4, 8],
     "hidden": [6, 6],
-    "development_set_points": 3,
 }
 TRAINER = {"kind": "lm", "iterations": 15}
 

@@ -16,6 +16,9 @@ from pipeline.models.base import Model
 from pipeline.models.pair import Layout, Pair, candidates
 from pipeline.plants.base import Plant
 
+# Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
+FOLLOWED = 1e-3
+
 
 def _column(value: float) -> Tensor:
     return torch.tensor([value], dtype=torch.float64)
@@ -40,7 +43,7 @@ class ObserverLaw(ControlLaw):
 
         T_hat(k) = f(x(k-1), mv_applied) + b d(k-1),   b = [f(x(k-1), mv_max) - f(x(k-1), mv_min)] / range
         d(k)     = d(k-1) + L (T(k) - T_hat(k)) / b
-        I(k+1)   = I(k) + ki (w - y)   while the MV is not limited and |w - y| < band
+        I(k+1)   = I(k) + ki (w - y)   while |w - y| < band, the MV is not limited, and the last one was applied
 
     An exact inverse over one period puts a closed-loop eigenvalue on the sampled plant's zero, which
     may lie outside the unit circle; over several periods, applied anew at every sample, it does not.
@@ -86,14 +89,14 @@ class ObserverLaw(ControlLaw):
         self.params = params
         self.observed = len(names) - 1 if params.observed is None else names.index(params.observed)
         self.n_pv = n = len(names)
-        self.n_state = n + 3  # started, x(k-1), d, I
+        self.n_state = n + 4  # started, x(k-1), d, I, mv(k-1)
         self.info = ("sp_requested", "sp_min", "sp_max", "disturbance", "integral")
         self.rising = _rising(forward, signals)
         self.register_buffer("span", self.high - self.low)
         self.register_buffer("band", _column(params.band))
         self.register_buffer("least", 1e-3 * (signals.sp[0].high - signals.sp[0].low) / self.span)
         grid = self.low + self.span * torch.linspace(0, 1, sections + 1, dtype=torch.float64)
-        layout = Layout(n_z=2 * n + 5, n=n, first=1, second=n + 3, mv=2 * n + 3)
+        layout = Layout(n_z=2 * n + 6, n=n, first=1, second=n + 4, mv=2 * n + 4)
         self.models = Pair(observer, forward, grid, layout, self._combine)
 
     def _combine(self, f: Tensor, g: Tensor, z: Tensor) -> Tensor:
@@ -101,7 +104,8 @@ class ObserverLaw(ControlLaw):
 
         f and g stand for [mv_applied, grid], z is [state, pv, mv_applied, sp].
         """
-        started, _, d, integral, pv, _, sp = torch.split(z, [1, self.n_pv, 1, 1, self.n_pv, 1, 1], dim=-1)
+        sizes = [1, self.n_pv, 1, 1, 1, self.n_pv, 1, 1]
+        started, _, d, integral, last_mv, pv, mv_applied, sp = torch.split(z, sizes, dim=-1)
         surprise = pv[..., self.observed : self.observed + 1] - f[..., :1]
         w_min, w_max = (g[..., 1:2], g[..., -1:]) if self.rising else (g[..., -1:], g[..., 1:2])
         error = sp - pv[..., :1]
@@ -114,7 +118,8 @@ class ObserverLaw(ControlLaw):
             w_max,
             (w_max - w_min) / self.span,
             sp + integral,
-            error,
+            error / self.params.band,
+            (mv_applied - last_mv) / (FOLLOWED * self.span),
             integral,
             integral + self.params.integral_gain * error,
             g[..., 1:],
@@ -130,8 +135,8 @@ class ObserverLaw(ControlLaw):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
         found = self.models(torch.cat([state, pv, mv_applied, sp], dim=-1))
-        parts = torch.split(found, [1] * 11 + [found.shape[-1] - 11], dim=-1)
-        started, kept, surprise, slope, w_min, w_max, width, request, error, integral, moved, g = parts
+        parts = torch.split(found, [1, 1, 1, 1, 1, 1, 1, 1, 2, 1, 1, found.shape[-1] - 12], dim=-1)
+        started, kept, surprise, slope, w_min, w_max, width, request, acts, integral, moved, g = parts
         # More than the whole actuator can never be acted on, and a bad sample must not be remembered for long.
         disturbance = torch.minimum(torch.maximum(kept + surprise / slope, -self.span), self.span)
         disturbance = started * disturbance
@@ -141,10 +146,11 @@ class ObserverLaw(ControlLaw):
         beyond = (request - within if self.rising else within - request) / torch.maximum(width, self.least)
         wanted = self.invert(pv, within, g) + beyond - disturbance
         mv = self.limited(wanted, mv_applied)
-        free = (mv == wanted) & (error.abs() < self.band)
+        # Acting on an error that someone else's MV leaves would be winding up, in manual as at a limit.
+        free = (mv == wanted) & (acts.abs().amax(dim=-1, keepdim=True) < 1)
         # The integral takes what the observer leaves: no more than the band in which it acts.
         integral_next = torch.where(free, torch.minimum(torch.maximum(moved, -self.band), self.band), integral)
-        state_next = torch.cat([torch.ones_like(error), pv, disturbance, integral_next], dim=-1)
+        state_next = torch.cat([torch.ones_like(integral), pv, disturbance, integral_next, mv], dim=-1)
         return mv, state_next, torch.cat([within, w_min, w_max, disturbance, integral], dim=-1)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import statistics
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -75,6 +76,14 @@ class LawEvidence:
         found = self.metrics.get("lock_ups")
         return None if found is None else int(found)
 
+    @property
+    def development(self) -> float | None:
+        """Median MAE of the data seeds over the development sequences; None with a lock-up there, or unmeasured."""
+        found = self.metrics.get("development") or {}
+        if not found or self.metrics.get("development_lock_ups"):
+            return None
+        return statistics.median(float(v) for v in found.values())
+
     def variant_of(self, setting: Mapping[str, Any]) -> str | None:
         """Name of the variant with exactly this setting beside the shipped one; "" is the shipped law itself."""
         shipped = {k: float(v) if isinstance(v, int) else v for k, v in (self.metrics.get("setting") or {}).items()}
@@ -121,10 +130,22 @@ class Evidence:
     models: Mapping[str, Mapping[str, Any]]
 
     @classmethod
-    def load(cls, case: Case, bounds: Bounds, work: Path) -> Self:
-        """Everything under ``work`` = work/<case>; raises ReportError where no law was validated."""
+    def load(
+        cls,
+        case: Case,
+        bounds: Bounds,
+        work: Path,
+        laws: Collection[str] | None = None,
+        models_of: Collection[str] | None = None,
+    ) -> Self:
+        """What lies under ``work`` = work/<case>, of the named laws and model sets (None: all that lie there).
+
+        A law or set that params.yaml no longer lists leaves its folder behind; it is no evidence any more.
+        Raises ReportError where no law was validated.
+        """
         validation, models = work / "validation", work / "models"
         names = sorted(p.parent.name for p in validation.glob("*/metrics.json"))
+        names = [n for n in names if laws is None or n in laws]
         names.sort(key=lambda n: ORDER.index(n) if n in ORDER else len(ORDER))
         if not names:
             raise ReportError(f"{validation} holds no law's metrics.json; run `dvc repro`")
@@ -135,7 +156,11 @@ class Evidence:
                 n: LawEvidence(n, _read(validation / n / "metrics.json"), validation / n / "trajectories.npz")
                 for n in names
             },
-            {p.parent.name: _read(p) for p in sorted(models.glob("*/metrics.json"))},
+            {
+                p.parent.name: _read(p)
+                for p in sorted(models.glob("*/metrics.json"))
+                if models_of is None or p.parent.name in models_of
+            },
         )
 
     @cached_property
@@ -196,9 +221,14 @@ class Evidence:
 
     @cached_property
     def best(self) -> str | None:
-        """The law with the lowest gate score among those without a lock-up."""
-        scores = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
-        known = {n: s for n, s in scores.items() if s is not None}
+        """The law with the lowest error over the development sequences, no scored test asked.
+
+        A law that locked up on one of them is out. Where no development was measured: by the gate score.
+        """
+        errors = {n: law.development for n, law in self.laws.items()}
+        if all(error is None for error in errors.values()):
+            errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
+        known = {n: e for n, e in errors.items() if e is not None}
         return min(known, key=lambda n: known[n], default=None)
 
     def loop(self, curve: Curve, scenario: str, hold: int | None = None) -> Loop | None:

@@ -1,4 +1,4 @@
-"""Stage publish: ``python -m pipeline.stages.publish`` writes the store and work/publish.json."""
+"""Stage publish: ``python -m pipeline.stages.publish`` writes the store and published.json."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.errors import PipelineError
 from pipeline.tracking.publish import publish
 
-RECEIPT = Path("work") / "publish.json"
+RECEIPT = Path("published.json")
 
 
 def main() -> int:

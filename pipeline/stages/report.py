@@ -7,7 +7,7 @@ import sys
 from pipeline.bounds import bounds_path, load_bounds
 from pipeline.cases import CASES
 from pipeline.command import run_stage
-from pipeline.params import CaseParams, choose, parse, read_section
+from pipeline.params import CaseParams, choose, entries, parse, read_section
 from pipeline.report.evidence import Evidence
 from pipeline.report.page import write_report
 from pipeline.stages import ARTIFACTS, WORK
@@ -21,7 +21,8 @@ def report(name: str) -> None:
     bounds = load_bounds(case) if bounds_path(case).exists() else {}
     if not bounds:
         print(f"report {name}: no bounds yet; `python -m pipeline.oracle {name}` computes them", file=sys.stderr)
-    evidence = Evidence.load(case, bounds, WORK / name)
+    laws, models = entries("controllers", name, "law"), entries("models", name, "model")
+    evidence = Evidence.load(case, bounds, WORK / name, laws, models)
     for path in write_report(evidence, WORK / name / "models", ARTIFACTS / name):
         print(path)
 

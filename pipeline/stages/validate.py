@@ -38,7 +38,8 @@ class Trial:
     metrics: dict[str, Metrics]
     sequences: dict[str, dict[str, Metrics]]  # of the tests with several sequences, by their seeds
     development: float  # mean MAE over the development sequences
-    lock_ups: int
+    development_lock_ups: int
+    lock_ups: int  # in all closed loops, those of the development included
     curves: dict[str, Trajectory]
     step_us: dict[str, float]
 
@@ -56,8 +57,8 @@ def validate(name: str) -> None:
     work = [(form, seed) for form in (BASE, *params.variants) for seed in seeds]
     trials = parallel_map(partial(_trial, case, params.law, choices.noise_seed), work, f"validate {name}")
     base = [t for t in trials if t.form == BASE]
-    # A candidate that locks up anywhere is out, whatever its mean.
-    shipped = min(base, key=lambda t: (t.lock_ups, t.development))
+    # A candidate that locks up is out, whatever its mean; no scored test has a say.
+    shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))
     folder = validation_folder(params.case, params.law)
     shutil.rmtree(folder, ignore_errors=True)
     title = read_json(design_folder(params.case, params.law) / "metrics.json")["title"]
@@ -90,7 +91,7 @@ def _trial(case: Case, law: str, noise_seed: int, item: tuple[str, int]) -> Tria
             lock_ups += sum(_stuck(case, test, found) for test, found in zip(tests, loops, strict=True))
             if len(tests) > 1 and not suffix:
                 sequences[name] = {str(test.seed): row for test, row in zip(tests, rows, strict=True)}
-    development = []
+    development, scored = [], lock_ups
     if form == BASE:
         for test in case.development():
             found = loop(test, None, 0)
@@ -101,15 +102,17 @@ def _trial(case: Case, law: str, noise_seed: int, item: tuple[str, int]) -> Tria
             (test,) = case.scenarios()[figure.scenario]
             curves[f"{figure.scenario}_hold{figure.hold}"] = loop(test.with_hold(figure.hold), None, 0)
     mean = statistics.fmean(development) if development else float("nan")
-    return Trial(
-        form, seed, metrics, sequences, mean, lock_ups, curves, _step_us(controller, next(iter(curves.values())))
-    )
+    step_us = _step_us(controller, next(iter(curves.values())))
+    return Trial(form, seed, metrics, sequences, mean, lock_ups - scored, lock_ups, curves, step_us)
 
 
 def _loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
-    """One closed loop; a step that the controller refuses keeps the MV, as the real loop's HOLD does."""
+    """One closed loop, with one more entry of info: whether the controller refused the step.
+
+    The MV is then kept, as the real loop's HOLD keeps it.
+    """
     state = controller.cold_state()
-    no_info = np.full(len(controller.manifest.info), np.nan)
+    n_info = len(controller.manifest.info)
 
     def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, Array]:
         nonlocal state
@@ -117,8 +120,8 @@ def _loop(controller: Controller, case: Case, test: Scenario, noise: Array | Non
             mv, state, info = controller.step(sp=sp, pv=pv, mv_applied=mv_applied, state=state)
         except LoopwrightError:
             state = controller.cold_state()
-            return mv_applied, no_info
-        return mv, info
+            return mv_applied, np.append(np.zeros(n_info), 1.0)
+        return mv, np.append(info, 0.0)
 
     return simulate_closed(case.plant, step, test, noise=noise, seed=seed)
 
@@ -132,7 +135,7 @@ def _stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
     """Locked up at an end of the MV, or with a step that the controller refused."""
     mv = case.plant.mv_signals[0]
     stuck = locked_up(loop.sp[:, 0], loop.pv[:, 0], loop.mv[:, 0], test.hold, low=mv.low, high=mv.high)
-    return stuck or bool(np.isnan(loop.info).any())
+    return stuck or bool(loop.info[:, -1].any())
 
 
 def _mean(rows: Iterable[Metrics]) -> Metrics:
@@ -160,6 +163,7 @@ def _summary(params: ControllerParams, base: list[Trial], trials: list[Trial], s
         "seeds": [t.seed for t in base],
         "shipped_seed": shipped.seed,
         "lock_ups": sum(t.lock_ups for t in base),
+        "development_lock_ups": sum(t.development_lock_ups for t in base),
         "development": {str(t.seed): t.development for t in base},
         "step_us": shipped.step_us,
         "scenarios": {name: _over_seeds({t.seed: t.metrics[name] for t in base}) for name in clean},

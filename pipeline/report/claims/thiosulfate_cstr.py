@@ -84,15 +84,15 @@ def _with_back_calculation(row: PaperFigure, evidence: Evidence) -> str:
     return "" if value is None else f"; with back-calculation {value:.3g}"
 
 
-def _over_r(evidence: Evidence) -> dict[float, float]:
-    """MAE on SP-A of every r of INCAD that was run."""
+def _over_r(evidence: Evidence, scenario: str = "sp_a") -> dict[float, float]:
+    """MAE of every r of INCAD that was run."""
     law = evidence.laws.get("incad")
     if law is None:
         return {}
     shipped = (law.metrics.get("setting") or {}).get("r")
     settings = [parse_setting(name) for name in law.metrics.get("variants") or {}]
     values = {float(s["r"]) for s in settings if set(s) == {"r"}} | ({float(shipped)} if shipped else set())
-    found = {r: evidence.figure("incad", "sp_a", "mae", {"r": r}) for r in sorted(values)}
+    found = {r: evidence.figure("incad", scenario, "mae", {"r": r}) for r in sorted(values)}
     return {r: mae for r, mae in found.items() if mae is not None}
 
 
@@ -144,14 +144,19 @@ def _inc(evidence: Evidence) -> Verdict:
 
 
 def _minimum(evidence: Evidence) -> Verdict:
-    found = _over_r(evidence)
-    best = _best_r(evidence)
-    if best is None or len(found) < 3:
-        return Verdict("", "", "fewer than three values of r were run", None)
-    inside = min(found) < best[0] < max(found)
-    values = ", ".join(f"r = {r:g}: {mae:.3g}" for r, mae in found.items())
-    because = f"the minimum lies at r = {best[0]:g}" + ("" if inside else ", an end of what was tried")
-    return Verdict("", "", f"MAE on SP-A {values}", inside, because + "; the paper's at 2.5")
+    shown, reasons, holds = [], [], False
+    for scenario, title in (("sp_a", "SP-A"), ("sp_b", "SP-B")):
+        found = _over_r(evidence, scenario)
+        if len(found) < 3:
+            return Verdict("", "", "fewer than three values of r were run", None)
+        best = min(found, key=lambda r: found[r])
+        inside = min(found) < best < max(found)
+        holds = holds or inside
+        shown.append(f"MAE on {title} " + ", ".join(f"r = {r:g}: {mae:.3g}" for r, mae in found.items()))
+        reasons.append(
+            f"on {title} the minimum lies at r = {best:g}" + ("" if inside else ", an end of what was tried")
+        )
+    return Verdict("", "", "; ".join(shown), holds, "; ".join(reasons) + "; the paper's at 2.5")
 
 
 def _slow_pid(evidence: Evidence) -> Verdict:
@@ -232,8 +237,22 @@ def _step_time(evidence: Evidence) -> Verdict:
     if not times:
         return Verdict("controller step, median", limit, "measured by `make bench`", None)
     shown = ", ".join(f"{n} {t:.0f} us" for n, t in times.items())
-    slow = [n for n in ("inc", "incad", "incadec", "inverse_dob") if times.get(n, 0.0) > 40]
-    return Verdict("controller step, median", limit, shown, not slow)
+    rbf = [times[n] for n in ("inc", "incad", "incadec", "inverse_dob") if n in times]
+    return Verdict("controller step, median", limit, shown, max(rbf) <= 40 if rbf else None)
+
+
+def _faster_than_nmpc(evidence: Evidence) -> Verdict:
+    """The NMPC's time is stored with the bounds; `make bench` measures both in one run."""
+    what, limit = (
+        "perfect NMPC's median step over the controllers' (SP-A; the NMPC's as stored)",
+        "at least 100 for each",
+    )
+    nmpc = evidence.bound("sp_a", "step_ms_p50")
+    times = {n: law.metrics["step_us"]["p50"] for n, law in evidence.laws.items() if law.metrics.get("step_us")}
+    if nmpc is None or not times:
+        return Verdict(what, limit, "measured by `make bench`", None)
+    ratios = {n: 1e3 * nmpc / t for n, t in times.items()}
+    return Verdict(what, limit, ", ".join(f"{n} {r:.0f}" for n, r in ratios.items()), min(ratios.values()) >= 100)
 
 
 CLAIMS = Claims(
@@ -246,5 +265,5 @@ CLAIMS = Claims(
         "the PID is slow, or unstable when tuned faster": _slow_pid,
         "the error correction leaves no offset": _no_offset,
     },
-    acceptance=(_steady_states, _turning_points, _eigenvalues, _zero, _centres, _rmse, _step_time),
+    acceptance=(_steady_states, _turning_points, _eigenvalues, _zero, _centres, _rmse, _step_time, _faster_than_nmpc),
 )
