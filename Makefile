@@ -35,7 +35,7 @@ check: $(STAMP) ## the static part of make test
 	mypy
 	lint-imports
 
-registry: $(STAMP) ## open MLflow's UI on localhost:$(PORT) (publishes first what the store lacks)
+registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes first what the store lacks
 	python -m pipeline.tracking publish
 	python -m pipeline.tracking serve --port $(PORT)
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from typing import Any, TypeVar
 
 import joblib
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
+
+from pipeline.errors import PipelineError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -30,14 +32,12 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item], labe
     """
     work = list(items)
     address = os.environ.get("DASK_SCHEDULER_ADDRESS")
-    context: Any = nullcontext()
-    if address:
-        from distributed import Client
-
-        client = Client(address)
-        context = joblib.parallel_config(backend="dask", client=client)
-    jobs = min(len(work), os.cpu_count() or 1) if not address else -1
-    with context, progress_bar() as bar:
+    jobs = max(1, min(len(work), os.cpu_count() or 1))
+    with ExitStack() as stack:
+        if address:
+            stack.enter_context(joblib.parallel_config(backend="dask", client=stack.enter_context(_cluster(address))))
+            jobs = -1
+        bar = stack.enter_context(progress_bar())
         task = bar.add_task(label, total=len(work))
         results = []
         runner = joblib.Parallel(n_jobs=jobs, return_as="generator")
@@ -47,6 +47,17 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item], labe
     if not bar.console.is_terminal:
         bar.console.print(f"{label}: {len(work)} done")
     return results
+
+
+def _cluster(address: str) -> Any:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise PipelineError(
+            f"DASK_SCHEDULER_ADDRESS is {address}, which needs the package distributed: "
+            "pip install '.[cluster]', or unset it to use this machine's cores"
+        ) from None
+    return Client(address)
 
 
 def progress_bar() -> Progress:

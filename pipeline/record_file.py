@@ -92,7 +92,7 @@ class Table:
         return values
 
     def _missing(self, wanted: str) -> RecordError:
-        near = difflib.get_close_matches(wanted, self.header, n=1, cutoff=0.0)
+        near = difflib.get_close_matches(wanted, self.header, n=1, cutoff=0.6)
         nearest = f"; the nearest is {near[0]!r}" if near else ""
         return RecordError(
             f"{self.path}: column {wanted!r} is missing{nearest}; the file has {', '.join(map(repr, self.header))}"

@@ -1,5 +1,6 @@
 """params.yaml: what is read, and what every mistake in it says."""
 
+import runpy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,3 +114,10 @@ def test_the_shipped_file_is_read_whole(monkeypatch: pytest.MonkeyPatch) -> None
         assert (controller.case, controller.model) in models
         assert name == f"{controller.case}-{controller.law}"
     assert set(tree["cases"]) == set(CASES)
+
+
+def test_reduced_numbers_all_stand_in_the_shipped_file() -> None:
+    """A key that tools/reduced.py shrinks but no section has would leave the reduced run at full size."""
+    root = Path(__file__).parents[1]
+    text = (root / "params.yaml").read_text()
+    assert [key for key in runpy.run_path(str(root / "tools" / "reduced.py"))["SMALL"] if f"{key}:" not in text] == []
