@@ -16,7 +16,7 @@ def test_results_come_in_the_order_of_the_items() -> None:
 
 
 def test_an_error_of_one_piece_is_the_error_of_all() -> None:
-    with pytest.raises(ValueError, match="math domain error|expected a nonnegative input"):
+    with pytest.raises(ValueError, match=r"math domain error|nonnegative"):
         parallel_map(math.sqrt, [1.0, -1.0], "roots")
 
 
