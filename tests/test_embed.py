@@ -41,6 +41,14 @@ def test_both_examples_give_the_controllers_bits(make_law: object, name: str, tm
     assert np.isfinite(first.mv).all()
 
 
+SHIPPED = sorted((EXAMPLES.parents[1] / "artifacts").glob("*/*.onnx"))
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
+def test_every_shipped_controller_gives_the_same_bits_without_our_package(file: Path) -> None:
+    assert run("python_runtime.py", file) == run("plain_onnxruntime.py", file)
+
+
 @pytest.mark.parametrize(("example", "lines"), [("python_runtime.py", 10), ("plain_onnxruntime.py", 20)])
 def test_the_examples_are_as_short_as_promised(example: str, lines: int) -> None:
     text = (EXAMPLES / example).read_text()
