@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pipeline.errors import ModelError
-from pipeline.metrics import fit_percent, r2, rmse
+from pipeline.metrics import fit_percent, per_region, r2, rmse
 from pipeline.models.base import Model
 from pipeline.models.fit import TRAINERS, FitHistory, Trainer
 from pipeline.models.mlp import MLP
@@ -100,7 +100,7 @@ class NnarxPart(Part):
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
     def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
-        """Train with early stopping; figures are of one step and of a free run over the validation data."""
+        """Train with early stopping; figures are of one step (by the region of the target, too) and of a free run."""
         if record is None:
             raise ModelError("a part of kind 'nnarx' learns from a record; point `data:` of its set at one")
         names = [s.name for s in plant.pv_signals]
@@ -126,6 +126,10 @@ class NnarxPart(Part):
             "rmse": rmse(validation.y, predicted),
             "r2": r2(validation.y, predicted),
             "fit_percent": fit_percent(validation.y, predicted),
+            "regions": {
+                name: {"rmse": error}
+                for name, error in per_region(rmse, validation.y, predicted, validation.x[:, 0], regions).items()
+            },
             "n_train": len(train),
             **_story(model, history),
         }

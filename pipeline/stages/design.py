@@ -81,11 +81,14 @@ def _closed_loop(plant: Plant) -> Callable[[Array], Array]:
 
 
 def _commit() -> str:
+    """Commit of the code, with "-dirty" where it or params.yaml was edited since."""
+    git = partial(subprocess.run, capture_output=True, text=True, timeout=10)
     try:
-        run = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=10)
+        head = git(["git", "rev-parse", "HEAD"], check=True).stdout.strip()
+        edited = git(["git", "diff", "--quiet", "HEAD", "--", "pipeline", "serving", "params.yaml"]).returncode
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return run.stdout.strip()
+    return head + ("-dirty" if edited else "")
 
 
 def _versions() -> dict[str, str]:
