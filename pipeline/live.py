@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from pipeline.errors import PlantError
 from pipeline.plants.base import Plant
 from pipeline.simulate import measured
 from pipeline.timetable import Timetable
@@ -50,6 +51,11 @@ class SimulatedPlant:
         self.mv = mv
         self.x = self._step(self.x, mv, self.plant.dv_nominal, self._parameters)
         self.k += 1
+        if not np.isfinite(self.x).all():
+            raise PlantError(
+                f"plant {self.plant.name!r} has left what its equations can compute at {self.k * self.plant.period_s:g} s; "
+                "give disturbances that it can physically meet"
+            )
 
 
 class Snapshot(Protocol):

@@ -160,6 +160,10 @@ class RecordParams:
     kind: str
     excitation: Mapping[str, Any]
 
+    def __post_init__(self) -> None:
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds is {list(self.seeds)}; give one or more different seeds, one record each")
+
     @classmethod
     def read(cls, name: str) -> RecordParams:
         """The section of one record."""

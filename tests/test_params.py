@@ -81,6 +81,12 @@ def test_section_errors_name_the_nearest(tmp_path: Path) -> None:
         read_section("records", "first", path)
 
 
+def test_a_record_needs_seeds() -> None:
+    values = {"case": "c", "record": "r", "seeds": [], "kind": "prbs", "excitation": {}}
+    with pytest.raises(ParamsError, match=r"records\.x: seeds is \[\]; give one or more"):
+        parse(RecordParams, values, "records.x")
+
+
 def test_choose_names_the_nearest() -> None:
     with pytest.raises(ParamsError, match="unknown law 'incda'; did you mean 'incad'"):
         choose(LAWS, "incda", "law", "controllers.x")
