@@ -52,8 +52,9 @@ class SimulatedPlant:
         self.x = self._step(self.x, mv, self.plant.dv_nominal, self._parameters)
         self.k += 1
         if not np.isfinite(self.x).all():
+            at_s = self.k * self.plant.period_s
             raise PlantError(
-                f"plant {self.plant.name!r} has left what its equations can compute at {self.k * self.plant.period_s:g} s; "
+                f"plant {self.plant.name!r} has left what its equations can compute at {at_s:g} s; "
                 "give disturbances that it can physically meet"
             )
 
