@@ -44,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except LoopwrightError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # `| head`: the reader has seen enough
+        sys.stderr.close()
     return 0
 
 

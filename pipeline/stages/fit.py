@@ -53,9 +53,9 @@ def _part(values: Mapping[str, Any], where: str) -> Part:
 
 def data_files(data: Path) -> dict[int, Path | None]:
     """Data seed -> its file: a folder of seed<k>.parquet, one record of a plant, or a plant's text (no file)."""
-    if data.suffix == ".py":
+    if data.suffix.lower() == ".py":
         return {0: None}
-    if data.suffix in {".csv", ".parquet"}:
+    if data.suffix.lower() in {".csv", ".parquet"}:
         return {0: data}
     files = {int(p.stem.removeprefix("seed")): p for p in data.glob("seed*.parquet")}
     if not files:

@@ -49,6 +49,8 @@ def _serve(args: argparse.Namespace) -> None:
     if uri.startswith("http"):
         print(f"the registry is served already: {uri}/#/models")
         return
+    if not 0 < args.port < 65_536:
+        raise TrackingError(f"port {args.port} does not exist; give one from 1 to 65535 with --port")
     with store(), socket.socket() as probe:
         if probe.connect_ex((HOST, args.port)) == 0:
             raise TrackingError(f"port {args.port} of {HOST} is taken; give another one with --port")

@@ -198,7 +198,10 @@ def promote(client: MlflowClient, name: str, number: str, alias: str) -> str:
     client.set_model_version_tag(version.name, str(version.version), "promoted_by", "hand")
     if alias == CHAMPION and "case" in version.tags:
         elect_case_champion(client, version.tags["case"])
-    return f"{version.name} version {version.version} is now @{alias}"
+    said = f"{version.name} version {version.version} is now @{alias}"
+    if alias == CHAMPION:
+        said += " by hand; the gate (no lock-up, better than the PID and than the last champion) was not asked"
+    return said
 
 
 def fetch(client: MlflowClient, what: str, folder: Path) -> list[Path]:

@@ -233,7 +233,9 @@ def _step_time(evidence: Evidence) -> Verdict:
         p50 = value.get("p50") if isinstance(value, Mapping) else value
         if p50 is not None:
             times[name] = float(p50)
-    limit = "≤ 40 us for the RBF laws"
+    limit = (
+        "≤ 40 us for inc, incad, incadec, inverse_dob (timed while validating, other work beside; alone: make bench)"
+    )
     if not times:
         return Verdict("controller step, median", limit, "measured by `make bench`", None)
     shown = ", ".join(f"{n} {t:.0f} us" for n, t in times.items())
