@@ -55,7 +55,9 @@ def draw_all(evidence: Evidence, folder: Path, models: Path) -> dict[str, str]:
     drawn: dict[str, str] = {}
     with mpl.rc_context(STYLE):
         for figure in evidence.case.figures:
-            canvas = _predictions(figure, models) if figure.scenario is None else _loops(evidence, figure)
+            canvas = (
+                _predictions(evidence.case, figure, models) if figure.scenario is None else _loops(evidence, figure)
+            )
             if canvas is not None:
                 name = f"figure_{figure.number:02d}.png"
                 _save(canvas, folder / name)
@@ -109,7 +111,9 @@ def _add(top: Axes, bottom: Axes, loop: Loop, label: str, colour: str, strong: b
     wide = 1.9 if strong else 1.2
     top.plot(loop["time_s"], _first(loop["pv"]), label=label, color=colour, linewidth=wide, zorder=order)
     mv = _first(loop["mv"])
-    bottom.step(loop["time_s"], mv, where="post", color=colour, linewidth=0.6 * wide, zorder=order)
+    # Laws that ring fill the panel: behind the strong curve they are only hinted at.
+    faint = 1.0 if strong else 0.5
+    bottom.step(loop["time_s"], mv, where="post", color=colour, linewidth=0.6 * wide, zorder=order, alpha=faint)
 
 
 def _first(values: Array) -> Array:
@@ -164,7 +168,7 @@ def _overview(evidence: Evidence, law: str) -> Canvas | None:
     return canvas
 
 
-def _predictions(figure: Figure, models: Path) -> Canvas | None:
+def _predictions(case: Case, figure: Figure, models: Path) -> Canvas | None:
     """The inverse model's MV beside the real one over some validation samples."""
     found = sorted(models.glob("*/predictions.npz"))
     if not found:
@@ -174,16 +178,18 @@ def _predictions(figure: Figure, models: Path) -> Canvas | None:
     canvas = Canvas(figsize=(SIZE[0], 4.2), layout="constrained")
     axes = canvas.subplots(1, 2, gridspec_kw={"width_ratios": (2.4, 1)})
     n = min(len(actual), 100)
-    axes[0].plot(time_s[:n], actual[:n], color="black", linewidth=1.0, label="applied")
-    axes[0].plot(time_s[:n], predicted[:n], ".", color=COLOURS["incad"], markersize=5, label="predicted")
+    # No line: a random split leaves samples that do not follow one another.
+    axes[0].plot(time_s[:n], actual[:n], "o", color="black", markersize=5, fillstyle="none", label="applied")
+    axes[0].plot(time_s[:n], predicted[:n], ".", color=COLOURS["incad"], markersize=4, label="predicted")
     axes[0].set_title(f"Figure {figure.number}. {figure.title}")
     axes[0].set_xlabel("time [s]")
-    axes[0].set_ylabel("MV")
+    mv = case.plant_class.mv_signals[0]
+    axes[0].set_ylabel(f"{_symbol(mv.name)} [{mv.unit}]")
     canvas.legend(loc="outside lower center", ncols=2)
     axes[1].plot(actual, predicted, ".", color=COLOURS["incad"], markersize=3)
     ends = [float(min(actual.min(), predicted.min())), float(max(actual.max(), predicted.max()))]
     axes[1].plot(ends, ends, color="black", linewidth=0.8)
-    axes[1].set_xlabel("applied")
-    axes[1].set_ylabel("predicted")
+    axes[1].set_xlabel(f"applied [{mv.unit}]")
+    axes[1].set_ylabel(f"predicted [{mv.unit}]")
     axes[1].set_aspect("equal", adjustable="box")
     return canvas
