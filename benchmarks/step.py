@@ -45,8 +45,8 @@ def main() -> int:
     parser.add_argument("files", nargs="*", type=Path, metavar="FILE")
     parser.add_argument("--nmpc-samples", type=int, default=160)
     parser.add_argument("--steps", type=int, default=5_000)
-    parser.add_argument("--loop-steps", type=int, default=300)
-    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--loop-steps", type=int, default=100)
+    parser.add_argument("--rounds", type=int, default=8)
     options = parser.parse_args()
     files = options.files or sorted(Path("artifacts").glob("*/*.onnx"))
     if not files:
