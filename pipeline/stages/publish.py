@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import os
 import sys
 from pathlib import Path
 
 from pipeline.errors import PipelineError
+from pipeline.stages import write_json
 from pipeline.tracking.publish import publish
 
 RECEIPT = Path("published.json")
@@ -20,10 +19,7 @@ def main() -> int:
     except PipelineError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    RECEIPT.parent.mkdir(exist_ok=True)
-    draft = RECEIPT.with_suffix(".draft")
-    draft.write_text(json.dumps(receipt, indent=1) + "\n")
-    os.replace(draft, RECEIPT)
+    write_json(RECEIPT, receipt)
     return 0
 
 
