@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pipeline.plants.base import Linearization, Plant
+from pipeline.plants.batch_reactor import BatchReactor
+from pipeline.plants.ph_neutralization import PhNeutralization, PhNeutralization15s
 from pipeline.plants.thiosulfate_cstr import ThiosulfateCstr
 
 PLANTS: dict[str, type[Plant]] = {
     ThiosulfateCstr.name: ThiosulfateCstr,
+    PhNeutralization.name: PhNeutralization,
+    PhNeutralization15s.name: PhNeutralization15s,
+    BatchReactor.name: BatchReactor,
 }
 
 __all__ = ["PLANTS", "Linearization", "Plant"]

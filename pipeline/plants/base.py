@@ -59,6 +59,14 @@ class Plant(ABC):
         """Nominal measured disturbances, shape (n_dv,)."""
         return np.zeros(len(self.dv_signals))
 
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """(x (n_x,), mv (n_mv,)) where an experiment starts: the steady state nearest the middle of the MV's range."""
+        _, xs, mvs = self.steady_curve
+        mv = self.mv_signals[0]
+        nearest = int(np.argmin(np.abs(mvs - (mv.low + mv.high) / 2)))
+        return np.asarray(xs[nearest]), np.array([mvs[nearest]])
+
     # ------------------------------------------------------------------ parameters
     @classmethod
     def parameter_names(cls) -> tuple[str, ...]:
