@@ -5,6 +5,11 @@ means that it never moves, so the whole test is one hold. At sample k the proces
 measured, the error r(k) - y(k) is counted, and only then the move acts: set point and process
 variable of the same sample belong together. All arrays are float64; the functions of one loop
 take shape ``(n,)``, ``closed_loop_metrics`` also ``(n, loops)``.
+
+A set point may also move within a hold, as the recipe of a batch does. Every figure is one of the
+errors alone, so it keeps its meaning: a step is then the error at the hold's first sample, its
+overshoot how far the process variable runs past the moving set point, and its settling when it
+has caught up with it.
 """
 
 from __future__ import annotations
@@ -53,6 +58,17 @@ def mae(sp: ArrayLike, pv: ArrayLike) -> float:
 def sse(sp: ArrayLike, pv: ArrayLike) -> float:
     """Sum of squared errors, sum_k (r(k) - y(k))^2."""
     return float(np.sum(_errors(sp, pv) ** 2))
+
+
+def sse_late(sp: ArrayLike, pv: ArrayLike, late_from: int) -> float:
+    """Sum of squared errors from sample ``late_from`` on, once the start that no controller can hasten is over.
+
+    Raises ValueError where the test has no such sample: a sum over nothing would look perfect.
+    """
+    error = _errors(sp, pv)
+    if not 0 <= late_from < error.size:
+        raise ValueError(f"late_from is sample {late_from} of a test of {error.size}; give one of 0..{error.size - 1}")
+    return float(np.sum(error[late_from:] ** 2))
 
 
 def ise(sp: ArrayLike, pv: ArrayLike, period_s: float) -> float:
@@ -159,7 +175,13 @@ def locked_up(
 
 
 def closed_loop_metrics(
-    sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, period_s: float, span: float = 1.0
+    sp: ArrayLike,
+    pv: ArrayLike,
+    mv: ArrayLike,
+    hold: int,
+    period_s: float,
+    span: float = 1.0,
+    late_from: int = 0,
 ) -> dict[str, float]:
     """The figures of one closed-loop test, ready for JSON.
 
@@ -178,18 +200,21 @@ def closed_loop_metrics(
         Sampling period [s].
     span
         The CV's range, for what counts as a step and as settled.
+    late_from
+        Sample from which ``sse_late`` counts; 0: there is no such figure.
 
     Returns
     -------
     dict
-        ``mae`` [CV], ``ise`` [CV^2 s], ``masse`` and ``max_asse`` [CV], ``overshoot`` (mean over
-        the steps, fraction of the step; 0 without steps), ``settling`` [s] (median over the
-        holds), ``mv_travel`` [MV]. Several loops: the mean over them, the largest ``max_asse``.
+        ``mae`` [CV], ``sse`` [CV^2], ``ise`` [CV^2 s], ``masse`` and ``max_asse`` [CV],
+        ``overshoot`` (mean over the steps, fraction of the step; 0 without steps), ``settling``
+        [s] (median over the holds), ``mv_travel`` [MV], and ``sse_late`` [CV^2] where asked for.
+        Several loops: the mean over them, the largest ``max_asse``.
 
     Raises
     ------
     ValueError
-        For shapes that do not match, or values that are not finite.
+        For shapes that do not match, values that are not finite, or a ``late_from`` beyond the test.
 
     """
     r = np.asarray(sp, dtype=np.float64)
@@ -206,6 +231,7 @@ def closed_loop_metrics(
         loops.append(
             (
                 mae(a, b),
+                sse(a, b),
                 ise(a, b, period_s),
                 masse(a, b, hold),
                 max_asse(a, b, hold),
@@ -214,10 +240,12 @@ def closed_loop_metrics(
             )
         )
     table = np.array(loops)
-    names = ("mae", "ise", "masse", "max_asse", "overshoot", "settling")
+    names = ("mae", "sse", "ise", "masse", "max_asse", "overshoot", "settling")
     found = dict(zip(names, map(float, table.mean(axis=0)), strict=True))
-    found["max_asse"] = float(table[:, 3].max())
+    found["max_asse"] = float(table[:, names.index("max_asse")].max())
     found["mv_travel"] = mv_travel(u)
+    if late_from:
+        found["sse_late"] = float(np.mean([sse_late(a, b, late_from) for a, b in zip(r.T, y.T, strict=True)]))
     return found
 
 

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as npst
 from pipeline import metrics
 from pipeline.metrics import closed_loop_metrics, locked_up
 
-KEYS = {"mae", "ise", "masse", "max_asse", "overshoot", "settling", "mv_travel"}
+KEYS = {"mae", "sse", "ise", "masse", "max_asse", "overshoot", "settling", "mv_travel"}
 SIGNAL = npst.arrays(np.float64, 40, elements=st.floats(-1e3, 1e3))
 
 
@@ -108,6 +108,32 @@ def test_several_loops_average_but_keep_the_worst_steady_state_error() -> None:
     found = closed_loop_metrics(sp, np.hstack([pv, pv]), np.zeros((30, 3)), hold=0, period_s=1.0)
     assert found["mae"] == pytest.approx(0.2)
     assert found["max_asse"] == pytest.approx(0.3)
+
+
+def test_late_squared_errors_leave_the_start_out() -> None:
+    sp = 10.0 * np.exp(-0.1 * np.arange(30))
+    pv = sp - np.where(np.arange(30) < 8, 5.0, 0.5)
+    found = closed_loop_metrics(sp, pv, np.zeros(30), hold=0, period_s=20.0, late_from=8)
+    assert set(found) == KEYS | {"sse_late"}
+    assert found["sse"] == pytest.approx(8 * 25 + 22 * 0.25)
+    assert found["sse_late"] == pytest.approx(22 * 0.25)
+    assert found["ise"] == pytest.approx(20 * found["sse"])
+
+
+@pytest.mark.parametrize("late_from", [30, -1])
+def test_a_late_part_without_samples_is_refused(late_from: int) -> None:
+    with pytest.raises(ValueError, match=rf"late_from is sample {late_from} of a test of 30; give one of 0..29"):
+        closed_loop_metrics(np.zeros(30), np.zeros(30), np.zeros(30), hold=0, period_s=1.0, late_from=late_from)
+
+
+def test_a_moving_set_point_is_overshot_and_settled_on_as_the_error_says() -> None:
+    # From 4 below a falling recipe: 1 past it at sample 5, then on it.
+    sp = np.linspace(20.0, 5.0, 40)
+    error = np.where(np.arange(40) < 5, 4.0, np.where(np.arange(40) == 5, -1.0, 0.0))
+    found = closed_loop_metrics(sp, sp - error, np.zeros(40), hold=0, period_s=20.0, span=100.0)
+    assert found["overshoot"] == pytest.approx(0.25)
+    assert found["settling"] == pytest.approx(6 * 20.0)
+    assert found["masse"] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_travel_adds_the_ways_of_all_actuators() -> None:
