@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.models.arx import ArxPart
 from pipeline.models.base import Model, load_model
 from pipeline.models.leverage_domain import DomainPart
 from pipeline.models.linearized import LinearizedPart
@@ -13,6 +14,7 @@ MODELS: dict[str, type[Part]] = {
     RbfPart.model.kind: RbfPart,
     MlpPart.model.kind: MlpPart,
     NnarxPart.model.kind: NnarxPart,
+    ArxPart.model.kind: ArxPart,
     DomainPart.model.kind: DomainPart,
     LinearizedPart.model.kind: LinearizedPart,
 }
