@@ -190,3 +190,16 @@ class MLP(Model):
 
     def _limited(self, y: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(y, self.y_low), self.y_high) if self.bounded else y
+
+
+def scaled_layers(net: MLP) -> list[tuple[Tensor, Tensor]]:
+    """(weight (n_in, n_out), bias (n_out,)) of each layer, from engineering units to engineering units.
+
+    Copies without a gradient; the residual column is not among them.
+    """
+    layers = [(w.detach().clone(), b.detach().clone()) for w, b in zip(net.weights, net.biases, strict=True)]
+    slope = layers[0][0] / net.x_scale[:, None]
+    layers[0] = (slope, layers[0][1] - net.x_center @ slope)
+    weight, bias = layers[-1]
+    layers[-1] = (weight * net.y_scale, bias * net.y_scale + net.y_center)
+    return layers

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.models.base import Model
-from pipeline.models.mlp import MLP
+from pipeline.models.mlp import MLP, scaled_layers
 
 Combine = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -93,7 +93,7 @@ class _Fused(nn.Module):
         super().__init__()
         k, h, h_last = len(grid) + 1, nets[0].hidden[0], nets[0].hidden[-1]
         self.shape = (2, k, h + 1)
-        layers = [_scaled_layers(net) for net in nets]
+        layers = [scaled_layers(net) for net in nets]
         self.depth = len(layers[0]) - 1
         into = torch.zeros(at.n_z + 1, 2, k, h + 1, dtype=torch.float64)
         into[-1, :, :, -1] = SATURATED
@@ -134,13 +134,3 @@ def _with_bias_unit(weight: Tensor, bias: Tensor) -> Tensor:
     full = torch.zeros(weight.shape[0] + 1, weight.shape[1] + 1, dtype=torch.float64)
     full[:-1, :-1], full[-1, :-1], full[-1, -1] = weight, bias, SATURATED
     return full
-
-
-def _scaled_layers(net: MLP) -> list[tuple[Tensor, Tensor]]:
-    """(weight, bias) of each layer, from engineering units to engineering units."""
-    layers = [(w.detach().clone(), b.detach().clone()) for w, b in zip(net.weights, net.biases, strict=True)]
-    slope = layers[0][0] / net.x_scale[:, None]
-    layers[0] = (slope, layers[0][1] - net.x_center @ slope)
-    weight, bias = layers[-1]
-    layers[-1] = (weight * net.y_scale, bias * net.y_scale + net.y_center)
-    return layers
