@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.cases import CASES, Case, Scenario
+from pipeline.cases import CASES, NOISE_SUFFIX, Case, Scenario
 from pipeline.errors import ParamsError, PlantError
 from pipeline.metrics import closed_loop_metrics
 
@@ -27,13 +27,24 @@ def cstr() -> Case:
     return CASES["thiosulfate_cstr"]
 
 
-def test_every_scenario_starts_at_a_steady_state_and_stays_within_the_signals(case: Case) -> None:
+def rests(case: Case, scenario: Scenario) -> bool:
+    """At rest under the nominal parameters or those of its first period, or at the start of a batch."""
     plant = case.plant
-    step = plant.stepper()
+    if scenario.x0 == pytest.approx(plant.start[0]):
+        return True
+    ends = [
+        plant.stepper()(scenario.x0, scenario.mv0, plant.dv_nominal, p)
+        for p in (plant.parameters(), scenario.parameters(plant)[0])
+    ]
+    return any(x == pytest.approx(scenario.x0, rel=1e-7) for x in ends)
+
+
+def test_every_scenario_starts_at_rest_and_stays_within_the_signals(case: Case) -> None:
+    plant = case.plant
     for scenario in (*(s for group in case.scenarios().values() for s in group), *case.development()):
         assert scenario.sp.shape == (scenario.samples, len(plant.sp_signals))
-        x = step(scenario.x0, scenario.mv0, plant.dv_nominal, plant.parameters())
-        assert x == pytest.approx(scenario.x0, rel=1e-7)
+        assert rests(case, scenario)
+        assert 0 <= scenario.late_from < scenario.samples
         for j, signal in enumerate(plant.sp_signals):
             assert np.all((scenario.sp[:, j] >= signal.low) & (scenario.sp[:, j] <= signal.high))
         assert scenario.parameters(plant).shape == (scenario.samples, len(plant.parameters()))
@@ -52,11 +63,33 @@ def test_the_gate_weighs_scenarios_that_exist(case: Case) -> None:
 
 
 def test_the_paper_names_scenarios_and_metrics_that_exist(case: Case) -> None:
-    metrics = set(closed_loop_metrics([0.0], [0.0], [0.0], 0, 1.0))
-    for row in (*(r for t in case.tables for r in t.rows), *case.requirements):
-        assert row.scenario in case.scenarios()
+    metrics = set(closed_loop_metrics([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], 0, 1.0, late_from=1))
+    scenarios = {name + end for name in case.scenarios() for end in ("", NOISE_SUFFIX)}
+    for row in (*(r for t in case.tables for r in t.rows if r.scenario), *case.requirements):
+        assert row.scenario in scenarios
         assert row.metric in metrics
-    assert {f.scenario for f in case.figures} <= {None, *case.scenarios()}
+    assert case.metric in metrics
+    assert {f.scenario for f in case.figures} <= {None, *scenarios}
+
+
+def test_the_shorter_period_has_the_same_tests() -> None:
+    slow, fast = CASES["ph_neutralization"].scenarios(), CASES["ph_neutralization_15s"].scenarios()
+    assert list(slow) == list(fast)
+    for name, tests in slow.items():
+        for one, other in zip(tests, fast[name], strict=True):
+            assert other.sp[::4] == pytest.approx(one.sp)
+            assert other.hold == 4 * one.hold
+            for key, values in one.changes.items():
+                assert other.changes[key][::4] == pytest.approx(values)
+
+
+def test_profiles_are_within_reach_once_the_late_errors_count() -> None:
+    case = CASES["batch_reactor"]
+    reach = case.plant.steady_curve[0]
+    for test in (*(s for group in case.scenarios().values() for s in group), *case.development()):
+        assert reach[0] < test.sp[test.late_from :].min()
+        assert test.sp[test.late_from :].max() < reach[-1]
+        assert test.sp[0] > test.x0[2]
 
 
 def test_noise_has_one_entry_a_process_variable(case: Case) -> None:

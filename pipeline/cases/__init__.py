@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from pipeline.cases.base import NOISE_SUFFIX, Case, Scenario
+from pipeline.cases.batch_reactor import BatchReactorCase
+from pipeline.cases.ph_neutralization import PhNeutralizationCase
+from pipeline.cases.ph_neutralization_15s import PhNeutralization15sCase
 from pipeline.cases.thiosulfate_cstr import ThiosulfateCstrCase
 
 CASES: dict[str, Case] = {
     ThiosulfateCstrCase.name: ThiosulfateCstrCase(),
+    PhNeutralizationCase.name: PhNeutralizationCase(),
+    PhNeutralization15sCase.name: PhNeutralization15sCase(),
+    BatchReactorCase.name: BatchReactorCase(),
 }
 
 __all__ = ["CASES", "NOISE_SUFFIX", "Case", "Scenario"]

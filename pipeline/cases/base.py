@@ -36,8 +36,9 @@ class Scenario:
     x0: Array  # (n_x,) steady state at the start
     mv0: Array  # (n_mv,) MV applied before sample 0
     changes: Mapping[str, Array] = field(default_factory=dict)  # plant parameter -> (n,)
-    hold: int = 0  # samples per set point; 0: it never moves
+    hold: int = 0  # samples per set point; 0: it never moves, or follows a course of its own
     seed: int | None = None  # of a random sequence
+    late_from: int = 0  # where above 0: the sample from which `sse_late` counts, once the set point is within reach
 
     def __post_init__(self) -> None:
         if self.sp.ndim != 2 or not len(self.sp):
@@ -75,12 +76,16 @@ class Scenario:
         """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""
         arrays = {"sp": self.sp, "x0": self.x0, "mv0": self.mv0, **self.changes}
         text = {key: [f"{v:.7g}" for v in np.ravel(values)] for key, values in arrays.items()}
-        return hashlib.sha256(json.dumps([text, self.hold], sort_keys=True).encode()).hexdigest()
+        what = [text, self.hold, *([self.late_from] if self.late_from else [])]
+        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class PaperFigure:
-    """One number of the paper's tables, and the same one from an independent implementation."""
+    """One number of the paper's tables, and the same one from an independent implementation.
+
+    Of a model, ``law`` names its set, ``scenario`` is empty and ``metric`` a path of the set's figures.
+    """
 
     label: str
     law: str
@@ -123,6 +128,8 @@ class Figure:
     curves: tuple[Curve, ...]
     scenario: str | None = None
     hold: int | None = None  # other than the scenario's own
+    info: tuple[str, ...] = ()  # entries of the controllers' info to show in place of the loop, a panel each
+    model: str | None = None  # the model set whose predictions it shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +161,11 @@ class Case(ABC):
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = ()
     claims: ClassVar[Mapping[str, str]] = {}  # what the paper states -> what an independent implementation found
+    # The figure that laws are compared by, "mae" or "sse" (sum of squared errors over a test's samples).
+    metric: ClassVar[str] = "mae"
+    recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
+    noise_draws: ClassVar[int] = 1  # closed loops with noise are run this many times, and their figures averaged
+    development_noise: ClassVar[bool] = False  # the plant is never measured without noise: nor is it for development
 
     def __post_init__(self) -> None:
         both = sorted(set(self.held_out_seeds) & set(self.development_seeds))
@@ -203,3 +215,32 @@ def held(levels: list[float], hold: int) -> Array:
 def random_levels(seed: int, count: int, low: float, high: float) -> list[float]:
     """``count`` set points uniform in [low, high]."""
     return [float(v) for v in np.random.default_rng(seed).uniform(low, high, count)]
+
+
+def from_rest(
+    plant: Plant,
+    name: str,
+    title: str,
+    sp: Array,
+    *,
+    hold: int = 0,
+    seed: int | None = None,
+    changes: Mapping[str, Array] | None = None,
+) -> Scenario:
+    """A test that starts at the steady state of its first set point, under its first parameters.
+
+    ``sp`` (n, 1); ``changes`` plant parameters over every period, each (n,). Raises PlantError
+    where there is no such steady state.
+    """
+    changes = changes or {}
+    first = plant.with_parameters({key: float(values[0]) for key, values in changes.items()})
+    x0, mv0 = first.steady_state_at(float(sp[0, 0]))
+    return Scenario(name, title, sp, x0, mv0, changes, hold, seed)
+
+
+def stepwise(n: int, *steps: tuple[int, float]) -> Array:
+    """Values of ``n`` samples from steps (first sample, value), shape (n,); the first step starts at sample 0."""
+    values = np.empty(n)
+    for at, value in steps:
+        values[at:] = value
+    return values
