@@ -18,6 +18,8 @@ from pipeline.errors import LawError
 from pipeline.plants.base import Plant
 
 SCHEMA = 1
+DEFAULTS: dict[str, Any] = {"metric": "mae", "recipe": False, "unforeseen": False}
+"""What a file means that does not say."""
 
 
 def bounds_path(case: Case) -> Path:
@@ -25,15 +27,51 @@ def bounds_path(case: Case) -> Path:
     return Path(__file__).parent / "cases" / f"{case.name}.bounds.json"
 
 
+def kinds(case: Case) -> tuple[str, ...]:
+    """The figures to compute: nmpc, offline, and nmpc_noise where it is the states that are measured.
+
+    Elsewhere the NMPC is given the state itself, which noise on the measurement does not reach; an
+    observer for it would be one more controller, and no bound.
+    """
+    return ("nmpc", "offline", "nmpc_noise") if measures_states(case.plant) else ("nmpc", "offline")
+
+
+def measures_states(plant: Plant) -> bool:
+    """Whether the plant's PVs are its states."""
+    return type(plant).output is Plant.output
+
+
+def problem(case: Case) -> dict[str, Any]:
+    """What the bounds of a whole case depend on, beside the scenarios: stored, and compared with what is stored."""
+    return {"plant": plant_digest(case.plant)} | {key: getattr(case, key) for key in DEFAULTS}
+
+
 def plant_digest(plant: Plant) -> str:
-    """sha256 of the plant's equations, parameters and sampling; comments and layout do not count."""
+    """sha256 of the plant's equations, parameters and sampling; comments and layout do not count.
+
+    An output of its own mostly calls other functions, so it counts by its values over the states'
+    ranges, six digits of them; the rates too, whose constants may stand outside of ``derivative``.
+    """
     source = ast.parse(textwrap.dedent(inspect.getsource(type(plant).derivative)))
     function = source.body[0]
     if isinstance(function, ast.FunctionDef) and ast.get_docstring(function) is not None:
         function.body = function.body[1:]
     names = dict(zip(plant.parameter_names(), plant.parameters().tolist(), strict=True))
     what = [ast.unparse(source), names, plant.period_s, plant.time_unit_s, plant.substeps]
+    if not measures_states(plant):
+        what.append(_probe(plant))
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+
+def _probe(plant: Plant) -> list[str]:
+    signals = (*plant.state_signals, *plant.mv_signals)
+    low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
+    found = []
+    for fractions in np.random.default_rng(0).uniform(0.1, 0.9, (7, len(signals))):
+        x, mv = np.split(low + fractions * (high - low), [len(plant.state_signals)])
+        values = (plant.measure(x), plant.rate(x, mv, plant.dv_nominal, plant.parameters()))
+        found += [f"{v:.6g}" for v in np.concatenate([np.array(v).ravel() for v in values])]
+    return found
 
 
 def read_stored(path: Path) -> dict[str, Any]:
@@ -48,30 +86,37 @@ def read_stored(path: Path) -> dict[str, Any]:
 def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dict[str, float]]]:
     """The bounds by scenario: ``{"sp_a": {"nmpc": {"mae": ...}, "offline": {...}}, "sp_a_noise": {"nmpc": ...}}``.
 
-    Figures of several sequences are their means, ``max_asse`` and ``step_ms_p99`` their largest,
-    ``failures`` their sum. Raises LawError where figures are missing or belong to another plant
-    or scenario than the case has now.
+    Figures of several sequences are put ``together``. Where the PVs are not the states, the NMPC's
+    figures with noise are those without (``kinds``). Raises LawError where figures are missing or
+    belong to another plant, metric or scenario than the case has now.
     """
     path = path or bounds_path(case)
     stored = read_stored(path)
     remedy = f"run `python -m pipeline.oracle {case.name}` (about ten minutes on an idle core)"
     if not stored:
         raise LawError(f"{path} holds no bounds of case {case.name!r}; {remedy}")
-    if stored.get("plant") != plant_digest(case.plant):
+    current = problem(case)
+    if stored.get("plant") != current["plant"]:
         raise LawError(f"the bounds in {path} belong to other equations or parameters of the plant; {remedy}")
+    for key, default in DEFAULTS.items():
+        if stored.get(key, default) != current[key]:
+            was = f"{key} {stored.get(key, default)!r}, and the case has {current[key]!r}"
+            raise LawError(f"the bounds in {path} were computed for the {was}; {remedy}")
     found: dict[str, dict[str, dict[str, float]]] = {}
     for name, scenarios in case.scenarios().items():
-        for kind in ("nmpc", "offline", "nmpc_noise"):
+        for kind in kinds(case):
             rows = [stored["figures"].get(name, {}).get(s.digest(), {}).get(kind) for s in scenarios]
             missing = [s.seed for s, row in zip(scenarios, rows, strict=True) if row is None]
             if missing:
                 which = f" (seeds {missing})" if missing[0] is not None else ""
                 raise LawError(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
             key = name + NOISE_SUFFIX if kind == "nmpc_noise" else name
-            found.setdefault(key, {})[kind.removesuffix("_noise")] = _together(rows)
+            found.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows)
+        found.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(found[name]["nmpc"])})
     return found
 
 
-def _together(rows: list[dict[str, float]]) -> dict[str, float]:
+def together(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Figures of several loops as one: means, the largest ``max_asse`` and ``step_ms_p99``, the sum of ``failures``."""
     how: dict[str, Callable[[list[float]], float]] = {"max_asse": max, "step_ms_p99": max, "failures": sum}
     return {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0]}

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import PlantError
 from pipeline.plants.base import Plant
 from serving.manifest import Signal
 
@@ -18,6 +19,9 @@ Array = NDArray[np.float64]
 # The plan is never allowed to leave the states' ranges by more than this fraction of them.
 MARGIN = 0.1
 
+# By metric: w below. Squared errors are small where absolute ones still count, and so must the weight be.
+MOVE_WEIGHT = {"mae": 1e-3, "sse": 1e-6}
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -25,7 +29,7 @@ class Plan:
 
     mv: Array  # (n, n_mv)
     x: Array  # (n + 1, n_x) states at the samples, the first one given
-    cost: float  # of the controlled variables' errors alone, in fractions of their ranges
+    cost: float  # of the controlled variables' errors alone, absolute or squared, in fractions of their ranges
     solved: bool
     iterations: int
     values: Array  # all variables of the problem, (per period, n)
@@ -35,12 +39,15 @@ class Plan:
 class Horizon:
     r"""Best moves over ``n`` periods for a plant that is known exactly.
 
-        min  sum_k sum_i |r_i(k) - y_i(k)| / span_i  +  w sum_k ((u(k) - u(k-1)) / span_u)^2,   k = 1..n
+        min  sum_k sum_i J((r_i(k) - y_i(k)) / span_i)  +  w sum_k ((u(k) - u(k-1)) / span_u)^2,   k = 1..n
 
-    over u(0)..u(n-1) within the MVs' ranges, each held for one period. The plant's ``derivative``
+    with J(e) = |e| for the metric "mae" and e^2 for "sse", over u(0)..u(n-1) within the MVs'
+    ranges, each held for one period. The plant's ``derivative``
     enters by Radau collocation (``elements`` of ``degree`` a period): implicit, so that neither
     the hot branch's stiffness nor an ignition within one period costs accuracy or stability, and
-    cheap to differentiate twice. The absolute value enters through slacks, s >= +-(r - y).
+    cheap to differentiate twice. The absolute value enters through slacks, s >= +-(r - y). Squared
+    errors are variables as well, s = r - y: the cost is then convex, and a strongly curved output
+    stands in a constraint, which takes the solver half the iterations.
 
     The small weight w chooses among equal tracking errors: an MV that rings between samples, on
     the sampled plant's zero outside the unit circle, costs no error at the samples.
@@ -51,13 +58,16 @@ class Horizon:
         plant: Plant,
         n: int,
         *,
+        metric: str = "mae",
         elements: int = 3,
         degree: int = 3,
-        move_weight: float = 1e-3,
+        move_weight: float | None = None,
         tolerance: float = 1e-7,
         max_iterations: int = 150,
     ) -> None:
-        self.plant, self.n = plant, n
+        if metric not in MOVE_WEIGHT:
+            raise PlantError(f"no horizon for the metric {metric!r}; it may be {' or '.join(MOVE_WEIGHT)}")
+        self.plant, self.n, self._squared = plant, n, metric == "sse"
         self._n_x, self._n_mv, self._n_cv = len(plant.state_signals), len(plant.mv_signals), len(plant.sp_signals)
         self._points = elements * degree
         self._x_low, self._x_span = _range(plant.state_signals)
@@ -78,11 +88,14 @@ class Horizon:
         defects = self._collocation(elements, degree).map(n)(starts, z, u, p)
         error = sp - self._controlled().map(n)(ends)
         moves = u[:, 1:] - u[:, :-1]
+        weight = MOVE_WEIGHT[metric] if move_weight is None else move_weight
+        cost = ca.sumsqr(s) if self._squared else ca.sum1(ca.vec(s))
+        binds = [ca.vec(s - error)] if self._squared else [ca.vec(s - error), ca.vec(s + error)]
         problem: Any = {
             "x": w,
             "p": ca.vertcat(x0, ca.vec(sp), ca.vec(p)),
-            "f": ca.sum1(ca.vec(s)) + move_weight * ca.sumsqr(moves),
-            "g": ca.vertcat(ca.vec(defects), ca.vec(s - error), ca.vec(s + error)),
+            "f": cost + weight * ca.sumsqr(moves),
+            "g": ca.vertcat(ca.vec(defects), *binds),
         }
         options: Any = {
             "expand": True,  # one flat expression evaluates several times faster than the map
@@ -101,10 +114,12 @@ class Horizon:
         self._solver = ca.nlpsol("horizon", "ipopt", problem, options)
         low, high = np.zeros((rows, n)), np.ones((rows, n))
         low[:n_z], high[:n_z] = -MARGIN, 1 + MARGIN
+        low[n_z + self._n_mv :] = -np.inf if self._squared else 0.0
         high[n_z + self._n_mv :] = np.inf
         self._bounds = {"lbx": low.ravel("F"), "ubx": high.ravel("F")}
-        n_g = n_z * n
-        upper = np.concatenate([np.zeros(n_g), np.full(2 * self._n_cv * n, np.inf)])
+        n_s = self._n_cv * n
+        slack = np.zeros(n_s) if self._squared else np.full(2 * n_s, np.inf)
+        upper = np.concatenate([np.zeros(n_z * n), slack])
         self._bounds |= {"lbg": np.zeros(upper.size), "ubg": upper}
 
     def _collocation(self, elements: int, degree: int) -> ca.Function:
@@ -189,7 +204,8 @@ class Horizon:
         x = np.vstack([x0, self._x_low + self._x_span * values[n_z - self._n_x : n_z].T])
         mv = self._mv_low + self._mv_span * np.clip(values[n_z : n_z + self._n_mv].T, 0.0, 1.0)
         cv = np.array(self.plant.measure(x[1:].T)).T[:, : self._n_cv]
-        cost = float(np.sum(np.abs(sp - cv) / self._cv_span))
+        error = np.abs(sp - cv) / self._cv_span
+        cost = float(np.sum(error**2 if self._squared else error))
         return Plan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), iterations, values, multipliers)
 
     def shifted(self, plan: Plan) -> Plan:
@@ -233,8 +249,8 @@ class Horizon:
             x = trace[-1]
             values[:n_z, k] = ((trace - self._x_low) / self._x_span).ravel()
             values[n_z : n_z + self._n_mv, k] = (mv - self._mv_low) / self._mv_span
-            error = sp[k] - np.array(self.plant.measure(x))[: self._n_cv, 0]
-            values[n_z + self._n_mv :, k] = np.abs(error) / self._cv_span
+            error = (sp[k] - np.array(self.plant.measure(x))[: self._n_cv, 0]) / self._cv_span
+            values[n_z + self._n_mv :, k] = error if self._squared else np.abs(error)
         return self._plan(np.asarray(x0), sp, values)
 
 

@@ -3,11 +3,19 @@
 Both know the plant exactly, its parameters at every sample included, and its whole state.
 
 NMPC sees the set point of now and no later one, and thinks that it stays; likewise the parameters.
-The offline optimum takes each hold by itself, from the state where it left the one before, with the
-hold's whole course of parameters and ``TAIL`` samples more of the same set point, so that a hold
+Where a case's disturbances are unforeseen, it knows the parameters of the period before instead,
+as a perfect observer tells them from what that period did: with those of now, a disturbance would
+cost it nothing.
+The offline optimum takes each set point by itself, from the state where it left the one before,
+with the whole course of parameters and ``TAIL`` samples more of the same set point, so that it
 ends at rest. It does not see the next set point either: with that preview a test of steps gets
 a lower bound, which no controller of the tests could use. It is the best of several locally
 best plans, and its figures are those of its own prediction.
+
+A case whose set point follows a recipe is another matter: its controllers may know the course, so
+NMPC sees it as far as it looks ahead, and the offline optimum is one plan for the whole test.
+
+Both minimize the case's metric: absolute or squared errors.
 
 ``python -m pipeline.oracle CASE`` computes both for every scenario of a case, NMPC also with
 measurement noise, and stores them in ``pipeline/cases/<case>.bounds.json``, from where
@@ -30,7 +38,17 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pipeline.bounds import SCHEMA, bounds_path, load_bounds, plant_digest, read_stored
+from pipeline.bounds import (
+    DEFAULTS,
+    SCHEMA,
+    bounds_path,
+    kinds,
+    load_bounds,
+    measures_states,
+    problem,
+    read_stored,
+    together,
+)
 from pipeline.cases import CASES, Case, Scenario
 from pipeline.errors import PlantError
 from pipeline.horizon import Horizon, Plan
@@ -46,40 +64,44 @@ Array = NDArray[np.float64]
 HORIZON = 40  # periods that the NMPC looks ahead; with 20 it does 2 % worse, with 60 half a percent better
 REACHES = (1, 2, 3)  # of the rollouts that a fresh search starts from
 TAIL = 20
-NOISE_SEED = 20_000  # plus the index of the sequence
+NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
+DRAW = 1_000
 
 
 class PerfectNmpc:
     """NMPC whose model is the plant: ``step`` gives the MV for one sample.
 
-    A new set point starts a fresh search from several rollouts, because plans that ignite the
-    reaction at different samples are different local optima; every other sample continues the
-    plan of the one before. A sample at which nothing can be solved applies that plan's next move
-    and counts in ``failures``.
+    A set point that the last step did not expect starts a fresh search from several rollouts,
+    because plans that ignite the reaction at different samples are different local optima; every
+    other sample continues the plan of the one before. A sample at which nothing can be solved
+    applies that plan's next move and counts in ``failures``.
     """
 
-    def __init__(self, plant: Plant, horizon: int = HORIZON) -> None:
+    def __init__(self, plant: Plant, horizon: int = HORIZON, metric: str = "mae") -> None:
         self.plant = plant
-        self._horizon = Horizon(plant, horizon)
+        self._horizon = Horizon(plant, horizon, metric=metric)
         self._simulate = plant.stepper()
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past: plan, set point and the count of failures."""
+        """Forget the past: plan, set points and the count of failures."""
         self.failures = 0
         self._plan: Plan | None = None
-        self._sp: Array | None = None
+        self._target: Array | None = None
 
     def step(self, x: Array, sp: Array, parameters: Array | None = None) -> Array:
         """The MV, shape (n_mv,), for state ``x`` (n_x,) and set point ``sp`` (n_sp,).
 
-        ``parameters`` (n_p,) are the plant's true ones at this sample; by default its nominal ones.
+        ``sp`` may also be the course of the set point from the next sample on, shape (m, n_sp),
+        whose last row stays. ``parameters`` (n_p,) are the plant's true ones at this sample; by
+        default its nominal ones.
         """
         n = self._horizon.n
-        target = np.tile(np.atleast_1d(np.asarray(sp, dtype=np.float64)), (n, 1))
+        course = np.atleast_2d(np.asarray(sp, dtype=np.float64))
+        target = course[np.minimum(np.arange(n), len(course) - 1)]
         p = np.tile(self.plant.parameters() if parameters is None else parameters, (n, 1))
         plan = None
-        if self._plan is not None and self._sp is not None and np.array_equal(self._sp, target[0]):
+        if self._plan is not None and self._target is not None and np.array_equal(self._target[1:], target[:-1]):
             plan = self._horizon.solve(x, target, p, self._horizon.shifted(self._plan))
         if plan is None or not plan.solved:
             plan = search(self._horizon, x, target, p, self._simulate)
@@ -87,7 +109,7 @@ class PerfectNmpc:
                 self.failures += 1
                 if self._plan is not None:
                     plan = self._horizon.shifted(self._plan)
-        self._plan, self._sp = plan, target[0]
+        self._plan, self._target = plan, target
         return plan.mv[0]
 
 
@@ -108,15 +130,22 @@ class Job:
 
 
 def run_nmpc(
-    nmpc: PerfectNmpc, scenario: Scenario, noise_std: Sequence[float] | None = None, seed: int = 0
+    nmpc: PerfectNmpc,
+    scenario: Scenario,
+    noise_std: Sequence[float] | None = None,
+    seed: int = 0,
+    recipe: bool = False,
+    unforeseen: bool = False,
 ) -> dict[str, float]:
     """Closed-loop metrics of the NMPC, its failures and its processor time a step.
 
-    The noise, one standard deviation a PV, reaches only the NMPC, which has no filter. Raises
-    PlantError for noise on a plant whose PVs are not its states.
+    The noise, one standard deviation a PV, reaches only the NMPC, which has no filter. With
+    ``recipe`` it sees the set points to come; ``unforeseen`` parameters it knows one sample late,
+    the first ones from the start. Raises PlantError for noise on a plant whose PVs are not its
+    states.
     """
     plant = nmpc.plant
-    if noise_std is not None and type(plant).output is not Plant.output:
+    if noise_std is not None and not measures_states(plant):
         raise PlantError(f"plant {plant.name!r} measures other things than its states; its NMPC cannot be given noise")
     rng = np.random.default_rng(seed)
     noise = np.zeros((scenario.samples, len(scenario.x0)))
@@ -124,46 +153,60 @@ def run_nmpc(
         noise = noise_draws(plant, scenario.samples, noise_std, rng)
     nmpc.reset()
     simulate, parameters = plant.stepper(), scenario.parameters(plant)
+    known = parameters[np.maximum(np.arange(scenario.samples) - unforeseen, 0)]
     x, cv, mv, times = scenario.x0, [], [], []
-    for sp, p, error in zip(scenario.sp, parameters, noise, strict=True):
+    for k, (p, error) in enumerate(zip(parameters, noise, strict=True)):
+        sp = scenario.sp[min(k + 1, scenario.samples - 1) :] if recipe else scenario.sp[k]
         cv.append(np.array(plant.measure(x))[: scenario.sp.shape[1], 0])
         begun = time.process_time()
-        mv.append(nmpc.step(x + error, sp, p))
+        mv.append(nmpc.step(x + error, sp, known[k]))
         times.append(1e3 * (time.process_time() - begun))
         x = simulate(x, mv[-1], plant.dv_nominal, p)
-    span = plant.sp_signals[0].high - plant.sp_signals[0].low
-    found = closed_loop_metrics(scenario.sp, np.array(cv), np.array(mv), scenario.hold, plant.period_s, span)
-    found |= {"failures": float(nmpc.failures)}
+    found = _figures(plant, scenario, np.array(cv), np.array(mv)) | {"failures": float(nmpc.failures)}
     return found | {f"step_ms_p{q}": float(np.percentile(times, q)) for q in (50, 99)}
 
 
-def run_offline(plant: Plant, scenario: Scenario, elements: int = 6) -> dict[str, float]:
-    """Closed-loop metrics of the offline optimum, and how many holds were not solved."""
-    hold, simulate = scenario.hold or scenario.samples, plant.stepper()
-    horizon = Horizon(plant, hold + TAIL, elements=elements)
-    everything = scenario.parameters(plant)
+def run_offline(
+    plant: Plant, scenario: Scenario, elements: int = 6, metric: str = "mae", recipe: bool = False
+) -> dict[str, float]:
+    """Closed-loop metrics of the offline optimum, and how many of its plans were not solved.
+
+    There is one plan for every stretch of equal set points, or a single one for a ``recipe``,
+    which ends with its last sample: nothing comes after it that it must be at rest for.
+    """
+    edges = [0] if recipe else [0, *np.flatnonzero(np.any(np.diff(scenario.sp, axis=0) != 0, axis=1)) + 1]
+    lengths = np.diff([*edges, scenario.samples])
+    horizon = Horizon(plant, int(lengths.max()) + (0 if recipe else TAIL), metric=metric, elements=elements)
+    everything, simulate = scenario.parameters(plant), plant.stepper()
     x, cv, mv, failures = scenario.x0, [], [], 0
-    for k in range(0, scenario.samples, hold):
-        target = np.tile(scenario.sp[k], (horizon.n, 1))
-        p = everything[np.minimum(np.arange(k, k + horizon.n), scenario.samples - 1)]
+    for k, length in zip(edges, lengths, strict=True):
+        ahead = k + np.arange(horizon.n)
+        target = scenario.sp[np.minimum(ahead + 1, k + length - 1)]
+        p = everything[np.minimum(ahead, scenario.samples - 1)]
         plan = search(horizon, x, target, p, simulate)
         failures += not plan.solved
-        cv.append(np.array(plant.measure(plan.x[:hold].T)).T[:, : target.shape[1]])
-        mv.append(plan.mv[:hold])
-        x = plan.x[hold]
+        cv.append(np.array(plant.measure(plan.x[:length].T)).T[:, : target.shape[1]])
+        mv.append(plan.mv[:length])
+        x = plan.x[length]
+    return _figures(plant, scenario, np.vstack(cv), np.vstack(mv)) | {"failures": float(failures)}
+
+
+def _figures(plant: Plant, scenario: Scenario, cv: Array, mv: Array) -> dict[str, float]:
     span = plant.sp_signals[0].high - plant.sp_signals[0].low
-    found = closed_loop_metrics(scenario.sp, np.vstack(cv), np.vstack(mv), scenario.hold, plant.period_s, span)
-    return found | {"failures": float(failures)}
+    return closed_loop_metrics(scenario.sp, cv, mv, scenario.hold, plant.period_s, span, scenario.late_from)
 
 
 def _compute(case: Case, job: Job) -> tuple[Job, dict[str, float], float]:
     begun = time.perf_counter()
     with threadpool_limits(1):
         if job.kind == "offline":
-            figures = run_offline(case.plant, job.scenario)
+            figures = run_offline(case.plant, job.scenario, metric=case.metric, recipe=case.recipe)
         else:
-            noise = case.noise_std.tolist() if job.kind == "nmpc_noise" else None
-            figures = run_nmpc(PerfectNmpc(case.plant, HORIZON), job.scenario, noise, NOISE_SEED + job.index)
+            nmpc = PerfectNmpc(case.plant, HORIZON, case.metric)
+            noise, draws = (case.noise_std.tolist(), case.noise_draws) if job.kind == "nmpc_noise" else (None, 1)
+            seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
+            know = (case.recipe, case.unforeseen)
+            figures = together([run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds])
     return job, figures, time.perf_counter() - begun
 
 
@@ -174,16 +217,11 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
     """
     path = path or bounds_path(case)
     stored = read_stored(path)
-    digest = plant_digest(case.plant)
-    if stored.get("plant") != digest or stored.get("horizon") != HORIZON:
-        stored = {"schema": SCHEMA, "case": case.name, "plant": digest, "horizon": HORIZON, "figures": {}}
+    current = problem(case) | {"horizon": HORIZON}
+    if any((DEFAULTS | stored).get(key) != value for key, value in current.items()):
+        stored = {"schema": SCHEMA, "case": case.name, **current, "figures": {}}
     scenarios = case.scenarios()
-    work = [
-        Job(s, i, kind)
-        for name in names
-        for i, s in enumerate(scenarios[name])
-        for kind in ("nmpc", "nmpc_noise", "offline")
-    ]
+    work = [Job(s, i, kind) for name in names for i, s in enumerate(scenarios[name]) for kind in kinds(case)]
     results = Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(_compute)(case, job) for job in work)
     for done, (job, figures, seconds) in enumerate(results, start=1):
         rounded = {key: float(f"{value:.6g}") for key, value in figures.items()}
@@ -193,7 +231,7 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
         draft.write_text(json.dumps(stored, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
         os.replace(draft, path)
         which = f"{job.scenario.name} {job.index} {job.kind}"
-        yield f"[{done}/{len(work)}] {which}: mae {rounded['mae']:.5f} ({seconds:.0f} s)"
+        yield f"[{done}/{len(work)}] {which}: {case.metric} {rounded[case.metric]:.6g} ({seconds:.0f} s)"
 
 
 def main(arguments: list[str] | None = None) -> int:

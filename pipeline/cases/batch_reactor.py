@@ -44,6 +44,7 @@ class BatchReactorCase(Case):
     name: ClassVar[str] = "batch_reactor"
     title: ClassVar[str] = "Batch reactor A -> B -> C"
     metric: ClassVar[str] = "sse"
+    unforeseen: ClassVar[bool] = True
     recipe: ClassVar[bool] = True
     noise_draws: ClassVar[int] = 10
     development_noise: ClassVar[bool] = True

@@ -51,6 +51,7 @@ class PhNeutralizationCase(Case):
     name: ClassVar[str] = "ph_neutralization"
     title: ClassVar[str] = "pH neutralization"
     metric: ClassVar[str] = "sse"
+    unforeseen: ClassVar[bool] = True
     plant_class: ClassVar[type[Plant]] = PhNeutralization
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
     noise: ClassVar[Mapping[str, float]] = {"pH": 0.02}
