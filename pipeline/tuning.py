@@ -1,4 +1,4 @@
-"""PID settings from a linearized plant: IMC, SIMC, and the IMC filter that is best in closed loop."""
+"""PID settings from a linearized plant: IMC, SIMC, ITAE, and the IMC filter that is best in closed loop."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import LawError
 from pipeline.plants.base import Linearization
+from pipeline.reduction import LagWithDeadTime, minimal
 
 Array = NDArray[np.float64]
 
@@ -43,19 +44,20 @@ class PidSettings:
 
 @dataclass(frozen=True, slots=True)
 class AllPole:
-    """The transfer function G(s) = b0 / prod(s - p_i), with time in seconds."""
+    """The transfer function G(s) = b0 / prod(s - p_i)."""
 
     b0: float
     poles: NDArray[np.complex128]  # largest real part first
 
     @classmethod
-    def of(cls, lin: Linearization, time_unit_s: float = 1.0, pv: int = 0, mv: int = 0) -> AllPole:
-        """G from one MV to one PV of a linearized plant.
+    def of(cls, lin: Linearization, pv: int = 0, mv: int = 0) -> AllPole:
+        """G from one MV to one PV of a linearized plant; poles that zeros cancel are not counted.
 
         Raises LawError where G has a finite zero or more than two poles: the tuning rules of this
         file do not hold there.
         """
-        a, b, c = lin.a / time_unit_s, lin.b[:, mv] / time_unit_s, lin.c[pv]
+        small = minimal(lin, pv, mv)
+        a, b, c = small.a, small.b[:, 0], small.c[0]
         n = len(a)
         markov = [float(c @ np.linalg.matrix_power(a, k) @ b) for k in range(n)]
         size = np.linalg.norm(c) * np.linalg.norm(b)
@@ -64,8 +66,6 @@ class AllPole:
                 f"IMC and SIMC need one or two poles and no zero; the linearized plant has {n} poles and the "
                 f"Markov parameters {', '.join(f'{m:.3g}' for m in markov)}: choose tuning `manual`"
             )
-        if markov[-1] == 0:
-            raise LawError("the MV does not act on the controlled variable of the linearized plant; check the pairing")
         values = np.linalg.eigvals(a).astype(np.complex128)
         return cls(markov[-1], values[np.argsort(-values.real)])
 
@@ -134,11 +134,37 @@ def simc_pid(process: AllPole, period_s: float, tau_c_s: float | None = None) ->
     return PidSettings(kc=kc * (1 + tau_d / tau_i), ti_s=tau_i + tau_d, td_s=tau_i * tau_d / (tau_i + tau_d))
 
 
+def itae_pid(process: LagWithDeadTime, period_s: float, sampling: float = 0.5) -> PidSettings:
+    """The PID with the least time-weighted absolute error after a set-point step, for a lag with dead time.
+
+        Kc = 0.965/k (theta/tau)^-0.855,  Ti = tau/(0.796 - 0.147 theta/tau),  Td = 0.308 tau (theta/tau)^0.9292
+
+    with theta the process's dead time and, for the sampling, ``sampling`` periods: half of one, as
+    an MV held over a period lags by that much. A lag without a dead time of its own then has a
+    sampled loop near its limit of stability; a whole period leaves a margin. Fitted for theta/tau
+    from 0.1 to 1. Raises LawError where theta/tau is so large that Ti has no meaning.
+
+    Source: Rovira, Murrill and Smith, 1969, as in Smith and Corripio, Principles and Practice of
+    Automatic Process Control, 2nd ed., section 7-4.3; the half period is theirs too (section 7-4.4).
+    """
+    theta, tau = process.dead_time_s + sampling * period_s, process.tau_s
+    ratio = theta / tau
+    if not 0 < 0.147 * ratio < 0.796:
+        raise LawError(
+            f"the ITAE rule is for dead times above 0 and up to the time constant ({tau:.3g} s); here {theta:.3g} s, "
+            f"of it {sampling * period_s:.3g} s for the sampling: take another period or tuning `optimized`"
+        )
+    return PidSettings(
+        kc=0.965 / process.gain * ratio**-0.855,
+        ti_s=tau / (0.796 - 0.147 * ratio),
+        td_s=0.308 * tau * ratio**0.9292,
+    )
+
+
 def sampled_loop(lin: Linearization, settings: PidSettings, period_s: float) -> Array:
     """The matrix that takes [dx, mv, y, d] of the sampled closed loop one period on, set point at rest.
 
-    The loop is stable where all eigenvalues lie inside the unit circle. ``period_s`` is in the
-    linearization's unit of time.
+    The loop is stable where all eigenvalues lie inside the unit circle.
     """
     phi, gamma = lin.sampled(period_s)
     n, h, s = len(phi), period_s, settings
@@ -171,14 +197,14 @@ def peak_sensitivity(lin: Linearization, settings: PidSettings, period_s: float)
     return float(np.abs(1 / (1 + loop)).max())
 
 
-def robust_imc(lin: Linearization, period_s: float, time_unit_s: float = 1.0, peak: float = 2.0) -> PidSettings:
+def robust_imc(lin: Linearization, period_s: float, peak: float = 2.0) -> PidSettings:
     """IMC with the shortest filter whose sampled loop keeps its peak sensitivity at ``peak`` or below.
 
     Where none does, the filter with the smallest peak. Raises LawError where no filter stabilizes.
     """
-    process = AllPole.of(lin, time_unit_s)
+    process, lin = AllPole.of(lin), minimal(lin)
     found = [imc_pid(process, float(v)) for v in np.geomspace(0.5, LONGEST_FILTER, 90) * period_s]
-    peaks = np.array([peak_sensitivity(lin, in_unit(s, time_unit_s), period_s / time_unit_s) for s in found])
+    peaks = np.array([peak_sensitivity(lin, s, period_s) for s in found])
     if np.isinf(peaks).all():
         raise LawError(
             f"no IMC filter from {0.5 * period_s:g} to {LONGEST_FILTER * period_s:g} s stabilizes the sampled loop; "
@@ -186,16 +212,6 @@ def robust_imc(lin: Linearization, period_s: float, time_unit_s: float = 1.0, pe
         )
     good = np.nonzero(peaks <= peak)[0]
     return found[int(good[0]) if good.size else int(peaks.argmin())]
-
-
-def in_unit(settings: PidSettings, time_unit_s: float) -> PidSettings:
-    """The settings with their times in another unit, as the linearization of a plant counts them."""
-    return replace(
-        settings,
-        ti_s=settings.ti_s / time_unit_s,
-        td_s=settings.td_s / time_unit_s,
-        filter_s=settings.filter_s / time_unit_s,
-    )
 
 
 def optimized_imc(

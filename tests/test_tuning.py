@@ -11,10 +11,12 @@ from pipeline.development import DevelopmentLoops
 from pipeline.errors import LawError, PlantError
 from pipeline.plants import Plant
 from pipeline.plants.base import Linearization
+from pipeline.reduction import LagWithDeadTime, minimal
 from pipeline.tuning import (
     AllPole,
     PidSettings,
     imc_pid,
+    itae_pid,
     optimized_imc,
     peak_sensitivity,
     robust_imc,
@@ -59,10 +61,56 @@ def test_transfer_function_of_the_cstr(middle: Linearization) -> None:
     assert process.b0 / np.prod(s - process.poles) == pytest.approx(exact, rel=1e-10)
 
 
-def test_time_unit_is_taken_out(middle: Linearization) -> None:
-    per_minute = Linearization(middle.x, middle.mv, 60 * middle.a, 60 * middle.b, middle.c)
-    assert imc_pid(AllPole.of(per_minute, 60.0), 2.0).ti_s == pytest.approx(imc_pid(AllPole.of(middle), 2.0).ti_s)
-    assert robust_imc(per_minute, 0.5, 60.0).kc == pytest.approx(robust_imc(middle, 0.5).kc)
+def test_states_that_do_not_count_are_not_counted(middle: Linearization) -> None:
+    """A state that the MV does not reach, one that the PV does not see, and other units of the states."""
+    a = np.block([[middle.a, np.ones((2, 1)), np.zeros((2, 1))], [np.zeros((1, 2)), np.array([[-3.0, 0.0]])],
+                  [np.array([[0.2, -0.1, 0.0, 0.4]])]])  # fmt: skip
+    b, c = np.vstack([middle.b, [[0.0], [1.0]]]), np.array([[*middle.c[0], 0.5, 0.0]])
+    unit = np.array([1e-4, 30.0, 1.0, 1e3])
+    big = Linearization(np.zeros(4), np.zeros(1), a * unit[:, None] / unit, b * unit[:, None], c / unit)
+    small = minimal(big)
+    assert small.a.shape == (2, 2)
+    np.testing.assert_allclose(small.eigenvalues, middle.eigenvalues, rtol=1e-8)
+    at = 0.3 + 0.7j
+    exact = middle.c[0] @ np.linalg.solve(at * np.eye(2) - middle.a, middle.b[:, 0])
+    assert small.c[0] @ np.linalg.solve(at * np.eye(2) - small.a, small.b[:, 0]) == pytest.approx(exact, rel=1e-9)
+    assert AllPole.of(big).b0 == pytest.approx(AllPole.of(middle).b0, rel=1e-8)
+    assert minimal(middle).a is middle.a
+
+
+def test_moments_of_a_lag_and_of_two() -> None:
+    assert LagWithDeadTime.of(first_order(-3.0, 40.0)) == LagWithDeadTime(
+        pytest.approx(-3.0), pytest.approx(40.0), pytest.approx(0.0, abs=1e-9)
+    )
+    tau1, tau2 = 30.0, 8.0
+    two = LagWithDeadTime.of(second_order(5.0 / (tau1 * tau2), 1 / tau1 + 1 / tau2, 1 / (tau1 * tau2)))
+    assert two.gain == pytest.approx(5.0)
+    assert two.tau_s == pytest.approx(np.hypot(tau1, tau2))
+    assert two.dead_time_s == pytest.approx(tau1 + tau2 - np.hypot(tau1, tau2))
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.4, 1.0])
+def test_itae_follows_a_step_of_the_lag_that_it_is_made_for(ratio: float) -> None:
+    """On a lag with dead time, finely sampled: little overshoot, and settled within some dead and lag times."""
+    tau, gain, steps = 10.0, -2.0, 40
+    theta = ratio * tau
+    rule, h = itae_pid(LagWithDeadTime(gain, tau, theta), 0.0), theta / steps
+    u, y, e1, e2, decay = [0.0] * steps, [0.0], 0.0, 0.0, np.exp(-h / tau)
+    while len(y) * h < 4 * theta + 4 * tau:
+        e = 1.0 - y[-1]
+        u.append(u[-1] + rule.kc * (e - e1 + h / rule.ti_s * e + rule.td_s / h * (e - 2 * e1 + e2)))
+        y.append(decay * y[-1] + (1 - decay) * gain * u[-1 - steps])
+        e1, e2 = e, e1
+    assert max(y) < 1.1
+    assert np.abs(np.array(y[round(0.8 * len(y)) :]) - 1).max() < 0.05
+
+
+def test_itae_counts_the_sampling_as_dead_time_and_scales() -> None:
+    ideal = itae_pid(LagWithDeadTime(2.0, 10.0, 3.0), 0.0)
+    assert itae_pid(LagWithDeadTime(2.0, 10.0, 1.0), 4.0) == ideal
+    assert itae_pid(LagWithDeadTime(2.0, 10.0, 0.0), 3.0, sampling=1.0) == ideal
+    slower = itae_pid(LagWithDeadTime(-1.0, 20.0, 6.0), 0.0)
+    assert (slower.kc, slower.ti_s, slower.td_s) == pytest.approx((-2 * ideal.kc, 2 * ideal.ti_s, 2 * ideal.td_s))
 
 
 @given(st.floats(0.3, 5.0))
@@ -147,6 +195,9 @@ def test_simc_is_skogestads_example() -> None:
         (lambda: AllPole.of(linear([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [1.0, 0.5])), "no zero"),
         (lambda: AllPole.of(linear([[-1.0, 0.0], [0.0, -2.0]], [1.0, 0.0], [0.0, 1.0])), "does not act"),
         (lambda: robust_imc(second_order(1.0, -20.0, -30.0), 0.5), "no IMC filter"),
+        (lambda: LagWithDeadTime.of(second_order(1.0, 0.3, -0.1)), "needs a stable plant"),
+        (lambda: LagWithDeadTime.of(second_order(1.0, 0.1, 1.0)), "moments"),
+        (lambda: itae_pid(LagWithDeadTime(1.0, 2.0, 0.0), 30.0), "up to the time constant"),
     ],
 )
 def test_what_a_rule_cannot_do_is_said(rule, message: str) -> None:

@@ -15,6 +15,7 @@ from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
 from pipeline.models.base import Model
 from pipeline.plants.base import Array, Linearization, Plant
+from pipeline.reduction import LagWithDeadTime
 from pipeline.tuning import AllPole, PidSettings
 
 
@@ -23,7 +24,7 @@ class HoldsLinearization(Protocol):
     """A model that is a plant linearized at a steady state."""
 
     def linearization(self) -> Linearization:
-        """The linearization, per unit of the plant's time."""
+        """The linearization, per second."""
 
 
 class PID(ControlLaw):
@@ -53,17 +54,19 @@ class PID(ControlLaw):
         """How the PID is tuned.
 
         ``tuning``: ``optimized`` (IMC, its filter and the set-point weight chosen in closed loop),
-        ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``manual`` with ``kc``
-        [mv/pv], ``ti_s``, ``td_s``. ``tracking_s`` [s] None is sqrt(Ti Td). ``set_point_weight``
-        None is 1, or optimized with the filter.
+        ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``itae`` (least time-weighted
+        error after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``.
+        ``tracking_s`` [s] None is sqrt(Ti Td). ``set_point_weight`` None is 1, or optimized with the
+        filter.
         ``operating_cv`` [pv] is the steady state to linearize where the model set has no part
         ``linearized``; None is the middle of the set point's range. The development set points
         are drawn for the optimization alone, ``development_set_points`` of them for each seed,
-        each held for ``development_hold`` samples. ``mv_rate`` [mv] is the largest change a
+        each held for ``development_hold`` samples. ``sampling`` is what ``itae`` counts of a period as
+        dead time: 0.5 is the textbook's, 1 more cautious. ``mv_rate`` [mv] is the largest change a
         sample, None unlimited.
         """
 
-        tuning: Literal["optimized", "imc", "simc", "manual"] = "optimized"
+        tuning: Literal["optimized", "imc", "simc", "itae", "manual"] = "optimized"
         kc: float | None = None
         ti_s: float | None = None
         td_s: float = 0.0
@@ -75,6 +78,7 @@ class PID(ControlLaw):
         development_seeds: tuple[int, ...] = (7001, 7002, 7003)
         development_set_points: int = 12
         development_hold: int = 60
+        sampling: float = 0.5
         mv_rate: float | None = None
 
     kc: Tensor  # (..., 1)
@@ -121,16 +125,17 @@ class PID(ControlLaw):
         rest = {"filter_s": p.filter_s, "tracking_s": p.tracking_s, "set_point_weight": weight}
         if p.tuning == "manual":
             if p.kc is None or p.ti_s is None:
-                raise LawError("PID tuning `manual` needs kc and ti_s; give both or choose optimized, imc or simc")
+                raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
             return cls(signals, PidSettings(p.kc, p.ti_s, p.td_s, **rest), p.mv_rate)
-        lin, unit = _linearization(params, models, plant), plant.time_unit_s
-        process = AllPole.of(lin, unit)
-        if p.tuning == "simc":
-            settings = tuning.simc_pid(process, signals.period_s, p.lambda_s)
+        lin = _linearization(params, models, plant)
+        if p.tuning == "itae":
+            settings = tuning.itae_pid(LagWithDeadTime.of(lin), signals.period_s, p.sampling)
+        elif p.tuning == "simc":
+            settings = tuning.simc_pid(AllPole.of(lin), signals.period_s, p.lambda_s)
         elif p.tuning == "imc" and p.lambda_s is not None:
-            settings = tuning.imc_pid(process, p.lambda_s)
+            settings = tuning.imc_pid(AllPole.of(lin), p.lambda_s)
         elif p.tuning == "imc":
-            settings = tuning.robust_imc(lin, signals.period_s, unit)
+            settings = tuning.robust_imc(lin, signals.period_s)
         elif p.tuning == "optimized":
             loops = DevelopmentLoops.draw(plant, p.development_seeds, p.development_set_points, p.development_hold)
             free = p.set_point_weight is None
@@ -140,10 +145,10 @@ class PID(ControlLaw):
                 return loops.mae(law, law.n_state, len(rows))
 
             base = PidSettings(0.0, 1.0, **rest)
-            settings = tuning.optimized_imc(process, signals.period_s, cost, base, optimize_weight=free)
+            settings = tuning.optimized_imc(AllPole.of(lin), signals.period_s, cost, base, optimize_weight=free)
             return cls(signals, settings, p.mv_rate)
         else:
-            raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, manual")
+            raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
         return cls(signals, replace(settings, **rest), p.mv_rate)
 
     def forward(

@@ -66,14 +66,14 @@ class Linearized(Model):
         return {"n_x": self.n_x, "n_mv": self.n_mv, "n_pv": self.n_pv, "period_s": self.period_s}
 
     @classmethod
-    def of(cls, at: Linearization, period_s: float, *, time_unit_s: float = 1.0, pv: Array | None = None) -> Self:
-        """The model of a linearization whose time runs in units of ``time_unit_s`` seconds.
+    def of(cls, at: Linearization, period_s: float, *, pv: Array | None = None) -> Self:
+        """The model of a linearization.
 
         ``pv`` (n_pv,) is the steady PV; None takes C x0, right where the PVs are linear in the state.
         """
         (n_x, n_mv), n_pv = at.b.shape, at.c.shape[0]
         model = cls(n_x, n_mv, n_pv, period_s)
-        phi, gamma = at.sampled(period_s / time_unit_s)
+        phi, gamma = at.sampled(period_s)
         values = {
             "x": at.x,
             "mv": at.mv,
@@ -92,10 +92,10 @@ class Linearized(Model):
         """The model at the steady state with controlled variable ``cv``; raises PlantError where there is none."""
         x, mv = plant.steady_state_at(cv)
         pv = np.array(plant.measure(x), float).ravel()
-        return cls.of(plant.linearize(x, mv), plant.period_s, time_unit_s=plant.time_unit_s, pv=pv)
+        return cls.of(plant.linearize(x, mv), plant.period_s, pv=pv)
 
     def linearization(self) -> Linearization:
-        """The continuous model, per unit of the plant's time."""
+        """The continuous model, per second."""
         return Linearization(*(t.numpy().copy() for t in (self.x, self.mv, self.a, self.b, self.c)))
 
     def forward(self, x: Tensor) -> Tensor:
