@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,37 +41,48 @@ def show_results(artifacts: Path, console: Console | None = None) -> None:
 
 def _table(validation: Validation, folder: Path) -> Table:
     scenarios, bounds = validation["scenarios"], validation.get("bounds", {})
-    names = [name for name in scenarios if not name.endswith("_noise")]
-    title = f"{validation['case']}: mean absolute error, median over data seeds; held_out / NMPC: the bound is 1"
+    metric = validation.get("metric", "mae")
+    weights = (validation.get("gate") or {}).get("weights") or {}
+    names = [name for name in scenarios if not name.endswith("_noise") or name in weights]
+    main = max(weights, key=lambda name: weights[name], default=names[-1])
+    words = (validation.get("titles") or {}).get("metric", "mean absolute error")
+    title = f"{validation['case']}: {words}, median over data seeds; {main} / NMPC: the bound is 1"
     table = Table(title=title, title_justify="left", box=box.SIMPLE)
     table.add_column("law", no_wrap=True)
     for name in names:
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("held_out / NMPC", justify="right", no_wrap=True)
+    table.add_column(f"{main} / NMPC", justify="right", no_wrap=True)
     table.add_column("size", justify="right", no_wrap=True)
-    laws = sorted({law for name in names for law in scenarios[name]}, key=lambda law: _sort_key(scenarios, names, law))
-    for law in laws:
-        figures = [scenarios[name].get(law, {}).get("mae") for name in names]
+
+    def ours(name: str, law: str) -> float | None:
+        value = scenarios.get(name, {}).get(law, {}).get(metric)
+        return None if value is None else float(value)
+
+    def bound(name: str) -> float | None:
+        value = bounds.get(name, {}).get("nmpc", {}).get(metric)
+        return None if value is None else float(value)
+
+    def key(law: str) -> float:
+        value = ours(main, law)
+        return math.inf if value is None else value
+
+    for law in sorted({law for name in names for law in scenarios[name]}, key=key):
         file = folder / f"{law}.onnx"
         size = f"{file.stat().st_size / 1024:.0f} kB" if file.exists() else "-"
-        table.add_row(law, *map(_figure, figures), _ratio(scenarios, bounds, law), size)
-    nmpc = [bounds.get(name, {}).get("nmpc", {}).get("mae") for name in names]
+        table.add_row(law, *(_figure(ours(name, law)) for name in names), _ratio(ours(main, law), bound(main)), size)
     table.add_section()
-    table.add_row("perfect NMPC", *map(_figure, nmpc), "", "")
+    table.add_row("perfect NMPC", *(_figure(bound(name)) for name in names), "", "")
     return table
 
 
-def _sort_key(scenarios: Validation, names: list[str], law: str) -> float:
-    last = names[-1] if "held_out" not in names else "held_out"
-    value = scenarios[last].get(law, {}).get("mae")
-    return float("inf") if value is None else float(value)
-
-
-def _ratio(scenarios: Validation, bounds: Validation, law: str) -> str:
-    ours = scenarios.get("held_out", {}).get(law, {}).get("mae")
-    bound = bounds.get("held_out", {}).get("nmpc", {}).get("mae")
+def _ratio(ours: float | None, bound: float | None) -> str:
     return f"{ours / bound:.2f}" if ours and bound else "-"
 
 
 def _figure(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}" if value >= 1e-3 else f"{value:.0e}"
+    """Four digits behind the point for a small figure, thousands grouped for a large one."""
+    if value is None:
+        return "-"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.4f}" if value >= 1e-3 else f"{value:.0e}"

@@ -10,13 +10,17 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from pipeline.cases import NOISE_SUFFIX
+from pipeline.cases.base import NOISE_SUFFIX
 from pipeline.report.claims import CLAIMS, PLAIN
 from pipeline.report.evidence import Evidence
 from pipeline.report.figures import draw_all
-from pipeline.report.verdicts import RULE, acceptance, paper_row, statements
+from pipeline.report.for_programs import validation
+from pipeline.report.model_evidence import candidates, model_rows
+from pipeline.report.verdicts import RULE, acceptance, paper_row, plain_reason, statements
+from pipeline.report.words import LONG, NO_UNIT, SHORT, number, scenario_name
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
+MOST_HEADLINES = 5
 
 
 def write_report(evidence: Evidence, models: Path, out: Path) -> list[Path]:
@@ -24,11 +28,11 @@ def write_report(evidence: Evidence, models: Path, out: Path) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     pictures = draw_all(evidence, out / "figures", models)
     content = context(evidence, pictures)
-    validation = json.dumps(evidence.validation(), indent=1, allow_nan=False) + "\n"
+    programs = json.dumps(validation(evidence), indent=1, allow_nan=False) + "\n"
     html, text = (
         _environment(end == "html").get_template(f"report.{end}.j2").render(content) for end in ("html", "md")
     )
-    files = {"validation.json": validation, "report.html": html, "report.md": text}
+    files = {"validation.json": programs, "report.html": html, "report.md": text}
     for name, body in files.items():
         draft = out / f"{name}.draft"
         draft.write_text(body, encoding="utf-8")
@@ -51,7 +55,7 @@ def _environment(html: bool) -> Environment:
 
 def figure(value: float | None) -> str:
     """A number with three digits; a dash where nothing was measured."""
-    return "–" if value is None else f"{value:.3g}"
+    return "–" if value is None else number(value)
 
 
 def cell(text: str) -> str:
@@ -62,53 +66,91 @@ def cell(text: str) -> str:
 def context(evidence: Evidence, pictures: Mapping[str, str]) -> dict[str, Any]:
     """Everything that the templates show."""
     case, claims = evidence.case, CLAIMS.get(evidence.case.name, PLAIN)
-    tables = [(table, [paper_row(row, evidence, claims.reason) for row in table.rows]) for table in case.tables]
+    # What is known of the paper's record says nothing of a user's own.
+    reason = plain_reason if evidence.own_data else claims.reason
+    tables = [(table, [paper_row(row, evidence, reason) for row in table.rows]) for table in case.tables]
     accepted, said = acceptance(evidence, claims), statements(evidence, claims)
+
+    models = [row for name, model in evidence.models.items() for row in model_rows(name, model)]
+
+    def of_kind(start: str) -> dict[str, str]:
+        return {k: v for k, v in pictures.items() if k.startswith(start)}
+
     return {
         "case": case,
         "evidence": evidence,
-        "best": evidence.laws.get(evidence.best or ""),
-        "headline": _headline(evidence),
-        "pictures": {k: v for k, v in pictures.items() if k.startswith("figure_")},
-        "loops": {k: v for k, v in pictures.items() if k.startswith("closed_loop_")},
-        "sweeps": {k: v for k, v in pictures.items() if k.startswith("sweep_")},
+        "metric": {"short": SHORT[case.metric], "long": LONG[case.metric]},
+        "noise": "true output, noisy measurement"
+        + (f", mean of {draws} draws" if (draws := case.noise_draws) > 1 else ""),
+        "floor": _floor(evidence),
+        "best": (best := evidence.laws.get(evidence.best or "")),
+        "seeds": "" if best is None else _seeds(best.seeds),
+        "headline": headline(evidence),
+        "pictures": of_kind("figure_"),
+        "loops": of_kind("closed_loop_"),
+        "sweeps": of_kind("sweep_") | of_kind("candidates_"),
         "overview": pictures.get("closed_loop.png"),
+        "main_test": evidence.main_words[0],
         "tables": tables,
         "rule": RULE,
         "acceptance": accepted,
         "met": sum(v.holds is True for v in accepted),
         "statements": said,
         "laws": [_law(evidence, law) for law in evidence.laws],
-        "scenarios": [_scenario(evidence, name, title) for name, title in evidence.scenarios.items()],
-        "models": [row for name, model in evidence.models.items() for row in _model(name, model)],
-        "step_ms": evidence.bound("held_out", "step_ms_p50"),
+        "scenarios": _rows(evidence),
+        "models": models,
+        "free_run": any(row["free_run"] is not None for row in models),
+        "candidates": [table for name, model in evidence.models.items() for table in candidates(name, model)],
+        "step_ms": evidence.bound(evidence.main_test, "step_ms_p50"),
         "registry": REGISTRY_URL,
     }
 
 
-def _headline(evidence: Evidence) -> list[tuple[str, str]]:
-    """The figures that stand at the top: value and what it is."""
-    best = evidence.best
+def _seeds(count: int) -> str:
+    return "one data seed" if count == 1 else f"{count} data seeds, each with networks of its own"
+
+
+def _floor(evidence: Evidence) -> str:
+    """What the gate takes for perfect, in words."""
+    if evidence.case.metric == "mae":
+        return f"{evidence.noise} (the measurement noise)"
+    return f"what the measurement noise alone adds up to ({evidence.noise:g} squared times the samples)"
+
+
+def headline(evidence: Evidence) -> list[tuple[str, str]]:
+    """The figures that stand at the top: value and what it is.
+
+    The best controller beside the bound on the test that weighs most, then on each test of the
+    case's requirements for it, and beside the PID.
+    """
+    best, case = evidence.best, evidence.case
     if best is None:
         return []
+    short = "" if case.metric == "mae" else f"{SHORT[case.metric]} of the "
+    bounds = {"nmpc": "perfect-model NMPC", "offline": "offline optimum"}
+    needs = [n for n in case.requirements if n.law in (None, best) and not n.low and not n.setting]
+    asked = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
     rows = []
-    for name, kind, words in (
-        ("held_out", "nmpc", "× perfect-model NMPC on held-out set points"),
-        ("sp_a", "offline", "× offline optimum on SP-A"),
-        ("sp_b", "offline", "× offline optimum on SP-B"),
-    ):
+    for name, kind in dict.fromkeys(asked):
         ratio = evidence.ratio(best, name, kind)
         if ratio is not None:
-            rows.append((f"{ratio:.2f}", words))
-    own, pid = evidence.figure(best, "held_out"), evidence.figure("pid", "held_out")
-    if own and pid and best != "pid":
-        rows.append((f"{100 * (1 - own / pid):.0f} %", "less error than the PID on held-out set points"))
+            rows.append((f"{ratio:.2f}", f"× {short}{bounds.get(kind, kind)} on {scenario_name(name, case.recipe)}"))
+    for need in needs:
+        late = evidence.figure(best, need.scenario, need.metric) if need.metric == "sse_late" else None
+        if late is not None:
+            where = scenario_name(need.scenario, case.recipe)
+            rows.append((number(late), f"{SHORT[need.metric]} on {where}; at most {number(need.high)} is asked"))
+    rows = rows[:MOST_HEADLINES]
+    own, pid = evidence.figure(best, evidence.main_test), evidence.figure("pid", evidence.main_test)
+    if own and pid and own < pid:
+        what = "less error" if case.metric == "mae" else "less squared error"
+        where = scenario_name(evidence.main_test, case.recipe)
+        rows.append((f"{100 * (1 - own / pid):.0f} %", f"{what} than the PID on {where}"))
     return rows
 
 
 def _law(evidence: Evidence, law: str) -> dict[str, Any]:
     found = evidence.laws[law]
-    step = found.metrics.get("step_us")
     setting = found.metrics.get("setting") or {}
     return {
         "name": law,
@@ -117,53 +159,44 @@ def _law(evidence: Evidence, law: str) -> dict[str, Any]:
         "score": evidence.score(law),
         "lock_ups": found.lock_ups,
         "seeds": found.seeds,
-        "step_us": step.get("p50") if isinstance(step, Mapping) else step,
+        "step_us": found.step_us,
     }
 
 
-def _scenario(evidence: Evidence, name: str, title: str) -> dict[str, Any]:
-    """A block of the big table: each law's MAE, its range, with noise, and its ratio to the bound."""
-    cells = {}
-    for law in evidence.laws:
-        cells[law] = {
-            "mae": evidence.figure(law, name),
-            "low": evidence.figure(law, name, "mae", None, "min"),
-            "high": evidence.figure(law, name, "mae", None, "max"),
-            "noise": evidence.figure(law, name + NOISE_SUFFIX),
-            "ratio": evidence.ratio(law, name),
-            "max_asse": evidence.figure(law, name, "max_asse"),
+def _rows(evidence: Evidence) -> list[dict[str, Any]]:
+    """The big table: each test in the case's metric, its late part where it has one, and the MV's travel at the end."""
+    case = evidence.case
+    rows = []
+    for name, tests in case.scenarios().items():
+        title = evidence.scenarios[name]
+        rows.append(_row(evidence, name, title, case.metric))
+        if case.metric == "sse" and tests[0].late_from:
+            late_s = tests[0].late_from * case.plant.period_s
+            rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", "sse_late"))
+    mv = case.plant_class.mv_signals[0]
+    unit = "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
+    return [*rows, _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")]
+
+
+def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, Any]:
+    """A row of the big table: each law's figure, its range, with noise, and its ratio to the bound."""
+    cells = {
+        law: {
+            "value": evidence.figure(law, name, metric),
+            "low": evidence.figure(law, name, metric, None, "min"),
+            "high": evidence.figure(law, name, metric, None, "max"),
+            "noise": evidence.figure(law, name + NOISE_SUFFIX, metric),
+            "ratio": evidence.ratio(law, name) if metric == evidence.case.metric else None,
         }
-    known = {law: c["mae"] for law, c in cells.items() if c["mae"] is not None}
+        for law in evidence.laws
+    }
+    known = {law: c["value"] for law, c in cells.items() if c["value"] is not None and metric != "mv_travel"}
     return {
         "name": name,
         "title": title,
         "cells": cells,
-        "winner": min(known, key=lambda law: known[law], default=None),
-        "nmpc": evidence.bound(name),
-        "nmpc_noise": evidence.bound(name + NOISE_SUFFIX),
-        "offline": evidence.bound(name, "mae", "offline"),
+        "winner": min(known, key=lambda law: known[law] or 0.0, default=None),
+        "nmpc": evidence.bound(name, metric),
+        "nmpc_noise": evidence.bound(name + NOISE_SUFFIX, metric),
+        "offline": evidence.bound(name, metric, "offline"),
     }
-
-
-def _model(name: str, model: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Rows of the models table, one for each part."""
-    rows = []
-    for part, found in (model.get("parts") or {}).items():
-        seeds = found.get("per_seed") or {}
-        median = found.get("median") or {}
-        errors = [s["rmse"] for s in seeds.values() if s.get("rmse") is not None]
-        rows.append(
-            {
-                "model": name,
-                "part": part,
-                "kind": found.get("kind", ""),
-                "horizon": found.get("horizon"),
-                "centres": median.get("centres"),
-                "rmse": median.get("rmse"),
-                "r2": median.get("r2"),
-                "range": [min(errors), max(errors)] if errors else None,
-                "per_seed": {seed: s.get("rmse") for seed, s in seeds.items()},
-                "regions": {r: v.get("rmse") for r, v in (median.get("regions") or {}).items()},
-            }
-        )
-    return rows

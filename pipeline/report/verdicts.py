@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 
 from pipeline.cases.base import PaperFigure, Requirement
 from pipeline.report.evidence import Evidence
+from pipeline.report.words import law_label, metric_name, number
 
 RELATIVE = 0.25
 ABSOLUTE = 1e-4
-NAMES = {"mae": "MAE", "masse": "MASSE", "max_asse": "MaxASSE"}
-"""How the paper writes a metric."""
 RULE = (
     f"A figure reproduces when it lies within {100 * RELATIVE:g} % of the paper's or within {ABSOLUTE:g} of it "
-    "(in the unit of the controlled variable). Ours are medians over the data seeds."
+    "(in the unit of the controlled variable). Ours are medians over the data seeds, whose networks were each trained "
+    "on another record."
 )
 
 
@@ -87,15 +87,19 @@ def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Row:
 
     median = ours("median")
     if median is None:
-        verdict, holds = "not measured: this setting was not validated", None
+        verdict, holds = f"not measured: {_unmeasured(row)}", None
     elif close(median, row.paper):
         verdict, holds = "reproduces", True
     else:
         verdict, holds = f"does not, because {reason(row, median, evidence)}", False
         if row.independent is not None and close(median, row.independent):
             verdict += f"; an independent implementation found {row.independent:g} too"
-    metric = NAMES.get(row.metric, row.metric)
+    metric = metric_name(row.metric)
     return Row(row.label, metric, row.paper, median, ours("min"), ours("max"), row.independent, verdict, holds)
+
+
+def _unmeasured(row: PaperFigure) -> str:
+    return "this setting was not validated" if row.scenario else f"no such figure in the model set {row.law}"
 
 
 def requirement(need: Requirement, evidence: Evidence) -> Verdict:
@@ -103,18 +107,20 @@ def requirement(need: Requirement, evidence: Evidence) -> Verdict:
     law = need.law or evidence.best
     who = _who(need, law)
     value = None if law is None else evidence.figure(law, need.scenario, need.metric, need.setting)
-    high, metric = need.high, NAMES.get(need.metric, need.metric)
-    limit = f"{metric} ≤ {need.high:g}" if not need.low else f"{need.low:g} ≤ {metric} ≤ {need.high:g}"
+    high, metric = need.high, metric_name(need.metric)
+    limit = f"{metric} ≤ {number(need.high, 6)}"
+    if need.low:
+        limit = f"{number(need.low, 6)} ≤ {limit}"
     if need.times is not None:
         bound = evidence.bound(need.scenario, need.metric, need.times)
         limit = f"{metric} ≤ {need.high:g} × {_bound_name(need.times)}"
         if bound is None:
             return Verdict(f"{who}, {need.scenario}", limit, "the bound is missing", None)
         high *= bound
-        limit += f" = {high:.4g}"
+        limit += f" = {number(high, 4)}"
     if value is None:
         return Verdict(f"{who}, {need.scenario}", limit, "not measured", None)
-    measured = f"{value:.4g}"
+    measured = number(value, 4)
     if need.times is not None and high:
         measured += f" ({value / high * need.high:.3f} ×)"
     return Verdict(f"{who}, {need.scenario}", limit, measured, need.low <= value <= high)
@@ -126,9 +132,7 @@ def _bound_name(kind: str) -> str:
 
 def _who(need: Requirement, law: str | None) -> str:
     """Who is meant: a law with its setting, or the best controller by name."""
-    inside = ", ".join(f"{k}={v:g}" for k, v in need.setting.items())
-    name = (law or "?").upper() + (f" ({inside})" if inside else "")
-    return name if need.law else f"best controller ({law or 'none'})"
+    return law_label(need.law, need.setting) if need.law else f"best controller ({law or 'none'})"
 
 
 def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict]:

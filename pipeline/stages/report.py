@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from pipeline.bounds import bounds_path, load_bounds
 from pipeline.cases import CASES
@@ -22,9 +23,15 @@ def report(name: str) -> None:
     if not bounds:
         print(f"report {name}: no bounds yet; `python -m pipeline.oracle {name}` computes them", file=sys.stderr)
     laws, models = entries("controllers", name, "law"), entries("models", name, "model")
-    evidence = Evidence.load(case, bounds, WORK / name, laws, models)
+    own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
+    evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data)
     for path in write_report(evidence, WORK / name / "models", ARTIFACTS / name):
         print(path)
+
+
+def _is_own(data: Path, case: str) -> bool:
+    """Whether models were learnt from a person's own file: neither a plant's text nor the case's experiments."""
+    return data.suffix != ".py" and not data.is_relative_to(WORK / case)
 
 
 if __name__ == "__main__":

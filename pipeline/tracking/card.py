@@ -34,7 +34,7 @@ def version_description(validation: Mapping[str, Any], gate: Gate, run_id: str, 
     """A version's description: verdict, closed-loop evidence per scenario, picture of the loop."""
     parts = [_verdict(gate), _table(validation, gate.law)]
     if picture:
-        alt = "Closed loop on a held-out sequence beside the PID and the perfect-model NMPC"
+        alt = "Closed loop on the test that weighs most, beside the PID"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
     return "\n".join(filter(None, parts))
 
@@ -52,24 +52,28 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
     scenarios = validation.get("scenarios") or {}
     bounds = validation.get("bounds") or {}
     titles = (validation.get("titles") or {}).get("scenarios") or {}
-    floor = (validation.get("gate") or {}).get("floor", 0.0)
-    heads = ["Scenario (mean absolute error)", "this law", "range over seeds", "with noise", "PID", "NMPC", "ratio"]
+    metric = validation.get("metric", "mae")
+    gate = validation.get("gate") or {}
+    floors = gate.get("floors") or {}
+    words = (validation.get("titles") or {}).get("metric", "mean absolute error")
+    heads = [f"Scenario ({words})", "this law", "range over seeds", "with noise", "PID", "NMPC", "ratio"]
     rows = []
     for name, laws in scenarios.items():
         own = laws.get(law)
         if name.endswith(NOISE_SUFFIX) or not own:
             continue
-        bound = ((bounds.get(name) or {}).get("nmpc") or {}).get("mae")
-        spread = [own.get("mae_min"), own.get("mae_max")]
+        bound = ((bounds.get(name) or {}).get("nmpc") or {}).get(metric)
+        floor = floors.get(name, gate.get("floor", 0.0))
+        spread = [own.get(f"{metric}_min"), own.get(f"{metric}_max")]
         rows.append(
             [
                 escape(str(titles.get(name, name))),
-                _figure(own.get("mae")),
+                _figure(own.get(metric)),
                 "" if None in spread else " … ".join(map(_figure, spread)),
-                _figure((scenarios.get(name + NOISE_SUFFIX) or {}).get(law, {}).get("mae")),
-                _figure((laws.get(BASELINE) or {}).get("mae")),
+                _figure((scenarios.get(name + NOISE_SUFFIX) or {}).get(law, {}).get(metric)),
+                _figure((laws.get(BASELINE) or {}).get(metric)),
                 _figure(bound),
-                f"{own['mae'] / bound:.2f}" if bound and bound >= floor and own.get("mae") is not None else "",
+                f"{own[metric] / bound:.2f}" if bound and bound >= floor and own.get(metric) is not None else "",
             ]
         )
     if not rows:
@@ -80,4 +84,4 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
 
 
 def _figure(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
+    return "" if value is None else f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -1,9 +1,10 @@
 """The promotion gate: what a version must show before an alias moves to it.
 
 The report stage writes into validation.json, for each law of a case, its gate score: the weighted
-mean over the gate's scenarios of MAE / MAE of the perfect-model NMPC, both at least the measurement
-noise, so lower is better and 1 is the bound. ``Gate.id`` is a digest of scenarios, weights and
-bounds: scores of different ids were measured on different tests and are never compared.
+mean over the gate's scenarios of its error over that of the perfect-model NMPC, in the case's metric
+(mean absolute or squared), both at least what the measurement noise would hide, so lower is better
+and 1 is the bound. ``Gate.id`` is a digest of scenarios, weights and bounds: scores of different ids
+were measured on different tests and are never compared.
 
 Aliases:
 

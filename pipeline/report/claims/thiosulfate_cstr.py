@@ -13,7 +13,8 @@ import numpy as np
 
 from pipeline.cases.base import PaperFigure
 from pipeline.plants.base import Linearization
-from pipeline.report.evidence import Evidence, parse_setting
+from pipeline.report.evidence import Evidence
+from pipeline.report.law_evidence import parse_setting
 from pipeline.report.verdicts import Claims, Verdict, plain_reason
 
 TJ = 250.0  # K

@@ -1,0 +1,74 @@
+"""validation.json: the figures of a case for programs, with the gate that decides about champions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from pipeline.cases import NOISE_SUFFIX
+from pipeline.report.evidence import Evidence
+from pipeline.report.words import LONG
+
+
+def validation(evidence: Evidence) -> dict[str, Any]:
+    """Figures by scenario and law, bounds, gate and titles; ``metric`` is the one that laws are compared by.
+
+    ``gate.floor`` is the standard deviation of the noise, ``gate.floors`` what it makes of each
+    scenario in the case's metric.
+    """
+    case = evidence.case
+    scenarios: dict[str, dict[str, Any]] = {}
+    for name in (n + end for end in ("", NOISE_SUFFIX) for n in evidence.scenarios):
+        rows = {law: _row(evidence, law, name) for law in evidence.laws if evidence.figure(law, name) is not None}
+        if rows:
+            scenarios[name] = rows
+    return {
+        "case": case.name,
+        "metric": case.metric,
+        "best": evidence.best,
+        "scenarios": scenarios,
+        "bounds": {name: {k: dict(v) for k, v in kinds.items()} for name, kinds in evidence.bounds.items()},
+        "gate": {
+            "id": gate_id(evidence),
+            "weights": dict(case.gate),
+            "floor": evidence.noise,
+            "floors": evidence.floors,
+            "laws": {
+                law: {
+                    "score": evidence.score(law),
+                    "lock_ups": found.lock_ups,
+                    "ratios": {s: r for s in case.gate if (r := evidence.gate_ratio(law, s)) is not None},
+                }
+                for law, found in evidence.laws.items()
+            },
+        },
+        "titles": {
+            "case": case.title,
+            "metric": LONG[case.metric],
+            "laws": {name: law.title for name, law in evidence.laws.items()},
+            "scenarios": evidence.scenarios,
+        },
+    }
+
+
+def _row(evidence: Evidence, law: str, scenario: str) -> dict[str, Any]:
+    row: dict[str, Any] = {metric: evidence.figure(law, scenario, metric) for metric in evidence.metrics}
+    row = {metric: value for metric, value in row.items() if value is not None}
+    row["seeds"] = evidence.laws[law].seeds
+    for how in ("min", "max"):
+        row[f"{evidence.case.metric}_{how}"] = evidence.figure(law, scenario, None, None, how)
+    return row
+
+
+def gate_id(evidence: Evidence) -> str:
+    """Digest of what the gate measures: scores of different ids may not be compared."""
+    case, tests = evidence.case, evidence.case.scenarios()
+    what: dict[str, Any] = {
+        s: [w, evidence.bound(s), [t.digest() for t in tests.get(s.removesuffix(NOISE_SUFFIX), ())]]
+        for s, w in case.gate.items()
+    }
+    what["floor"] = evidence.noise
+    if case.metric != "mae":
+        what["metric"] = case.metric
+    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:12]

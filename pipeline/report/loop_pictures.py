@@ -1,0 +1,213 @@
+"""Closed loops drawn: set point, controlled variable and MV of several controllers, or what their info says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+
+from pipeline.cases.base import NOISE_SUFFIX, Case, Curve, Figure
+from pipeline.report.drawing import (
+    BASELINE,
+    SHADES,
+    SIZE,
+    axis_label,
+    colour_of,
+    ratio_unit,
+    symbol,
+    time_axis,
+)
+from pipeline.report.evidence import Evidence
+from pipeline.report.law_evidence import Array, Loop
+from pipeline.report.words import SHORT, law_label, number
+
+LATE_COLOUR = "#f2f2f2"
+ORDERS_FOR_LOG = 2.0  # powers of ten that an info must span to be drawn over them
+
+
+class LoopPanels:
+    """The controlled variable with its set point, the MV, and the error of the late part where a test has one."""
+
+    def __init__(self, case: Case, title: str, late_from: int = 0) -> None:
+        self.late_from = late_from
+        heights = (3, 1.6, 2) if late_from else (3, 2)
+        self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + 1.2 * bool(late_from)), layout="constrained")
+        panels = list(self.canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}))
+        cv, mv = case.plant_class.sp_signals[0], case.plant_class.mv_signals[0]
+        self.cv: Axes = panels[0]
+        self.mv: Axes = panels[-1]
+        self.error: Axes | None = panels[1] if late_from else None
+        self.bottom = panels[-1]
+        self.cv.set_title(title)
+        self.cv.set_ylabel(axis_label(symbol(cv.name), cv.unit))
+        self.mv.set_ylabel(axis_label(symbol(mv.name), mv.unit))
+        if self.error is not None:
+            self.error.set_ylabel(axis_label("error", cv.unit))
+            self.error.axhline(0.0, color="black", linewidth=0.9, linestyle="--", zorder=2)
+
+    def add(self, loop: Loop, label: str, colour: str, strong: bool = False) -> None:
+        """One controller; the strong one lies in front."""
+        # Each move acts over the period after its sample: a staircase that begins there.
+        order, wide = (4.0, 1.9) if strong else (3.0, 1.2)
+        time, _ = time_axis(loop["time_s"])
+        pv = first(loop["pv"])
+        self.cv.plot(time, pv, label=label, color=colour, linewidth=wide, zorder=order)
+        # Laws that ring fill the panel: behind the strong curve they are only hinted at.
+        faint = 1.0 if strong else 0.5
+        mv = first(loop["mv"])
+        self.mv.step(time, mv, where="post", color=colour, linewidth=0.6 * wide, zorder=order, alpha=faint)
+        if self.error is not None:
+            late = slice(self.late_from, None)
+            error = first(loop["sp"])[late] - pv[late]
+            self.error.plot(time[late], error, color=colour, linewidth=wide, zorder=order)
+
+    def finish(self, loop: Loop) -> Canvas:
+        """The set point, the time axis and the legend."""
+        time, words = time_axis(loop["time_s"])
+        self.cv.plot(time, first(loop["sp"]), "--", color="black", linewidth=0.9, label="set point", zorder=2)
+        self.cv.margins(x=0.01)
+        self.bottom.set_xlabel(words)
+        labels = self.cv.get_legend_handles_labels()[1]
+        self.canvas.legend(loc="outside lower center", ncols=min(4, len(labels)))
+        return self.canvas
+
+
+def first(values: Array) -> Array:
+    """The controlled variable or the first MV, shape (n,)."""
+    return values if values.ndim == 1 else values[:, 0]
+
+
+def late_from(case: Case, scenario: str) -> int:
+    """The sample from which the test is scored a second time; 0: it is not."""
+    tests = case.scenarios().get(scenario.removesuffix(NOISE_SUFFIX), ())
+    return tests[0].late_from if tests else 0
+
+
+def curves_and_loops(evidence: Evidence, figure: Figure, curves: Sequence[Curve]) -> list[tuple[Curve, Loop]]:
+    """The curves that have a trajectory."""
+    found = [(c, evidence.loop(c, figure.scenario or "", figure.hold)) for c in curves]
+    return [(c, loop) for c, loop in found if loop is not None]
+
+
+def colours(evidence: Evidence, figure: Figure) -> dict[int, str]:
+    """Colour of each curve by its place: the law's, or shades where several settings of one law are shown."""
+    laws = [c.law for c in figure.curves]
+    if len(set(laws)) < len(laws):
+        return {i: SHADES[i % len(SHADES)] for i in range(len(laws))}
+    return {i: colour_of(law, evidence.laws) for i, law in enumerate(laws)}
+
+
+def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
+    """A figure of the paper: its curves, and our best controller with them."""
+    curves: Sequence[Curve] = figure.curves
+    best = None if evidence.best is None else Curve(evidence.best)
+    if best is not None and not any(_is_shipped(evidence, c) for c in curves if c.law == best.law):
+        curves = (*curves, best)
+    found = curves_and_loops(evidence, figure, curves)
+    if not found:
+        return None
+    late = 0 if figure.hold else late_from(evidence.case, figure.scenario or "")
+    panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", late)
+    own = colours(evidence, figure)
+    for curve, loop in found:
+        ours = curve is best
+        label = law_label(curve.law, curve.setting) + (" (ours, best)" if ours else "")
+        panels.add(loop, label, "black" if ours else own[curves.index(curve)], ours)
+    return panels.finish(found[0][1])
+
+
+def _is_shipped(evidence: Evidence, curve: Curve) -> bool:
+    return evidence.laws[curve.law].variant_of(curve.setting) == ""
+
+
+def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
+    """What the controllers of a figure say of themselves over time, a panel for each entry of info."""
+    found = []
+    for curve, loop in curves_and_loops(evidence, figure, figure.curves):
+        names = evidence.laws[curve.law].info
+        if "info" in loop and set(figure.info) <= set(names):
+            found.append((curve, loop, {name: loop["info"][:, names.index(name)] for name in figure.info}))
+    if not found:
+        return None
+    count = len(figure.info)
+    canvas = Canvas(figsize=(SIZE[0], 1.0 + 1.7 * count), layout="constrained")
+    panels = list(np.atleast_1d(canvas.subplots(count, 1, sharex=True)))
+    own = colours(evidence, figure)
+    for curve, loop, values in found:
+        time, words = time_axis(loop["time_s"])
+        colour = own[figure.curves.index(curve)]
+        for axes, name in zip(panels, figure.info, strict=True):
+            axes.step(time, values[name], where="post", color=colour, linewidth=1.3, label=_label(curve))
+        panels[-1].set_xlabel(words)
+    for axes, name in zip(panels, figure.info, strict=True):
+        axes.set_ylabel(info_label(evidence.case, name))
+        if over_orders(np.concatenate([values[name] for _, _, values in found])):
+            axes.set_yscale("log")
+        for at in moves(found[0][1]):
+            axes.axvline(at, color="#b0b0b0", linewidth=0.8, linestyle=":", zorder=1)
+        axes.margins(x=0.01)
+    panels[0].set_title(f"Figure {figure.number}. {figure.title}")
+    if len(found) > 1:
+        handles, labels = panels[0].get_legend_handles_labels()
+        canvas.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+    else:
+        panels[0].set_title(_label(found[0][0]), loc="right", fontweight="normal", fontsize="medium")
+    return canvas
+
+
+def _label(curve: Curve) -> str:
+    return law_label(curve.law, curve.setting)
+
+
+def moves(loop: Loop) -> Array:
+    """Times at which a set point that is held moves; none of one that follows a course."""
+    sp, (time, _) = first(loop["sp"]), time_axis(loop["time_s"])
+    at = np.flatnonzero(np.diff(sp)) + 1
+    return time[at] if len(at) < len(sp) / 4 else time[:0]
+
+
+def over_orders(values: Array) -> bool:
+    """Whether positive values span so many powers of ten that a linear axis would show only the largest."""
+    return bool(np.all(values > 0)) and float(np.ptp(np.log10(values))) > ORDERS_FOR_LOG
+
+
+def info_label(case: Case, name: str) -> str:
+    """An entry of info as an axis's label, with its unit where the name tells what it is."""
+    cv, mv = case.plant_class.sp_signals[0], case.plant_class.mv_signals[0]
+    known = {
+        "kc": ("$k_c$", ratio_unit(mv.unit, cv.unit)),
+        "tau_i_s": (r"$\tau_i$", "s"),
+        "tau_d_s": (r"$\tau_d$", "s"),
+        "penalty": (r"penalty $\mu$", ""),
+        "offset": ("offset $d$", cv.unit),
+        "linearization_error": ("linearization error", cv.unit),
+    }
+    return axis_label(*known.get(name, (name.replace("_", " "), "")))
+
+
+def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
+    """A law beside the PID on the test that weighs most in the gate (its first sequence), with the figures over all."""
+    scenario, metric = evidence.main_test, evidence.case.metric
+    own = evidence.loop(Curve(law), scenario)
+    if own is None:
+        return None
+    error, bound = evidence.figure(law, scenario), evidence.bound(scenario)
+    beside = "" if not bound or error is None else f", {error / bound:.2f} × perfect-model NMPC"
+    late = evidence.figure(law, scenario, "sse_late") if metric == "sse" else None
+    rest = "" if late is None else f"; late part {number(late)}"
+    title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"
+    panels = LoopPanels(evidence.case, title, late_from(evidence.case, scenario))
+    baseline = evidence.loop(Curve(BASELINE), scenario) if law != BASELINE else None
+    if baseline is not None:
+        error = evidence.figure(BASELINE, scenario)
+        panels.add(baseline, f"PID, {SHORT[metric]} {_error(error, metric)}", colour_of(BASELINE, evidence.laws))
+    panels.add(own, law, colour_of(law, evidence.laws), strong=True)
+    return panels.finish(own)
+
+
+def _error(value: float | None, metric: str) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.4f}" if metric == "mae" else number(value, 4)

@@ -1,0 +1,69 @@
+"""How metrics, laws and tests are called in front of a person."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.cases.base import NOISE_SUFFIX
+
+SHORT = {
+    "mae": "MAE",
+    "sse": "SSE",
+    "sse_late": "late SSE",
+    "ise": "ISE",
+    "masse": "MASSE",
+    "max_asse": "MaxASSE",
+    "overshoot": "overshoot",
+    "settling": "settling time",
+    "mv_travel": "MV travel",
+}
+"""A metric as it stands in a table."""
+LONG = {"mae": "mean absolute error", "sse": "sum of squared errors"}
+"""A case's metric in words."""
+NO_UNIT = frozenset({"", "-", "1"})
+"""How a signal says that it is a plain number."""
+
+
+def number(value: float, digits: int = 3) -> str:
+    """``value`` with so many digits, thousands grouped and not as a power of ten."""
+    large = 10 ** min(digits, 4) <= abs(value) < 1e9
+    return f"{value:,.0f}" if large else f"{value:.{digits}g}"
+
+
+def metric_name(metric: str) -> str:
+    """A metric's short name; of a path into a model set's figures, ``one_step.nnarx``, the words before the dot."""
+    first = metric.partition(".")[0]
+    return SHORT.get(first, first.replace("_", " "))
+
+
+def law_name(law: str) -> str:
+    """``linearized_pid`` as linearized PID, ``inc`` as INC: a law's abbreviations are upper-case."""
+    parts = law.split("_")
+    return " ".join(p.upper() if len(p) <= 3 or len(parts) == 1 else p for p in parts)
+
+
+def law_label(law: str, setting: Mapping[str, Any]) -> str:
+    """A law with its setting: INCAD (r=2.5)."""
+    return law_name(law) + (f" ({setting_text(setting)})" if setting else "")
+
+
+def setting_text(setting: Mapping[str, Any]) -> str:
+    """``r=2.5, correction=back_calculation``: how params.yaml names a variant."""
+    return ", ".join(
+        key if value is True else f"{key}={value:g}" if isinstance(value, int | float) else f"{key}={value}"
+        for key, value in setting.items()
+    )
+
+
+def scenario_name(scenario: str, recipe: bool) -> str:
+    """A test inside a sentence: held-out set points, SP-A, set point, trajectory with noise."""
+    bare = scenario.removesuffix(NOISE_SUFFIX)
+    if bare == "held_out":
+        words = "held-out recipes" if recipe else "held-out set points"
+    elif re.fullmatch(r"[a-z]{1,3}_[a-z0-9]", bare):
+        words = bare.upper().replace("_", "-")
+    else:
+        words = bare.replace("_", " ")
+    return words + (" with noise" if scenario != bare else "")
