@@ -1,0 +1,106 @@
+"""What the laws share that act on the prediction of an NNARX."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from pipeline.errors import LawError, ModelError
+from pipeline.laws.adaptive import (
+    AdaptiveGains,
+    AdaptiveParams,
+    minimum_variance_gains,
+    signed_unit,
+    target,
+    target_slots,
+)
+from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
+from pipeline.memory import Memory, Slot, Stage
+from pipeline.models.base import Model
+from pipeline.models.instantaneous import Arx, arx
+from pipeline.models.next_output import NextOutput
+from pipeline.models.nnarx import NNARX
+
+
+@dataclass(frozen=True, slots=True)
+class NnarxParams(AdaptiveParams):
+    """Those of an adaptive PID, and how much the model believes the measurement.
+
+    ``offset_filter`` alpha and ``trust``, both in (0, 1], as in ``NextOutput``; 1 is as the paper.
+    """
+
+    offset_filter: float = 1.0
+    trust: float = 1.0
+
+    def __post_init__(self) -> None:
+        AdaptiveParams.__post_init__(self)
+        for name in ("offset_filter", "trust"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must lie in (0, 1], 1 to believe every sample")
+
+
+def require_nnarx(models: Mapping[str, Model], law: str) -> NNARX:
+    """Part ``nnarx`` of a model set; raises LawError that says what the law needs and what the set has."""
+    needs = f"law {law!r} needs a part 'nnarx' (kind nnarx, one MV, delay 1)"
+    if "nnarx" not in models:
+        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
+    model = models["nnarx"]
+    if not isinstance(model, NNARX):
+        raise LawError(f"{needs}; the model set's is of kind {model.kind}")
+    return model
+
+
+def central_model(model: NNARX) -> Arx:
+    """The linear model at the centre of the training data."""
+    return arx(model, model.net.x_center)
+
+
+class NnarxPid(ControlLaw):
+    """A PID law over part ``nnarx``: model, gains, and the memory and formulas of both. ``forward`` is the law's.
+
+    ``more`` are slots of the law's own; ``told`` the names of its info after those of the gains.
+    """
+
+    incremental = True
+
+    def __init__(
+        self,
+        signals: LawSignals,
+        model: NNARX,
+        params: NnarxParams,
+        *,
+        more: Mapping[str, Slot] | None = None,
+        told: tuple[str, ...] = (),
+    ) -> None:
+        super().__init__(signals, params.mv_rate)
+        require_single_loop(signals, self.name)
+        centre = central_model(model)
+        slope = float(centre.b[0])
+        unit = signed_unit(signals, params.plant_gain, slope)
+        start = params.gains or minimum_variance_gains(centre.a, slope * unit, params)
+        try:
+            self.model = NextOutput(model, unit, params.offset_filter, params.trust)
+        except ModelError as error:
+            raise LawError(f"law {self.name!r}: {error}") from error
+        self.gains = AdaptiveGains(params, signals, unit, start)
+        more = more or {}
+        self.memory = Memory({**target_slots(params.preview), **self.model.slots, **self.gains.slots, **more})
+        self.stage = Stage(
+            self.memory.layout,
+            lambda p: {
+                "known": self.memory.then(p),
+                **self.gains.terms(p),
+                **self.model.terms(p, target(p, params.preview)),
+                **{name: p[name] for name in more},
+            },
+        )
+        self.n_state = self.memory.n_state
+        self.info = (*AdaptiveGains.info, "offset", *told)
+
+    def commanded(self, now: Mapping[str, Tensor], step: Tensor) -> Tensor:
+        """The MV (..., 1) after a move of ``step`` units, within its limits."""
+        mv: Any = now["mv"]
+        return self.limited(mv + step * self.gains.unit, mv)
