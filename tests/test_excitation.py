@@ -10,10 +10,12 @@ from made_up_plant import Lag, Mixer
 
 from pipeline.errors import ParamsError, PlantError
 from pipeline.excitation import EXCITATIONS, OpenLoop
+from pipeline.excitation.batches import Batches
 from pipeline.excitation.operating_point import OperatingPoint
 from pipeline.excitation.sequences import TAPS, Aprbs, Multisine, Prbs, RandomSteps, maximal_length
 from pipeline.models.regressors import forward_pairs, inverse_pairs
 from pipeline.params import parse
+from pipeline.plants.batch_reactor import BatchReactor
 from pipeline.plants.thiosulfate_cstr import ThiosulfateCstr
 from pipeline.record import Record
 from pipeline.simulate import simulate_open
@@ -24,6 +26,7 @@ SMALL = {
     "aprbs": {"samples": 300, "order": 5},
     "multisine": {"samples": 300, "cycle": 100, "lines": 10},
     "operating_point": {"samples": 300, "run_length": 120, "restarts": 50},
+    "batches": {"samples": 30, "batches": 10},
 }
 
 
@@ -274,3 +277,66 @@ def test_short_runs_of_several_moves_hold_each_and_go_to_the_ends(cstr: Thiosulf
     assert (mv[:, :12].reshape(200, 3, 4) == mv[:, :12:4, None]).all()
     assert (mv[:, -1] == mv[:, -2]).all()
     assert np.isin(mv[:, :12], (0.0, 500.0)).mean() == pytest.approx(0.5, abs=0.1)
+
+
+# ---------------------------------------------------------------- batches
+
+
+def levels_of(excitation: Batches, seed: int = 0) -> np.ndarray:
+    """MVs of each batch on [0, 1], shape (batches, samples)."""
+    return excitation.unit_sequence(1, np.random.default_rng(seed)).reshape(excitation.batches, excitation.samples)
+
+
+def test_every_batch_is_a_run_from_the_start_of_the_plant() -> None:
+    plant = BatchReactor()
+    record = Batches(samples=50, batches=40).run(plant, 0)
+    assert np.array_equal(np.bincount(record.run), np.full(40, 50))
+    first = np.flatnonzero(record.time_s == 0)
+    assert np.array_equal(record.pv[first, 0], np.full(40, 25.0))
+    # Full heating brings the reactor to where the profile can be followed, full cooling keeps it below.
+    ends = record.pv[first + 20, 0]
+    assert ends.min() < 45
+    assert ends.max() > 85
+
+
+def test_batches_hold_their_first_level_for_any_time_and_the_others_alike() -> None:
+    excitation = Batches(samples=40, batches=400, hold=4, constant=0.0, binary=0.0, end_fraction=0.0)
+    changes = [np.flatnonzero(np.diff(row)) + 1 for row in levels_of(excitation)]
+    first = np.array([c[0] if len(c) else 40 for c in changes])
+    assert all((np.diff(c) == 4).all() for c in changes)
+    assert set(first) == set(range(1, 41))
+    assert np.abs(np.bincount(first, minlength=41)[1:] - 10).max() < 5 * np.sqrt(10)
+
+
+def test_shares_of_constant_and_of_binary_batches() -> None:
+    mv = levels_of(Batches(samples=60, batches=4000, hold=2, constant=0.2, binary=0.3, end_fraction=0.25))
+    alike = np.ptp(mv, axis=1) == 0
+    binary = np.isin(mv, (0.0, 1.0)).all(axis=1) & ~alike
+    # A batch also keeps one level by chance: where the first one is held to the end, one in sixty.
+    assert alike.mean() == pytest.approx(0.2 + 0.8 / 60, abs=0.03)
+    assert binary.mean() == pytest.approx(0.3 * 59 / 60, abs=0.03)
+    others = mv[~alike & ~binary]
+    assert np.isin(others[:, 0], (0.0, 1.0)).mean() == pytest.approx(0.25, abs=0.04)
+    # From full heating to full cooling, once, at any time.
+    heated = np.flatnonzero((mv[:, 0] == 1) & (mv[:, -1] == 0) & ((np.diff(mv, axis=1) != 0).sum(axis=1) == 1))
+    assert len(heated) > 5
+
+
+def test_the_start_of_a_batch_may_vary_within_the_range_of_the_states() -> None:
+    plant = BatchReactor()
+    excitation = Batches(samples=5, batches=2000, start_spread=(0.05, 0.0, 2.0))
+    x0 = excitation.initial_states(plant, np.random.default_rng(0))
+    assert x0[:, 0].max() == 1.0  # of C_A, whose range ends at the start
+    assert x0[:, 0].min() > 0.7
+    assert np.array_equal(x0[:, 1], np.zeros(2000))
+    assert x0[:, 2].mean() == pytest.approx(25.0, abs=0.2)
+    assert x0[:, 2].std() == pytest.approx(2.0, rel=0.1)
+    with pytest.raises(ParamsError, match=r"start_spread is \[1\.0\]; give one .* each state .*: C_A, C_B, T"):
+        Batches(start_spread=(1.0,)).run(plant, 0)
+    with pytest.raises(ParamsError, match=r"binary is 0\.6; it must be between 0 and 0\.5"):
+        Batches(constant=0.5, binary=0.6)
+
+
+def test_an_experiment_starts_where_its_plant_does() -> None:
+    record = RandomSteps(samples=10).run(BatchReactor(), 0)
+    assert record.pv[0, 0] == 25.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pipeline.excitation.base import Excitation, OpenLoop
+from pipeline.excitation.batches import Batches
 from pipeline.excitation.operating_point import OperatingPoint
 from pipeline.excitation.sequences import Aprbs, Multisine, Prbs, RandomSteps
 
@@ -12,6 +13,7 @@ EXCITATIONS: dict[str, type[Excitation]] = {
     Aprbs.kind: Aprbs,
     Multisine.kind: Multisine,
     OperatingPoint.kind: OperatingPoint,
+    Batches.kind: Batches,
 }
 
 __all__ = ["EXCITATIONS", "Excitation", "OpenLoop"]

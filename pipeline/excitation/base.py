@@ -54,7 +54,7 @@ class OpenLoop(Excitation):
     low, high : float, optional
         Range of the MVs [unit of the MV], inside their signals' range, which is the default.
     start : tuple of float
-        State at sample 0; empty: the steady state whose MV is nearest to the middle of its range.
+        State at sample 0; empty: where the plant's experiments start (``Plant.start``).
     """
 
     low: float | None = None
@@ -89,8 +89,4 @@ class OpenLoop(Excitation):
 
     def initial_state(self, plant: Plant) -> Array:
         """State at sample 0, shape (n_x,)."""
-        if self.start:
-            return np.array(self.start)
-        low, high = self.limits(plant)
-        _, xs, mvs = plant.steady_curve
-        return np.asarray(xs[np.argmin(np.abs(mvs - (low[0] + high[0]) / 2))])
+        return np.array(self.start) if self.start else plant.start[0]

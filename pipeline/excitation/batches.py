@@ -1,0 +1,106 @@
+"""Excitation of a batch: many short runs from the plant's start, under levels of every kind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ParamsError
+from pipeline.excitation.base import OpenLoop
+from pipeline.plants.base import Array, Plant
+from pipeline.record import Record
+from pipeline.simulate import measured, noise_draws, simulate_batch
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batches(OpenLoop):
+    """Start-ups: every run starts afresh, and its MVs lead through a different part of the batch.
+
+    One long run of a batch reactor shows its start once and then the reactor with nothing left in
+    it. Here a batch holds its first level for a random time, up to the whole batch, and then draws
+    a new one every ``hold`` samples: full heating of any length followed by anything occurs, which
+    is what a controller does. Some batches keep one level, some know only the ends of the range.
+
+    Attributes
+    ----------
+    samples : int
+        Samples of a batch [-]; the record has ``batches`` times as many.
+    batches : int
+        Number of batches, each a run of the record [-].
+    hold : int
+        Samples for which a level after the first is held [-].
+    constant, binary : float
+        Fractions of the batches that keep one level, and that go from one end of the MV's range to
+        the other only [-]; together at most 1.
+    end_fraction : float
+        Fraction of the other batches' levels that are an end of the range [-], 0 to 1; the rest are
+        uniform over it.
+    start_spread : tuple of float
+        Standard deviation of each state at the start of a batch [unit of the state], within the
+        state's range; empty: every batch starts alike.
+
+    """
+
+    kind: ClassVar[str] = "batches"
+    samples: int = 50
+    batches: int = 100
+    hold: int = 3
+    constant: float = 0.1
+    binary: float = 0.2
+    end_fraction: float = 0.3
+    start_spread: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("batches", "hold"):
+            self.require(name, 1)
+        for name in ("constant", "binary", "end_fraction"):
+            self.require(name, 0, 1)
+        self.require("binary", 0, 1 - self.constant)
+
+    def run(self, plant: Plant, seed: int) -> Record:
+        """The record of all batches; levels, starts and noise come from ``seed``.
+
+        Raises ParamsError for a spread that does not fit the plant's states.
+        """
+        rng = np.random.default_rng(seed)
+        low, high = self.limits(plant)
+        # Rounding may put the last bit of a limit outside it.
+        mv = np.clip(low + (high - low) * self.unit_sequence(len(low), rng), low, high)
+        moves = mv.reshape(self.batches, self.samples, -1)
+        x = simulate_batch(plant, self.initial_states(plant, rng), moves)[:, :-1]
+        pv = measured(plant, x.reshape(len(mv), -1)) + noise_draws(plant, len(mv), self.noise, rng)
+        return Record.of(plant, pv, mv, run=np.repeat(np.arange(self.batches), self.samples))
+
+    def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
+        """The MVs of all batches on [0, 1], one batch after the other, shape (batches * samples, n_mv)."""
+        b, n = self.batches, self.samples
+        draw = rng.random(b)
+        constant, binary = draw < self.constant, draw >= 1 - self.binary
+        share = np.where(binary, 1.0, self.end_fraction)[:, None, None]
+        levels = rng.random((b, n, n_mv))
+        ends = rng.integers(0, 2, (b, n, n_mv)).astype(np.float64)
+        levels = np.where(rng.random((b, n, n_mv)) < share, ends, levels)
+        first = np.where(constant, n, rng.integers(1, n + 1, b))
+        return np.concatenate([levels[i, self._level(int(first[i]))] for i in range(b)])
+
+    def _level(self, first: int) -> NDArray[np.int64]:
+        """Number of the level at each sample of a batch whose first one is held ``first`` samples, shape (samples,)."""
+        after = np.arange(self.samples) - first
+        return np.where(after < 0, 0, 1 + after // self.hold)
+
+    def initial_states(self, plant: Plant, rng: np.random.Generator) -> Array:
+        """State at the start of each batch, shape (batches, n_x)."""
+        states = plant.state_signals
+        spread = np.array(self.start_spread or np.zeros(len(states)))
+        if spread.shape != (len(states),) or not np.all(np.isfinite(spread) & (spread >= 0)):
+            names = ", ".join(s.name for s in states)
+            raise ParamsError(
+                f"excitation {self.kind!r}: start_spread is {list(self.start_spread)}; "
+                f"give one standard deviation >= 0 for each state of {plant.name!r}: {names}"
+            )
+        x0 = self.initial_state(plant) + spread * rng.standard_normal((self.batches, len(states)))
+        return np.clip(x0, [s.low for s in states], [s.high for s in states])
