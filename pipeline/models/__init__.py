@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pipeline.models.arx import ArxPart
 from pipeline.models.base import Model, load_model
+from pipeline.models.identification_example import IdentificationExamplePart
 from pipeline.models.leverage_domain import DomainPart
 from pipeline.models.linearized import LinearizedPart
-from pipeline.models.network_parts import MlpPart, NnarxPart
+from pipeline.models.network_parts import MlpPart
+from pipeline.models.nnarx_part import NnarxPart
 from pipeline.models.parts import Learnt, Part
 from pipeline.models.rbf_part import RbfPart
 
@@ -17,6 +19,7 @@ MODELS: dict[str, type[Part]] = {
     ArxPart.model.kind: ArxPart,
     DomainPart.model.kind: DomainPart,
     LinearizedPart.model.kind: LinearizedPart,
+    "identification_example": IdentificationExamplePart,  # whose model is an NNARX
 }
 
 __all__ = ["MODELS", "Learnt", "Model", "Part", "load_model"]

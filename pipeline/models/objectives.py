@@ -143,13 +143,26 @@ class Windows:
         _weights(self.weight, len(self.past), self.steps)
 
     @classmethod
-    def of(cls, record: Record, n_y: int, n_u: int, steps: int, *, target: int = 0, delay: int = 1) -> Self:
-        """All windows of ``steps`` samples of one PV of a record, none reaching over the end of a run.
+    def of(
+        cls,
+        record: Record,
+        n_y: int,
+        n_u: int,
+        steps: int,
+        *,
+        target: int = 0,
+        delay: int = 1,
+        every: int = 1,
+        least_back: int = 0,
+    ) -> Self:
+        """Windows of ``steps`` samples of one PV of a record, none reaching over the end of a run.
 
-        Lags and delay as in ``nnarx_pairs``. Raises RecordError where no run is long enough.
+        Lags and delay as in ``nnarx_pairs``. Of all windows each ``every``-th; with ``least_back`` rows before
+        a window's last measured one, although these lags may need fewer: so that models of other lags are
+        compared over the same windows. Raises RecordError where no run is long enough.
         """
-        back = max(n_y - 1, n_u + delay - 2)
-        k = record.starts(back + steps) + back  # last measured row of each window
+        back = max(n_y - 1, n_u + delay - 2, least_back)
+        k = (record.starts(back + steps) + back)[::every]  # last measured row of each window
         y = record.pv[:, target]
         return cls(
             y[k[:, None] + np.arange(1 - n_y, 1)],
