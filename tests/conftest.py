@@ -12,8 +12,11 @@ import torch
 
 from pipeline.laws import LAWS, ControlLaw, LawSignals
 from pipeline.models import Model
+from pipeline.models.fit import LevenbergMarquardt
 from pipeline.models.fuzzy_means import FuzzyMeansRBF
 from pipeline.models.leverage_domain import LeverageDomain
+from pipeline.models.nnarx import NNARX
+from pipeline.models.objectives import Samples
 from pipeline.plants import PLANTS, Plant
 from pipeline.simulate import simulate_batch
 
@@ -24,6 +27,14 @@ QUICK: dict[str, dict[str, Any]] = {
 # Forms of a law that its defaults do not reach, under the contract too.
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "incadec": [{"correction": "back_calculation"}],
+    "linearized_pid": [
+        {"adaptive": True},
+        {"adaptive": True, "momentum": 0.4, "window": 5, "noise_variance": 1e-4, "offset_filter": 0.3, "trust": 0.6},
+        {"preview": "ramp", "trust": 0.5},
+        {"momentum": 0.4, "window": 2, "noise_variance": 1e-4},
+    ],
+    "gauss_newton_pid": [{"relinearize": 1, "momentum": 0.3, "offset_filter": 0.5}],
+    "minimum_variance": [{"relinearize": 1, "preview": "ramp", "offset_filter": 0.8}],
 }
 HORIZON = 3
 
@@ -68,12 +79,20 @@ def parts(plant: Plant) -> dict[str, Model]:
     def network(inputs: np.ndarray, target: np.ndarray) -> Model:
         return FuzzyMeansRBF(8).fit(inputs, target).to_torch()
 
+    def lagged(y: np.ndarray, u: np.ndarray) -> Model:
+        phi = np.stack([y[:, 1:-1], y[:, :-2], u[:, 1:], u[:, :-1]], axis=-1).reshape(-1, 4)
+        samples = Samples(phi, y[:, 2:].reshape(-1, 1))
+        model = NNARX.scaled_to(phi, samples.y, n_y=2, n_u=2, hidden=(6,), residual=True)
+        LevenbergMarquardt(iterations=20).fit(model.net, samples, samples, seed=0)
+        return model.eval()
+
     one, forward = np.column_stack([now, ahead(1)[:, 0]]), np.column_stack([now, moves])
     return {
         "inverse": network(one, moves),
         "domain": LeverageDomain.fit(one),
         "forward": network(forward[held], ahead(HORIZON)[held, 0]),
         "observer": network(forward, ahead(1)[:, 1]),
+        "nnarx": lagged(x[:, :, 0], runs[:, :, 0]),
     }
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pipeline.laws.base import ControlLaw, LawSignals
+from pipeline.laws.gauss_newton_pid import GaussNewtonPid
 from pipeline.laws.inverse import INC, INCAD, INCADEC
 from pipeline.laws.inverse_dob import ForwardDob, InverseDob
+from pipeline.laws.linearized_pid import LinearizedPid
+from pipeline.laws.minimum_variance import MinimumVariance
 from pipeline.laws.pid import PID
 
 LAWS: dict[str, type[ControlLaw]] = {
@@ -12,6 +15,9 @@ LAWS: dict[str, type[ControlLaw]] = {
     INCAD.name: INCAD,
     INCADEC.name: INCADEC,
     PID.name: PID,
+    LinearizedPid.name: LinearizedPid,
+    GaussNewtonPid.name: GaussNewtonPid,
+    MinimumVariance.name: MinimumVariance,
     InverseDob.name: InverseDob,
     ForwardDob.name: ForwardDob,
 }

@@ -107,13 +107,13 @@ class LinearizedPid(NnarxPid):
         else:
             z = self._gains(now, ahead, self.penalty)
         z, changed = self.gains.settled(now, z, free)
-        mv = self.commanded(now, self.gains.step(now, z))
+        mv, moved = self.commanded(now, self.gains.step(now, z))
         told = [self.gains.told(z, ahead.slope, free), ahead.offset]
         given = {**ahead.kept, **loud, **changed}
         if self.adaptive:
             told, given = [*told, error, penalty], {**given, "penalty": following}
         else:
-            told.append(self._error(ahead, (mv - now["mv"]) * self.gains.by_unit))
+            told.append(self.linearization_error(ahead, moved))
         state_next, info = self.memory.stored(now["known"], given), torch.cat(told, dim=-1)
         if self.adaptive:
             return mv.squeeze(-2), state_next.squeeze(-2), info.squeeze(-2)
@@ -124,15 +124,11 @@ class LinearizedPid(NnarxPid):
         c = ahead.slope * ahead.slope + penalty
         return self.gains.update(now, ahead.slope * ahead.gap / c, c)
 
-    def _error(self, ahead: Ahead, step: Tensor) -> Tensor:
-        """|NN - linear| (..., 1) at a move."""
-        return (self.model.moved(ahead, step) - ahead.slope * step).abs()
-
     def _searched(self, now: Named, ahead: Ahead, free: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gains, linearization error and penalty of the first candidate that agrees, and the next sample's penalty."""
         penalties = now["penalty"] * self.doubled
         z = self._gains(now, ahead, penalties)
-        error = self._error(ahead, self.gains.step(now, z))
+        error = self.linearization_error(ahead, self.gains.step(now, z))
         penalty = torch.where(error <= self.allowed, penalties, self.none).amin(dim=-2, keepdim=True)
         first, nothing = penalties == penalty, torch.zeros_like(penalty)
         z, error = (torch.where(first, t, nothing).sum(dim=-2, keepdim=True) for t in (z, error))

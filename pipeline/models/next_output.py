@@ -113,3 +113,38 @@ class NextOutput(nn.Module):
         """``moved`` and its slope at a move of ``step`` units, (..., 1) each."""
         rest, slope = self.along.rest_and_slope(self.along.moved(ahead.at, step))
         return rest - ahead.rest, slope
+
+
+class GaussNewton(nn.Module):
+    """The move that brings y(t+1) nearest to r(t+1), by a few linearizations of the network.
+
+        du_0 = 0,   du_{i+1} = b_i (r - y_i + b_i du_i) / (b_i^2 + mu),   y_i = NN at du_i, b_i its slope
+
+    which are the Gauss-Newton steps of min (r - y)^2 + mu du^2. Each is limited to the actuator's
+    room, beyond which the network has learnt nothing; a slope below ``slope_min`` is taken for that.
+    ``forward`` gives the move (..., 1) in units and the last b^2 + mu.
+    """
+
+    penalty: Tensor  # (1,)
+    slope_min: Tensor  # (1,)
+
+    def __init__(self, model: NextOutput, times: int, penalty: float, slope_min: float) -> None:
+        super().__init__()
+        self.model, self.times = model, times
+        self.register_buffer("penalty", torch.tensor([penalty], dtype=torch.float64))
+        self.register_buffer("slope_min", torch.tensor([slope_min], dtype=torch.float64))
+
+    def forward(self, ahead: Ahead, down: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+        """Within the room ``down`` <= move <= ``up``, (..., 1) each, in units."""
+        move, curvature = self._step(ahead.gap, ahead.slope, torch.zeros_like(ahead.gap), down, up)
+        for _ in range(self.times - 1):
+            added, slope = self.model.relinearized(ahead, move)
+            move, curvature = self._step(ahead.gap - added, slope, move, down, up)
+        return move, curvature
+
+    def _step(self, gap: Tensor, slope: Tensor, move: Tensor, down: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+        """One step from a move that leaves ``gap``."""
+        slope = torch.maximum(slope, self.slope_min)
+        curvature = slope * slope + self.penalty
+        wanted = slope * (gap + slope * move) / curvature
+        return torch.minimum(torch.maximum(wanted, down), up), curvature
