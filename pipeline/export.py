@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
-import tempfile
 from collections.abc import Callable, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
 
+from pipeline.controller_file import assembled, draft_of, write_sidecar
 from pipeline.errors import ExportError
 from pipeline.graph import law_graph
 from pipeline.laws.base import ControlLaw
 from serving.controller import Controller
-from serving.digest import TRAILER_BYTES, file_digest, seal
 from serving.errors import LoopwrightError
-from serving.manifest import INPUTS, MANIFEST_KEY, Manifest
+from serving.manifest import INPUTS, Manifest
 
 Array: TypeAlias = NDArray[np.float64]
 GATE_STEPS = 1_000
@@ -85,32 +80,15 @@ def export(
         provenance=dict(provenance),
         evidence=dict(evidence or {}),
     )
-    with _draft(path) as draft:
-        draft.write_bytes(_assemble(model.SerializeToString(), manifest))
+    with draft_of(path) as draft:
+        draft.write_bytes(assembled(model.SerializeToString(), manifest))
         try:
             controller = Controller(draft)
         except LoopwrightError as error:
             raise ExportError(f"law {law.name!r} does not make a controller: {_after_path(error, draft)}") from error
         parity_gate(law, controller, drive=drive)
         os.replace(draft, path)
-    _write_sidecar(path, manifest)
-    return manifest
-
-
-def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any]) -> Manifest:
-    """Copy a controller with other evidence in its manifest; the graph's bytes stay as they are.
-
-    Raises ArtifactError if ``src`` is no controller.
-    """
-    src, dst = Path(src), Path(dst)
-    manifest = replace(Controller(src).manifest, evidence=dict(evidence))
-    model = onnx.ModelProto.FromString(src.read_bytes()[:-TRAILER_BYTES])
-    del model.metadata_props[:]
-    with _draft(dst) as draft:
-        draft.write_bytes(_assemble(model.SerializeToString(), manifest))
-        Controller(draft)
-        os.replace(draft, dst)
-    _write_sidecar(dst, manifest)
+    write_sidecar(path, manifest)
     return manifest
 
 
@@ -202,33 +180,6 @@ def _check_shapes(law: ControlLaw) -> None:
                 f"law {law.name!r} gives {name} as {output.dtype} of shape {tuple(output.shape)}; "
                 f"it must be torch.float64 of shape ({n},)"
             )
-
-
-def _assemble(model: bytes, manifest: Manifest) -> bytes:
-    """Model bytes + manifest + digest; appended, because a protobuf may be continued so."""
-    entry = onnx.StringStringEntryProto(key=MANIFEST_KEY, value=manifest.to_json())
-    return seal(model + onnx.ModelProto(metadata_props=[entry]).SerializeToString())
-
-
-def _write_sidecar(path: Path, manifest: Manifest) -> None:
-    """``<law>.json``: the manifest again and the file's SHA-256, for hosts that cannot read ONNX metadata."""
-    text = json.dumps({**json.loads(manifest.to_json()), "sha256": file_digest(path.read_bytes())}, indent=2)
-    with _draft(path.with_suffix(".json")) as draft:
-        draft.write_text(text + "\n", encoding="utf-8")
-        os.replace(draft, path.with_suffix(".json"))
-
-
-@contextmanager
-def _draft(path: Path) -> Any:
-    """A file beside ``path`` to write and rename; whatever fails, none is left behind."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    os.chmod(name, 0o644)
-    try:
-        yield Path(name)
-    finally:
-        Path(name).unlink(missing_ok=True)
 
 
 def _after_path(error: LoopwrightError, draft: Path) -> str:

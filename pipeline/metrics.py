@@ -29,6 +29,8 @@ STEP_BAND = 0.02
 """Settled: within this fraction of the step ..."""
 RANGE_BAND = 0.002
 """... or within this fraction of the CV's range, whichever is wider (a disturbance test has no step)."""
+FAR = 0.02
+"""Fraction of the CV's range beyond which a saturated loop has not arrived."""
 
 
 def _errors(sp: ArrayLike, pv: ArrayLike) -> Array:
@@ -154,14 +156,14 @@ def locked_up(
     *,
     low: float,
     high: float,
-    error: float = 0.02,
+    span: float,
 ) -> bool:
     """Whether the loop is stuck in some hold: saturated, far from its set point, and not moving on.
 
     That is, for the whole second half of a hold the MV sits at one end of [low, high] while
-    |r - y| > ``error`` (in the CV's unit).
-    A slow plant may rightly saturate for long, but it arrives within half a hold or gets closer
-    than ``error``; an inverse model asked beyond its data sits there for ever. Shapes (n,).
+    |r - y| is more than ``FAR`` of ``span``, the CV's range. A slow plant, or a batch that heats up,
+    may rightly saturate for long, but it arrives within half a hold (of a recipe: half the batch)
+    or gets closer than that; an inverse model asked beyond its data sits there for ever. Shapes (n,).
     """
     e = np.abs(_errors(sp, pv))
     u = np.asarray(mv, dtype=np.float64).reshape(e.shape)
@@ -169,7 +171,7 @@ def locked_up(
     for part in holds(e.size, hold):
         half = slice(part.start + (part.stop - part.start) // 2, part.stop)
         stuck = bool(np.all(u[half] <= low + near) or np.all(u[half] >= high - near))
-        if stuck and bool(np.all(e[half] > error)):
+        if stuck and bool(np.all(e[half] > FAR * span)):
             return True
     return False
 

@@ -14,8 +14,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from pipeline.controller_file import with_evidence
 from pipeline.errors import ExportError
-from pipeline.export import GATE_TOLERANCE, export, parity_gate, with_evidence
+from pipeline.export import GATE_TOLERANCE, export, parity_gate
 from pipeline.laws import ControlLaw, LawSignals
 from serving import Controller, Signal
 from serving.digest import TRAILER_BYTES, file_digest

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.export import with_evidence
+from pipeline.controller_file import with_evidence
 from serving import Controller
 from serving.__main__ import main
 

@@ -68,8 +68,7 @@ def _export(
 
 def _closed_loop(plant: Plant) -> Callable[[Array], Array]:
     """The plant as the parity gate drives it: one period further with each MV."""
-    cvs, xs, _ = plant.steady_curve
-    state = xs[len(cvs) // 2]
+    state, _ = plant.start
     step, dv, p = plant.stepper(), plant.dv_nominal, plant.parameters()
 
     def drive(mv: Array) -> Array:
