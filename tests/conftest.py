@@ -12,6 +12,7 @@ import torch
 
 from pipeline.laws import LAWS, ControlLaw, LawSignals
 from pipeline.models import Model
+from pipeline.models.arx import ARX
 from pipeline.models.fit import LevenbergMarquardt
 from pipeline.models.fuzzy_means import FuzzyMeansRBF
 from pipeline.models.leverage_domain import LeverageDomain
@@ -35,6 +36,11 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     ],
     "gauss_newton_pid": [{"relinearize": 1, "momentum": 0.3, "offset_filter": 0.5}],
     "minimum_variance": [{"relinearize": 1, "preview": "ramp", "offset_filter": 0.8}],
+    "recursive_pid": [
+        {"preview": "ramp", "momentum": 0.4, "window": 3, "noise_variance": 1e-4, "offset_filter": 0.5},
+        {"forgetting": 1.0, "offset_filter": 0.0},
+    ],
+    "self_tuning_pid": [{"prefilter": (0.5,), "forgetting": 1.0}],
 }
 HORIZON = 3
 
@@ -79,20 +85,23 @@ def parts(plant: Plant) -> dict[str, Model]:
     def network(inputs: np.ndarray, target: np.ndarray) -> Model:
         return FuzzyMeansRBF(8).fit(inputs, target).to_torch()
 
-    def lagged(y: np.ndarray, u: np.ndarray) -> Model:
-        phi = np.stack([y[:, 1:-1], y[:, :-2], u[:, 1:], u[:, :-1]], axis=-1).reshape(-1, 4)
-        samples = Samples(phi, y[:, 2:].reshape(-1, 1))
+    def lagged(samples: Samples) -> Model:
+        phi = samples.x
         model = NNARX.scaled_to(phi, samples.y, n_y=2, n_u=2, hidden=(6,), residual=True)
         LevenbergMarquardt(iterations=20).fit(model.net, samples, samples, seed=0)
         return model.eval()
 
+    y, u = x[:, :, 0], runs[:, :, 0]
+    phi = np.stack([y[:, 1:-1], y[:, :-2], u[:, 1:], u[:, :-1]], axis=-1).reshape(-1, 4)
+    lags = Samples(phi, y[:, 2:].reshape(-1, 1))
     one, forward = np.column_stack([now, ahead(1)[:, 0]]), np.column_stack([now, moves])
     return {
         "inverse": network(one, moves),
         "domain": LeverageDomain.fit(one),
         "forward": network(forward[held], ahead(HORIZON)[held, 0]),
         "observer": network(forward, ahead(1)[:, 1]),
-        "nnarx": lagged(x[:, :, 0], runs[:, :, 0]),
+        "nnarx": lagged(lags),
+        "arx": ARX.fit(lags.x, lags.y, n_y=2, n_u=2),
     }
 
 

@@ -9,6 +9,8 @@ from pipeline.laws.inverse_dob import ForwardDob, InverseDob
 from pipeline.laws.linearized_pid import LinearizedPid
 from pipeline.laws.minimum_variance import MinimumVariance
 from pipeline.laws.pid import PID
+from pipeline.laws.recursive_pid import RecursivePid
+from pipeline.laws.self_tuning_pid import SelfTuningPid
 
 LAWS: dict[str, type[ControlLaw]] = {
     INC.name: INC,
@@ -18,6 +20,8 @@ LAWS: dict[str, type[ControlLaw]] = {
     LinearizedPid.name: LinearizedPid,
     GaussNewtonPid.name: GaussNewtonPid,
     MinimumVariance.name: MinimumVariance,
+    RecursivePid.name: RecursivePid,
+    SelfTuningPid.name: SelfTuningPid,
     InverseDob.name: InverseDob,
     ForwardDob.name: ForwardDob,
 }

@@ -97,7 +97,9 @@ class RecursiveLeastSquares(nn.Module):
         # S w w' / (beta + sqrt(f beta)) = K w' / (1 + sqrt(f / beta))
         root = root - gain / (1 + (self.forgetting / beta).sqrt()) * w
         if self.bounded:
-            return theta, self.growth * root - self.excess * (root @ (root.transpose(-1, -2) @ root)), error
+            # As many numbers as columns: onnxruntime takes a single one beside a MatMul into it, in float32.
+            excess = self.excess.expand(1, root.shape[-1])
+            return theta, self.growth * root - excess * (root @ (root.transpose(-1, -2) @ root)), error
         return theta, self.growth * root, error
 
     @torch.no_grad()

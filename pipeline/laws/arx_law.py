@@ -1,0 +1,44 @@
+"""What the laws share that go on learning an ARX model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pipeline.errors import LawError, ModelError
+from pipeline.laws.base import LawSignals
+from pipeline.models.arx import ARX
+from pipeline.models.base import Model
+from pipeline.models.recursive import RecursiveLeastSquares
+from pipeline.models.recursive_arx import RecursiveArx
+
+
+def require_arx(models: Mapping[str, Model], law: str) -> ARX:
+    """Part ``arx`` of a model set; raises LawError that says what the law needs and what the set has."""
+    needs = f"law {law!r} needs a part 'arx' (kind arx, one MV, delay 1)"
+    if "arx" not in models:
+        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
+    model = models["arx"]
+    if not isinstance(model, ARX):
+        raise LawError(f"{needs}; the model set's is of kind {model.kind}")
+    if model.n_mv != 1 or model.delay != 1:
+        raise LawError(f"{needs}; the model set's has {model.n_mv} MVs and delay {model.delay}")
+    return model
+
+
+def estimator(
+    law: str,
+    signals: LawSignals,
+    model: ARX,
+    unit: float,
+    *,
+    forgetting: float,
+    covariance: float,
+    prefilter: Sequence[float] = (),
+    n_y: int | None = None,
+) -> RecursiveArx:
+    """The model as a law learns it on, with ``unit`` [mv] from ``signed_unit``; raises LawError for wrong numbers."""
+    try:
+        rls = RecursiveLeastSquares(forgetting, covariance)
+    except ModelError as error:
+        raise LawError(f"law {law!r}: {error}") from error
+    return RecursiveArx(model, signals.sp[0], signals.mv[0], unit, rls, prefilter, n_y)
