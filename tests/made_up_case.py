@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +18,59 @@ import numpy as np
 import yaml
 from onnx import TensorProto, helper
 
-from pipeline.cases import CASES, NOISE_SUFFIX
+from pipeline.cases import CASES, NOISE_SUFFIX, Case, Scenario
 
-CASE = "thiosulfate_cstr"
-QUALITY = {"inc": 2.7, "incad": 1.8, "incadec": 3.9, "pid": 1.35, "inverse_dob": 1.12, "forward_dob": 1.16}
-"""Of each law: MAE as a multiple of the bound's."""
-BOUND = {"sp_a": 0.064, "sp_b": 0.0073, "tin": 0.0002, "ua": 0.0004, "ua_gradual": 0.0001, "held_out": 0.036}
-SETTING = {"incad": {"r": 1.5}, "incadec": {"r": 5.5, "correction": "as_printed"}}
-VARIANTS = {"incad": ("r=2.5", "r=3.5", "r=4.5", "r=10"), "incadec": ("r=10", "r=5.5, back", "r=10, back")}
 SEEDS = (0, 1, 2)
+GAINS = ("kc", "tau_i_s", "tau_d_s", "penalty", "linearization_error")
+
+
+@dataclass(frozen=True)
+class Miniature:
+    """Which case is made up, and how good each of its laws is."""
+
+    case: str
+    quality: Mapping[str, float]  # of each law: its error as a multiple of the bound's
+    bound: Mapping[str, float]  # of each test, in the case's metric
+    setting: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    offline: Mapping[str, float] = field(default_factory=dict)
+    adaptive: tuple[str, ...] = ()  # laws with ``GAINS`` in their info
+
+    @property
+    def of(self) -> Case:
+        return CASES[self.case]
+
+    @cached_property
+    def tests(self) -> Mapping[str, Scenario]:
+        """The first sequence of each test."""
+        return {name: scenarios[0] for name, scenarios in self.of.scenarios().items()}
+
+
+THIOSULFATE = Miniature(
+    "thiosulfate_cstr",
+    {"inc": 2.7, "incad": 1.8, "incadec": 3.9, "pid": 1.35, "inverse_dob": 1.12, "forward_dob": 1.16},
+    {"sp_a": 0.064, "sp_b": 0.0073, "tin": 0.0002, "ua": 0.0004, "ua_gradual": 0.0001, "held_out": 0.036},
+    {"incad": {"r": 1.5}, "incadec": {"r": 5.5, "correction": "as_printed"}},
+    {"incad": ("r=2.5", "r=3.5", "r=4.5", "r=10"), "incadec": ("r=10", "r=5.5, back", "r=10, back")},
+    {"sp_a": 0.0635, "sp_b": 0.0072},
+)
+PH = Miniature(
+    "ph_neutralization",
+    {"linearized_pid": 1.3, "gauss_newton_pid": 1.01, "recursive_pid": 1.25, "self_tuning_pid": 1.6, "pid": 1.4},
+    {"set_point": 6.04, "disturbance": 0.144, "held_out": 8.0, "buffer": 7.0, "base": 0.01},
+    {"linearized_pid": {"penalty": 1.0}, "recursive_pid": {"penalty": 1.0}},
+    {"linearized_pid": ("penalty=20", "adaptive"), "recursive_pid": ("penalty=5",)},
+    adaptive=("linearized_pid", "gauss_newton_pid", "recursive_pid"),
+)
+BATCH = Miniature(
+    "batch_reactor",
+    {"linearized_pid": 1.004, "gauss_newton_pid": 1.001, "recursive_pid": 1.002, "pid": 1.01},
+    {"trajectory": 13_252.0, "fouling": 14_181.0, "held_out": 8000.0},
+    {},
+    {"linearized_pid": ("plain",)},
+    adaptive=("linearized_pid", "recursive_pid"),
+)
+CASE, QUALITY = THIOSULFATE.case, THIOSULFATE.quality
 
 
 def write_json(path: Path, tree: Any) -> None:
@@ -31,9 +78,13 @@ def write_json(path: Path, tree: Any) -> None:
     path.write_text(json.dumps(tree))
 
 
-def figures(mae: float) -> dict[str, float]:
+def figures(error: float, metric: str = "mae") -> dict[str, float]:
+    mae = error if metric == "mae" else (error / 150) ** 0.5
+    late = {"sse_late": error / 1000} if error > 1000 else {}
     return {
         "mae": mae,
+        "sse": mae**2 * 150,
+        **late,
         "ise": mae**2 * 50,
         "masse": mae / 100,
         "max_asse": mae / 50,
@@ -43,24 +94,35 @@ def figures(mae: float) -> dict[str, float]:
     }
 
 
-def spread(mae: float) -> dict[str, Any]:
-    per_seed = {str(s): figures(mae * (1 + 0.02 * (s - 1))) for s in SEEDS}
-    return {"median": figures(mae), "min": figures(mae * 0.98), "max": figures(mae * 1.02), "per_seed": per_seed}
+def spread(error: float, metric: str = "mae") -> dict[str, Any]:
+    per_seed = {str(s): figures(error * (1 + 0.02 * (s - 1)), metric) for s in SEEDS}
+    ends = {"min": figures(error * 0.98, metric), "max": figures(error * 1.02, metric)}
+    return {"median": figures(error, metric), **ends, "per_seed": per_seed}
 
 
-def trajectory(scenario: Any, quality: float) -> dict[str, np.ndarray]:
-    n = scenario.samples
-    pv = np.empty((n, 2))
-    ca = float(scenario.x0[0])
+def trajectory(case: Case, scenario: Scenario, quality: float, adaptive: bool = False) -> dict[str, np.ndarray]:
+    """A lag towards the set point; a second measured state follows; gains that move with the error."""
+    plant = case.plant
+    n, low, high = scenario.samples, plant.mv_signals[0].low, plant.mv_signals[0].high
+    cv = np.empty(n)
+    now = float(np.asarray(plant.measure(scenario.x0)).ravel()[0])
     for k in range(n):
-        pv[k] = ca, 300 + 60 * (1 - ca)
-        ca += (float(scenario.sp[k, 0]) - ca) * 0.5 / quality
-    return {"time_s": np.arange(n) * 0.5, "sp": scenario.sp, "pv": pv, "mv": 250 + 200 * (scenario.sp - pv[:, :1])}
+        cv[k] = now
+        now += (float(scenario.sp[k, 0]) - now) * 0.5 / quality
+    pv = np.stack([cv, 300 + 60 * (1 - cv)], axis=1)[:, : len(plant.pv_signals)]
+    error = scenario.sp[:, 0] - cv
+    mv = (low + high) / 2 + (high - low) / 4 * np.tanh(error)
+    found = {"time_s": np.arange(n) * plant.period_s, "sp": scenario.sp, "pv": pv, "mv": mv[:, None]}
+    if adaptive:
+        kc, tau_i = 30 / (1 + np.abs(error)), 40 + 3000 * np.tanh(error**2)
+        found["info"] = np.stack([kc, tau_i, 20 + 5 * error, 1 + 40 * np.abs(error), np.abs(error) / 10], axis=1)
+    return found
 
 
-def write_controller(path: Path, law: str, gain: float) -> None:
+def write_controller(path: Path, law: str, gain: float, mini: Miniature = THIOSULFATE) -> None:
     """A proportional law as ONNX, with the manifest beside it."""
-    ins = [helper.make_tensor_value_info(n, TensorProto.DOUBLE, [k]) for n, k in (("sp", 1), ("pv", 2))]
+    sizes = (("sp", 1), ("pv", len(mini.of.plant.pv_signals)))
+    ins = [helper.make_tensor_value_info(n, TensorProto.DOUBLE, [k]) for n, k in sizes]
     outs = [helper.make_tensor_value_info("mv", TensorProto.DOUBLE, [1])]
     constants = [
         helper.make_tensor("gain", TensorProto.DOUBLE, [1], [gain]),
@@ -73,7 +135,14 @@ def write_controller(path: Path, law: str, gain: float) -> None:
     ]
     graph = helper.make_graph(nodes, "law", ins, outs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    manifest = {"schema": 1, "case": CASE, "law": law, "period_s": 0.5, "provenance": {}, "evidence": {}}
+    manifest = {
+        "schema": 1,
+        "case": mini.case,
+        "law": law,
+        "period_s": mini.of.plant.period_s,
+        "provenance": {},
+        "evidence": {},
+    }
     helper.set_model_props(model, {"loopwright.manifest": json.dumps(manifest)})
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(model.SerializeToString())
@@ -104,42 +173,77 @@ def write_models(root: Path) -> None:
     np.savez(folder / "predictions.npz", time_s=np.arange(200) * 0.5, actual=actual, predicted=actual * 0.97 + 5)
 
 
-def write_validation(root: Path, law: str, quality: float, lock_ups: int = 0, gain: float = 100.0) -> None:
+def write_nnarx_models(root: Path, mini: Miniature = PH) -> None:
+    """A set of NNARX whose size was searched, and the identification example with its curves."""
+    folder = root / "work" / mini.case / "models"
+    sizes = [(1, 1, 10, 0.05), (2, 2, 6, 0.0062), (2, 2, 10, 0.0041), (3, 3, 10, 0.004)]
+
+    def row(seed: int, size: tuple[int, int, int, float]) -> dict[str, Any]:
+        n_y, n_u, width, free = size
+        count, chosen = width * (n_y + n_u + 2) + 1, size == sizes[2 + (seed == 2)]
+        errors = {"rmse": free / 3, "free_run_rmse": free * (1 + 0.1 * seed)}
+        return {"n_y": n_y, "n_u": n_u, "hidden": [width], "parameters": count, **errors, "chosen": chosen}
+
+    seeds = {
+        str(s): {"rmse": 0.0013, "free_run_rmse": 0.0041, "r2": 0.9999, "candidates": [row(s, size) for size in sizes]}
+        for s in SEEDS
+    }
+    part = {"kind": "nnarx", "per_seed": seeds, "median": {"rmse": 0.0013, "free_run_rmse": 0.0041, "r2": 0.9999}}
+    write_json(folder / "nnarx" / "metrics.json", {"model": "nnarx", "parts": {"nnarx": part}})
+    sse = {"nnarx": 0.055, "linearized": 0.6, "recursive_0.8": 2.6, "recursive_0.5": 5.0}
+    one_step = {k: {"median": v, "min": v * 0.9, "max": v * 1.1} for k, v in sse.items()}
+    part = {"kind": "identification_example", "per_seed": {"0": {"one_step": one_step}}, "median": {}}
+    name = "identification_example"
+    write_json(folder / name / "metrics.json", {"model": name, "parts": {"example": part}})
+    measured = np.sin(np.arange(100) * 2 * np.pi / 25)
+    curves = {k: measured + np.sqrt(v / 50) * np.cos(np.arange(100)) for k, v in sse.items()}
+    np.savez(folder / name / "predictions.npz", time_s=np.arange(100.0), measured=measured, **curves)
+
+
+def write_validation(
+    root: Path, law: str, quality: float, lock_ups: int = 0, gain: float = 100.0, mini: Miniature = THIOSULFATE
+) -> None:
     """What validate leaves of one law."""
-    folder = root / "work" / CASE / "validation" / law
-    case = CASES[CASE]
-    tests = {name: scenarios[0] for name, scenarios in case.scenarios().items()}
-    maes = {name: bound * quality for name, bound in BOUND.items()}
+    folder = root / "work" / mini.case / "validation" / law
+    case, metric = mini.of, mini.of.metric
+    tests = mini.tests
+    errors = {name: bound * quality for name, bound in mini.bound.items()}
+    variants, adaptive = mini.variants.get(law, ()), law in mini.adaptive
     metrics: dict[str, Any] = {
         "law": law,
         "title": law.upper(),
         "seeds": list(SEEDS),
         "shipped_seed": 0,
         "lock_ups": lock_ups,
-        "setting": SETTING.get(law, {}),
-        "scenarios": {name: spread(mae) for name, mae in maes.items()},
-        "noise": {name: spread(mae * 1.1 + 1e-4) for name, mae in maes.items()},
+        "setting": mini.setting.get(law, {}),
+        "info": list(GAINS) if adaptive else [],
+        "scenarios": {name: spread(error, metric) for name, error in errors.items()},
+        "noise": {name: spread(error * 1.1 + 1e-4, metric) for name, error in errors.items()},
         "variants": {
-            v: {name: spread(mae * (1.2 + 0.1 * i)) for name, mae in maes.items()}
-            for i, v in enumerate(VARIANTS.get(law, ()))
+            v: {name: spread(error * (1.2 + 0.1 * i), metric) for name, error in errors.items()}
+            for i, v in enumerate(variants)
         },
         "step_us": {"p50": 25.0, "p99": 60.0},
     }
     write_json(folder / "metrics.json", metrics)
+    loops = {**tests, **{name + NOISE_SUFFIX: test for name, test in tests.items()}}
+    loops |= {
+        f"{f.scenario}_hold{f.hold}": tests[f.scenario].with_hold(f.hold) for f in case.figures if f.hold and f.scenario
+    }
     arrays = {}
-    loops = {**tests, "sp_a_hold160": tests["sp_a"].with_hold(160)}
-    for i, variant in enumerate(("base", "noise", *VARIANTS.get(law, ()))):
+    for i, variant in enumerate(("base", *variants)):
         for name, scenario in loops.items():
-            for field, values in trajectory(scenario, quality * (1 + 0.3 * i)).items():
-                arrays[f"{name}/{variant}/0/{field}"] = values
+            for key, values in trajectory(case, scenario, quality * (1 + 0.3 * i), adaptive).items():
+                arrays[f"{name}/{variant}/0/{key}"] = values
     np.savez_compressed(folder / "trajectories.npz", **arrays)
-    write_controller(root / "artifacts" / CASE / f"{law}.onnx", law, gain)
+    write_controller(root / "artifacts" / mini.case / f"{law}.onnx", law, gain, mini)
 
 
-def bounds() -> dict[str, Any]:
-    """What the oracle's script stored."""
-    rows: dict[str, Any] = {name: {"nmpc": figures(mae)} for name, mae in BOUND.items()}
-    rows["sp_a"]["offline"], rows["sp_b"]["offline"] = figures(0.0635), figures(0.0072)
+def bounds(mini: Miniature = THIOSULFATE) -> dict[str, Any]:
+    """What the oracle's script stored; the squared error after a recipe's start is nothing to it."""
+    rows: dict[str, Any] = {name: {"nmpc": figures(error, mini.of.metric)} for name, error in mini.bound.items()}
+    for name, error in mini.offline.items():
+        rows[name]["offline"] = figures(error, mini.of.metric)
     return rows
 
 
@@ -189,11 +293,11 @@ def write_lock(root: Path, laws: dict[str, dict[str, Any]]) -> None:
     (root / "dvc.lock").write_text(yaml.safe_dump({"schema": "2.0", "stages": stages}, sort_keys=False))
 
 
-def write_case(root: Path, quality: dict[str, float] = QUALITY) -> None:
+def write_case(root: Path, quality: Mapping[str, float] | None = None, mini: Miniature = THIOSULFATE) -> None:
     """The whole miniature, without the report's outputs."""
-    records = root / "work" / CASE / "records" / "steps"
+    records = root / "work" / mini.case / "records" / "steps"
     records.mkdir(parents=True)
     (records / "seed0.csv").write_text("run,time_s\n0,0.0\n")
-    write_models(root)
-    for law, value in quality.items():
-        write_validation(root, law, value)
+    write_models(root) if mini is THIOSULFATE else write_nnarx_models(root, mini)
+    for law, value in (quality or mini.quality).items():
+        write_validation(root, law, value, mini=mini)

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-from pipeline.cases import NOISE_SUFFIX, Case
+from pipeline.cases import NOISE_SUFFIX, Case, Scenario
 from pipeline.cases.base import Curve
 from pipeline.report.law_evidence import LawEvidence, Loop, ReportError, read_metrics
 from pipeline.report.model_evidence import model_figure
@@ -68,12 +68,17 @@ class Evidence:
         )
 
     @cached_property
+    def tests(self) -> Mapping[str, tuple[Scenario, ...]]:
+        """The case's tests; it makes them anew each time it is asked, steady states and all."""
+        return self.case.scenarios()
+
+    @cached_property
     def scenarios(self) -> dict[str, str]:
         """Title of each scenario, without those with noise."""
         several = "held-out recipes" if self.case.recipe else "held-out sequences of random set points"
         return {
             name: tests[0].title if len(tests) == 1 else f"{len(tests)} {several}"
-            for name, tests in self.case.scenarios().items()
+            for name, tests in self.tests.items()
         }
 
     @cached_property
@@ -90,6 +95,15 @@ class Evidence:
         """The test that weighs most in the gate."""
         return max(self.case.gate, key=lambda name: self.case.gate[name])
 
+    def late_from(self, scenario: str) -> int:
+        """The sample from which the test, with noise or without, is scored a second time; 0: it is not."""
+        tests = self.tests.get(scenario.removesuffix(NOISE_SUFFIX), ())
+        return tests[0].late_from if tests else 0
+
+    def late_s(self, scenario: str) -> float:
+        """The same in seconds."""
+        return self.late_from(scenario) * self.case.plant.period_s
+
     @property
     def main_title(self) -> str:
         """Title of the test that weighs most."""
@@ -99,7 +113,7 @@ class Evidence:
     def main_words(self) -> tuple[str, str]:
         """What a picture of the main test shows, and what the test is to somebody who doubts a tuning."""
         name, recipe = self.main_test, self.case.recipe
-        if len(self.case.scenarios()[name.removesuffix(NOISE_SUFFIX)]) == 1:
+        if len(self.tests[name.removesuffix(NOISE_SUFFIX)]) == 1:
             return (scenario_name(name, recipe),) * 2
         if recipe:
             return "a held-out recipe", "recipes that nothing was tuned on"
@@ -146,7 +160,7 @@ class Evidence:
             return dict.fromkeys(self.scenarios, self.noise)
         return {
             name: self.noise**2 * statistics.fmean(test.samples for test in tests)
-            for name, tests in self.case.scenarios().items()
+            for name, tests in self.tests.items()
         }
 
     def floor(self, scenario: str) -> float:

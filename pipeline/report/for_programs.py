@@ -63,7 +63,7 @@ def _row(evidence: Evidence, law: str, scenario: str) -> dict[str, Any]:
 
 def gate_id(evidence: Evidence) -> str:
     """Digest of what the gate measures: scores of different ids may not be compared."""
-    case, tests = evidence.case, evidence.case.scenarios()
+    case, tests = evidence.case, evidence.tests
     what: dict[str, Any] = {
         s: [w, evidence.bound(s), [t.digest() for t in tests.get(s.removesuffix(NOISE_SUFFIX), ())]]
         for s, w in case.gate.items()

@@ -70,10 +70,10 @@ class LawEvidence:
         found = self.metrics.get("lock_ups")
         return None if found is None else int(found)
 
-    @property
-    def info(self) -> tuple[str, ...]:
-        """Names of the controller's info, in the order of the trajectories' columns."""
-        return tuple(self.metrics.get("info") or ())
+    def info(self, setting: Mapping[str, Any]) -> tuple[str, ...]:
+        """Names of the controller's info with this setting, in the order of the trajectories' columns."""
+        own = self.metrics.get("info") or ()
+        return tuple((self.metrics.get("variant_info") or {}).get(self.variant_of(setting), own))
 
     @property
     def development(self) -> float | None:

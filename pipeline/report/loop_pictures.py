@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases.base import NOISE_SUFFIX, Case, Curve, Figure
+from pipeline.cases.base import Case, Curve, Figure
 from pipeline.report.drawing import (
     BASELINE,
     SHADES,
@@ -21,10 +21,10 @@ from pipeline.report.drawing import (
 )
 from pipeline.report.evidence import Evidence
 from pipeline.report.law_evidence import Array, Loop
-from pipeline.report.words import SHORT, law_label, number
+from pipeline.report.words import SHORT, law_label, number, ratio
 
-LATE_COLOUR = "#f2f2f2"
-ORDERS_FOR_LOG = 2.0  # powers of ten that an info must span to be drawn over them
+SCALES = {"kc", "tau_i_s", "tau_d_s", "penalty"}  # info whose ratios matter, not its differences
+ORDERS_FOR_LOG = 2.0  # powers of ten that these must span to be drawn over them
 
 
 class LoopPanels:
@@ -79,12 +79,6 @@ def first(values: Array) -> Array:
     return values if values.ndim == 1 else values[:, 0]
 
 
-def late_from(case: Case, scenario: str) -> int:
-    """The sample from which the test is scored a second time; 0: it is not."""
-    tests = case.scenarios().get(scenario.removesuffix(NOISE_SUFFIX), ())
-    return tests[0].late_from if tests else 0
-
-
 def curves_and_loops(evidence: Evidence, figure: Figure, curves: Sequence[Curve]) -> list[tuple[Curve, Loop]]:
     """The curves that have a trajectory."""
     found = [(c, evidence.loop(c, figure.scenario or "", figure.hold)) for c in curves]
@@ -108,7 +102,7 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     found = curves_and_loops(evidence, figure, curves)
     if not found:
         return None
-    late = 0 if figure.hold else late_from(evidence.case, figure.scenario or "")
+    late = 0 if figure.hold else evidence.late_from(figure.scenario or "")
     panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", late)
     own = colours(evidence, figure)
     for curve, loop in found:
@@ -126,7 +120,7 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     """What the controllers of a figure say of themselves over time, a panel for each entry of info."""
     found = []
     for curve, loop in curves_and_loops(evidence, figure, figure.curves):
-        names = evidence.laws[curve.law].info
+        names = evidence.laws[curve.law].info(curve.setting)
         if "info" in loop and set(figure.info) <= set(names):
             found.append((curve, loop, {name: loop["info"][:, names.index(name)] for name in figure.info}))
     if not found:
@@ -143,11 +137,12 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
         panels[-1].set_xlabel(words)
     for axes, name in zip(panels, figure.info, strict=True):
         axes.set_ylabel(info_label(evidence.case, name))
-        if over_orders(np.concatenate([values[name] for _, _, values in found])):
-            axes.set_yscale("log")
+        if name in SCALES and over_orders(np.concatenate([values[name] for _, _, values in found])):
+            axes.set_yscale("log", nonpositive="clip")
         for at in moves(found[0][1]):
             axes.axvline(at, color="#b0b0b0", linewidth=0.8, linestyle=":", zorder=1)
         axes.margins(x=0.01)
+    canvas.align_ylabels(panels)
     panels[0].set_title(f"Figure {figure.number}. {figure.title}")
     if len(found) > 1:
         handles, labels = panels[0].get_legend_handles_labels()
@@ -169,8 +164,9 @@ def moves(loop: Loop) -> Array:
 
 
 def over_orders(values: Array) -> bool:
-    """Whether positive values span so many powers of ten that a linear axis would show only the largest."""
-    return bool(np.all(values > 0)) and float(np.ptp(np.log10(values))) > ORDERS_FOR_LOG
+    """Whether values above 0 span so many powers of ten that a linear axis would show only the largest."""
+    positive = values[values > 0]
+    return 2 * len(positive) > len(values) and float(np.ptp(np.log10(positive))) > ORDERS_FOR_LOG
 
 
 def info_label(case: Case, name: str) -> str:
@@ -194,11 +190,11 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     if own is None:
         return None
     error, bound = evidence.figure(law, scenario), evidence.bound(scenario)
-    beside = "" if not bound or error is None else f", {error / bound:.2f} × perfect-model NMPC"
-    late = evidence.figure(law, scenario, "sse_late") if metric == "sse" else None
-    rest = "" if late is None else f"; late part {number(late)}"
+    beside = "" if not bound or error is None else f", {ratio(error / bound)} × perfect-model NMPC"
+    late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
+    rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"
-    panels = LoopPanels(evidence.case, title, late_from(evidence.case, scenario))
+    panels = LoopPanels(evidence.case, title, evidence.late_from(scenario))
     baseline = evidence.loop(Curve(BASELINE), scenario) if law != BASELINE else None
     if baseline is not None:
         error = evidence.figure(BASELINE, scenario)

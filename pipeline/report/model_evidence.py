@@ -72,7 +72,7 @@ def candidates(name: str, model: Metrics) -> list[dict[str, Any]]:
     """
     tables = []
     for part, found in (model.get("parts") or {}).items():
-        searches = [row["search"] for row in (found.get("per_seed") or {}).values() if row.get("search")]
+        searches = [row["candidates"] for row in (found.get("per_seed") or {}).values() if row.get("candidates")]
         sizes: dict[tuple[Any, ...], list[Metrics]] = {}
         for candidate in (c for search in searches for c in search):
             sizes.setdefault((candidate["n_y"], candidate["n_u"], *candidate["hidden"]), []).append(candidate)

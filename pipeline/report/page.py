@@ -17,7 +17,7 @@ from pipeline.report.figures import draw_all
 from pipeline.report.for_programs import validation
 from pipeline.report.model_evidence import candidates, model_rows
 from pipeline.report.verdicts import RULE, acceptance, paper_row, plain_reason, statements
-from pipeline.report.words import LONG, NO_UNIT, SHORT, number, scenario_name
+from pipeline.report.words import LONG, NO_UNIT, SHORT, number, ratio, scenario_name
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 MOST_HEADLINES = 5
@@ -49,13 +49,18 @@ def _environment(html: bool) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"figure": figure, "cell": cell}
+    environment.filters |= {"figure": figure, "times": times, "cell": cell}
     return environment
 
 
 def figure(value: float | None) -> str:
     """A number with three digits; a dash where nothing was measured."""
     return "–" if value is None else number(value)
+
+
+def times(value: float | None) -> str:
+    """A ratio with three digits, and one more where it comes near 1."""
+    return "–" if value is None else number(value, 4 if abs(value - 1) < 0.01 else 3)
 
 
 def cell(text: str) -> str:
@@ -132,19 +137,21 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     asked = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
     rows = []
     for name, kind in dict.fromkeys(asked):
-        ratio = evidence.ratio(best, name, kind)
-        if ratio is not None:
-            rows.append((f"{ratio:.2f}", f"× {short}{bounds.get(kind, kind)} on {scenario_name(name, case.recipe)}"))
+        value = evidence.ratio(best, name, kind)
+        if value is not None:
+            rows.append((ratio(value), f"× {short}{bounds.get(kind, kind)} on {scenario_name(name, case.recipe)}"))
     for need in needs:
         late = evidence.figure(best, need.scenario, need.metric) if need.metric == "sse_late" else None
         if late is not None:
             where = scenario_name(need.scenario, case.recipe)
             rows.append((number(late), f"{SHORT[need.metric]} on {where}; at most {number(need.high)} is asked"))
     rows = rows[:MOST_HEADLINES]
-    own, pid = evidence.figure(best, evidence.main_test), evidence.figure("pid", evidence.main_test)
+    late_s = evidence.late_s(evidence.main_test)
+    metric = "sse_late" if late_s else case.metric
+    own, pid = (evidence.figure(law, evidence.main_test, metric) for law in (best, "pid"))
     if own and pid and own < pid:
         what = "less error" if case.metric == "mae" else "less squared error"
-        where = scenario_name(evidence.main_test, case.recipe)
+        where = scenario_name(evidence.main_test, case.recipe) + (f", from {late_s:g} s on" if late_s else "")
         rows.append((f"{100 * (1 - own / pid):.0f} %", f"{what} than the PID on {where}"))
     return rows
 
@@ -167,11 +174,9 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
     """The big table: each test in the case's metric, its late part where it has one, and the MV's travel at the end."""
     case = evidence.case
     rows = []
-    for name, tests in case.scenarios().items():
-        title = evidence.scenarios[name]
+    for name, title in evidence.scenarios.items():
         rows.append(_row(evidence, name, title, case.metric))
-        if case.metric == "sse" and tests[0].late_from:
-            late_s = tests[0].late_from * case.plant.period_s
+        if late_s := evidence.late_s(name):
             rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", "sse_late"))
     mv = case.plant_class.mv_signals[0]
     unit = "" if mv.unit in NO_UNIT else f" [{mv.unit}]"

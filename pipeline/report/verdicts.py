@@ -17,7 +17,7 @@ RELATIVE = 0.25
 ABSOLUTE = 1e-4
 RULE = (
     f"A figure reproduces when it lies within {100 * RELATIVE:g} % of the paper's or within {ABSOLUTE:g} of it "
-    "(in the unit of the controlled variable). Ours are medians over the data seeds, whose networks were each trained "
+    "(in its own unit). Ours are medians over the data seeds, whose networks were each trained "
     "on another record."
 )
 
@@ -93,7 +93,7 @@ def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Row:
     else:
         verdict, holds = f"does not, because {reason(row, median, evidence)}", False
         if row.independent is not None and close(median, row.independent):
-            verdict += f"; an independent implementation found {row.independent:g} too"
+            verdict += f"; an independent implementation found {number(row.independent, 4)} too"
     metric = metric_name(row.metric)
     return Row(row.label, metric, row.paper, median, ours("min"), ours("max"), row.independent, verdict, holds)
 

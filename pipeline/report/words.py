@@ -32,6 +32,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:,.0f}" if large else f"{value:.{digits}g}"
 
 
+def ratio(value: float) -> str:
+    """A multiple of a bound: two decimals, and more where it comes within a hundredth of it."""
+    return f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
+
+
 def metric_name(metric: str) -> str:
     """A metric's short name; of a path into a model set's figures, ``one_step.nnarx``, the words before the dot."""
     first = metric.partition(".")[0]

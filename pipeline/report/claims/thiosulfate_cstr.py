@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.cases.base import PaperFigure
 from pipeline.plants.base import Linearization
+from pipeline.report.claims.timing import faster_than_nmpc, step_within
 from pipeline.report.evidence import Evidence
 from pipeline.report.law_evidence import parse_setting
 from pipeline.report.verdicts import Claims, Verdict, plain_reason
@@ -227,37 +228,6 @@ def _middle_zero(evidence: Evidence) -> float:
     return float(_middle(evidence).sampled_zeros(evidence.case.plant.period_s)[0].real)
 
 
-def _step_time(evidence: Evidence) -> Verdict:
-    times = {}
-    for name, law in evidence.laws.items():
-        value = law.metrics.get("step_us")
-        p50 = value.get("p50") if isinstance(value, Mapping) else value
-        if p50 is not None:
-            times[name] = float(p50)
-    limit = (
-        "≤ 40 us for inc, incad, incadec, inverse_dob (timed while validating, other work beside; alone: make bench)"
-    )
-    if not times:
-        return Verdict("controller step, median", limit, "measured by `make bench`", None)
-    shown = ", ".join(f"{n} {t:.0f} us" for n, t in times.items())
-    rbf = [times[n] for n in ("inc", "incad", "incadec", "inverse_dob") if n in times]
-    return Verdict("controller step, median", limit, shown, max(rbf) <= 40 if rbf else None)
-
-
-def _faster_than_nmpc(evidence: Evidence) -> Verdict:
-    """The NMPC's time is stored with the bounds; `make bench` measures both in one run."""
-    what, limit = (
-        "perfect NMPC's median step over the controllers' (SP-A; the NMPC's as stored)",
-        "at least 100 for each",
-    )
-    nmpc = evidence.bound("sp_a", "step_ms_p50")
-    times = {n: law.metrics["step_us"]["p50"] for n, law in evidence.laws.items() if law.metrics.get("step_us")}
-    if nmpc is None or not times:
-        return Verdict(what, limit, "measured by `make bench`", None)
-    ratios = {n: 1e3 * nmpc / t for n, t in times.items()}
-    return Verdict(what, limit, ", ".join(f"{n} {r:.0f}" for n, r in ratios.items()), min(ratios.values()) >= 100)
-
-
 CLAIMS = Claims(
     reason=reason,
     statements={
@@ -268,5 +238,14 @@ CLAIMS = Claims(
         "the PID is slow, or unstable when tuned faster": _slow_pid,
         "the error correction leaves no offset": _no_offset,
     },
-    acceptance=(_steady_states, _turning_points, _eigenvalues, _zero, _centres, _rmse, _step_time, _faster_than_nmpc),
+    acceptance=(
+        _steady_states,
+        _turning_points,
+        _eigenvalues,
+        _zero,
+        _centres,
+        _rmse,
+        step_within(40.0, "inc", "incad", "incadec", "inverse_dob"),
+        faster_than_nmpc(100.0, "sp_a", "SP-A"),
+    ),
 )
