@@ -36,9 +36,14 @@ class Miniature:
     offline: Mapping[str, float] = field(default_factory=dict)
     adaptive: tuple[str, ...] = ()  # laws with ``GAINS`` in their info
 
-    @property
+    @cached_property
     def of(self) -> Case:
-        return CASES[self.case]
+        """The case; its tests, whose steady states take seconds, are made once."""
+        case = CASES[self.case]
+        found = case.scenarios()
+        case = case.with_held_out(case.held_out_seeds)
+        object.__setattr__(case, "scenarios", lambda: found)
+        return case
 
     @cached_property
     def tests(self) -> Mapping[str, Scenario]:

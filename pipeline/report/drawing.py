@@ -71,7 +71,8 @@ def ratio_unit(top: str, bottom: str) -> str:
     """Unit of a quotient."""
     if bottom in NO_UNIT:
         return top
-    return f"{'1' if top in NO_UNIT else top}/{bottom}"
+    below = f"({bottom})" if "/" in bottom else bottom
+    return f"{'1' if top in NO_UNIT else top}/{below}"
 
 
 def save(canvas: Canvas, path: Path) -> None:

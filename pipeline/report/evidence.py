@@ -77,8 +77,7 @@ class Evidence:
         """Title of each scenario, without those with noise."""
         several = "held-out recipes" if self.case.recipe else "held-out sequences of random set points"
         return {
-            name: tests[0].title if len(tests) == 1 else f"{len(tests)} {several}"
-            for name, tests in self.tests.items()
+            name: tests[0].title if len(tests) == 1 else f"{len(tests)} {several}" for name, tests in self.tests.items()
         }
 
     @cached_property
@@ -159,8 +158,7 @@ class Evidence:
         if self.case.metric == "mae":
             return dict.fromkeys(self.scenarios, self.noise)
         return {
-            name: self.noise**2 * statistics.fmean(test.samples for test in tests)
-            for name, tests in self.tests.items()
+            name: self.noise**2 * statistics.fmean(test.samples for test in tests) for name, tests in self.tests.items()
         }
 
     def floor(self, scenario: str) -> float:
