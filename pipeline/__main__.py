@@ -97,7 +97,7 @@ def _simulate(options: argparse.Namespace) -> None:
     )
     title = f"{controller.manifest.law} on {plant.title}"
     history = close_loop(controller, plant, run, title=title, speed=options.speed)
-    print(summary(plant, history))
+    print(summary(plant, history, "mae" if case is None else case.metric))
     picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
     draw(picture, plant, history, title, run.marks)
     print(f"picture: {picture}")

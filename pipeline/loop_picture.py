@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
-from pipeline.metrics import mae, mv_travel
+from pipeline.metrics import mae, mv_travel, sse
 from pipeline.plants.base import Plant
 
 Array = NDArray[np.float64]
@@ -32,16 +32,18 @@ class History:
     reason: list[str] = field(default_factory=list)
 
 
-def summary(plant: Plant, history: History) -> str:
-    """MAE and final error of each controlled variable, MV travel, faults; one line each."""
+def summary(plant: Plant, history: History, metric: str = "mae") -> str:
+    """The error of each controlled variable in the case's metric, and at the end, MV travel, faults; one line each."""
     sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
     lines = []
     for i, s in enumerate(plant.sp_signals):
-        lines.append(
-            f"MAE {s.name} {mae(sp[:, i], pv[:, i]):.4g} {s.unit}, final error {sp[-1, i] - pv[-1, i]:.3g} {s.unit}"
-        )
+        unit = "" if s.unit == "-" else f" {s.unit}"
+        error = f"MAE {s.name} {mae(sp[:, i], pv[:, i]):.4g}{unit}"
+        if metric == "sse":
+            error = f"SSE {s.name} {sse(sp[:, i], pv[:, i]):.6g}, {error}"
+        lines.append(f"{error}, final error {sp[-1, i] - pv[-1, i]:.3g}{unit}")
     for i, s in enumerate(plant.mv_signals):
-        lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g} {s.unit}")
+        lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g}" + ("" if s.unit == "-" else f" {s.unit}"))
     faults = sum(map(bool, history.reason))
     if faults:
         lines.append(f"{faults} scans with a fault, the last one: {next(r for r in reversed(history.reason) if r)}")

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from pipeline.cases import CASES
 from pipeline.cases.base import Curve, Figure, PaperFigure, Requirement
+from pipeline.loop_picture import History, summary
 from pipeline.report.claims import CLAIMS
 from pipeline.report.evidence import Evidence
 from pipeline.report.for_programs import gate_id, validation
@@ -281,3 +282,13 @@ def test_the_table_in_the_terminal_and_the_card_in_the_registry(written):
     assert "Scenario (sum of squared errors)" in card
     assert f"{own / bound:.2f}" in card
     assert "e+" not in card
+
+
+def test_a_loop_tried_by_hand_is_told_in_the_cases_metric():
+    sp, pv = (np.array([[7.0], [8.0]]), np.array([[7.0], [7.5]]))
+    mv = np.array([[900.0], [950.0]])
+    history = History([0.0, 60.0], ["AUTO"] * 2, list(sp), list(pv), list(pv), list(mv), ["", ""])
+    assert summary(PH.of.plant, history, "sse").splitlines() == [
+        "SSE pH 0.25, MAE pH 0.25, final error 0.5",
+        "travel of q3 50 ml/min",
+    ]
