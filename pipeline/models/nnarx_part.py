@@ -13,7 +13,7 @@ from pipeline.errors import ModelError
 from pipeline.metrics import fit_percent, per_region, r2, rmse
 from pipeline.models.base import Model
 from pipeline.models.fit import FitHistory, Trainer
-from pipeline.models.lag_search import Candidate, Size, parsimonious
+from pipeline.models.lag_search import SLACK, Candidate, Size, parsimonious
 from pipeline.models.network_parts import story, trainer_of
 from pipeline.models.nnarx import NNARX
 from pipeline.models.objectives import Samples, Windows
@@ -33,8 +33,9 @@ class NnarxPart(Part):
     ``n_y``, ``n_u``, ``delay`` the lags; ``hidden`` the widths. ``steps`` the prediction horizon that is
     trained on: 1 is the one-step error, more a free run of that many periods, begun from the one-step fit.
     ``search`` lists sizes, e.g. [{n_y: 2, n_u: 2}, {n_y: 3, n_u: 3, hidden: [15]}], each trained alike;
-    the smallest of those within 5 % of the best free run over ``free_run`` periods stays. ``compared``
-    validation samples show the one-step predictions beside those of linear models, 0 none.
+    the smallest of those whose free run over ``free_run`` periods errs at most ``slack`` (relative) more
+    than the best one's stays. Measurement noise counts in that error: where it dominates, take less slack.
+    ``compared`` validation samples show the one-step predictions beside those of linear models, 0 none.
     """
 
     model: ClassVar[type[Model]] = NNARX
@@ -47,6 +48,7 @@ class NnarxPart(Part):
     steps: int = 1
     free_run: int = 20
     search: tuple[Size, ...] = ()
+    slack: float = SLACK
     compared: int = 200
     forgetting: tuple[float, ...] = FORGETTING
     train_fraction: float = 0.7
@@ -66,7 +68,7 @@ class NnarxPart(Part):
         sizes = [self._sized(size) for size in self.search or (Size(),)]
         back = max(max(s.n_y - 1, s.n_u + s.delay - 2) for s in sizes)
         trials = [size._trial(*halves, target, back, seed) for size in sizes]
-        best = parsimonious([candidate for *_, candidate in trials])
+        best = parsimonious([candidate for *_, candidate in trials], self.slack)
         model, history, candidate = trials[best]
         metrics = {
             "free_run_rmse": candidate.free_run_rmse,
@@ -123,10 +125,9 @@ class NnarxPart(Part):
         self, model: NNARX, trainer: Trainer, train: Record, validation: Record, target: int, seed: int
     ) -> FitHistory:
         """Go on from the one-step fit: a free run of random weights leads nowhere."""
-        # Windows that overlap by half use every sample twice; all of them cost steps / 2 times as much and add little.
-        every = max(1, self.steps // 2)
+        # End to end, each sample once: all windows cost ``steps`` times as much and validate no better.
         before, after = (
-            Windows.of(r, self.n_y, self.n_u, self.steps, target=target, delay=self.delay, every=every)
+            Windows.of(r, self.n_y, self.n_u, self.steps, target=target, delay=self.delay, every=self.steps)
             for r in (train, validation)
         )
         return replace(trainer, restarts=0).fit(model.net, before, after, seed=seed)
