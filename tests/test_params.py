@@ -127,3 +127,20 @@ def test_reduced_numbers_all_stand_in_the_shipped_file() -> None:
     root = Path(__file__).parents[1]
     text = (root / "params.yaml").read_text()
     assert [key for key in runpy.run_path(str(root / "tools" / "reduced.py"))["SMALL"] if f"{key}:" not in text] == []
+
+
+def test_the_reduced_run_shows_every_case_and_law_and_lacks_nothing_that_it_needs() -> None:
+    root = Path(__file__).parents[1]
+    whole = yaml.safe_load((root / "params.yaml").read_text())
+    tree = runpy.run_path(str(root / "tools" / "reduced.py"))["reduced"](whole)
+    controllers = tree["controllers"].values()
+    assert {c["law"] for c in controllers} == {c["law"] for c in whole["controllers"].values()}
+    assert {c["case"] for c in controllers} == set(CASES)
+    assert len(controllers) < len(whole["controllers"])
+    models = {(m["case"], m["model"]) for m in tree["models"].values()}
+    assert {(c["case"], c["model"]) for c in controllers} <= models
+    records = {f"work/{r['case']}/records/{r['record']}" for r in tree["records"].values()}
+    data = {m["data"] for m in tree["models"].values()}
+    assert {d for d in data if d.startswith("work/")} == records
+    # Nothing grew: a batch is shorter than what a record is cut down to.
+    assert tree["records"]["batch_reactor-batches"]["samples"] == whole["records"]["batch_reactor-batches"]["samples"]

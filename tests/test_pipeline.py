@@ -72,6 +72,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
         "models": ["inverse", "linearized"],
         "controllers": ["incad", "pid"],
     }
+    tree["cases"] = {CASE: tree["cases"][CASE]}
     for section, names in keep.items():
         tree[section] = {f"{CASE}-{name}": tree[section][f"{CASE}-{name}"] for name in names}
     tree["records"][f"{CASE}-random_steps"]["seeds"] = [0]

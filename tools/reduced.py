@@ -1,4 +1,4 @@
-"""Write params.yaml again with small numbers: the same stages, done in a few minutes.
+"""Write params.yaml again with small numbers and each law once: the same stages, done in a few minutes.
 
     python tools/reduced.py PARAMS.yaml
 
@@ -13,10 +13,11 @@ from typing import Any
 
 import yaml
 
-# Key -> its value in a reduced run, wherever it stands in the file and only where it stands.
+# Key -> its value in a reduced run, wherever it stands in the file and only where it stands; a number only shrinks.
 SMALL: dict[str, Any] = {
     "seeds": [0, 1],
     "samples": 3000,
+    "batches": 40,
     "restarts": 300,
     "rows": 1500,
     "partitions": 10,
@@ -26,16 +27,54 @@ SMALL: dict[str, Any] = {
 TRAINER = {"kind": "lm", "iterations": 15}
 
 
-def reduced(tree: Any) -> Any:
-    """``tree`` with the numbers of SMALL; networks train for a few iterations only."""
-    if isinstance(tree, dict):
-        found = {key: SMALL.get(key, reduced(value)) for key, value in tree.items()}
-        if found.get("kind") == "mlp":
-            found["trainer"] = TRAINER
-        if "variants" in found:
-            found["variants"] = dict(list(found["variants"].items())[:1])
-        return found
-    return tree
+def reduced(tree: dict[str, Any]) -> dict[str, Any]:
+    """The sections of params.yaml with the numbers of SMALL, and no more controllers than show every law and case."""
+    return fewer(shrunk(tree))
+
+
+def shrunk(tree: Any) -> Any:
+    """``tree`` with the numbers of SMALL; networks train for a few iterations only, of the variants the first stays."""
+    if not isinstance(tree, dict):
+        return tree
+    found = {key: _small(key, value) for key, value in tree.items()}
+    if found.get("kind") == "mlp":
+        found["trainer"] = TRAINER
+    if "variants" in found:
+        found["variants"] = dict(list(found["variants"].items())[:1])
+    return found
+
+
+def _small(key: str, value: Any) -> Any:
+    if key not in SMALL:
+        return shrunk(value)
+    return min(value, SMALL[key]) if isinstance(value, int) else SMALL[key]
+
+
+def fewer(tree: dict[str, Any]) -> dict[str, Any]:
+    """Each law in the first case that has it, the first law of each case, and the model sets and records of these."""
+    laws: set[str] = set()
+    cases: set[str] = set()
+    controllers, dropped = {}, set()
+    for name, entry in tree["controllers"].items():
+        if entry["law"] in laws and entry["case"] in cases:
+            dropped.add((entry["case"], entry["model"]))
+            continue
+        laws.add(entry["law"])
+        cases.add(entry["case"])
+        controllers[name] = entry
+    used = {(entry["case"], entry["model"]) for entry in controllers.values()}
+    models = {
+        name: entry
+        for name, entry in tree["models"].items()
+        if (entry["case"], entry["model"]) in used or (entry["case"], entry["model"]) not in dropped
+    }
+    data = {entry["data"] for entry in models.values()}
+    records = {
+        name: entry
+        for name, entry in tree["records"].items()
+        if f"work/{entry['case']}/records/{entry['record']}" in data
+    }
+    return {**tree, "records": records, "models": models, "controllers": controllers}
 
 
 def main() -> None:
