@@ -37,8 +37,8 @@ class GaussNewtonPid(NnarxPid):
     class Params(NnarxParams):
         """As NnarxParams, with a smaller penalty; ``relinearize`` is the number of linearizations, 1 or more."""
 
-        penalty: float = 0.02
-        relinearize: int = 3
+        penalty: float = 0.05
+        relinearize: int = 5
 
         def __post_init__(self) -> None:
             NnarxParams.__post_init__(self)

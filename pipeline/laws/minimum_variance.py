@@ -44,8 +44,8 @@ class MinimumVariance(ControlLaw):
         ``mv_rate`` [mv] the largest change a sample, None unlimited.
         """
 
-        penalty: float = 0.02
-        relinearize: int = 3
+        penalty: float = 0.05
+        relinearize: int = 5
         preview: Literal["held", "ramp"] = "held"
         plant_gain: Literal["auto", "positive", "negative"] = "auto"
         slope_min: float = 1e-3

@@ -110,18 +110,22 @@ class NextOutput(nn.Module):
         return self.along.rest(self.along.moved(ahead.at, step)) - ahead.rest
 
     def relinearized(self, ahead: Ahead, step: Tensor) -> tuple[Tensor, Tensor]:
-        """``moved`` and its slope at a move of ``step`` units, (..., 1) each."""
-        rest, slope = self.along.rest_and_slope(self.along.moved(ahead.at, step))
-        return rest - ahead.rest, slope
+        """``rest`` and ``slope`` at a move of ``step`` units, (..., 1) each."""
+        return self.along.rest_and_slope(self.along.moved(ahead.at, step))
 
 
 class GaussNewton(nn.Module):
     """The move that brings y(t+1) nearest to r(t+1), by a few linearizations of the network.
 
-        du_0 = 0,   du_{i+1} = b_i (r - y_i + b_i du_i) / (b_i^2 + mu),   y_i = NN at du_i, b_i its slope
+        du_0 = 0,   du_{i+1} = du_i + (b_i (r - y_i) - mu du_i) / (b_i^2 + mu)
 
-    which are the Gauss-Newton steps of min (r - y)^2 + mu du^2. Each is limited to the actuator's
-    room, beyond which the network has learnt nothing; a slope below ``slope_min`` is taken for that.
+    with y_i what the network predicts for du_i and b_i its slope there: the Gauss-Newton steps of
+    min (r - y)^2 + mu du^2. The numerator's sign tells on which side of du_i the minimum lies. Two
+    such moves enclose it (at first: what the actuator can do), and a step that leads out of them is
+    replaced by their middle; without that, a plant that is steep in the middle and flat at its
+    ends makes the steps, and then the loop, jump between two moves for ever. A slope below
+    ``slope_min`` is taken for that, so that a dip of the network is crossed.
+
     ``forward`` gives the move (..., 1) in units and the last b^2 + mu.
     """
 
@@ -131,20 +135,27 @@ class GaussNewton(nn.Module):
     def __init__(self, model: NextOutput, times: int, penalty: float, slope_min: float) -> None:
         super().__init__()
         self.model, self.times = model, times
-        self.register_buffer("penalty", torch.tensor([penalty], dtype=torch.float64))
-        self.register_buffer("slope_min", torch.tensor([slope_min], dtype=torch.float64))
+        for name, value in (("penalty", penalty), ("slope_min", slope_min)):
+            self.register_buffer(name, torch.tensor([value], dtype=torch.float64))
 
     def forward(self, ahead: Ahead, down: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
         """Within the room ``down`` <= move <= ``up``, (..., 1) each, in units."""
-        move, curvature = self._step(ahead.gap, ahead.slope, torch.zeros_like(ahead.gap), down, up)
-        for _ in range(self.times - 1):
-            added, slope = self.model.relinearized(ahead, move)
-            move, curvature = self._step(ahead.gap - added, slope, move, down, up)
-        return move, curvature
-
-    def _step(self, gap: Tensor, slope: Tensor, move: Tensor, down: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-        """One step from a move that leaves ``gap``."""
-        slope = torch.maximum(slope, self.slope_min)
+        slope = torch.maximum(ahead.slope, self.slope_min)
         curvature = slope * slope + self.penalty
-        wanted = slope * (gap + slope * move) / curvature
-        return torch.minimum(torch.maximum(wanted, down), up), curvature
+        push = slope * ahead.gap
+        move = torch.minimum(torch.maximum(push / curvature, down), up)
+        nothing, goal = torch.zeros_like(move), ahead.gap + ahead.rest
+        more = push > 0
+        low, high = torch.where(more, nothing, down), torch.where(more, up, nothing)
+        for _ in range(self.times - 1):
+            rest, slope = self.model.relinearized(ahead, move)
+            slope = torch.maximum(slope, self.slope_min)
+            curvature = slope * slope + self.penalty
+            push = slope * (goal - rest) - self.penalty * move
+            more = push > 0
+            low, high = torch.where(more, move, low), torch.where(more, high, move)
+            newton = move + push / curvature
+            # At the minimum itself the step is zero and the move an end of what encloses it.
+            inside = (newton >= low) & (newton <= high)
+            move = torch.where(inside, newton, 0.5 * (low + high))
+        return move, curvature
