@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.report.drawing import PALETTE, colour_of, ratio_unit, time_axis
 from pipeline.report.law_evidence import parse_setting
-from pipeline.report.loop_pictures import moves, over_orders
+from pipeline.report.loop_pictures import finite, moves, over_orders
 from pipeline.report.words import law_name, number, ratio, scenario_name, setting_text
 
 
@@ -67,6 +67,10 @@ def test_scales_and_marks_follow_the_data():
     assert over_orders(np.array([0.0, 1.0, 10.0, 1e4]))
     assert not over_orders(np.array([1.0, 2.0, 50.0]))
     assert not over_orders(np.array([0.0, 0.0, 0.0, 1e-9, 1.0]))
+    times = finite(np.array([1e-9, 30.0, 6e5]), "tau_i_s", 60.0)
+    assert times[:2].tolist() == [0.0, 30.0]
+    assert np.isnan(times[2])
+    assert finite(np.array([1e-9, 6e5]), "kc", 60.0).tolist() == [1e-9, 6e5]
     time_s = np.arange(40.0)
     held = np.repeat([7.0, 9.0], 20)[:, None]
     assert moves({"time_s": time_s, "sp": held}).tolist() == [20.0]

@@ -24,6 +24,7 @@ from pipeline.report.law_evidence import Array, Loop
 from pipeline.report.words import SHORT, law_label, number, ratio
 
 SCALES = {"kc", "tau_i_s", "tau_d_s", "penalty"}  # info whose ratios matter, not its differences
+SHORTEST, LONGEST = 1e-3, 9e3  # periods; times below and above say that there is no such action
 ORDERS_FOR_LOG = 2.0  # powers of ten that these must span to be drawn over them
 
 
@@ -106,9 +107,9 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", late)
     own = colours(evidence, figure)
     for curve, loop in found:
-        ours = curve is best
+        ours, alone = curve is best, len(found) == 1
         label = law_label(curve.law, curve.setting) + (" (ours, best)" if ours else "")
-        panels.add(loop, label, "black" if ours else own[curves.index(curve)], ours)
+        panels.add(loop, label, "black" if ours else own[curves.index(curve)], ours or alone)
     return panels.finish(found[0][1])
 
 
@@ -122,7 +123,9 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     for curve, loop in curves_and_loops(evidence, figure, figure.curves):
         names = evidence.laws[curve.law].info(curve.setting)
         if "info" in loop and set(figure.info) <= set(names):
-            found.append((curve, loop, {name: loop["info"][:, names.index(name)] for name in figure.info}))
+            columns = {name: loop["info"][:, names.index(name)] for name in figure.info}
+            period_s = evidence.case.plant.period_s
+            found.append((curve, loop, {name: finite(v, name, period_s) for name, v in columns.items()}))
     if not found:
         return None
     count = len(figure.info)
@@ -135,10 +138,12 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
         for axes, name in zip(panels, figure.info, strict=True):
             axes.step(time, values[name], where="post", color=colour, linewidth=1.3, label=_label(curve))
         panels[-1].set_xlabel(words)
+    gaps = any(np.isnan(v).any() for _, _, values in found for v in values.values())
     for axes, name in zip(panels, figure.info, strict=True):
         axes.set_ylabel(info_label(evidence.case, name))
         if name in SCALES and over_orders(np.concatenate([values[name] for _, _, values in found])):
-            axes.set_yscale("log", nonpositive="clip")
+            axes.set_yscale("log", nonpositive="mask")
+            gaps = True
         for at in moves(found[0][1]):
             axes.axvline(at, color="#b0b0b0", linewidth=0.8, linestyle=":", zorder=1)
         axes.margins(x=0.01)
@@ -148,7 +153,8 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
         handles, labels = panels[0].get_legend_handles_labels()
         canvas.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
     else:
-        panels[0].set_title(_label(found[0][0]), loc="right", fontweight="normal", fontsize="medium")
+        words = _label(found[0][0]) + ("; gaps: no such action" if gaps else "")
+        panels[0].set_title(words, loc="right", fontweight="normal", fontsize="medium")
     return canvas
 
 
@@ -161,6 +167,14 @@ def moves(loop: Loop) -> Array:
     sp, (time, _) = first(loop["sp"]), time_axis(loop["time_s"])
     at = np.flatnonzero(np.diff(sp)) + 1
     return time[at] if len(at) < len(sp) / 4 else time[:0]
+
+
+def finite(values: Array, name: str, period_s: float) -> Array:
+    """An info (n,) as it is drawn: a time of thousands of periods stands for no action, a tiny one for 0."""
+    if not name.endswith("_s"):
+        return values
+    values = np.where(values < SHORTEST * period_s, 0.0, values)
+    return np.where(values > LONGEST * period_s, np.nan, values)
 
 
 def over_orders(values: Array) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.cases.base import Curve, PaperFigure
 from pipeline.report.claims.timing import faster_than_nmpc, step_within
 from pipeline.report.evidence import Evidence
+from pipeline.report.loop_pictures import LONGEST
 from pipeline.report.verdicts import Claims, Verdict, plain_reason
 from pipeline.report.words import law_label, number, ratio
 
@@ -28,7 +29,6 @@ PRINTED = (990.0, 1020.0)  # [ml/min] ends of the paper's disturbance
 SLOW = 2.0  # times the SSE with a penalty of 1
 OVERSHOOT = 0.10  # of a step: what deserves the name
 REST = 0.05  # [pH] of steady error: a loop that comes to rest has less
-LONGEST = 0.9e4  # periods; an integral time beyond says that there is no integral action
 
 
 # ---------------------------------------------------------------- why a figure differs
@@ -172,7 +172,7 @@ def _at_bounds(evidence: Evidence) -> Verdict:
     if loop is None or "info" not in loop or not {"kc", "tau_i_s", "tau_d_s"} <= set(names):
         return Verdict("", "", "not measured", None)
     kc, tau_i, tau_d = (loop["info"][:, names.index(n)] for n in ("kc", "tau_i_s", "tau_d_s"))
-    active = (kc <= 0) | (tau_i >= LONGEST * evidence.case.plant.period_s) | (tau_d <= 0)
+    active = (kc <= 0) | (tau_i > LONGEST * evidence.case.plant.period_s) | (tau_d <= 0)
     share = float(np.mean(active))
     because = "without bounds, infinitely many settings give the same move; the least change within them is taken"
     return Verdict("", "", f"a bound is active in {100 * share:.0f} % of the samples on {SET}", share > 0, because)
