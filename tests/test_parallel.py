@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+from functools import partial
+from pathlib import Path
+from threading import Event
 
 import pytest
 
@@ -18,6 +22,51 @@ def test_results_come_in_the_order_of_the_items() -> None:
 def test_an_error_of_one_piece_is_the_error_of_all() -> None:
     with pytest.raises(ValueError, match=r"math domain error|nonnegative"):
         parallel_map(math.sqrt, [1.0, -1.0], "roots")
+
+
+def mark(folder: Path, item: int) -> int:
+    with (folder / f"{item}").open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    return item**2
+
+
+def test_every_piece_is_done_once_whoever_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    assert parallel_map(partial(mark, tmp_path), range(20), "squares") == [i**2 for i in range(20)]
+    taken = [(tmp_path / f"{i}").read_text().split() for i in range(20)]
+    assert all(len(pids) == 1 for pids in taken)
+    assert [str(os.getpid())] in taken  # this process works too
+
+
+def meet(folder: Path, item: int) -> int:
+    """Wait, at most a minute, until another process has begun the other item."""
+    (folder / f"{item}").write_text(str(os.getpid()))
+    other = folder / f"{1 - item}"
+    for _ in range(6_000):
+        if other.exists() and other.read_text():
+            return int(other.read_text())
+        Event().wait(0.01)
+    raise TimeoutError("no other process came")
+
+
+def test_pieces_run_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    one, other = parallel_map(partial(meet, tmp_path), [0, 1], "meetings")
+    assert one != other
+    assert os.getpid() in (one, other)
+
+
+def give_up(here: int, item: int) -> int:
+    if os.getpid() != here:
+        os._exit(3)
+    Event().wait(0.05)
+    return item
+
+
+def test_a_helper_that_dies_is_an_error_and_no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with pytest.raises(Exception, match="worker process managed by the executor was unexpectedly terminated"):
+        parallel_map(partial(give_up, os.getpid()), range(2_000), "exits")
 
 
 def test_a_cluster_without_its_package_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
