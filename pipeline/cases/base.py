@@ -7,7 +7,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -234,9 +234,15 @@ def from_rest(
     where there is no such steady state.
     """
     changes = changes or {}
-    first = plant.with_parameters({key: float(values[0]) for key, values in changes.items()})
+    first = _same(plant.with_parameters({key: float(values[0]) for key, values in changes.items()}))
     x0, mv0 = first.steady_state_at(float(sp[0, 0]))
     return Scenario(name, title, sp, x0, mv0, changes, hold, seed)
+
+
+@cache
+def _same(plant: Plant) -> Plant:
+    """The first plant with these parameters: it has its steady states already, which take longer than many a test."""
+    return plant
 
 
 def stepwise(n: int, *steps: tuple[int, float]) -> Array:
