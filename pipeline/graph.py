@@ -6,7 +6,9 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, Self
 
 import numpy as np
 import onnx
@@ -33,20 +35,14 @@ def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
 
     Raises ExportError where the law cannot be such a graph.
     """
-    sizes = (len(law.signals.sp), len(law.signals.pv), len(law.signals.dv), len(law.signals.mv), law.n_state)
-    example = tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
-    with _quiet():
-        try:
-            program = torch.onnx.export(
-                law, example, dynamo=True, external_data=False, verbose=False, optimize=False, opset_version=OPSET
-            )
-        except Exception as error:  # torch wraps whatever went wrong in exceptions of its own
-            raise ExportError(f"law {law.name!r} cannot be traced: {_cause(error)}") from error
-    assert program is not None
-    assert program.exported_program is not None
-    model = program.model
-    _restore_floats(model, _python_floats(program.exported_program))
-    inputs = _name_ends(model, sizes)
+    try:
+        traced = _Traced.of(law)
+        translated, inputs = _translated(traced)
+    except ExportError:
+        raise
+    except Exception as error:  # torch wraps whatever went wrong in exceptions of its own
+        raise ExportError(f"law {law.name!r} cannot be traced: {_cause(error)}") from error
+    model = ir.from_proto(_filled(translated, law))
     _simplify(model)
     inputs = tuple(name for name in inputs if any(v.name == name for v in model.graph.inputs))
     proto = ir.to_proto(model)
@@ -55,6 +51,59 @@ def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     del proto.graph.value_info[:], proto.metadata_props[:], proto.graph.metadata_props[:]
     _check(law, proto)
     return proto, inputs
+
+
+@dataclass(frozen=True)
+class _Traced:
+    """A law as torch traces it. Equal to that of another law which differs in its buffers' values alone.
+
+    The text holds every operation, its numbers, and the names and shapes of the buffers; beside
+    them only constants can differ, which are compared by value.
+    """
+
+    text: str
+    constants: bytes
+    sizes: tuple[int, ...]
+    program: torch.export.ExportedProgram = field(compare=False)
+
+    @classmethod
+    def of(cls, law: ControlLaw) -> Self:
+        signals = law.signals
+        sizes = (len(signals.sp), len(signals.pv), len(signals.dv), len(signals.mv), law.n_state)
+        example = tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
+        with _quiet():
+            program = torch.export.export(law, example, strict=False)
+        constants = {name: t.numpy() for name, t in program.constants.items() if isinstance(t, torch.Tensor)}
+        values = b"".join(f"{n} {t.dtype} {t.shape}".encode() + t.tobytes() for n, t in sorted(constants.items()))
+        return cls(str(program), values, sizes, program)
+
+
+@lru_cache(maxsize=16)
+def _translated(traced: _Traced) -> tuple[onnx.ModelProto, tuple[str, ...]]:
+    """The traced law in ONNX, as long as it is written, and its inputs.
+
+    Most of an export's time goes here, so laws of other seeds share it. The buffers are those of
+    the law that came first.
+    """
+    with _quiet():
+        program = torch.onnx.export(
+            traced.program, dynamo=True, external_data=False, verbose=False, optimize=False, opset_version=OPSET
+        )
+    assert program is not None
+    assert program.exported_program is not None
+    _restore_floats(program.model, _python_floats(program.exported_program))
+    inputs = _name_ends(program.model, traced.sizes)
+    return ir.to_proto(program.model), inputs
+
+
+def _filled(translated: onnx.ModelProto, law: ControlLaw) -> onnx.ModelProto:
+    """The graph with the law's own buffers."""
+    proto, buffers = onnx.ModelProto(), law.state_dict()
+    proto.CopyFrom(translated)
+    for tensor in proto.graph.initializer:
+        if tensor.name in buffers:
+            tensor.CopyFrom(onnx.numpy_helper.from_array(buffers[tensor.name].numpy(), tensor.name))
+    return proto
 
 
 def _python_floats(program: torch.export.ExportedProgram) -> set[float]:
