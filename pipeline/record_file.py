@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
@@ -129,6 +128,8 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]], metadata: Mappi
     draft = path.with_name(f"{path.name}.{os.getpid()}.draft")
     try:
         if suffix == ".csv":
+            import pandas as pd  # here, because stages read Parquet and importing pandas takes long
+
             pd.DataFrame(dict(columns)).to_csv(draft, index=False, lineterminator="\n")
         else:
             table = pa.table(dict(columns)).replace_schema_metadata({METADATA_KEY: json.dumps(metadata).encode()})
@@ -151,6 +152,8 @@ def _read_parquet(path: Path) -> Table:
 
 
 def _read_csv(path: Path) -> Table:
+    import pandas as pd  # here, as above
+
     with path.open(encoding="utf-8-sig", newline="") as file:
         head = file.readline()
     # A spreadsheet in a country with the decimal comma separates cells by semicolons.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
-from scipy.stats import chi2
+from scipy.special import chdtri
 from torch import Tensor, nn
 
 from pipeline.errors import LawError
@@ -181,7 +181,7 @@ class AdaptiveGains(nn.Module):
             "lo": params.gain_low,
             "hi": params.gain_high,
             "gamma": [params.momentum],
-            "threshold": [variance * float(chi2.ppf(CONFIDENCE, m)) if m else 0.0],
+            "threshold": [variance * float(chdtri(m, 1 - CONFIDENCE)) if m else 0.0],
             "slope_min": [params.slope_min],
             "forms": [[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]],
             "by_unit": [1 / unit],

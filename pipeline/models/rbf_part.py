@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from pipeline.errors import ParamsError
 from pipeline.models.base import Model
-from pipeline.models.fuzzy_means import FuzzyMeansRBF
 from pipeline.models.parts import Learnt, Regions, StaticPart, predict
 from pipeline.models.rbf import RBF, Basis
 from pipeline.models.regressors import Pairs
-from pipeline.models.sweep import SweepResult, sweep
 from pipeline.plants.base import Plant
 from pipeline.record import Record
+
+if TYPE_CHECKING:
+    from pipeline.models.sweep import SweepResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +59,16 @@ class RbfPart(StaticPart):
         return Learnt(model, metrics, found, predictions)
 
     def _fit(self, train: Pairs, validation: Pairs, plant: Plant, regions: Regions) -> tuple[Model, dict[str, Any]]:
+        from pipeline.models.fuzzy_means import FuzzyMeansRBF  # here: scikit-learn is slow to import, and few need it
+
         estimator = FuzzyMeansRBF(self.partitions, basis=self.basis, width=self.width, ridge=self.ridge)
         model = estimator.fit(train.x, train.y).to_torch()
         metrics = self.scored(model, validation, plant, regions)
         return model, metrics | {"centres": len(estimator.centres_), "c": self.partitions, "n_train": len(train)}
 
     def _sweep(self, train: Pairs, validation: Pairs, plant: Plant, regions: Regions) -> SweepResult:
+        from pipeline.models.sweep import sweep  # here, as above
+
         return sweep(
             train.x,
             train.y,
