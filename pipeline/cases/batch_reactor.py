@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -24,8 +24,9 @@ HEURISTIC = Curve("linearized_pid")
 _GAINS = ("kc", "tau_i_s", "tau_d_s")
 
 
-def profile(level: float, height: float, rate: float, period_s: float) -> Array:
+def profile(numbers: Sequence[float], period_s: float) -> Array:
     """Set points level + height exp(-rate t) from t = 0 to the end of the batch [deg C], shape (n, 1)."""
+    level, height, rate = numbers
     t = np.arange(0.0, END_S, period_s)
     return np.asarray(level + height * np.exp(-rate * t))[:, None]
 
@@ -96,19 +97,19 @@ class BatchReactorCase(Case):
         )
 
     def _random(self, name: str, seed: int) -> Scenario:
-        numbers = tuple(np.random.default_rng(seed).uniform(LOW, HIGH).tolist())
+        numbers = np.random.default_rng(seed).uniform(LOW, HIGH).tolist()
         return self._batch(name, f"Random profile, seed {seed}", numbers, seed=seed)
 
     def _batch(
         self,
         name: str,
         title: str,
-        numbers: tuple[float, ...],
+        numbers: Sequence[float],
         changed: Mapping[str, float] | None = None,
         seed: int | None = None,
     ) -> Scenario:
         period = self.plant.period_s
-        sp = profile(*numbers, period_s=period)
+        sp = profile(numbers, period)
         x0, mv0 = self.plant.start
         changes = {key: np.full(len(sp), value) for key, value in (changed or {}).items()}
         return Scenario(name, title, sp, x0, mv0, changes, 0, seed, round(LATE_S / period))

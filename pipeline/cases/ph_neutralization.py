@@ -150,9 +150,13 @@ class PhNeutralizationCase(Case):
     def development(self) -> tuple[Scenario, ...]:
         """Random sequences of other seeds, and other disturbances than the scored ones."""
         n = 6 * self.hold
-        acid, buffer = np.repeat([1000.0, 985.0, 995.0], n // 3), stepwise(n, (0, Q2), (n // 3, 45.0))
+        acid, more = np.repeat([1000.0, 985.0, 995.0], n // 3), stepwise(n, (0, Q2), (n // 3, 45.0))
+        less = stepwise(n, (0, Q2), (2 * self.hold // 5, 21.0))
+        steps = held([7.3, 8.8, 8.8, 7.9, 7.9, 7.9], self.hold)
         return (
             *(self._random("development", seed) for seed in self.development_seeds),
             from_rest(self.plant, "acid", "Acid flow down", held([7.6], n), changes={"q1": acid}),
-            from_rest(self.plant, "more_buffer", "Buffer flow up", held([8.4], n), changes={"q2": buffer}),
+            from_rest(self.plant, "more_buffer", "Buffer flow up", held([8.4], n), changes={"q2": more}),
+            # A third less buffer, a plant gain up by half: a loop without any reserve shows here.
+            from_rest(self.plant, "less_buffer", "Buffer flow down", steps, hold=self.hold, changes={"q2": less}),
         )
