@@ -51,7 +51,7 @@ class RecursivePid(ControlLaw):
         """
 
         forgetting: float = 0.98
-        covariance: float = 0.1
+        covariance: float = 1.0
         offset_filter: float = 1.0
 
         def __post_init__(self) -> None:

@@ -51,6 +51,8 @@ class SelfTuningPid(ControlLaw):
     class Params:
         """Numbers of the law; MVs count in units of half the MV's range, PVs in their own.
 
+        The defaults suit the pH tank sampled every minute, by search on its development sequences.
+
         Parameters
         ----------
         prefilter
@@ -71,10 +73,10 @@ class SelfTuningPid(ControlLaw):
             Largest change of the MV a sample [mv]; None is unlimited.
         """
 
-        prefilter: tuple[float, ...] = (-0.2, -0.4, 0.05)
-        integral: float = 0.4
-        forgetting: float = 0.98
-        covariance: float = 0.1
+        prefilter: tuple[float, ...] = (0.5, -0.3, 0.12)
+        integral: float = 0.68
+        forgetting: float = 0.96
+        covariance: float = 0.44
         gain_high: tuple[float, float, float] = (10.0, 10.0, 10.0)
         plant_gain: Literal["auto", "positive", "negative"] = "auto"
         slope_min: float = 1e-3
