@@ -55,7 +55,7 @@ def _here(function: Callable[[Item], Result], work: list[Item], advance: Callabl
     """Share the items out between this process and helpers on the other cores, one by one.
 
     A helper imports for seconds what this process has imported already, and takes its first item
-    only then: little work is done before, and nobody waits for a helper that has none.
+    only then, so that little work is done before nobody needs it.
     """
     left = deque(range(len(work)))
     futures: list[Future[Result]] = [Future() for _ in work]
@@ -85,17 +85,19 @@ def _here(function: Callable[[Item], Result], work: list[Item], advance: Callabl
             return  # shut down before it was ready
         take(lambda item: pool.submit(_helped, payload, item).result())
 
+    finished = False
     try:
         for _ in range(helpers):
             Thread(target=help_along, daemon=True).start()
         take(lambda item: _one_thread(function, item))
         ended, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        for error in (future.exception() for future in ended):
+            if error is not None:
+                raise error
+        finished = True
     finally:
         if helpers:
-            pool.shutdown(kill_workers=True)
-    for error in (future.exception() for future in ended):
-        if error is not None:
-            raise error
+            pool.shutdown(kill_workers=not finished)
     return [future.result() for future in futures]
 
 
