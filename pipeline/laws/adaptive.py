@@ -162,6 +162,7 @@ class AdaptiveGains(nn.Module):
     lo: Tensor  # (3,)
     hi: Tensor  # (3,)
     gamma: Tensor  # (1,)
+    fresh_share: Tensor  # (1,) 1 - gamma
     threshold: Tensor  # (1,) [pv^2] of the sum of the window's squared errors
     slope_min: Tensor  # (1,)
     forms: Tensor  # (3, 5): z -> kc dt, Kd dt, Ki, kc, kc [mv/pv]
@@ -181,6 +182,7 @@ class AdaptiveGains(nn.Module):
             "lo": params.gain_low,
             "hi": params.gain_high,
             "gamma": [params.momentum],
+            "fresh_share": [1 - params.momentum],
             "threshold": [variance * float(chdtri(m, 1 - CONFIDENCE)) if m else 0.0],
             "slope_min": [params.slope_min],
             "forms": [[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]],
@@ -239,7 +241,7 @@ class AdaptiveGains(nn.Module):
         if not self.filtered:
             z = torch.where(free, z, now["gains"])
             return z, {"gains": z}
-        change = now["change"] + (1 - self.gamma) * (z - now["gains"])
+        change = now["change"] + self.fresh_share * (z - now["gains"])
         change = torch.where(free, change, torch.zeros_like(change))
         # Filtered changes may lead out of the bounds although neither gains do.
         z = torch.minimum(torch.maximum(now["gains"] + change, self.lo), self.hi)

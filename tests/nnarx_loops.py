@@ -1,0 +1,99 @@
+"""Networks and closed loops for the tests of the laws over an NNARX. Not a test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from pipeline.cases import Case
+from pipeline.cases.base import Scenario
+from pipeline.excitation import Excitation
+from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.models import MODELS, Model
+from pipeline.models.nnarx import NNARX
+from pipeline.plants import Plant
+from pipeline.simulate import Trajectory, simulate_closed
+from serving.manifest import Signal
+
+DV = torch.zeros(0, dtype=torch.float64)
+
+
+def trained(plant: Plant, excitation: Excitation, lags: int, seed: int = 0) -> NNARX:
+    """An NNARX as params.yaml asks for it, without the figures that its report shows."""
+    part = MODELS["nnarx"](n_y=lags, n_u=lags, hidden=(10,), steps=10, compared=0)
+    model = part.learn(excitation.run(plant, seed), plant, {}, seed).model
+    assert isinstance(model, NNARX)
+    return model
+
+
+def designed(name: str, model: Model, plant: Plant, signals: LawSignals | None = None, **params: Any) -> ControlLaw:
+    law = LAWS[name]
+    return law.design(law.Params(**params), {"nnarx": model}, signals or LawSignals.of(plant), plant).eval()
+
+
+def stepper(law: ControlLaw, through: Callable[[np.ndarray], np.ndarray] = lambda mv: mv):
+    """The law as ``simulate_closed`` steps it; ``through`` stands between its MV and the plant's, both ways."""
+    state = torch.zeros(law.n_state, dtype=torch.float64)
+
+    def step(sp, pv, mv_applied):
+        nonlocal state
+        with torch.no_grad():
+            inputs = (torch.from_numpy(np.array(v)) for v in (sp, pv))
+            mv, state, info = law(*inputs, DV, torch.from_numpy(through(mv_applied)), state)
+        return through(mv.numpy()), info.numpy()
+
+    return step
+
+
+def closed(
+    law: ControlLaw, case: Case, test: Scenario, noise: float = 0.0, seed: int = 0, **through: Any
+) -> Trajectory:
+    return simulate_closed(case.plant, stepper(law, **through), test, noise=[noise], seed=seed)
+
+
+def sse(track: Trajectory, start: int = 0) -> float:
+    return float(((track.sp - track.pv)[start:] ** 2).sum())
+
+
+def info(law: ControlLaw, track: Trajectory) -> dict[str, np.ndarray]:
+    return dict(zip(law.info, track.info.T, strict=True))
+
+
+def mirrored(signal: Signal) -> Callable[[np.ndarray], np.ndarray]:
+    """What turns a signal's range round."""
+    return lambda value: signal.low + signal.high - value
+
+
+def mirrored_in_mv(model: NNARX, mv: Signal) -> NNARX:
+    """The same plant's model, whose MV has been turned round."""
+    other = NNARX(**model.config())
+    other.load_state_dict(model.state_dict())
+    net = other.net
+    net.x_center[model.n_y :] = mirrored(mv)(net.x_center[model.n_y :])
+    net.x_scale[model.n_y :] *= -1
+    return other.eval()
+
+
+def negated_in_pv(model: NNARX) -> NNARX:
+    """The model of a plant that measures -y."""
+    other = NNARX(**model.config())
+    other.load_state_dict(model.state_dict())
+    net = other.net
+    net.x_center[: model.n_y] *= -1
+    net.x_scale[: model.n_y] *= -1
+    net.y_center *= -1
+    net.y_scale *= -1
+    return other.eval()
+
+
+def negated_signals(signals: LawSignals) -> LawSignals:
+    """The signals of a plant that measures -y."""
+
+    def negated(group: tuple[Signal, ...]) -> tuple[Signal, ...]:
+        return tuple(replace(s, low=-s.high, high=-s.low) for s in group)
+
+    return replace(signals, sp=negated(signals.sp), pv=negated(signals.pv))
