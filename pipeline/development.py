@@ -31,6 +31,7 @@ class DevelopmentLoops:
     """
 
     plant: Plant
+    hold: int  # samples of each set point
     sp: Array  # (n, s) set point of every sequence at every sample
     x0: Array  # (s, n_x)
     mv0: Array  # (s, n_mv)
@@ -56,14 +57,17 @@ class DevelopmentLoops:
         starts = [plant.steady_state_at(float(first)) for first in levels[:, 0]]
         return cls(
             plant,
+            hold,
             np.repeat(levels, hold, axis=1).T,
             np.array([x for x, _ in starts]),
             np.array([u for _, u in starts]),
         )
 
-    def mae(self, step: LawStep, n_state: int, candidates: int = 1) -> Array:
+    def error(self, step: LawStep, n_state: int, candidates: int = 1, *, time_weighted: bool = False) -> Array:
         """Mean absolute error (candidates,) of each candidate over all sequences.
 
+        ``time_weighted`` multiplies each error by the periods since its set point moved, which makes
+        of the mean an ITAE: a slow or swinging end then counts for more than the unavoidable beginning.
         ``step`` takes shapes (candidates, s, .): a law whose numbers have a leading dimension
         of candidates. The error of a sample counts before that sample's move acts. A candidate
         whose loop is not finite has an infinite error.
@@ -81,7 +85,8 @@ class DevelopmentLoops:
         with torch.no_grad():
             for k in range(n):
                 pv = np.array(self.plant.measure(x)).T.reshape(*lanes, -1)
-                error += np.abs(self.sp[k] - pv[..., 0])
+                weight = k % self.hold if time_weighted else 1
+                error += weight * np.abs(self.sp[k] - pv[..., 0])
                 sp = torch.from_numpy(self.sp[k])[:, None].expand(*lanes, 1)
                 mv, state, _ = step(sp, torch.from_numpy(pv), seen_dv, mv, state)
                 x = np.array(advance(x, mv.reshape(candidates * s, -1).T.numpy(), dv, p))

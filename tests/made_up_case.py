@@ -63,8 +63,12 @@ PH = Miniature(
     "ph_neutralization",
     {"linearized_pid": 1.3, "gauss_newton_pid": 1.01, "recursive_pid": 1.25, "self_tuning_pid": 1.6, "pid": 1.4},
     {"set_point": 6.04, "disturbance": 0.144, "held_out": 8.0, "buffer": 7.0, "base": 0.01},
-    {"linearized_pid": {"penalty": 1.0}, "recursive_pid": {"penalty": 1.0}},
-    {"linearized_pid": ("penalty=20", "adaptive"), "recursive_pid": ("penalty=5",)},
+    {"linearized_pid": {"penalty": 1.0}, "recursive_pid": {"penalty": 1.0}, "pid": {"tuning": "optimized"}},
+    {
+        "linearized_pid": ("penalty=20", "adaptive"),
+        "recursive_pid": ("penalty=5",),
+        "pid": ("tuning=itae, sampling=1",),
+    },
     adaptive=("linearized_pid", "gauss_newton_pid", "recursive_pid"),
 )
 BATCH = Miniature(

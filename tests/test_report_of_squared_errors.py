@@ -200,7 +200,7 @@ def test_claims_of_the_tank_follow_the_measurement(tmp_path):
     rewrite(tmp_path, PH, "linearized_pid", ("variants", "adaptive", "set_point"), sse=5.0)
     rewrite(tmp_path, PH, "recursive_pid", set_point, sse=9.0)
     rewrite(tmp_path, PH, "recursive_pid", ("scenarios", "disturbance"), max_asse=0.2)
-    rewrite(tmp_path, PH, "pid", set_point, overshoot=0.02)
+    rewrite(tmp_path, PH, "pid", ("variants", "tuning=itae, sampling=1", "set_point"), overshoot=0.02)
     after = outcomes()
     turned = {
         "the PID with fixed settings overshoots and oscillates": False,

@@ -235,6 +235,22 @@ def test_development_loops_start_at_rest(plant: Plant) -> None:
     def hold(sp, pv, dv, mv_applied, state):
         return mv_applied, state, mv_applied
 
-    assert still.mae(hold, 0, candidates=2).max() < 1e-6
+    assert still.error(hold, 0, candidates=2).max() < 1e-6
+
+
+def test_time_weighted_errors_count_what_comes_late(plant: Plant) -> None:
+    """An MV that never moves: the error stays as it is over each hold, but for the plant's own motion."""
+    loops = DevelopmentLoops.draw(plant, (3,), 2, 6)
+
+    def hold(sp, pv, dv, mv_applied, state):
+        return mv_applied, state, mv_applied
+
+    plain, weighted = (loops.error(hold, 0, time_weighted=w)[0] for w in (False, True))
+    step = abs(loops.sp[6, 0] - loops.sp[0, 0])
+    assert plain == pytest.approx(step / 2, rel=1e-3)
+    assert weighted == pytest.approx(step / 2 * 2.5, rel=1e-3)  # mean of 0..5 over the hold with an error
+
+
+def test_development_loops_must_be_asked_for(plant: Plant) -> None:
     with pytest.raises(PlantError, match="need seeds"):
         DevelopmentLoops.draw(plant, (), 3, 5)

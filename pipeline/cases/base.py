@@ -92,7 +92,7 @@ class PaperFigure:
     scenario: str
     metric: str
     paper: float
-    setting: Mapping[str, float] = field(default_factory=dict)  # of the law, such as r
+    setting: Mapping[str, float | str] = field(default_factory=dict)  # of the law, such as r
     independent: float | None = None
 
 
@@ -110,12 +110,12 @@ class Curve:
     """One controller in a figure."""
 
     law: str
-    setting: Mapping[str, float] = field(default_factory=dict)
+    setting: Mapping[str, float | str] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
         """The paper's way to write it: INCAD (r=2.5)."""
-        inside = ", ".join(f"{k}={v:g}" for k, v in self.setting.items())
+        inside = ", ".join(f"{k}={v}" if isinstance(v, str) else f"{k}={v:g}" for k, v in self.setting.items())
         return self.law.upper() + (f" ({inside})" if inside else "")
 
 
@@ -142,7 +142,7 @@ class Requirement:
     high: float
     low: float = 0.0
     times: str | None = None  # "nmpc" or "offline"
-    setting: Mapping[str, float] = field(default_factory=dict)
+    setting: Mapping[str, float | str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

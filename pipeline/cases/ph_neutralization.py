@@ -31,7 +31,7 @@ Q1 = (990.0, 1010.0, 1020.0)  # [ml/min], 3000 s each
 Q2, Q2_HALVED = 33.0, 16.5  # [ml/min]
 WA3, WA3_WEAK = -3.05e-3, -2.75e-3  # [mol/l], NaOH .003 and .0027 mol/l with the carbonate in it unchanged
 
-FIXED = Curve("pid")
+FIXED = Curve("pid", {"tuning": "itae", "sampling": 1.0})
 LINEARIZED = Curve("linearized_pid", {"penalty": 20.0})
 ADAPTIVE = Curve("linearized_pid", {"adaptive": True})
 _COMPARED = (ADAPTIVE, Curve("recursive_pid", {"penalty": 5.0}), Curve("self_tuning_pid"))

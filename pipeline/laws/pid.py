@@ -53,9 +53,10 @@ class PID(ControlLaw):
     class Params:
         """How the PID is tuned.
 
-        ``tuning``: ``optimized`` (IMC, its filter and the set-point weight chosen in closed loop),
-        ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``itae`` (least time-weighted
-        error after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``.
+        ``tuning``: ``optimized`` (IMC, its filter and the set-point weight chosen in closed loop, by the
+        ``criterion`` mean absolute error or integral of the time-weighted one),
+        ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``itae`` (the rule for the
+        least ITAE after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``.
         ``tracking_s`` [s] None is sqrt(Ti Td). ``set_point_weight`` None is 1, or optimized with the
         filter.
         ``operating_cv`` [pv] is the steady state to linearize where the model set has no part
@@ -67,6 +68,7 @@ class PID(ControlLaw):
         """
 
         tuning: Literal["optimized", "imc", "simc", "itae", "manual"] = "optimized"
+        criterion: Literal["mae", "itae"] = "mae"
         kc: float | None = None
         ti_s: float | None = None
         td_s: float = 0.0
@@ -142,7 +144,7 @@ class PID(ControlLaw):
 
             def cost(rows: Sequence[PidSettings]) -> Array:
                 law = cls(signals, rows, p.mv_rate)
-                return loops.mae(law, law.n_state, len(rows))
+                return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
 
             base = PidSettings(0.0, 1.0, **rest)
             settings = tuning.optimized_imc(AllPole.of(lin), signals.period_s, cost, base, optimize_weight=free)

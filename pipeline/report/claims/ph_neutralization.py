@@ -20,6 +20,7 @@ from pipeline.report.words import law_label, number, ratio
 
 Setting = Mapping[str, Any]
 SET, DISTURBED = "set_point", "disturbance"
+ITAE: Setting = {"tuning": "itae", "sampling": 1.0}
 FIXED_1, FIXED_20, ADAPTIVE = {"penalty": 1.0}, {"penalty": 20.0}, {"adaptive": True}
 RECURSIVE_5 = {"penalty": 5.0}
 # pH -> base flow [ml/min] of the nominal steady state
@@ -82,12 +83,14 @@ def _compared(evidence: Evidence, scenario: str, *rows: tuple[str, Setting]) -> 
 
 
 def _fixed(evidence: Evidence) -> Verdict:
-    overshoot = evidence.figure("pid", SET, "overshoot")
-    found = _compared(evidence, SET, ("pid", {}), ("linearized_pid", ADAPTIVE))
+    overshoot = evidence.figure("pid", SET, "overshoot", ITAE)
+    found = _compared(evidence, SET, ("pid", ITAE), ("pid", {}), ("linearized_pid", ADAPTIVE))
     if overshoot is None or found is None:
         return Verdict("", "", "not measured", None)
     measured = f"overshoot {100 * overshoot:.0f} % of the step; {found[1]}"
-    because = "with ITAE settings it is ahead of the adaptive form" if found[0][0] < found[0][1] else ""
+    rule, tuned, adaptive = found[0]
+    ahead = [words for words, sse in (("by the rule", rule), ("tuned in closed loop", tuned)) if sse < adaptive]
+    because = f"{' and '.join(ahead)} it is ahead of the adaptive form" if ahead else ""
     return Verdict("", "", measured, overshoot > OVERSHOOT, because)
 
 
