@@ -139,10 +139,10 @@ def test_requirements_with_noise_with_late_errors_and_of_variants(batch):
     assert met(None, "trajectory_noise", "sse_late", noisy / 1000 - 0.01) is False
     assert met(None, "held_out", "sse", 1.0011, times="nmpc") is True
     assert met(None, "held_out_noise", "sse", 2.0, times="nmpc") is None  # no bound with noise
-    assert met("linearized_pid", "trajectory", "sse", 1e9, setting={"plain": True}) is True
+    assert met("linearized_pid", "trajectory", "sse", 1e9, setting={"calmed": True}) is True
     assert met("linearized_pid", "trajectory", "sse", 1e9, setting={"penalty": 3.0}) is None
-    row = requirement(Requirement("linearized_pid", "trajectory", "sse", 13_320.0, setting={"plain": True}), evidence)
-    assert row.what == "linearized PID (plain), trajectory"
+    row = requirement(Requirement("linearized_pid", "trajectory", "sse", 13_320.0, setting={"calmed": True}), evidence)
+    assert row.what == "linearized PID (calmed), trajectory"
     assert row.limit == "SSE ≤ 13,320"
 
 
@@ -231,7 +231,7 @@ def test_claims_of_the_reactor_follow_the_measurement(tmp_path):
     assert outcome(ahead) is False  # better in all, not after the start
     rewrite(tmp_path, BATCH, "linearized_pid", ("noise", "trajectory"), sse_late=1.0)
     assert outcome(ahead) is True
-    assert outcome("filter and update criterion calm the settings") is True
+    assert outcome("filter and update criterion calm the settings") is False  # the made-up variant moves more
     row = CASES[BATCH.case].tables[0].rows[1]
     said = paper_row(row, load(tmp_path, BATCH), claims.reason).verdict
     assert "13,252 is lost while full heating cannot reach the profile" in said
@@ -249,14 +249,14 @@ def test_a_persons_own_data_get_no_reasons_of_the_papers(batch, tmp_path):
 def test_info_is_drawn_by_its_name_whatever_else_the_setting_tells(batch):
     evidence = load(batch, BATCH)
     law = evidence.laws["linearized_pid"]
-    figure = Figure(1, "x", (Curve("linearized_pid", {"plain": True}),), "trajectory", info=("kc", "penalty"))
+    figure = Figure(1, "x", (Curve("linearized_pid", {"calmed": True}),), "trajectory", info=("kc", "penalty"))
     canvas = info_picture(evidence, figure)
     assert canvas is not None
-    loop = law.loop("trajectory", {"plain": True})
+    loop = law.loop("trajectory", {"calmed": True})
     assert loop is not None
     for axes, column in zip(canvas.axes, (0, 3), strict=True):
         assert np.array_equal(axes.lines[0].get_ydata(), loop["info"][:, column])
-    turned = {**law.metrics, "variant_info": {"plain": ["penalty", "x", "y", "kc", "z"]}}
+    turned = {**law.metrics, "variant_info": {"calmed": ["penalty", "x", "y", "kc", "z"]}}
     swapped = replace(evidence, laws={**evidence.laws, "linearized_pid": replace(law, metrics=turned)})
     canvas = info_picture(swapped, figure)
     assert canvas is not None

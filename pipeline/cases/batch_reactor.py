@@ -19,8 +19,8 @@ LOW, HIGH = (46.0, 38.0, 1.5e-3), (58.0, 56.0, 3.5e-3)
 JACKET = ("alpha1", "alpha2", "beta1", "beta2")
 FOULED = 0.8
 
-PLAIN = Curve("linearized_pid", {"plain": True})
-HEURISTIC = Curve("linearized_pid")
+PLAIN = Curve("linearized_pid")
+CALMED = Curve("linearized_pid", {"calmed": True})
 _GAINS = ("kc", "tau_i_s", "tau_d_s")
 
 
@@ -58,7 +58,7 @@ class BatchReactorCase(Case):
             3,
             "Adaptive PID controllers, example 2",
             (
-                PaperFigure("INST-NNPID", "linearized_pid", "trajectory_noise", "sse", 13_764.0, {}, 13_301.0),
+                PaperFigure("INST-NNPID", CALMED.law, "trajectory_noise", "sse", 13_764.0, CALMED.setting, 13_301.0),
                 PaperFigure("REC-LINPID", "recursive_pid", "trajectory_noise", "sse", 24_373.0, {}, 13_282.0),
             ),
         ),
@@ -66,8 +66,8 @@ class BatchReactorCase(Case):
     figures: ClassVar[tuple[Figure, ...]] = (
         Figure(16, "Linearized PID without filter and update criterion", (PLAIN,), "trajectory_noise"),
         Figure(17, "Its settings", (PLAIN,), "trajectory_noise", info=_GAINS),
-        Figure(18, "Linearized PID with both", (HEURISTIC,), "trajectory_noise"),
-        Figure(19, "Its settings", (HEURISTIC,), "trajectory_noise", info=_GAINS),
+        Figure(18, "Linearized PID with both", (CALMED,), "trajectory_noise"),
+        Figure(19, "Its settings", (CALMED,), "trajectory_noise", info=_GAINS),
         Figure(20, "Recursive PID", (Curve("recursive_pid"),), "trajectory_noise"),
     )
     requirements: ClassVar[tuple[Requirement, ...]] = (
