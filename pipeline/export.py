@@ -111,7 +111,7 @@ def parity_gate(
         sp, pv, dv = walk["sp"].jump(1 / 40), walk["pv"].step(), walk["dv"].step()
         if drive is not None:
             pv = np.asarray(drive(theirs[0]), dtype=np.float64)
-        with torch.no_grad():
+        with torch.inference_mode():
             applied = ours[0] if drive is None else theirs[0]
             ours = tuple(o.numpy() for o in law(*(torch.from_numpy(v) for v in (sp, pv, dv, applied, ours[1]))))
         try:

@@ -33,12 +33,14 @@ def reduced(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def shrunk(tree: Any) -> Any:
-    """``tree`` with the numbers of SMALL; networks train for a few iterations only, of the variants the first stays."""
+    """``tree`` with the numbers of SMALL; networks train shortly, of the variants the first stays, of sizes two."""
     if not isinstance(tree, dict):
         return tree
     found = {key: _small(key, value) for key, value in tree.items()}
     if found.get("kind") == "mlp":
         found["trainer"] = TRAINER
+    if "search" in found:
+        found["search"] = found["search"][:2]
     if "variants" in found:
         found["variants"] = dict(list(found["variants"].items())[:1])
     return found
