@@ -1,12 +1,14 @@
-"""One step of adapting PID gains: the bounded least-squares problem in closed form, and the forms of the gains."""
+"""One step of adapting PID gains: the bounded least-squares problem in closed form, and what gains mean."""
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from collections.abc import Sequence
 
-# Times longer than this many periods say only that there is no such action.
-LONGEST = 1e4
+import torch
+from torch import Tensor, nn
+
+LONGEST = 1e4  # periods; a time as long says only that there is no such action
+NEXT_TO_NOTHING = 1e-8  # share of its bound at which a gain counts as none
 
 
 def gain_update(
@@ -55,32 +57,42 @@ def gain_update(
     return torch.minimum(torch.maximum(z_prev + nu * w * push, lo), hi)
 
 
-def error_weights(z: Tensor) -> Tensor:
-    """Weights (k0, k1, k2) of e(t), e(t-1), e(t-2) for the gains z = (kc, Ki, Kd), both (..., 3).
+class PidForm(nn.Module):
+    """kc [mv/pv], tau_i and tau_d [s], shape (..., 3), of gains z = (kc, Ki, Kd) >= 0 of one unit of move.
 
-        rho'z = k0 e + k1 e1 + k2 e2,   Ki = kc dt/tau_i,   Kd = kc tau_d/dt
+        tau_i = kc dt/Ki,   tau_d = Kd dt/kc
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eq. 4.
+    A gain that is nothing beside its bound counts as none, and no time is longer than LONGEST
+    periods: what is divided by next to nothing is rounding, and has no meaning either.
+
+    Parameters
+    ----------
+    period_s
+        dt [s].
+    unit
+        One unit of move [mv], with its sign.
+    largest
+        Upper bounds of the gains.
+
+    Source: seed 002_4e35f3d541bda8ae.txt, eq. 4; eq. 25 there is the inverse of another form, without the
+    trapezoidal integral.
     """
-    kc, ki, kd = z.unbind(-1)
-    return torch.stack([kc + ki / 2 + kd, ki / 2 - kc - 2 * kd, kd], dim=-1)
 
+    forms: Tensor  # (3, 5): z -> kc dt, Kd dt, Ki, kc, kc unit
+    least: Tensor  # (2,) of Ki and kc
+    longest: Tensor  # (1,) [s]
 
-def gains(k: Tensor) -> Tensor:
-    """The gains z = (kc, Ki, Kd) of the weights (k0, k1, k2): the inverse of ``error_weights``.
+    def __init__(self, period_s: float, unit: float, largest: Sequence[float]) -> None:
+        super().__init__()
+        h = period_s
+        for name, values in (
+            ("forms", [[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]]),
+            ("least", [NEXT_TO_NOTHING * largest[1], NEXT_TO_NOTHING * largest[0]]),
+            ("longest", [LONGEST * h]),
+        ):
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
 
-    Source: eq. 4; eq. 25 there is the inverse of another form, without the trapezoidal integral.
-    """
-    k0, k1, k2 = k.unbind(-1)
-    return torch.stack([(k0 - k1 - 3 * k2) / 2, k0 + k1 + k2, k2], dim=-1)
-
-
-def pid_times(z: Tensor, period_s: float) -> Tensor:
-    """(tau_i, tau_d) [s], shape (..., 2), of the gains z = (kc, Ki, Kd) >= 0, at most LONGEST periods.
-
-    tau_i = kc dt/Ki,   tau_d = Kd dt/kc
-    """
-    of = z[..., [0, 2]]
-    by = z[..., [1, 0]]
-    tiny = torch.finfo(z.dtype).tiny
-    return period_s * torch.clamp(of / torch.clamp(by, min=tiny), max=LONGEST)
+    def forward(self, z: Tensor) -> Tensor:
+        """Shape (..., 3), of gains (..., 3)."""
+        of, by, kc = torch.split(z @ self.forms, [2, 2, 1], dim=-1)
+        return torch.cat([kc, torch.minimum(of / torch.maximum(by, self.least), self.longest)], dim=-1)

@@ -1,4 +1,4 @@
-"""The closed form of the gain update against a bounded least-squares solver, and the forms of PID gains."""
+"""The closed form of the gain update against a bounded least-squares solver, and what PID gains mean."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from pipeline.gain_update import LONGEST, error_weights, gain_update, gains, pid_times
+from pipeline.gain_update import LONGEST, PidForm, gain_update
 
 LO, HI = np.array([0.0, 0.0, 0.0]), np.array([5.0, 2.0, 8.0])
 W = np.array([1.0, 0.3, 2.0])
@@ -143,24 +143,27 @@ def test_nan_stays_nan(index: int) -> None:
     assert np.isnan(p.solved()).any()
 
 
-@given(z=st.tuples(*[st.floats(0, 100)] * 3), e=st.tuples(*[st.floats(-10, 10)] * 3))
-def test_forms_of_the_gains(z: tuple[float, ...], e: tuple[float, ...]) -> None:
-    gain, (e0, e1, e2) = torch.tensor(z, dtype=torch.float64), e
-    move = z[0] * (e0 - e1) + z[1] * (e0 + e1) / 2 + z[2] * (e0 - 2 * e1 + e2)
-    k = error_weights(gain)
-    assert float(k @ torch.tensor(e, dtype=torch.float64)) == pytest.approx(move, rel=1e-9, abs=1e-9)
-    torch.testing.assert_close(gains(k), gain, rtol=1e-12, atol=1e-12)
-
-
-def test_times_of_equation_4() -> None:
-    kc, tau_i, tau_d, dt = 0.7, 90.0, 12.0, 15.0
+@given(
+    kc=st.floats(0.01, 5),
+    tau_i=st.floats(20, 500),
+    tau_d=st.floats(0.1, 60),
+    e=st.tuples(*[st.floats(-10, 10)] * 3),
+)
+def test_gains_are_the_pid_of_equation_4(kc: float, tau_i: float, tau_d: float, e: tuple[float, ...]) -> None:
+    dt, unit = 15.0, -40.0
     k0 = kc * (1 + dt / (2 * tau_i) + tau_d / dt)
     k1 = -kc * (1 - dt / (2 * tau_i) + 2 * tau_d / dt)
-    z = gains(torch.tensor([k0, k1, kc * tau_d / dt], dtype=torch.float64))
-    assert float(z[0]) == pytest.approx(kc)
-    np.testing.assert_allclose(pid_times(z, dt).numpy(), [tau_i, tau_d])
+    k2 = kc * tau_d / dt
+    # The right inverse of equation 4, in the place of equation 25.
+    assert (k0 - k1 - 3 * k2) / 2 == pytest.approx(kc)
+    z = torch.tensor([(k0 - k1 - 3 * k2) / 2, k0 + k1 + k2, k2], dtype=torch.float64)
+    rho = torch.tensor([e[0] - e[1], (e[0] + e[1]) / 2, e[0] - 2 * e[1] + e[2]], dtype=torch.float64)
+    assert float(rho @ z) == pytest.approx(k0 * e[0] + k1 * e[1] + k2 * e[2], abs=1e-9)
+    form = PidForm(dt, unit, HI)
+    np.testing.assert_allclose(form(z).numpy(), [unit * kc, tau_i, tau_d], rtol=1e-9)
 
 
 def test_times_stay_finite_without_an_action() -> None:
-    z = torch.tensor([[0.0, 1.0, 2.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
-    np.testing.assert_allclose(pid_times(z, 2.0).numpy(), 2 * LONGEST * np.array([[0, 1], [1, 0], [0, 0]]))
+    z = torch.tensor([[0.0, 1.0, 2.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1e-20, 1e-21, 1e-25]], dtype=torch.float64)
+    times = 2 * LONGEST * np.array([[0, 1], [1, 0], [0, 0], [0, 0]])
+    np.testing.assert_allclose(PidForm(2.0, 1.0, HI)(z)[:, 1:].numpy(), times, atol=1e-9)

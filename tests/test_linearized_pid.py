@@ -105,7 +105,13 @@ FORMS = [
     {"momentum": 0.4, "window": 4, "noise_variance": 0.01},
     {"adaptive": True},
     {"adaptive": True, "eps_high": 0.03, "eps_low": 0.01, "momentum": 0.2, "window": 1, "noise_variance": 0.01},
-    {"adaptive": True, "eps_high": 1e-4, "eps_low": 1e-5, "penalty_start": 0.05},  # all doublings are used up
+    {
+        "adaptive": True,
+        "eps_high": 1e-4,
+        "eps_low": 1e-5,
+        "penalty_start": 0.05,
+        "penalty_low": 0.02,
+    },  # all doublings are used up
 ]
 
 

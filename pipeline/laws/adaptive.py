@@ -10,13 +10,12 @@ from scipy.special import chdtri
 from torch import Tensor, nn
 
 from pipeline.errors import LawError
-from pipeline.gain_update import LONGEST, gain_update
+from pipeline.gain_update import PidForm, gain_update
 from pipeline.laws.base import LawSignals
 from pipeline.memory import Named, Slot, constant
 
 Three = tuple[float, float, float]
 CONFIDENCE = 0.99  # of the update criterion: noise alone trips it in one sample of a hundred
-TINY = 1e-30
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,16 +164,14 @@ class AdaptiveGains(nn.Module):
     fresh_share: Tensor  # (1,) 1 - gamma
     threshold: Tensor  # (1,) [pv^2] of the sum of the window's squared errors
     slope_min: Tensor  # (1,)
-    forms: Tensor  # (3, 5): z -> kc dt, Kd dt, Ki, kc, kc [mv/pv]
     by_unit: Tensor  # (1,) 1/unit
-    tiny: Tensor  # (1,)
-    longest: Tensor  # (1,) [s]
 
     def __init__(self, params: AdaptiveParams, signals: LawSignals, unit: float, start: Three) -> None:
         super().__init__()
         self.filtered = params.momentum > 0 and not params.plain
         self.window = 0 if params.window is None or params.plain else params.window
-        h, m, variance = signals.period_s, self.window, params.noise_variance or 0.0
+        m, variance = self.window, params.noise_variance or 0.0
+        self.form = PidForm(signals.period_s, unit, params.gain_high)
         numbers = {
             "unit": [unit],
             "lam": [params.stiffness],
@@ -185,10 +182,7 @@ class AdaptiveGains(nn.Module):
             "fresh_share": [1 - params.momentum],
             "threshold": [variance * float(chdtri(m, 1 - CONFIDENCE)) if m else 0.0],
             "slope_min": [params.slope_min],
-            "forms": [[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]],
             "by_unit": [1 / unit],
-            "tiny": [TINY],
-            "longest": [LONGEST * h],
         }
         for name, values in numbers.items():
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
@@ -253,9 +247,7 @@ class AdaptiveGains(nn.Module):
 
     def told(self, z: Tensor, slope: Tensor, free: Tensor) -> Tensor:
         """``info``: kc [mv/pv], tau_i and tau_d [s], the slope [pv/mv], and whether the gains were free to change."""
-        of, by, kc = torch.split(z @ self.forms, [2, 2, 1], dim=-1)
-        times = torch.minimum(of / torch.maximum(by, self.tiny), self.longest)
-        return torch.cat([kc, times, slope * self.by_unit, free.to(z.dtype)], dim=-1)
+        return torch.cat([self.form(z), slope * self.by_unit, free.to(z.dtype)], dim=-1)
 
 
 def _error(p: Named) -> Tensor:

@@ -37,7 +37,7 @@ class GaussNewtonPid(NnarxPid):
     class Params(NnarxParams):
         """As NnarxParams, with a smaller penalty; ``relinearize`` is the number of linearizations, 1 or more."""
 
-        penalty: float = 0.05
+        penalty: float = 0.1
         relinearize: int = 5
 
         def __post_init__(self) -> None:

@@ -49,7 +49,7 @@ class LinearizedPid(NnarxPid):
 
         adaptive: bool = False
         penalty_start: float = 20.0
-        penalty_low: float = 0.01
+        penalty_low: float = 0.1
         eps_high: float = 0.2
         eps_low: float = 0.05
 

@@ -44,7 +44,7 @@ class MinimumVariance(ControlLaw):
         ``mv_rate`` [mv] the largest change a sample, None unlimited.
         """
 
-        penalty: float = 0.05
+        penalty: float = 0.1
         relinearize: int = 5
         preview: Literal["held", "ramp"] = "held"
         plant_gain: Literal["auto", "positive", "negative"] = "auto"

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
+from pipeline.gain_update import PidForm
 from pipeline.laws.adaptive import signed_unit
 from pipeline.laws.arx_law import estimator, require_arx
 from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
@@ -17,7 +18,6 @@ from pipeline.models.arx import ARX
 from pipeline.models.base import Model
 from pipeline.plants.base import Plant
 
-LONGEST = 1e4  # periods; times longer than this say only that there is no such action
 TERMS = 3  # of F: more would be no PID
 
 
@@ -94,10 +94,7 @@ class SelfTuningPid(ControlLaw):
     to_gains: Tensor  # (n, 3): theta -> kc, Ki, Kd
     slope_min: Tensor  # (1,)
     hi: Tensor  # (3,)
-    forms: Tensor  # (3, 5): gains -> kc dt, Kd dt, Ki, kc, kc [mv/pv]
     by_unit: Tensor  # (1,) 1/unit
-    tiny: Tensor  # (1,)
-    longest: Tensor  # (1,) [s]
 
     def __init__(self, signals: LawSignals, model: ARX, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
@@ -113,17 +110,15 @@ class SelfTuningPid(ControlLaw):
             prefilter=params.prefilter,
             n_y=max(TERMS, model.n_y),
         )
-        n, h, nu = self.model.size, signals.period_s, params.integral
+        n, nu = self.model.size, params.integral
+        self.form = PidForm(signals.period_s, unit, params.gain_high)
         of_f = [[0.0, nu, 0.0], [-nu, nu, 0.0], [-2 * nu, nu, nu]]
         numbers = {
             "unit": [unit],
             "to_gains": of_f + [[0.0] * 3] * (n - TERMS),
             "slope_min": [params.slope_min],
             "hi": params.gain_high,
-            "forms": [[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]],
             "by_unit": [1 / unit],
-            "tiny": [1e-30],
-            "longest": [LONGEST * h],
         }
         for name, values in numbers.items():
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
@@ -161,7 +156,5 @@ class SelfTuningPid(ControlLaw):
         z = torch.where(told, self._limited_gains(estimate.theta), now["gains"])
         move = (now["rho"] * z).sum(dim=-1, keepdim=True)
         mv = self.limited(now["mv"] + move * self.unit, now["mv"])
-        of, by, kc = torch.split(z @ self.forms, [2, 2, 1], dim=-1)
-        times = torch.minimum(of / torch.maximum(by, self.tiny), self.longest)
-        info = torch.cat([kc, times, slope * self.by_unit, told.to(z.dtype)], dim=-1)
+        info = torch.cat([self.form(z), slope * self.by_unit, told.to(z.dtype)], dim=-1)
         return mv, self.memory.stored(now["known"], {**estimate.kept, "gains": z}), info
