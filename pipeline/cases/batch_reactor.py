@@ -19,7 +19,7 @@ LOW, HIGH = (46.0, 38.0, 1.5e-3), (58.0, 56.0, 3.5e-3)
 JACKET = ("alpha1", "alpha2", "beta1", "beta2")
 FOULED = 0.8
 
-PLAIN = Curve("linearized_pid")
+PLAIN = Curve("linearized_pid", {"as_printed": True})
 CALMED = Curve("linearized_pid", {"calmed": True})
 _GAINS = ("kc", "tau_i_s", "tau_d_s")
 

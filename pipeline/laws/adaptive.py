@@ -45,8 +45,6 @@ class AdaptiveParams:
         Sign of dPV/dMV; ``auto`` takes the model's at the centre of its data.
     slope_min
         The model is acted on where its slope, in that sign, is above this [pv].
-    plain
-        Without momentum and update criterion, whatever they are.
     mv_rate
         Largest change of the MV a sample [mv]; None is unlimited.
     """
@@ -63,7 +61,6 @@ class AdaptiveParams:
     preview: Literal["held", "ramp"] = "held"
     plant_gain: Literal["auto", "positive", "negative"] = "auto"
     slope_min: float = 1e-3
-    plain: bool = False
     mv_rate: float | None = None
 
     def __post_init__(self) -> None:
@@ -168,8 +165,8 @@ class AdaptiveGains(nn.Module):
 
     def __init__(self, params: AdaptiveParams, signals: LawSignals, unit: float, start: Three) -> None:
         super().__init__()
-        self.filtered = params.momentum > 0 and not params.plain
-        self.window = 0 if params.window is None or params.plain else params.window
+        self.filtered = params.momentum > 0
+        self.window = 0 if params.window is None else params.window
         m, variance = self.window, params.noise_variance or 0.0
         self.form = PidForm(signals.period_s, unit, params.gain_high)
         numbers = {
