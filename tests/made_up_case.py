@@ -76,7 +76,7 @@ BATCH = Miniature(
     {"linearized_pid": 1.004, "gauss_newton_pid": 1.001, "recursive_pid": 1.002, "pid": 1.01},
     {"trajectory": 13_252.0, "fouling": 14_181.0, "held_out": 8000.0},
     {},
-    {"linearized_pid": ("calmed", "as_printed")},
+    {"linearized_pid": ("calmed", "without_recipe")},
     adaptive=("linearized_pid", "recursive_pid"),
 )
 CASE, QUALITY = THIOSULFATE.case, THIOSULFATE.quality

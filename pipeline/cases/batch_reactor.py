@@ -19,7 +19,7 @@ LOW, HIGH = (46.0, 38.0, 1.5e-3), (58.0, 56.0, 3.5e-3)
 JACKET = ("alpha1", "alpha2", "beta1", "beta2")
 FOULED = 0.8
 
-PLAIN = Curve("linearized_pid", {"as_printed": True})
+PLAIN = Curve("linearized_pid", {"without_recipe": True})
 CALMED = Curve("linearized_pid", {"calmed": True})
 _GAINS = ("kc", "tau_i_s", "tau_d_s")
 
@@ -64,9 +64,14 @@ class BatchReactorCase(Case):
         ),
     )
     figures: ClassVar[tuple[Figure, ...]] = (
-        Figure(16, "Linearized PID without filter and update criterion", (PLAIN,), "trajectory_noise"),
+        Figure(
+            16,
+            "Linearized PID that knows nothing of the recipe, without filter and update criterion",
+            (PLAIN,),
+            "trajectory_noise",
+        ),
         Figure(17, "Its settings", (PLAIN,), "trajectory_noise", info=_GAINS),
-        Figure(18, "Linearized PID with both", (CALMED,), "trajectory_noise"),
+        Figure(18, "The same with both", (CALMED,), "trajectory_noise"),
         Figure(19, "Its settings", (CALMED,), "trajectory_noise", info=_GAINS),
         Figure(20, "Recursive PID", (Curve("recursive_pid"),), "trajectory_noise"),
     )

@@ -43,7 +43,8 @@ class PhNeutralizationCase(Case):
 
     The printed disturbance of the buffer's flow, 990 to 1020 ml/min, is that of the acid's: the
     buffer's is 33 ml/min. Beyond the printed tests: random set points, the buffer's flow halved
-    without the controller's knowledge, a weaker base, and each test again with measurement noise.
+    without the controller's knowledge, a weaker base (at a low pH: for 8 and 9 the base would not
+    suffice), and each test again with measurement noise.
     """
 
     held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
@@ -80,11 +81,17 @@ class PhNeutralizationCase(Case):
             3,
             "Adaptive PID controllers, example 1",
             (
-                PaperFigure("INST-NNPID", ADAPTIVE.law, "set_point", "sse", 17.5477, ADAPTIVE.setting, 18.57),
-                PaperFigure("REC-LINPID", "recursive_pid", "set_point", "sse", 19.4597, {"penalty": 5.0}, 17.2),
-                PaperFigure("STPID", "self_tuning_pid", "set_point", "sse", 30.4284, {}, 6.6),
-                PaperFigure("INST-NNPID", ADAPTIVE.law, "disturbance", "sse", 0.1659, ADAPTIVE.setting, 0.153),
-                PaperFigure("STPID", "self_tuning_pid", "disturbance", "sse", 0.2782, {}, 0.166),
+                PaperFigure(
+                    "INST-NNPID, set points", ADAPTIVE.law, "set_point", "sse", 17.5477, ADAPTIVE.setting, 18.57
+                ),
+                PaperFigure(
+                    "REC-LINPID, set points", "recursive_pid", "set_point", "sse", 19.4597, {"penalty": 5.0}, 17.2
+                ),
+                PaperFigure("STPID, set points", "self_tuning_pid", "set_point", "sse", 30.4284, {}, 6.6),
+                PaperFigure(
+                    "INST-NNPID, disturbance", ADAPTIVE.law, "disturbance", "sse", 0.1659, ADAPTIVE.setting, 0.153
+                ),
+                PaperFigure("STPID, disturbance", "self_tuning_pid", "disturbance", "sse", 0.2782, {}, 0.166),
             ),
         ),
     )
@@ -112,7 +119,7 @@ class PhNeutralizationCase(Case):
         Requirement(None, "base", "max_asse", 1e-2),
     )
     claims: ClassVar[Mapping[str, str]] = {
-        "the PID with fixed settings overshoots and oscillates": "ITAE settings give 8.29, ahead of the adaptive form",
+        "the PID with fixed settings overshoots and oscillates": "ITAE settings give 8.29, less than the adaptive form's 18.57",
         "a fixed penalty of 20 is slow": "reproduces: 43.4",
         "the adaptive penalty is needed": "does not reproduce: a fixed penalty of 1 gives 7.8 against 18.6",
         "the linearized PID is ahead of the recursive one": "does not reproduce: 7.8 against 7.4 with a penalty of 1",
@@ -151,8 +158,8 @@ class PhNeutralizationCase(Case):
         """Random sequences of other seeds, and other disturbances than the scored ones."""
         n = 6 * self.hold
         acid, more = np.repeat([1000.0, 985.0, 995.0], n // 3), stepwise(n, (0, Q2), (n // 3, 45.0))
-        less = stepwise(n, (0, Q2), (2 * self.hold // 5, 21.0))
-        steps = held([7.3, 8.8, 8.8, 7.9, 7.9, 7.9], self.hold)
+        less = stepwise(n, (0, Q2), (n // 4, 21.0))
+        steps = held([7.3, 8.8, 7.9, 8.5, 7.1, 8.2], self.hold)
         return (
             *(self._random("development", seed) for seed in self.development_seeds),
             from_rest(self.plant, "acid", "Acid flow down", held([7.6], n), changes={"q1": acid}),

@@ -25,5 +25,7 @@ class PhNeutralization15sCase(PhNeutralizationCase):
         Requirement(None, "held_out", "sse", 1.10, times="nmpc"),
         Requirement(None, "set_point", "max_asse", 1e-3),
         Requirement(None, "held_out", "max_asse", 1e-2),
+        Requirement(None, "buffer", "max_asse", 1e-2),
+        Requirement(None, "base", "max_asse", 1e-2),
     )
     claims: ClassVar[Mapping[str, str]] = {}

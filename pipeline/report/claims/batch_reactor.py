@@ -14,7 +14,7 @@ from pipeline.report.verdicts import Claims, Verdict, plain_reason
 from pipeline.report.words import law_name, number
 
 TEST, NOISY = "trajectory", "trajectory_noise"
-PLAIN, CALM = (Curve("linearized_pid", {form: True}) for form in ("as_printed", "calmed"))
+PLAIN, CALM = (Curve("linearized_pid", {form: True}) for form in ("without_recipe", "calmed"))
 
 
 def reason(row: PaperFigure, ours: float, evidence: Evidence) -> str:
