@@ -119,7 +119,7 @@ class PhNeutralizationCase(Case):
         Requirement(None, "base", "max_asse", 1e-2),
     )
     claims: ClassVar[Mapping[str, str]] = {
-        "the PID with fixed settings overshoots and oscillates": "ITAE settings give 8.29, less than the adaptive form's 18.57",
+        "the PID with fixed settings overshoots and oscillates": "ITAE settings give 8.29, the adaptive form 18.57",
         "a fixed penalty of 20 is slow": "reproduces: 43.4",
         "the adaptive penalty is needed": "does not reproduce: a fixed penalty of 1 gives 7.8 against 18.6",
         "the linearized PID is ahead of the recursive one": "does not reproduce: 7.8 against 7.4 with a penalty of 1",
