@@ -1,5 +1,6 @@
 """params.yaml: what is read, and what every mistake in it says."""
 
+import re
 import runpy
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -144,3 +145,17 @@ def test_the_reduced_run_shows_every_case_and_law_and_lacks_nothing_that_it_need
     assert {d for d in data if d.startswith("work/")} == records
     # Nothing grew: a batch is shorter than what a record is cut down to.
     assert tree["records"]["batch_reactor-batches"]["samples"] == whole["records"]["batch_reactor-batches"]["samples"]
+
+
+@pytest.mark.parametrize(
+    ("cls", "values", "said"),
+    [
+        (LAWS["linearized_pid"].Params, {"slope_min": -1.0}, "slope_min is -1.0"),
+        (LAWS["self_tuning_pid"].Params, {"slope_min": -1.0}, "slope_min is -1.0"),
+        (MODELS["nnarx"], {"slack": -1.0}, "slack is -1.0; it must be at least 0"),
+        (MODELS["nnarx"], {"steps": 0}, "steps is 0; it must be at least 1"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused_where_they_stand(cls, values, said):
+    with pytest.raises(ParamsError, match=f"here: {re.escape(said)}"):
+        parse(cls, values, "here")

@@ -67,6 +67,8 @@ class AdaptiveParams:
         for name in ("penalty", "stiffness"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0")
+        if not self.slope_min >= 0:
+            raise ValueError(f"slope_min is {self.slope_min}; it must be 0 or above, or the guard lets everything pass")
         if not min(self.weights) > 0:
             raise ValueError(f"weights is {list(self.weights)}; each must be above 0")
         if not all(0 <= low < high for low, high in zip(self.gain_low, self.gain_high, strict=True)):

@@ -87,6 +87,8 @@ class SelfTuningPid(ControlLaw):
                 raise ValueError(f"prefilter has {len(self.prefilter)} coefficients; a PID has room for {TERMS}")
             if not self.integral > 0:
                 raise ValueError(f"integral is {self.integral}; it must be above 0")
+            if not self.slope_min >= 0:
+                raise ValueError(f"slope_min is {self.slope_min}; it must be 0 or above")
             if not min(self.gain_high) > 0:
                 raise ValueError(f"gain_high is {list(self.gain_high)}; each must be above 0")
 

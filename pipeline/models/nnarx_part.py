@@ -54,6 +54,11 @@ class NnarxPart(Part):
     train_fraction: float = 0.7
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 1), ("free_run", 1), ("compared", 1), ("slack", 0.0)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least:g}")
+
     def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
         """Train each size with early stopping on the last part of the record; the figures are of the one that stays.
 
