@@ -76,6 +76,10 @@ class BatchReactorCase(Case):
         Figure(20, "Recursive PID", (Curve("recursive_pid"),), "trajectory_noise"),
     )
     requirements: ClassVar[tuple[Requirement, ...]] = (
+        Requirement("linearized_pid", "trajectory_noise", "sse", 13_320.0),
+        Requirement("linearized_pid", "trajectory_noise", "sse_late", 15.0),
+        Requirement("gauss_newton_pid", "trajectory_noise", "sse_late", 15.0),
+        Requirement("minimum_variance", "trajectory_noise", "sse_late", 15.0),
         Requirement(None, "trajectory_noise", "sse", 13_320.0),
         Requirement(None, "trajectory_noise", "sse_late", 15.0),
     )

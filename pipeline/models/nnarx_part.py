@@ -55,7 +55,7 @@ class NnarxPart(Part):
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("free_run", 1), ("compared", 1), ("slack", 0.0)):
+        for name, least in (("steps", 1), ("free_run", 1), ("compared", 0), ("slack", 0.0)):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least:g}")
 
