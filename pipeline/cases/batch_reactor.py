@@ -70,9 +70,9 @@ class BatchReactorCase(Case):
             (PLAIN,),
             "trajectory_noise",
         ),
-        Figure(17, "Its settings", (PLAIN,), "trajectory_noise", info=_GAINS),
-        Figure(18, "The same with both", (CALMED,), "trajectory_noise"),
-        Figure(19, "Its settings", (CALMED,), "trajectory_noise", info=_GAINS),
+        Figure(17, "Settings in figure 16", (PLAIN,), "trajectory_noise", info=_GAINS),
+        Figure(18, "Linearized PID without recipe, with filter and update criterion", (CALMED,), "trajectory_noise"),
+        Figure(19, "Settings in figure 18", (CALMED,), "trajectory_noise", info=_GAINS),
         Figure(20, "Recursive PID", (Curve("recursive_pid"),), "trajectory_noise"),
     )
     requirements: ClassVar[tuple[Requirement, ...]] = (

@@ -100,9 +100,13 @@ class PhNeutralizationCase(Case):
         Figure(8, "PID with fixed settings (ITAE) after set-point changes", (FIXED,), "set_point"),
         Figure(9, "Linearized PID with a fixed penalty of 20", (LINEARIZED,), "set_point"),
         Figure(10, "Linearized PID with the adaptive penalty", (ADAPTIVE,), "set_point"),
-        Figure(11, "Its settings", (ADAPTIVE,), "set_point", info=("kc", "tau_i_s", "tau_d_s")),
+        Figure(11, "Settings in figure 10", (ADAPTIVE,), "set_point", info=("kc", "tau_i_s", "tau_d_s")),
         Figure(
-            12, "Its penalty and linearization error", (ADAPTIVE,), "set_point", info=("penalty", "linearization_error")
+            12,
+            "Penalty and linearization error in figure 10",
+            (ADAPTIVE,),
+            "set_point",
+            info=("penalty", "linearization_error"),
         ),
         Figure(13, "Adaptive PIDs after set-point changes", _COMPARED, "set_point"),
         Figure(14, "Adaptive PIDs under changes of the acid's flow", _COMPARED, "disturbance"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,6 +34,8 @@ class LoopPanels:
 
     def __init__(self, case: Case, title: str, late_from: int = 0) -> None:
         self.late_from = late_from
+        # A set point that is held jumps; a recipe's course is sampled from a curve.
+        self.sp_style = "default" if case.recipe else "steps-post"
         heights = (3, 1.6, 2) if late_from else (3, 2)
         self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + 1.2 * bool(late_from)), layout="constrained")
         panels = list(self.canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}))
@@ -67,7 +70,8 @@ class LoopPanels:
     def finish(self, loop: Loop) -> Canvas:
         """The set point, the time axis and the legend."""
         time, words = time_axis(loop["time_s"])
-        self.cv.plot(time, first(loop["sp"]), "--", color="black", linewidth=0.9, label="set point", zorder=2)
+        style: Any = {"drawstyle": self.sp_style, "linewidth": 0.9, "zorder": 2}
+        self.cv.plot(time, first(loop["sp"]), "--", color="black", label="set point", **style)
         self.cv.margins(x=0.01)
         self.bottom.set_xlabel(words)
         labels = self.cv.get_legend_handles_labels()[1]
