@@ -66,7 +66,7 @@ class BatchReactorCase(Case):
     figures: ClassVar[tuple[Figure, ...]] = (
         Figure(
             16,
-            "Linearized PID that knows nothing of the recipe, without filter and update criterion",
+            "Linearized PID without recipe, filter and update criterion",
             (PLAIN,),
             "trajectory_noise",
         ),
