@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from pipeline.errors import LawError, ModelError
-from pipeline.laws.base import LawSignals
+from pipeline.laws.base import LawSignals, require_kind
 from pipeline.models.arx import ARX
 from pipeline.models.base import Model
 from pipeline.models.recursive import RecursiveLeastSquares
@@ -14,14 +14,12 @@ from pipeline.models.recursive_arx import RecursiveArx
 
 def require_arx(models: Mapping[str, Model], law: str) -> ARX:
     """Part ``arx`` of a model set; raises LawError that says what the law needs and what the set has."""
-    needs = f"law {law!r} needs a part 'arx' (kind arx, one MV, delay 1)"
-    if "arx" not in models:
-        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
-    model = models["arx"]
-    if not isinstance(model, ARX):
-        raise LawError(f"{needs}; the model set's is of kind {model.kind}")
+    model = require_kind(models, ARX, law)
     if model.n_mv != 1 or model.delay != 1:
-        raise LawError(f"{needs}; the model set's has {model.n_mv} MVs and delay {model.delay}")
+        raise LawError(
+            f"law {law!r} needs a part 'arx' (kind arx, one MV, delay 1); "
+            f"the model set's has {model.n_mv} MVs and delay {model.delay}"
+        )
     return model
 
 

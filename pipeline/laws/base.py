@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,8 @@ from pipeline.errors import LawError
 from pipeline.models.base import Model
 from pipeline.plants.base import Plant
 from serving.manifest import Signal
+
+M = TypeVar("M", bound=Model)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,21 @@ def require_part(models: Mapping[str, Model], part: str, law: str, n_in: int, n_
         raise LawError(f"{needs}; the model set's takes other inputs: {error}".replace("\n", " ")) from error
     if shape != (n_out,):
         raise LawError(f"{needs}; the model set's gives {shape}")
+    return model
+
+
+def require_kind(models: Mapping[str, Model], cls: type[M], law: str) -> M:
+    """The model of a set that stands under its kind's own name, for laws that hold one loop by it.
+
+    Raises LawError that says what the law needs and what the set has.
+    """
+    part = cls.kind
+    needs = f"law {law!r} needs a part {part!r} (kind {part}, one MV, delay 1)"
+    if part not in models:
+        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
+    model = models[part]
+    if not isinstance(model, cls):
+        raise LawError(f"{needs}; the model set's is of kind {model.kind}")
     return model
 
 

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import LawSignals
-from pipeline.laws.nnarx_law import NnarxParams, NnarxPid, require_nnarx
+from pipeline.laws.base import LawSignals, require_kind
+from pipeline.laws.nnarx_law import NnarxParams, NnarxPid
 from pipeline.memory import Named, Slot, constant
 from pipeline.models.base import Model
 from pipeline.models.next_output import Ahead
@@ -90,7 +90,7 @@ class LinearizedPid(NnarxPid):
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         """The law over part ``nnarx``; raises LawError."""
-        return cls(signals, require_nnarx(models, cls.name), params)
+        return cls(signals, require_kind(models, NNARX, cls.name), params)
 
     def forward(
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor

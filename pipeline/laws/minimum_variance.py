@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.adaptive import signed_unit, target, target_slots
-from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
-from pipeline.laws.nnarx_law import central_model, next_output, require_nnarx, room
+from pipeline.laws.base import ControlLaw, LawSignals, require_kind, require_single_loop
+from pipeline.laws.nnarx_law import central_model, next_output, room
 from pipeline.memory import Memory, Stage
 from pipeline.models.base import Model
 from pipeline.models.next_output import GaussNewton
@@ -86,7 +86,7 @@ class MinimumVariance(ControlLaw):
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         """The law over part ``nnarx``; raises LawError."""
-        return cls(signals, require_nnarx(models, cls.name), params)
+        return cls(signals, require_kind(models, NNARX, cls.name), params)
 
     def forward(
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor

@@ -18,7 +18,6 @@ from pipeline.laws.adaptive import (
 )
 from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
 from pipeline.memory import Memory, Named, Slot, Stage
-from pipeline.models.base import Model
 from pipeline.models.instantaneous import Arx, arx
 from pipeline.models.next_output import Ahead, NextOutput
 from pipeline.models.nnarx import NNARX
@@ -39,17 +38,6 @@ class NnarxParams(AdaptiveParams):
         for name in ("offset_filter", "trust"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must lie in (0, 1], 1 to believe every sample")
-
-
-def require_nnarx(models: Mapping[str, Model], law: str) -> NNARX:
-    """Part ``nnarx`` of a model set; raises LawError that says what the law needs and what the set has."""
-    needs = f"law {law!r} needs a part 'nnarx' (kind nnarx, one MV, delay 1)"
-    if "nnarx" not in models:
-        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
-    model = models["nnarx"]
-    if not isinstance(model, NNARX):
-        raise LawError(f"{needs}; the model set's is of kind {model.kind}")
-    return model
 
 
 def central_model(model: NNARX) -> Arx:
