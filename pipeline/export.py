@@ -104,7 +104,7 @@ def parity_gate(
     """
     signals, rng = law.signals, np.random.default_rng(0)
     walk = {name: _Walk(getattr(signals, name), rng) for name in ("sp", "pv", "dv")}
-    mv = np.array([(s.low + s.high) / 2 for s in signals.mv])
+    mv = np.array([s.middle for s in signals.mv])
     ours = theirs = (mv, np.zeros(law.n_state), np.zeros(len(law.info)))
     pairs = []
     for k in range(steps):

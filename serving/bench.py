@@ -37,7 +37,7 @@ def bench(
     Inputs move a little from step to step around the middle of their ranges.
     """
     m, rng = controller.manifest, np.random.default_rng(0)
-    middle = {n: np.array([(s.low + s.high) / 2 for s in m.signals(n)]) for n in ("sp", "pv", "dv", "mv_applied")}
+    middle = {n: np.array([s.middle for s in m.signals(n)]) for n in ("sp", "pv", "dv", "mv_applied")}
     span = {n: np.array([s.high - s.low for s in m.signals(n)]) for n in middle}
     count = max(steps, loop_steps)
     feeds = [{n: middle[n] + 0.01 * span[n] * rng.uniform(-1, 1, len(span[n])) for n in middle} for _ in range(count)]

@@ -155,7 +155,7 @@ class Controller:
         """Inputs that any law can be warmed with: the middle of each range, no past."""
         with self._lock:
             for _, name, buffer, _ in self._inputs:
-                buffer[...] = [(s.low + s.high) / 2 for s in self.manifest.signals(name)] or 0.0
+                buffer[...] = [s.middle for s in self.manifest.signals(name)] or 0.0
 
     # ------------------------------------------------------------------ refusals
     def _vector(self, name: str, value: object, length: int) -> Array:

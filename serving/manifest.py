@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict, dataclass, field, fields
+from itertools import pairwise
 from typing import Any, Self
 
 from serving.errors import ArtifactError
@@ -34,6 +35,19 @@ class Signal:
                 f"signal {self.name!r} has the range [{self.low}, {self.high}]; "
                 "low and high must be finite and low < high"
             )
+        if self.values is not None and not (
+            self.values and all(self.low <= v <= self.high for v in self.values) and _increasing(self.values)
+        ):
+            raise ArtifactError(
+                f"signal {self.name!r} has the values {list(self.values)}; they must be one or more, each above the "
+                f"one before and within the range [{self.low:g}, {self.high:g}]"
+            )
+
+    @property
+    def middle(self) -> float:
+        """A value in the middle of the range; of a discrete signal, the allowed one nearest to it."""
+        middle = (self.low + self.high) / 2
+        return middle if self.values is None else min(self.values, key=lambda v: abs(v - middle))
 
     def to_dict(self) -> dict[str, Any]:
         """The signal as JSON-ready values; ``values`` only where the signal is discrete."""
@@ -149,6 +163,10 @@ class Manifest:
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise ArtifactError(f"the manifest is malformed: {error!r}") from error
+
+
+def _increasing(values: tuple[float, ...]) -> bool:
+    return all(a < b for a, b in pairwise(values))
 
 
 def _not_finite(text: str) -> float:

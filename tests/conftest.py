@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,10 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     ],
     "self_tuning_pid": [{"prefilter": (0.5,), "forgetting": 1.0}],
 }
+# The plant that a law is for; the others are designed over the first case's.
+PLANT_OF_LAW: dict[str, str] = {}
+# Set points that a plant is put to rest at; of a plant that is not named, three within its range.
+AT_REST: dict[str, tuple[float, float, float]] = {"thiosulfate_cstr": (0.1, 0.66613, 0.97)}
 HORIZON = 3
 
 LawFactory = Callable[..., ControlLaw]
@@ -64,8 +69,31 @@ def signals(plant: Plant) -> LawSignals:
     return LawSignals.of(plant)
 
 
+def plant_of(law: str) -> Plant:
+    """The plant that a law is designed over."""
+    return PLANTS[PLANT_OF_LAW.get(law, "thiosulfate_cstr")]()
+
+
+def rest_points(plant: Plant) -> tuple[float, float, float]:
+    """Three set points that the plant can hold."""
+    sp = plant.sp_signals[0]
+    low, middle, high = (sp.low + f * (sp.high - sp.low) for f in (0.2, 0.5, 0.8))
+    return AT_REST.get(plant.name, (low, middle, high))
+
+
 @pytest.fixture(scope="session")
-def parts(plant: Plant) -> dict[str, Model]:
+def parts() -> dict[str, Model]:
+    """The quick model set of the first case."""
+    return quick_parts("thiosulfate_cstr")
+
+
+@cache
+def quick_parts(plant: str) -> dict[str, Model]:
+    """The quick model set of a plant."""
+    return PARTS[plant](PLANTS[plant]())
+
+
+def _thiosulfate_parts(plant: Plant) -> dict[str, Model]:
     """A model set with every part that a law may ask for: small networks over short random runs.
 
     Good enough to be smooth and finite; nothing is asserted of their accuracy.
@@ -105,13 +133,19 @@ def parts(plant: Plant) -> dict[str, Model]:
     }
 
 
+PARTS: dict[str, Callable[[Plant], dict[str, Model]]] = {
+    "thiosulfate_cstr": _thiosulfate_parts,
+}
+
+
 @pytest.fixture(scope="session")
-def make_law(parts: dict[str, Model], signals: LawSignals, plant: Plant) -> LawFactory:
-    """``make_law(name, **params)``: a law of LAWS over the quick model set."""
+def make_law() -> LawFactory:
+    """``make_law(name, **params)``: a law of LAWS over its plant's quick model set."""
 
     def make(name: str, **params: Any) -> ControlLaw:
-        cls = LAWS[name]
-        return cls.design(cls.Params(**{**QUICK.get(name, {}), **params}), parts, signals, plant).eval()
+        cls, plant = LAWS[name], plant_of(name)
+        given = cls.Params(**{**QUICK.get(name, {}), **params})
+        return cls.design(given, quick_parts(plant.name), LawSignals.of(plant), plant).eval()
 
     return make
 
@@ -124,6 +158,12 @@ def law(request: pytest.FixtureRequest, make_law: LawFactory) -> ControlLaw:
     """Every law in turn."""
     name, form = request.param
     return make_law(name, **form)
+
+
+@pytest.fixture(scope="session")
+def law_plant(law: ControlLaw) -> Plant:
+    """The plant of the law in turn."""
+    return plant_of(law.name)
 
 
 @dataclass(frozen=True)

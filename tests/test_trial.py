@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.cases import CASES, Case
 from pipeline.stages import trial
-from pipeline.stages.trial import DRAW, close_loop, repeated, score, stuck, together, try_file
+from pipeline.stages.trial import DRAW, close_loop, repeated, stuck, together, try_file
 from serving.errors import OutputError
 
 
@@ -48,12 +48,12 @@ def test_noisy_figures_are_means_over_different_noise(case: Case) -> None:
     controller: Any = Proportional()
     found = repeated(controller, case, test, True, 7)
     loops = [close_loop(controller, case, test, case.noise_std, 7 + DRAW * i) for i in range(case.noise_draws)]
-    rows = [score(case, test, loop) for loop in loops]
+    rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     assert len({row["sse"] for row in rows}) == case.noise_draws
     assert found.metrics["sse"] == pytest.approx(np.mean([row["sse"] for row in rows]), rel=1e-12)
     assert np.array_equal(found.first.measured, loops[0].measured)
     quiet = repeated(controller, case, test, False, 7)
-    assert quiet.metrics == score(case, test, close_loop(controller, case, test, None, 0))
+    assert quiet.metrics == case.score(test, quiet.first.pv, quiet.first.mv)
 
 
 def test_figures_of_a_test_with_a_late_part_count_it(case: Case) -> None:
@@ -61,7 +61,7 @@ def test_figures_of_a_test_with_a_late_part_count_it(case: Case) -> None:
     controller: Any = Proportional()
     loop = close_loop(controller, case, test, None, 0)
     error = (loop.sp - loop.pv)[:, 0]
-    found = score(case, test, loop)
+    found = case.score(test, loop.pv, loop.mv)
     assert found["sse_late"] == pytest.approx(float(np.sum(error[test.late_from :] ** 2)))
     assert found["sse"] > 5 * found["sse_late"] > 0
 

@@ -8,12 +8,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError, PlantError
+from pipeline.metrics import closed_loop_metrics, rmse
 from pipeline.plants.base import Plant
 
 Array = NDArray[np.float64]
@@ -39,6 +40,8 @@ class Scenario:
     hold: int = 0  # samples per set point; 0: it never moves, or follows a course of its own
     seed: int | None = None  # of a random sequence
     late_from: int = 0  # where above 0: the sample from which `sse_late` counts, once the set point is within reach
+    plant: Plant | None = None  # what the test runs on, where that is not the case's plant
+    reference: Array | None = None  # (n, 1) what the CV should do, where that is not to be at its set point at once
 
     def __post_init__(self) -> None:
         if self.sp.ndim != 2 or not len(self.sp):
@@ -49,6 +52,10 @@ class Scenario:
                     f"scenario {self.name!r}: {key} has shape {values.shape}; "
                     f"give one value a period, ({len(self.sp)},)"
                 )
+        if self.reference is not None and self.reference.shape != self.sp.shape:
+            raise PlantError(
+                f"scenario {self.name!r}: reference has shape {self.reference.shape}; give that of sp, {self.sp.shape}"
+            )
 
     @property
     def samples(self) -> int:
@@ -76,7 +83,11 @@ class Scenario:
         """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""
         arrays = {"sp": self.sp, "x0": self.x0, "mv0": self.mv0, **self.changes}
         text = {key: [f"{v:.7g}" for v in np.ravel(values)] for key, values in arrays.items()}
-        what = [text, self.hold, *([self.late_from] if self.late_from else [])]
+        what: list[Any] = [text, self.hold, *([self.late_from] if self.late_from else [])]
+        if self.reference is not None:
+            what.append([f"{v:.7g}" for v in np.ravel(self.reference)])
+        if self.plant is not None:
+            what.append([self.plant.name, *(f"{v:.7g}" for v in self.plant.parameters())])
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
@@ -161,7 +172,8 @@ class Case(ABC):
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = ()
     claims: ClassVar[Mapping[str, str]] = {}  # what the paper states -> what an independent implementation found
-    # The figure that laws are compared by, "mae" or "sse" (sum of squared errors over a test's samples).
+    # The figure that laws are compared by: "mae", "sse" (sum of squared errors over a test's samples), or "tracking"
+    # (root mean square of reference - CV, where the tests have a reference).
     metric: ClassVar[str] = "mae"
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
@@ -194,6 +206,17 @@ class Case(ABC):
     def with_held_out(self, seeds: tuple[int, ...]) -> Self:
         """The case scored on other held-out sequences."""
         return replace(self, held_out_seeds=seeds)
+
+    def score(self, test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
+        """Figures of one closed loop, of the process variables without noise: pv (n, n_pv), mv (n, n_mv).
+
+        A case that is judged by more than ``closed_loop_metrics`` adds to them.
+        """
+        sp = self.plant.sp_signals[0]
+        found = closed_loop_metrics(test.sp, pv, mv, test.hold, self.plant.period_s, sp.high - sp.low, test.late_from)
+        if test.reference is not None:
+            found["tracking"] = rmse(test.reference, pv[:, : test.reference.shape[1]])
+        return found
 
     @abstractmethod
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:

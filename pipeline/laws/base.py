@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import inf
 from typing import Any, ClassVar, Self, TypeVar
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 
 from pipeline.errors import LawError
 from pipeline.models.base import Model
-from pipeline.plants.base import Plant
+from pipeline.plants.base import Array, Plant
 from serving.manifest import Signal
 
 M = TypeVar("M", bound=Model)
@@ -32,6 +33,19 @@ class LawSignals:
     def of(cls, plant: Plant) -> Self:
         """The signals of a controller for ``plant``."""
         return cls(plant.period_s, plant.sp_signals, plant.pv_signals, plant.dv_signals, plant.mv_signals)
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What can be said of a law without a closed-loop test: a proof of stability, how a training went.
+
+    ``figures`` go where people and programs read figures (report, manifest, registry); ``arrays`` are
+    kept for pictures; ``notes`` are sentences that stand below the figures in the report.
+    """
+
+    figures: Mapping[str, float] = field(default_factory=dict)
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def require_part(models: Mapping[str, Model], part: str, law: str, n_in: int, n_out: int) -> Model:
@@ -104,8 +118,9 @@ class ControlLaw(nn.Module, ABC):
         self.register_buffer("high", torch.tensor([s.high for s in signals.mv], dtype=torch.float64))
         if mv_rate is not None and not mv_rate > 0:
             raise LawError(f"mv_rate is {mv_rate}; give the largest MV change a sample, above 0, or leave it out")
-        rate = None if mv_rate is None else torch.full((len(signals.mv),), mv_rate, dtype=torch.float64)
-        self.register_buffer("rate", rate)
+        # A valve that is open or shut has no rate: half way is nowhere.
+        rates = [inf if s.values else mv_rate for s in signals.mv]
+        self.register_buffer("rate", None if mv_rate is None else torch.tensor(rates, dtype=torch.float64))
 
     @classmethod
     @abstractmethod
@@ -120,6 +135,10 @@ class ControlLaw(nn.Module, ABC):
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step."""
+
+    def analysis(self, plant: Plant) -> Analysis:
+        """What the law says of itself beside its closed loops over ``plant``; nothing, unless it has a theory."""
+        return Analysis()
 
     def limited(self, mv: Tensor, mv_applied: Tensor) -> Tensor:
         """The MV within the actuator's range and, where a rate is set, within reach of the applied one.

@@ -61,7 +61,7 @@ class JacketedBatchReactor(Plant):
         return np.full(2, self.T_0), np.array([0.0, HOT])
 
     @property
-    def regions(self) -> dict[str, tuple[float, float]]:  # type: ignore[override]  # a cached property in the base
+    def regions(self) -> dict[str, tuple[float, float]]:
         """One region: there is one steady state at every temperature."""
         return {"all": (-np.inf, np.inf)}
 

@@ -113,6 +113,21 @@ class LawEvidence:
         found: Mapping[str, Any] | None = tree.get(scenario)
         return found
 
+    def analysis(self, setting: Mapping[str, Any]) -> Mapping[str, Any]:
+        """``figures`` and ``notes`` of the law's analysis with this setting; empty where it has none."""
+        name = self.variant_of(setting)
+        found: Mapping[str, Any] = (self.metrics.get("analysis") or {}).get("base" if name == "" else name) or {}
+        return found
+
+    def analysis_arrays(self, setting: Mapping[str, Any]) -> Loop:
+        """Arrays of the analysis by name; empty where none were kept."""
+        path, name = self.trajectories.with_name("analysis.npz"), self.variant_of(setting)
+        if name is None or not path.exists():
+            return {}
+        start = f"{name or 'base'}/"
+        with np.load(path, allow_pickle=False) as file:
+            return {k.removeprefix(start): np.asarray(file[k], float) for k in file.files if k.startswith(start)}
+
     def loop(self, scenario: str, setting: Mapping[str, Any]) -> Loop | None:
         """Trajectory of the shipped data seed, arrays (n, ...) by field; None where none was stored.
 

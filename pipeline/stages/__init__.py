@@ -35,6 +35,11 @@ def controller_file(case: str, law: str, form: str, seed: int) -> Path:
     return design_folder(case, law) / re.sub(r"[^\w.=]+", "_", form) / f"seed{seed}.onnx"
 
 
+def analysis_file(case: str, law: str, form: str, seed: int) -> Path:
+    """The arrays of a form's analysis, beside its exported file; there only where the law has some."""
+    return controller_file(case, law, form, seed).with_suffix(".analysis.npz")
+
+
 def validation_folder(case: str, law: str) -> Path:
     """Folder of a controller's validation."""
     return WORK / case / "validation" / law

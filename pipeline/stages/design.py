@@ -18,13 +18,13 @@ from pipeline.cases import CASES
 from pipeline.command import run_stage
 from pipeline.errors import LawError
 from pipeline.export import export
-from pipeline.laws import LAWS, LawSignals
+from pipeline.laws import LAWS, ControlLaw, LawSignals
 from pipeline.models import load_model
 from pipeline.parallel import parallel_map
 from pipeline.params import ControllerParams, choose, digest, parse
 from pipeline.plants.base import Array, Plant
 from pipeline.simulate import measured
-from pipeline.stages import BASE, controller_file, design_folder, model_folder, read_json, write_json
+from pipeline.stages import BASE, analysis_file, controller_file, design_folder, model_folder, read_json, write_json
 
 
 def design(name: str) -> None:
@@ -63,7 +63,18 @@ def _export(
     path = controller_file(params.case, params.law, form, seed)
     origin = {**provenance, "data_seed": seed, "record_sha256": data.get(str(seed))}
     export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
-    return {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
+    row = {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
+    return row | _analysed(law, plant, analysis_file(params.case, params.law, form, seed))
+
+
+def _analysed(law: ControlLaw, plant: Plant, path: Path) -> dict[str, Any]:
+    """What the law says of itself, its arrays in a file of their own; nothing of a law that has no analysis."""
+    analysis = law.analysis(plant)
+    if analysis.arrays:
+        arrays: dict[str, Any] = {name: np.asarray(array) for name, array in analysis.arrays.items()}
+        np.savez_compressed(path, **arrays)
+    said = {"figures": {k: float(v) for k, v in analysis.figures.items()}, "notes": list(analysis.notes)}
+    return {"analysis": said} if any(said.values()) else {}
 
 
 def _closed_loop(plant: Plant) -> Callable[[Array], Array]:

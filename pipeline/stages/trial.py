@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.cases import NOISE_SUFFIX, Case, Scenario
-from pipeline.metrics import closed_loop_metrics, locked_up
+from pipeline.metrics import locked_up
 from pipeline.plants.base import Array
 from pipeline.simulate import Trajectory, simulate_closed
 from pipeline.stages import BASE, controller_file
@@ -90,7 +90,7 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     """One test; with noise as many times as the case draws it."""
     draws = range(case.noise_draws if noise else 1)
     loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
-    rows = [score(case, test, loop) for loop in loops]
+    rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     means = {key: statistics.fmean(row[key] for row in rows) for key in rows[0]}
     return Repeated(means, loops[0], sum(stuck(case, test, loop) for loop in loops))
 
@@ -112,13 +112,7 @@ def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array 
             return mv_applied, np.append(np.zeros(n_info), 1.0)
         return mv, np.append(info, 0.0)
 
-    return simulate_closed(case.plant, step, test, noise=noise, seed=seed)
-
-
-def score(case: Case, test: Scenario, loop: Trajectory) -> Metrics:
-    """The loop's figures, of the process variable without its noise."""
-    sp, period_s = case.plant.sp_signals[0], case.plant.period_s
-    return closed_loop_metrics(loop.sp, loop.pv, loop.mv, test.hold, period_s, sp.high - sp.low, test.late_from)
+    return simulate_closed(test.plant or case.plant, step, test, noise=noise, seed=seed)
 
 
 def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:

@@ -7,6 +7,7 @@ import statistics
 import sys
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,16 @@ from pipeline.controller_file import with_evidence
 from pipeline.errors import LawError
 from pipeline.parallel import parallel_map
 from pipeline.params import CaseParams, ControllerParams, choose, parse, read_section
-from pipeline.stages import ARTIFACTS, BASE, controller_file, design_folder, read_json, validation_folder, write_json
+from pipeline.stages import (
+    ARTIFACTS,
+    BASE,
+    analysis_file,
+    controller_file,
+    design_folder,
+    read_json,
+    validation_folder,
+    write_json,
+)
 from pipeline.stages.trial import Metrics, Trial, step_us, try_file
 from serving.controller import Controller
 
@@ -42,10 +52,13 @@ def validate(name: str) -> None:
     source = controller_file(params.case, params.law, BASE, shipped.seed)
     folder = validation_folder(params.case, params.law)
     shutil.rmtree(folder, ignore_errors=True)
+    designed = read_json(design_folder(params.case, params.law) / "metrics.json")
+    analysis = {r["form"]: r["analysis"] for r in designed["controllers"] if _is_told(r, shipped.seed)}
     metrics = {
         "law": params.law,
-        "title": read_json(design_folder(params.case, params.law) / "metrics.json")["title"],
+        "title": designed["title"],
         **_summary(params, base, trials, shipped),
+        "analysis": analysis,
         "metric": case.metric,
         "step_us": step_us(Controller(source), next(iter(shipped.curves.values()))),
     }
@@ -53,7 +66,27 @@ def validate(name: str) -> None:
     curves = {f"{s}/{t.form}/{t.seed}": c for t in trials if t.seed == shipped.seed for s, c in t.curves.items()}
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)
-    with_evidence(source, ARTIFACTS / params.case / f"{params.law}.onnx", _evidence(case, base, shipped))
+    _keep_analysis(params, shipped.seed, folder / "analysis.npz")
+    evidence = _evidence(case, base, shipped)
+    if BASE in analysis:
+        evidence["analysis"] = analysis[BASE]["figures"]
+    with_evidence(source, ARTIFACTS / params.case / f"{params.law}.onnx", evidence)
+
+
+def _is_told(row: Mapping[str, Any], seed: int) -> bool:
+    return row["seed"] == seed and "analysis" in row
+
+
+def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:
+    """Put the arrays of every form's analysis into one file, as <form>/<name>."""
+    arrays: dict[str, Any] = {}
+    for form in (BASE, *params.variants):
+        source = analysis_file(params.case, params.law, form, seed)
+        if source.exists():
+            with np.load(source, allow_pickle=False) as file:
+                arrays |= {f"{form}/{name}": file[name] for name in file.files}
+    if arrays:
+        np.savez_compressed(path, **arrays)
 
 
 def _summary(params: ControllerParams, base: list[Trial], trials: list[Trial], shipped: Trial) -> dict[str, Any]:
