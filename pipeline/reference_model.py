@@ -1,0 +1,204 @@
+"""Reference models: how a controlled variable should follow its set point, optimal by ITAE."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm
+from scipy.optimize import minimize
+
+Array = NDArray[np.float64]
+
+ORDERS = range(1, 7)
+# D. Graham, R. C. Lathrop, The synthesis of "optimum" transient response, AIEE Transactions 72, 1953.
+CLASSIC: dict[int, tuple[float, ...]] = {
+    1: (),
+    2: (1.4,),
+    3: (1.75, 2.15),
+    4: (2.1, 3.4, 2.7),
+    5: (2.8, 5.0, 5.5, 3.4),
+    6: (3.25, 6.6, 8.6, 7.45, 3.95),
+}
+"""Coefficients of s^(n-1)..s^1 of the tables in use, found on an analogue computer."""
+GRID = 0.01  # of the time wn t over which a cost is integrated
+DOUBLINGS = 13  # of the grid: 8192 points, up to wn t = 82
+DECIMALS = 4  # of a coefficient: far finer than the criterion tells apart, coarser than a search's last bits
+
+
+class Sampled(NamedTuple):
+    """x(k+1) = phi x(k) + gamma r(k),  y(k) = c x(k), the set point r held over each period.
+
+    Shapes (n, n), (n, 1), (1, n).
+    """
+
+    phi: Array
+    gamma: Array
+    c: Array
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceModel:
+    """All-pole model of unit gain from a set point r to the course y that the CV should take.
+
+        M(s) = wn^n / (s^n + d_{n-1} wn s^(n-1) + ... + d_1 wn^(n-1) s + wn^n)
+
+    Its state is x_i = y^(i-1) / wn^(i-1), i = 1..n, in the unit of the set point: at rest at a level
+    it is (level, 0, .., 0).
+
+    Parameters
+    ----------
+    order
+        n >= 1.
+    coefficients
+        d_{n-1} .. d_1, for s^(n-1) .. s^1 [-].
+    wn
+        Natural frequency [rad/s].
+
+    Raises
+    ------
+    ValueError
+        An order, a number of coefficients or a frequency that make no model, or poles that are not stable.
+
+    Source: seed 001_4ed8acfa2fdd36af.txt, eq. 7 and 8.
+    """
+
+    order: int
+    coefficients: tuple[float, ...]
+    wn: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.order < 1 or len(self.coefficients) != self.order - 1:
+            raise ValueError(
+                f"a reference model of order {self.order} has {len(self.coefficients)} coefficients; "
+                "give an order of at least 1 and one coefficient fewer than it"
+            )
+        if not (math.isfinite(self.wn) and self.wn > 0):
+            raise ValueError(f"the natural frequency of a reference model is {self.wn} rad/s; it must be above 0")
+        if not _stable(np.array(self.coefficients)):
+            raise ValueError(
+                f"a reference model with coefficients {self.coefficients} of s^{self.order - 1}..s^1 is not stable; "
+                "give a polynomial whose roots all have a negative real part"
+            )
+
+    @classmethod
+    def optimal(cls, order: int, wn: float = 1.0) -> Self:
+        """The model of least ITAE that the search finds for this order; quick, and the same every time."""
+        return cls(order, searched(order), wn)
+
+    @classmethod
+    def classic(cls, order: int, wn: float = 1.0) -> Self:
+        """The model of the classic table; raises ValueError beyond order 6."""
+        if order not in CLASSIC:
+            raise ValueError(f"the classic table has no order {order}; it has 1 to {max(CLASSIC)}")
+        return cls(order, CLASSIC[order], wn)
+
+    def continuous(self) -> tuple[Array, Array, Array]:
+        """(A (n, n), B (n, 1), C (1, n)) of dx/dt = A x + B r, y = C x [1/s]."""
+        a, b, c = _companion(np.array(self.coefficients))
+        return self.wn * a, self.wn * b, c
+
+    def sampled(self, period_s: float) -> Sampled:
+        """The exact model at the samples, ``period_s`` [s] apart."""
+        a, b, c = self.continuous()
+        phi, gamma = _held(a, b, period_s)
+        return Sampled(phi, gamma, c)
+
+    def response(self, levels: ArrayLike, period_s: float) -> Array:
+        """The course y, shape (n, 1), for the set points r, (n,) or (n, 1), from rest at the first of them."""
+        r = np.asarray(levels, dtype=np.float64).reshape(-1)
+        phi, gamma, c = self.sampled(period_s)
+        x = np.zeros(self.order)
+        x[0] = r[0]
+        y = np.empty((len(r), 1))
+        for k, level in enumerate(r):
+            y[k] = c @ x
+            x = phi @ x + gamma[:, 0] * level
+        return y
+
+    def itae(self) -> float:
+        """ITAE of a unit step, integral of t |1 - y(t)| dt, with time counted in 1/wn."""
+        return itae(np.array(self.coefficients))
+
+
+def itae(coefficients: Array) -> float:
+    """ITAE of a unit step for d_{n-1} .. d_1 at wn = 1, to about 1e-5; inf where the model is not stable."""
+    return cost(coefficients, lambda t, e: t * e)
+
+
+def cost(coefficients: Array, integrand: Callable[[Array, Array], Array]) -> float:
+    """Integral over time of |f(t, e)|, e = 1 - y the error after a unit step at wn = 1; inf if not stable.
+
+    By the trapezoidal rule; where a smooth f changes its sign between two points, |f| is that of a straight
+    line: the cost then stays smooth in the coefficients, and a search finds its bottom.
+    """
+    if not _stable(coefficients):
+        return math.inf
+    a, b, _ = _companion(coefficients)
+    phi, _ = _held(a, b, GRID)
+    # The error's own state starts at (1, 0, .., 0) and decays: x(k) = phi^k x(0), twice as many points a pass.
+    x = np.zeros((len(a), 1))
+    x[0] = 1.0
+    for _ in range(DOUBLINGS):
+        x = np.hstack([x, phi @ x])
+        phi = phi @ phi
+    f = integrand(GRID * np.arange(x.shape[1]), x[0])
+    size = np.abs(f)
+    crossed = np.flatnonzero(f[:-1] * f[1:] < 0)
+    excess = size[crossed] * size[crossed + 1] / (size[crossed] + size[crossed + 1])
+    return float(GRID * (size.sum() - (size[0] + size[-1]) / 2 - excess.sum()))
+
+
+@cache
+def searched(order: int, seed: int = 0, neighbours: int = 400) -> tuple[float, ...]:
+    """Coefficients d_{n-1} .. d_1 of least ITAE, rounded to ``DECIMALS``.
+
+    Random neighbourhood search from the binomial polynomial (s + 1)^n: of polynomials drawn near the
+    best one so far, a better one takes its place; the neighbourhood widens after a success and shrinks
+    after failures. It comes close, and a Nelder-Mead simplex goes the rest of the way, which from
+    order 6 on the search alone does not. Raises ValueError for an order below 1.
+
+    Source: seed 001_4ed8acfa2fdd36af.txt, section on optimal models (the search).
+    """
+    if order < 1:
+        raise ValueError(f"the order of a reference model is {order}; it must be at least 1")
+    if order == 1:
+        return ()
+    rng = np.random.default_rng(seed)
+    best = np.array([math.comb(order, i) for i in range(1, order)], dtype=np.float64)
+    least, width = itae(best), 0.2
+    for _ in range(neighbours):
+        trial = best * np.exp(width * rng.standard_normal(order - 1))
+        found = itae(trial)
+        if found < least:
+            best, least, width = trial, found, min(1.5 * width, 0.5)
+        else:
+            width = max(0.95 * width, 1e-3)
+    polished = minimize(itae, best, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-12, "maxiter": 2_000})
+    return tuple(round(float(v), DECIMALS) for v in polished.x)
+
+
+def _stable(coefficients: Array) -> bool:
+    return bool(np.all(np.roots([1.0, *coefficients, 1.0]).real < 0))
+
+
+def _companion(coefficients: Array) -> tuple[Array, Array, Array]:
+    """(A, B, C) at wn = 1 of the chain of integrators y, dy/dt, .."""
+    n = len(coefficients) + 1
+    a = np.diag(np.ones(n - 1), 1)
+    a[-1] = [-1.0, *(-d for d in coefficients[::-1])]
+    b, c = np.zeros((n, 1)), np.zeros((1, n))
+    b[-1], c[0, 0] = 1.0, 1.0
+    return a, b, c
+
+
+def _held(a: Array, b: Array, period: float) -> tuple[Array, Array]:
+    """(phi, gamma) over one period with the input held: the matrix exponential of [[A, B], [0, 0]]."""
+    n = len(a)
+    both = expm(period * np.block([[a, b], [np.zeros((1, n + 1))]]))
+    return both[:n, :n], both[:n, n:]
