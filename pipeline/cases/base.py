@@ -177,6 +177,7 @@ class Case(ABC):
     metric: ClassVar[str] = "mae"
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
+    data_seeds: ClassVar[int] = 5  # that the best law must come from; 1 where nothing is learnt from data
     noise_draws: ClassVar[int] = 1  # closed loops with noise are run this many times, and their figures averaged
     development_noise: ClassVar[bool] = False  # the plant is never measured without noise: nor is it for development
 

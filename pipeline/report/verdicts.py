@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from matplotlib.figure import Figure as Canvas
+
 from pipeline.cases.base import PaperFigure, Requirement
 from pipeline.report.evidence import Evidence
 from pipeline.report.words import law_label, metric_name, number
@@ -38,8 +40,17 @@ Check = Callable[[Evidence], Verdict]
 
 
 @dataclass(frozen=True, slots=True)
+class CasePicture:
+    """A picture that only this case has: figures/<name>.png, below its title; ``draw`` gives None where it cannot."""
+
+    name: str
+    title: str
+    draw: Callable[[Evidence], Canvas | None]
+
+
+@dataclass(frozen=True, slots=True)
 class Claims:
-    """What only somebody who knows the case can say: reasons for differences, and further checks.
+    """What only somebody who knows the case can say: reasons for differences, and further checks and pictures.
 
     ``reason`` gives the words for a table's figure that does not reproduce; ``statements`` maps
     each of ``Case.claims`` to its check; ``acceptance`` are checks beyond ``Case.requirements``.
@@ -48,6 +59,7 @@ class Claims:
     reason: Reason
     statements: dict[str, Check] = field(default_factory=dict)
     acceptance: tuple[Check, ...] = ()
+    pictures: tuple[CasePicture, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +154,9 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict]:
     common = [
         Verdict(
             "best controller, data seeds",
-            "≥ 5",
+            f"≥ {evidence.case.data_seeds}",
             "none is without a lock-up" if best is None else str(best.seeds),
-            best is not None and best.seeds >= 5,
+            best is not None and best.seeds >= evidence.case.data_seeds,
         ),
         Verdict(
             "best controller, lock-ups over all seeds and scenarios",
