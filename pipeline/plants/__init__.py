@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pipeline.plants.base import Linearization, Plant
 from pipeline.plants.batch_reactor import BatchReactor
+from pipeline.plants.fuzzy_batch_reactor import FuzzyBatchReactor
 from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr
 from pipeline.plants.jacketed_batch_reactor import JacketedBatchReactor
 from pipeline.plants.ph_neutralization import PhNeutralization, PhNeutralization15s
@@ -17,6 +18,7 @@ PLANTS: dict[str, type[Plant]] = {
     BatchReactor.name: BatchReactor,
     HensonSeborgCstr.name: HensonSeborgCstr,
     JacketedBatchReactor.name: JacketedBatchReactor,
+    FuzzyBatchReactor.name: FuzzyBatchReactor,
     ReversibleCstr.name: ReversibleCstr,
 }
 
