@@ -23,6 +23,7 @@ $(STAMP): pyproject.toml constraints.txt tools/setup.sh
 	@touch $@
 
 run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, publish
+	@python -m pipeline.stages.check
 	dvc repro
 	@python -m pipeline results
 

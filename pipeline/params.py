@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import hashlib
 import json
 import types
@@ -22,24 +23,41 @@ PARAMS_FILE = Path("params.yaml")
 
 def read_section(kind: str, name: str, path: Path = PARAMS_FILE) -> dict[str, Any]:
     """The mapping ``kind: {name: ...}`` of params.yaml; raises ParamsError where it is not there."""
+    entry = _entry(_entry(_tree(path), kind, str(path)), name, f"{path}: {kind}")
+    if not isinstance(entry, dict):
+        raise ParamsError(f"{path}: {kind}.{name} is {entry!r}; it must be a mapping")
+    return entry
+
+
+def sections(kind: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
+    """Names of all sections of one kind (cases, records, models, controllers), in their order."""
+    section = _entry(_tree(path), kind, str(path))
+    if not isinstance(section, dict):
+        raise ParamsError(f"{path}: {kind} is {section!r}; it must be a mapping of names to their sections")
+    return tuple(map(str, section))
+
+
+@functools.lru_cache(maxsize=4)
+def _parsed(text: str) -> Any:
+    """YAML's reader is slow, and whoever checks every section asks for the same text again and again."""
+    return yaml.safe_load(text)
+
+
+def _tree(path: Path) -> dict[str, Any]:
     try:
-        tree = yaml.safe_load(path.read_text())
+        tree = _parsed(path.read_text())
     except FileNotFoundError:
         raise ParamsError(f"{path} is not here; run from the repository's root") from None
     except yaml.YAMLError as error:
         raise ParamsError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
     if not isinstance(tree, dict):
         raise ParamsError(f"{path} holds no mapping; it needs the sections cases, records, models, controllers")
-    section = _entry(tree, kind, str(path))
-    entry = _entry(section, name, f"{path}: {kind}")
-    if not isinstance(entry, dict):
-        raise ParamsError(f"{path}: {kind}.{name} is {entry!r}; it must be a mapping")
-    return entry
+    return tree
 
 
 def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
     """What the section ``kind`` lists for ``case``: the values of ``field`` of its entries, in their order."""
-    tree = yaml.safe_load(path.read_text())
+    tree = _tree(path)
     return tuple(str(e[field]) for e in (tree.get(kind) or {}).values() if e.get("case") == case)
 
 

@@ -26,7 +26,7 @@ def fit(name: str) -> None:
     """Train the parts of ``models.<name>`` on each data seed; write them, metrics.json and the sweep."""
     params = ModelParams.read(name)
     case = choose(CASES, params.case, "case", f"models.{name}")
-    parts = {part: _part(values, f"models.{name}.parts.{part}") for part, values in params.parts.items()}
+    parts = {part: part_of(values, f"models.{name}.parts.{part}") for part, values in params.parts.items()}
     folder = model_folder(params.case, params.model)
     shutil.rmtree(folder, ignore_errors=True)
     data = data_files(params.data)
@@ -45,7 +45,8 @@ def fit(name: str) -> None:
     write_json(folder / "metrics.json", metrics)
 
 
-def _part(values: Mapping[str, Any], where: str) -> Part:
+def part_of(values: Mapping[str, Any], where: str) -> Part:
+    """The description of one part of a set; ParamsError says what of it cannot be."""
     options = dict(values)
     kind = choose(MODELS, options.pop("kind", None), "kind of part", f"{where}.kind")
     return parse(kind, options, where)

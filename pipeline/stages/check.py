@@ -1,0 +1,116 @@
+"""``python -m pipeline.stages.check``: every section of params.yaml read before hours of work depend on it.
+
+A typo in a controller's section would otherwise show only when its own stage runs, after the fits.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.cases import CASES
+from pipeline.errors import ParamsError, PipelineError
+from pipeline.excitation import EXCITATIONS
+from pipeline.laws import LAWS
+from pipeline.models.network_parts import trainer_of
+from pipeline.params import (
+    CaseParams,
+    ControllerParams,
+    ModelParams,
+    RecordParams,
+    choose,
+    parse,
+    read_section,
+    sections,
+)
+from pipeline.stages import WORK, record_folder
+from pipeline.stages.fit import part_of
+
+
+def mistakes() -> list[str]:
+    """One line for every section that its stage would refuse, in the order of the stages."""
+    found = []
+    for kind, check in CHECKS.items():
+        for name in sections(kind):
+            try:
+                check(name)
+            except (PipelineError, OSError) as error:
+                found.append(" ".join(str(error).split()))
+    return found
+
+
+def _case(name: str) -> None:
+    params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
+    choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+
+
+def _record(name: str) -> None:
+    params, where = RecordParams.read(name), f"records.{name}"
+    _known_case(params.case, where)
+    parse(choose(EXCITATIONS, params.kind, "excitation", where), params.excitation, where)
+
+
+def _model(name: str) -> None:
+    params, where = ModelParams.read(name), f"models.{name}"
+    _known_case(params.case, where)
+    for part, values in params.parts.items():
+        found = part_of(values, f"{where}.parts.{part}")
+        trainer = getattr(found, "trainer", None)
+        if isinstance(trainer, Mapping):
+            try:
+                trainer_of(trainer)
+            except ParamsError as error:
+                raise ParamsError(f"{where}.parts.{part}: {error}") from None
+    records = {record_folder(r.case, r.record) for r in map(RecordParams.read, sections("records"))}
+    if params.data.is_relative_to(WORK) and params.data not in records:
+        raise ParamsError(f"{where}.data is {params.data}, which no record makes; records are {_listed(records)}")
+    if not params.data.is_relative_to(WORK) and not params.data.exists():
+        raise ParamsError(f"{where}.data is {params.data}, which is not there; give a record's folder or a file")
+
+
+def _controller(name: str) -> None:
+    params, where = ControllerParams.read(name), f"controllers.{name}"
+    _known_case(params.case, where)
+    law = choose(LAWS, params.law, "law", where)
+    for form, settings in {"": {}, **params.variants}.items():
+        parse(law.Params, {**params.settings, **settings}, where + (f".variants.{form}" if form else ""))
+    models = {m.model for m in map(ModelParams.read, sections("models")) if m.case == params.case}
+    if params.model not in models:
+        raise ParamsError(f"{where}.model is {params.model!r}; {params.case} has the model sets {_listed(models)}")
+
+
+def _known_case(case: str, where: str) -> None:
+    choose(CASES, case, "case", where)
+    if case not in sections("cases"):
+        raise ParamsError(f"{where}.case is {case!r}, which has no section under `cases:` of params.yaml; add one")
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(sorted(map(str, names))) or "none"
+
+
+CHECKS: dict[str, Callable[[str], None]] = {
+    "cases": _case,
+    "records": _record,
+    "models": _model,
+    "controllers": _controller,
+}
+
+
+def main() -> int:
+    """Check params.yaml; 0 where every section can be read, else 2 after a line for each mistake."""
+    try:
+        found = mistakes()
+    except PipelineError as error:
+        found = [str(error)]
+    for line in found:
+        print(f"check: {line}", file=sys.stderr)
+    if not found:
+        print(f"check: {Path('params.yaml')} has no mistake: " + ", ".join(f"{len(sections(k))} {k}" for k in CHECKS))
+    return 2 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
