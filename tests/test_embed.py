@@ -61,3 +61,11 @@ def test_the_plain_example_needs_nothing_of_ours() -> None:
     imported = {a.name.partition(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
     assert imported - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
     assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
+
+
+@pytest.mark.parametrize("example", ["python_runtime.py", "plain_onnxruntime.py"])
+def test_an_example_without_a_file_says_what_it_wants(example: str) -> None:
+    done = subprocess.run([sys.executable, str(EXAMPLES / example)], capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0
+    assert done.stderr.startswith("usage: ")
+    assert "FILE.onnx" in done.stderr

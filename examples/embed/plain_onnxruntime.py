@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import onnxruntime as ort
 
+file = sys.argv[1] if sys.argv[1:] else sys.exit("usage: python plain_onnxruntime.py FILE.onnx")
 options = ort.SessionOptions()
 options.intra_op_num_threads = 1
-session = ort.InferenceSession(sys.argv[1], options, providers=["CPUExecutionProvider"])
+session = ort.InferenceSession(file, options, providers=["CPUExecutionProvider"])
 m = json.loads(session.get_modelmeta().custom_metadata_map["loopwright.manifest"])
 names = [output.name for output in session.get_outputs()]
 state, mv = np.zeros(m["n_state"]), np.array([s["low"] for s in m["mv"]])
