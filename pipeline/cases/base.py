@@ -175,6 +175,9 @@ class Case(ABC):
     # The figure that laws are compared by: "mae", "sse" (sum of squared errors over a test's samples), or "tracking"
     # (root mean square of reference - CV, where the tests have a reference).
     metric: ClassVar[str] = "mae"
+    # A figure that `score` adds, or that a law's analysis has -> its words in a table, unit and all ("IAE [K s]").
+    # What a case names here, its report shows of every test.
+    metric_words: ClassVar[Mapping[str, str]] = {}
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
     data_seeds: ClassVar[int] = 5  # that the best law must come from; 1 where nothing is learnt from data

@@ -106,7 +106,7 @@ def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Row:
         verdict, holds = f"does not, because {reason(row, median, evidence)}", False
         if row.independent is not None and close(median, row.independent):
             verdict += f"; an independent implementation found {number(row.independent, 4)} too"
-    metric = metric_name(row.metric)
+    metric = metric_name(row.metric, evidence.case.metric_words)
     return Row(row.label, metric, row.paper, median, ours("min"), ours("max"), row.independent, verdict, holds)
 
 
@@ -119,7 +119,7 @@ def requirement(need: Requirement, evidence: Evidence) -> Verdict:
     law = need.law or evidence.best
     who = _who(need, law)
     value = None if law is None else evidence.figure(law, need.scenario, need.metric, need.setting)
-    high, metric = need.high, metric_name(need.metric)
+    high, metric = need.high, metric_name(need.metric, evidence.case.metric_words)
     limit = f"{metric} ≤ {number(need.high, 6)}"
     if need.low:
         limit = f"{number(need.low, 6)} ≤ {limit}"

@@ -18,9 +18,14 @@ SHORT = {
     "overshoot": "overshoot",
     "settling": "settling time",
     "mv_travel": "MV travel",
+    "tracking": "tracking RMS",
 }
 """A metric as it stands in a table."""
-LONG = {"mae": "mean absolute error", "sse": "sum of squared errors"}
+LONG = {
+    "mae": "mean absolute error",
+    "sse": "sum of squared errors",
+    "tracking": "RMS distance from the reference model",
+}
 """A case's metric in words."""
 NO_UNIT = frozenset({"", "-", "1"})
 """How a signal says that it is a plain number."""
@@ -37,10 +42,14 @@ def ratio(value: float) -> str:
     return f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
 
 
-def metric_name(metric: str) -> str:
-    """A metric's short name; of a path into a model set's figures, ``one_step.nnarx``, the words before the dot."""
+def metric_name(metric: str, own: Mapping[str, str] | None = None) -> str:
+    """A metric's short name; of a path into a model set's figures, ``one_step.nnarx``, the words before the dot.
+
+    ``own`` are the words of the case, ``Case.metric_words``.
+    """
     first = metric.partition(".")[0]
-    return SHORT.get(first, first.replace("_", " "))
+    words = {**SHORT, **(own or {})}
+    return words.get(metric) or words.get(first) or first.replace("_", " ")
 
 
 def law_name(law: str) -> str:
