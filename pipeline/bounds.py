@@ -7,18 +7,25 @@ import hashlib
 import inspect
 import json
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.cases import NOISE_SUFFIX, Case
+from pipeline.cases import NOISE_SUFFIX, Case, Scenario
 from pipeline.errors import LawError
+from pipeline.horizon import Effort
 from pipeline.plants.base import Plant
 
 SCHEMA = 1
-DEFAULTS: dict[str, Any] = {"metric": "mae", "recipe": False, "unforeseen": False}
+DEFAULTS: dict[str, Any] = {
+    "metric": "mae",
+    "recipe": False,
+    "unforeseen": False,
+    "effort": json.loads(json.dumps(asdict(Effort()))),
+}
 """What a file means that does not say."""
 
 
@@ -43,7 +50,15 @@ def measures_states(plant: Plant) -> bool:
 
 def problem(case: Case) -> dict[str, Any]:
     """What the bounds of a whole case depend on, beside the scenarios: stored, and compared with what is stored."""
-    return {"plant": plant_digest(case.plant)} | {key: getattr(case, key) for key in DEFAULTS}
+    found = {key: getattr(case, key) for key in DEFAULTS if key != "effort"}
+    effort = json.loads(json.dumps(asdict(case.effort)))  # as it comes back from the file
+    return {"plant": plant_digest(case.plant), **found, "effort": effort}
+
+
+def bounded(case: Case, scenarios: Sequence[Scenario]) -> bool:
+    """Whether a test has bounds: not where it runs on a map from sample to sample, which no solver here plans over."""
+    plants = (type(s.plant or case.plant) for s in scenarios)
+    return all(plant.transition is Plant.transition for plant in plants)
 
 
 def plant_digest(plant: Plant) -> str:
@@ -51,6 +66,7 @@ def plant_digest(plant: Plant) -> str:
 
     An output of its own mostly calls other functions, so it counts by its values over the states'
     ranges, six digits of them; the rates too, whose constants may stand outside of ``derivative``.
+    A plant with a discrete MV counts with the values of its relaxation.
     """
     source = ast.parse(textwrap.dedent(inspect.getsource(type(plant).derivative)))
     function = source.body[0]
@@ -60,6 +76,8 @@ def plant_digest(plant: Plant) -> str:
     what = [ast.unparse(source), names, plant.period_s, plant.time_unit_s, plant.substeps]
     if not measures_states(plant):
         what.append(_probe(plant))
+    if any(s.values is not None for s in plant.mv_signals):
+        what.append(_probe(plant.relaxed()))
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
@@ -87,8 +105,9 @@ def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dic
     """The bounds by scenario: ``{"sp_a": {"nmpc": {"mae": ...}, "offline": {...}}, "sp_a_noise": {"nmpc": ...}}``.
 
     Figures of several sequences are put ``together``. Where the PVs are not the states, the NMPC's
-    figures with noise are those without (``kinds``). Raises LawError where figures are missing or
-    belong to another plant, metric or scenario than the case has now.
+    figures with noise are those without (``kinds``). Tests without bounds
+    (``bounded``) are left out. Raises LawError where figures are missing or belong to another plant,
+    metric, effort or scenario than the case has now.
     """
     path = path or bounds_path(case)
     stored = read_stored(path)
@@ -104,7 +123,7 @@ def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dic
             raise LawError(f"the bounds in {path} were computed for the {was}; {remedy}")
     found: dict[str, dict[str, dict[str, float]]] = {}
     for name, scenarios in case.scenarios().items():
-        for kind in kinds(case):
+        for kind in kinds(case) if bounded(case, scenarios) else ():
             rows = [stored["figures"].get(name, {}).get(s.digest(), {}).get(kind) for s in scenarios]
             missing = [s.seed for s, row in zip(scenarios, rows, strict=True) if row is None]
             if missing:
@@ -112,7 +131,8 @@ def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dic
                 raise LawError(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
             key = name + NOISE_SUFFIX if kind == "nmpc_noise" else name
             found.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows)
-        found.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(found[name]["nmpc"])})
+        if name in found:
+            found.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(found[name]["nmpc"])})
     return found
 
 

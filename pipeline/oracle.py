@@ -13,9 +13,13 @@ a lower bound, which no controller of the tests could use. It is the best of sev
 best plans, and its figures are those of its own prediction.
 
 A case whose set point follows a recipe is another matter: its controllers may know the course, so
-NMPC sees it as far as it looks ahead, and the offline optimum is one plan for the whole test.
+NMPC sees it as far as it looks ahead, and the offline optimum is one plan for the whole test. The
+same holds where tracking counts, of the reference in the set point's place.
 
 Both minimize the case's metric: absolute or squared errors.
+
+A plant with a discrete MV is replaced by its ``relaxed()``, the figures' MVs being those that stand
+for its own. A test on a plant in discrete time has no bounds.
 
 ``python -m pipeline.oracle CASE`` computes both for every scenario of a case, NMPC also with
 measurement noise, and stores them in ``pipeline/cases/<case>.bounds.json``, from where
@@ -41,6 +45,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.bounds import (
     DEFAULTS,
     SCHEMA,
+    bounded,
     bounds_path,
     kinds,
     load_bounds,
@@ -51,19 +56,21 @@ from pipeline.bounds import (
 )
 from pipeline.cases import CASES, Case, Scenario
 from pipeline.errors import PlantError
-from pipeline.horizon import Horizon, Plan
+from pipeline.horizon import Effort, Horizon, Plan
 from pipeline.metrics import closed_loop_metrics
 from pipeline.plants.base import Plant
-from pipeline.simulate import noise_draws
+from pipeline.simulate import measured, noise_draws
 from serving.errors import LoopwrightError
 
 __all__ = ["Job", "PerfectNmpc", "compute", "load_bounds", "main", "run_nmpc", "run_offline", "search"]
 
 Array = NDArray[np.float64]
 
-HORIZON = 40  # periods that the NMPC looks ahead; with 20 it does 2 % worse, with 60 half a percent better
-REACHES = (1, 2, 3)  # of the rollouts that a fresh search starts from
-TAIL = 20
+Score = Callable[[Scenario, Array, Array], dict[str, float]]
+"""Figures of a closed loop, from the test, PVs (n, n_pv) and MVs (n, n_mv): ``Case.score``."""
+
+DEFAULT = Effort()
+CAME_TRUE = 1e-5  # of the states' ranges: how far a prediction may be off
 NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
 DRAW = 1_000
 
@@ -73,21 +80,26 @@ class PerfectNmpc:
 
     A set point that the last step did not expect starts a fresh search from several rollouts,
     because plans that ignite the reaction at different samples are different local optima; every
-    other sample continues the plan of the one before. A sample at which nothing can be solved
-    applies that plan's next move and counts in ``failures``.
+    other sample continues the plan of the one before: as it is, for less than ``effort.every``
+    samples and while nothing is other than it expected, or solved again from there. A sample at
+    which nothing can be solved applies that plan's next move and counts in ``failures``.
     """
 
-    def __init__(self, plant: Plant, horizon: int = HORIZON, metric: str = "mae") -> None:
-        self.plant = plant
-        self._horizon = Horizon(plant, horizon, metric=metric)
+    def __init__(self, plant: Plant, metric: str = "mae", effort: Effort = DEFAULT) -> None:
+        self.plant, self._every = plant, effort.every
+        self._reaches = effort.reaches
+        self._horizon = Horizon(plant, effort.periods, metric=metric, elements=effort.elements, degree=effort.degree)
         self._simulate = plant.stepper()
+        self._span = np.array([s.high - s.low for s in plant.state_signals])
         self.reset()
 
     def reset(self) -> None:
         """Forget the past: plan, set points and the count of failures."""
         self.failures = 0
+        self._age = 0  # samples since the plan was solved
         self._plan: Plan | None = None
         self._target: Array | None = None
+        self._parameters: Array | None = None
 
     def step(self, x: Array, sp: Array, parameters: Array | None = None) -> Array:
         """The MV, shape (n_mv,), for state ``x`` (n_x,) and set point ``sp`` (n_sp,).
@@ -100,22 +112,37 @@ class PerfectNmpc:
         course = np.atleast_2d(np.asarray(sp, dtype=np.float64))
         target = course[np.minimum(np.arange(n), len(course) - 1)]
         p = np.tile(self.plant.parameters() if parameters is None else parameters, (n, 1))
-        plan = None
-        if self._plan is not None and self._target is not None and np.array_equal(self._target[1:], target[:-1]):
-            plan = self._horizon.solve(x, target, p, self._horizon.shifted(self._plan))
+        plan, rest = None, None if self._plan is None else self._horizon.shifted(self._plan)
+        if rest is not None and self._target is not None and np.array_equal(self._target[1:], target[:-1]):
+            plan = rest if self._follow(x, rest, p[0]) else self._horizon.solve(x, target, p, rest)
+        self._age = self._age + 1 if plan is not None and plan is rest else 0
         if plan is None or not plan.solved:
-            plan = search(self._horizon, x, target, p, self._simulate)
+            plan = search(self._horizon, x, target, p, self._simulate, self._reaches)
             if not plan.solved:
                 self.failures += 1
-                if self._plan is not None:
-                    plan = self._horizon.shifted(self._plan)
-        self._plan, self._target = plan, target
+                plan = rest or plan
+        self._plan, self._target, self._parameters = plan, target, p[0]
         return plan.mv[0]
 
+    def _follow(self, x: Array, rest: Plan, p: Array) -> bool:
+        """Whether the rest of the last plan still stands: young, and neither state nor parameters surprise it."""
+        if self._age + 1 >= self._every or not rest.solved or self._parameters is None:
+            return False
+        if not np.array_equal(self._parameters, p):
+            return False
+        return bool(np.all(np.abs(x - rest.x[0]) <= CAME_TRUE * self._span))
 
-def search(horizon: Horizon, x: Array, sp: Array, p: Array, simulate: Callable[..., Array]) -> Plan:
+
+def search(
+    horizon: Horizon,
+    x: Array,
+    sp: Array,
+    p: Array,
+    simulate: Callable[..., Array],
+    reaches: Sequence[int] = DEFAULT.reaches,
+) -> Plan:
     """The best plan found from several rollouts; the best rollout itself where none was solved."""
-    starts = [horizon.rollout(x, sp, p, reach, simulate) for reach in REACHES]
+    starts = [horizon.rollout(x, sp, p, reach, simulate) for reach in reaches]
     plans = [horizon.solve(x, sp, p, start) for start in starts]
     return min([plan for plan in plans if plan.solved] or starts, key=lambda plan: plan.cost)
 
@@ -136,13 +163,15 @@ def run_nmpc(
     seed: int = 0,
     recipe: bool = False,
     unforeseen: bool = False,
+    score: Score | None = None,
 ) -> dict[str, float]:
     """Closed-loop metrics of the NMPC, its failures and its processor time a step.
 
     The noise, one standard deviation a PV, reaches only the NMPC, which has no filter. With
-    ``recipe`` it sees the set points to come; ``unforeseen`` parameters it knows one sample late,
-    the first ones from the start. Raises PlantError for noise on a plant whose PVs are not its
-    states.
+    ``recipe`` it sees the set points to come, or those of the reference where there is one;
+    ``unforeseen`` parameters it knows one sample late, the first ones from the start. ``score``
+    gives the metrics, those of ``closed_loop_metrics`` by default. Raises PlantError for noise on a
+    plant whose PVs are not its states.
     """
     plant = nmpc.plant
     if noise_std is not None and not measures_states(plant):
@@ -154,58 +183,76 @@ def run_nmpc(
     nmpc.reset()
     simulate, parameters = plant.stepper(), scenario.parameters(plant)
     known = parameters[np.maximum(np.arange(scenario.samples) - unforeseen, 0)]
-    x, cv, mv, times = scenario.x0, [], [], []
+    course = _course(scenario, recipe)
+    x, states, mv, times = scenario.x0, [], [], []
     for k, (p, error) in enumerate(zip(parameters, noise, strict=True)):
-        sp = scenario.sp[min(k + 1, scenario.samples - 1) :] if recipe else scenario.sp[k]
-        cv.append(np.array(plant.measure(x))[: scenario.sp.shape[1], 0])
+        sp = course[min(k + 1, scenario.samples - 1) :] if recipe else course[k]
+        states.append(x)
         begun = time.process_time()
         mv.append(nmpc.step(x + error, sp, known[k]))
         times.append(1e3 * (time.process_time() - begun))
         x = simulate(x, mv[-1], plant.dv_nominal, p)
-    found = _figures(plant, scenario, np.array(cv), np.array(mv)) | {"failures": float(nmpc.failures)}
+    found = _figures(plant, scenario, np.array(states), np.array(mv), score) | {"failures": float(nmpc.failures)}
     return found | {f"step_ms_p{q}": float(np.percentile(times, q)) for q in (50, 99)}
 
 
 def run_offline(
-    plant: Plant, scenario: Scenario, elements: int = 6, metric: str = "mae", recipe: bool = False
+    plant: Plant,
+    scenario: Scenario,
+    metric: str = "mae",
+    recipe: bool = False,
+    effort: Effort = DEFAULT,
+    score: Score | None = None,
 ) -> dict[str, float]:
     """Closed-loop metrics of the offline optimum, and how many of its plans were not solved.
 
     There is one plan for every stretch of equal set points, or a single one for a ``recipe``,
     which ends with its last sample: nothing comes after it that it must be at rest for.
     """
+    course = _course(scenario, recipe)
     edges = [0] if recipe else [0, *np.flatnonzero(np.any(np.diff(scenario.sp, axis=0) != 0, axis=1)) + 1]
     lengths = np.diff([*edges, scenario.samples])
-    horizon = Horizon(plant, int(lengths.max()) + (0 if recipe else TAIL), metric=metric, elements=elements)
+    n = int(lengths.max()) + (0 if recipe else effort.tail)
+    horizon = Horizon(plant, n, metric=metric, elements=effort.fine, degree=effort.degree)
     everything, simulate = scenario.parameters(plant), plant.stepper()
-    x, cv, mv, failures = scenario.x0, [], [], 0
+    x, states, mv, failures = scenario.x0, [], [], 0
     for k, length in zip(edges, lengths, strict=True):
         ahead = k + np.arange(horizon.n)
-        target = scenario.sp[np.minimum(ahead + 1, k + length - 1)]
+        target = course[np.minimum(ahead + 1, k + length - 1)]
         p = everything[np.minimum(ahead, scenario.samples - 1)]
-        plan = search(horizon, x, target, p, simulate)
+        plan = search(horizon, x, target, p, simulate, effort.reaches)
         failures += not plan.solved
-        cv.append(np.array(plant.measure(plan.x[:length].T)).T[:, : target.shape[1]])
+        states.append(plan.x[:length])
         mv.append(plan.mv[:length])
         x = plan.x[length]
-    return _figures(plant, scenario, np.vstack(cv), np.vstack(mv)) | {"failures": float(failures)}
+    return _figures(plant, scenario, np.vstack(states), np.vstack(mv), score) | {"failures": float(failures)}
 
 
-def _figures(plant: Plant, scenario: Scenario, cv: Array, mv: Array) -> dict[str, float]:
+def _course(scenario: Scenario, recipe: bool) -> Array:
+    """What the CV should do: the set point, or what stands in its place where its course is known."""
+    return scenario.sp if scenario.reference is None or not recipe else scenario.reference
+
+
+def _figures(plant: Plant, scenario: Scenario, x: Array, mv: Array, score: Score | None) -> dict[str, float]:
+    pv, actual = measured(plant, x), plant.actual(mv)
+    if score is not None:
+        return score(scenario, pv, actual)
     span = plant.sp_signals[0].high - plant.sp_signals[0].low
-    return closed_loop_metrics(scenario.sp, cv, mv, scenario.hold, plant.period_s, span, scenario.late_from)
+    return closed_loop_metrics(scenario.sp, pv, actual, scenario.hold, plant.period_s, span, scenario.late_from)
 
 
 def _compute(case: Case, job: Job) -> tuple[Job, dict[str, float], float]:
     begun = time.perf_counter()
+    plant = (job.scenario.plant or case.plant).relaxed()
+    ahead = case.recipe or case.metric == "tracking"
     with threadpool_limits(1):
         if job.kind == "offline":
-            figures = run_offline(case.plant, job.scenario, metric=case.metric, recipe=case.recipe)
+            figures = run_offline(plant, job.scenario, case.metric, ahead, case.effort, case.score)
         else:
-            nmpc = PerfectNmpc(case.plant, HORIZON, case.metric)
+            nmpc = PerfectNmpc(plant, case.metric, case.effort)
             noise, draws = (case.noise_std.tolist(), case.noise_draws) if job.kind == "nmpc_noise" else (None, 1)
             seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
-            know = (case.recipe, case.unforeseen)
+            know = (ahead, case.unforeseen, case.score)
             figures = together([run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds])
     return job, figures, time.perf_counter() - begun
 
@@ -217,11 +264,17 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
     """
     path = path or bounds_path(case)
     stored = read_stored(path)
-    current = problem(case) | {"horizon": HORIZON}
+    current = problem(case)
     if any((DEFAULTS | stored).get(key) != value for key, value in current.items()):
         stored = {"schema": SCHEMA, "case": case.name, **current, "figures": {}}
     scenarios = case.scenarios()
-    work = [Job(s, i, kind) for name in names for i, s in enumerate(scenarios[name]) for kind in kinds(case)]
+    work = [
+        Job(s, i, kind)
+        for name in names
+        if bounded(case, scenarios[name])
+        for i, s in enumerate(scenarios[name])
+        for kind in kinds(case)
+    ]
     results = Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(_compute)(case, job) for job in work)
     for done, (job, figures, seconds) in enumerate(results, start=1):
         rounded = {key: float(f"{value:.6g}") for key, value in figures.items()}

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from pipeline import oracle
-from pipeline.bounds import DEFAULTS, bounds_path, load_bounds, plant_digest
+from pipeline.bounds import DEFAULTS, bounds_path, load_bounds, plant_digest, problem
 from pipeline.cases import CASES, Scenario
 from pipeline.cases.ph_neutralization import PhNeutralizationCase
 from pipeline.cases.thiosulfate_cstr import ThiosulfateCstrCase
 from pipeline.errors import LawError
+from pipeline.horizon import Effort
 from pipeline.metrics import closed_loop_metrics
 from pipeline.plants.ph_neutralization import PhNeutralization
 from pipeline.plants.thiosulfate_cstr import ThiosulfateCstr
@@ -27,6 +28,7 @@ class TinyCase(ThiosulfateCstrCase):
     """A case whose every scenario takes a moment."""
 
     held_out_seeds: tuple[int, ...] = (1, 2)
+    effort: ClassVar[Effort] = Effort(periods=8, tail=2, reaches=(2,))
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         middle = super().scenarios()["tin"][0]
@@ -40,11 +42,7 @@ class TinyCase(ThiosulfateCstrCase):
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bounds") / "tiny.json"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(oracle, "HORIZON", 8)
-        patch.setattr(oracle, "TAIL", 2)
-        patch.setattr(oracle, "REACHES", (2,))
-        lines = list(oracle.compute(TinyCase(), ["held_out"], path=path))
+    lines = list(oracle.compute(TinyCase(), ["held_out"], path=path))
     assert len(lines) == 6
     return path
 
@@ -133,6 +131,8 @@ def test_the_batch_s_bounds_are_those_of_an_independent_implementation() -> None
 class TinyTank(PhNeutralizationCase):
     """A tank whose pH stays for four samples."""
 
+    effort: ClassVar[Effort] = Effort(periods=4, tail=2)
+
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         x0, mv0 = self.plant.steady_state_at(7.0)
         return {"held_out": (Scenario("held_out", "", np.full((4, 1), 7.2), x0, mv0),)}
@@ -141,10 +141,7 @@ class TinyTank(PhNeutralizationCase):
 @pytest.fixture(scope="module")
 def tank(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bounds") / "tank.json"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(oracle, "HORIZON", 4)
-        patch.setattr(oracle, "TAIL", 2)
-        lines = list(oracle.compute(TinyTank(), ["held_out"], path=path))
+    lines = list(oracle.compute(TinyTank(), ["held_out"], path=path))
     assert [line.split(": ")[1].split()[0] for line in lines] == ["sse", "sse"]
     return path
 
@@ -155,7 +152,10 @@ def test_noise_does_not_reach_an_nmpc_that_is_given_the_state(tank: Path) -> Non
     assert bounds["held_out_noise"] == {"nmpc": bounds["held_out"]["nmpc"]}
 
 
-@pytest.mark.parametrize(("key", "other"), [("metric", "mae"), ("recipe", True), ("unforeseen", False)])
+@pytest.mark.parametrize(
+    ("key", "other"),
+    [("metric", "mae"), ("recipe", True), ("unforeseen", False), ("effort", Effort(periods=4, tail=3))],
+)
 def test_figures_for_another_aim_are_refused_and_computed_anew(
     tank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str, other: Any
 ) -> None:
@@ -164,17 +164,16 @@ def test_figures_for_another_aim_are_refused_and_computed_anew(
         load_bounds(TinyTank(), tank)
     path = tmp_path / "again.json"
     path.write_text(tank.read_text())
-    monkeypatch.setattr(oracle, "HORIZON", 4)
-    monkeypatch.setattr(oracle, "TAIL", 2)
     assert len(list(oracle.compute(TinyTank(), ["held_out"], path=path))) == 2
-    assert json.loads(path.read_text())[key] == other
+    assert json.loads(path.read_text())[key] == problem(TinyTank())[key]
     load_bounds(TinyTank(), path)
 
 
 def test_a_file_that_says_no_aim_means_the_defaults(stored: Path, tmp_path: Path) -> None:
     tree = json.loads(stored.read_text())
     silent = tmp_path / "silent.json"
-    silent.write_text(json.dumps({key: value for key, value in tree.items() if key not in DEFAULTS}))
+    silent.write_text(json.dumps({key: value for key, value in tree.items() if DEFAULTS.get(key) != value}))
+    assert not {"metric", "recipe", "unforeseen"} & set(json.loads(silent.read_text()))
     assert load_bounds(TinyCase(), silent) == load_bounds(TinyCase(), stored)
 
 
@@ -186,9 +185,6 @@ def test_noisy_figures_are_means_over_the_draws(tmp_path: Path, monkeypatch: pyt
         list(oracle.compute(TinyCase((1,)), ["held_out"], path=path))
         return load_bounds(TinyCase((1,)), path)["held_out_noise"]["nmpc"]
 
-    monkeypatch.setattr(oracle, "HORIZON", 5)
-    monkeypatch.setattr(oracle, "TAIL", 1)
-    monkeypatch.setattr(oracle, "REACHES", (2,))
     both, one, other = figures(2, 0), figures(1, 0), figures(1, oracle.DRAW)
     assert both["mae"] == pytest.approx((one["mae"] + other["mae"]) / 2, rel=1e-5)
     assert one["mae"] != other["mae"]

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from pipeline import oracle
 from pipeline.cases import CASES, Case, Scenario
 from pipeline.errors import PlantError
-from pipeline.horizon import Horizon
+from pipeline.horizon import Effort, Horizon
 from pipeline.metrics import mae
 from pipeline.oracle import PerfectNmpc, run_nmpc, run_offline, search
 from pipeline.plants.base import Plant
@@ -27,7 +27,7 @@ def case() -> Case:
 
 @pytest.fixture(scope="module")
 def nmpc(case: Case) -> PerfectNmpc:
-    return PerfectNmpc(case.plant, horizon=20)
+    return PerfectNmpc(case.plant, effort=Effort(periods=20))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_the_plan_obeys_the_plant_and_the_actuator(case: Case) -> None:
 def test_the_nmpc_beats_feedforward_and_nearly_reaches_the_offline_optimum(
     case: Case, nmpc: PerfectNmpc, ascent: Scenario
 ) -> None:
-    closed, best = run_nmpc(nmpc, ascent), run_offline(case.plant, ascent, elements=3)
+    closed, best = run_nmpc(nmpc, ascent), run_offline(case.plant, ascent, effort=Effort(fine=3))
     assert closed["failures"] == best["failures"] == 0
     assert closed["max_asse"] < 1e-5
     assert best["mae"] <= 1.001 * closed["mae"]
@@ -95,7 +95,7 @@ def test_noise_reaches_the_nmpc_and_repeats(case: Case, nmpc: PerfectNmpc, ascen
 
 
 def test_a_failed_solve_goes_on_with_the_older_plan(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    nmpc = PerfectNmpc(case.plant, horizon=12)
+    nmpc = PerfectNmpc(case.plant, effort=Effort(periods=12))
     x, sp = case.plant.steady_states(250.0)[1], np.array([0.7])
     nmpc.step(x, sp)
     expected = nmpc._plan.mv[1]
@@ -141,7 +141,7 @@ def test_an_unforeseen_disturbance_costs_the_nmpc_one_sample(tank: Plant) -> Non
     x0, mv0 = tank.steady_state_at(8.0)
     q1 = np.repeat([tank.parameters()[tank.parameter_names().index("q1")], 1010.0], 6)
     scenario = Scenario("acid", "", np.full((12, 1), 8.0), x0, mv0, {"q1": q1})
-    nmpc = PerfectNmpc(tank, 10, "sse")
+    nmpc = PerfectNmpc(tank, "sse", Effort(periods=10))
     assert run_nmpc(nmpc, scenario)["sse"] < 1e-9
     missed = tank.measure(tank.stepper()(x0, mv0, tank.dv_nominal, tank.parameters({"q1": 1010.0})))
     assert run_nmpc(nmpc, scenario, unforeseen=True)["sse"] == pytest.approx((8 - float(missed[0])) ** 2, rel=1e-4)
@@ -162,8 +162,8 @@ def test_a_recipe_is_followed_as_closely_as_can_be(batch: Case, period_s: float,
     time_s = np.arange(0.0, 300.0, period_s)
     sp = 54.0 + 71.0 * np.exp(-2.5e-3 * time_s)[:, None]
     test = replace(printed, sp=sp, late_from=round(200 / period_s))
-    best = run_offline(plant, test, elements=2, metric="sse", recipe=True)
-    nmpc = PerfectNmpc(plant, 12, "sse")
+    best = run_offline(plant, test, "sse", True, Effort(fine=2))
+    nmpc = PerfectNmpc(plant, "sse", Effort(periods=12))
     aware, blind = run_nmpc(nmpc, test, recipe=True), run_nmpc(nmpc, test)
     assert best["sse"] == pytest.approx(lowest, abs=1.0)
     assert aware["sse"] == pytest.approx(best["sse"], rel=1e-4)
@@ -174,13 +174,13 @@ def test_each_set_point_is_planned_by_itself_unless_it_is_a_recipe(tank: Plant) 
     # Equal neighbours are one set point, of whatever length: its plan ends at rest. A recipe's plan starts early.
     x0, mv0 = tank.steady_state_at(7.0)
     test = Scenario("steps", "", np.repeat([7.0, 7.0, 9.0], 5)[:, None], x0, mv0, {}, 5)
-    steps, course = (run_offline(tank, test, 3, "sse", recipe) for recipe in (False, True))
+    steps, course = (run_offline(tank, test, "sse", recipe, Effort(fine=3)) for recipe in (False, True))
     assert steps["sse"] == pytest.approx(4 + 1.0393, rel=1e-3)
     assert course["sse"] < steps["sse"]
 
 
 def test_an_unknown_metric_is_refused(tank: Plant) -> None:
-    with pytest.raises(PlantError, match="no horizon for the metric 'itae'; it may be mae or sse"):
+    with pytest.raises(PlantError, match="no horizon for the metric 'itae'; it may be mae, sse, tracking"):
         Horizon(tank, 5, metric="itae")
 
 
@@ -188,7 +188,7 @@ def test_noise_on_what_is_no_state_is_refused(tank: Plant) -> None:
     x0, mv0 = tank.steady_state_at(7.0)
     scenario = Scenario("rest", "", np.full((3, 1), 7.0), x0, mv0)
     with pytest.raises(PlantError, match="measures other things than its states; its NMPC cannot be given noise"):
-        run_nmpc(PerfectNmpc(tank, 5, "sse"), scenario, [0.02])
+        run_nmpc(PerfectNmpc(tank, "sse", Effort(periods=5)), scenario, [0.02])
 
 
 def test_an_unknown_scenario_is_named(capsys: pytest.CaptureFixture[str]) -> None:

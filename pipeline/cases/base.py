@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError, PlantError
+from pipeline.horizon import Effort
 from pipeline.metrics import closed_loop_metrics, rmse
 from pipeline.plants.base import Plant
 
@@ -181,6 +182,7 @@ class Case(ABC):
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
     data_seeds: ClassVar[int] = 5  # that the best law must come from; 1 where nothing is learnt from data
+    effort: ClassVar[Effort] = Effort()  # how far and how finely the bounds are searched
     noise_draws: ClassVar[int] = 1  # closed loops with noise are run this many times, and their figures averaged
     development_noise: ClassVar[bool] = False  # the plant is never measured without noise: nor is it for development
 

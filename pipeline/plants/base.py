@@ -67,6 +67,22 @@ class Plant(ABC):
         nearest = int(np.argmin(np.abs(mvs - (mv.low + mv.high) / 2)))
         return np.asarray(xs[nearest]), np.array([mvs[nearest]])
 
+    # ------------------------------------------------------------------ discrete MVs
+    def relaxed(self) -> Plant:
+        """A plant of the same states and parameters whose MVs are all continuous, for solvers that know no others.
+
+        This plant itself unless it has a discrete MV: it then gives one that can do whatever it can, so that
+        what is best there bounds what can be done here. PlantError where it does not.
+        """
+        discrete = [s.name for s in self.mv_signals if s.values is not None]
+        if discrete:
+            raise PlantError(f"plant {self.name!r} has the discrete MV {discrete[0]!r} and no relaxed() without it")
+        return self
+
+    def actual(self, mv: Array) -> Array:
+        """Of a plant that is the relaxation of another: the other's MVs for its own, both (n, n_mv)."""
+        return mv
+
     # ------------------------------------------------------------------ parameters
     @classmethod
     def parameter_names(cls) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from serving.manifest import Signal
 
 HOT, COLD = 1.0, 2.0  # the values of the mode
 GRID = 400  # points of the steady curve
+LEAK = 1e-3  # of full flow that a shut valve of SignedFlow lets through, at most
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,10 @@ class JacketedBatchReactor(Plant):
         jacket = self.phi * k_m * (t_in - t_w) + self.a_w * (t - t_w) + self.a_0 * (self.T_0 - t_w)
         return ca.vertcat(self.a_c * (t_w - t), jacket)
 
+    def relaxed(self) -> SignedFlow:
+        """The reactor with one signed flow in place of throttle and mode."""
+        return SignedFlow(**{name: getattr(self, name) for name in self.parameter_names()})
+
     @cached_property
     def steady_curve(self) -> tuple[Array, Array, Array]:
         """(T (n,), x (n, 2), flow (n,)) over the set point's range; the flow counts below 0 where it is cold."""
@@ -97,3 +102,46 @@ class JacketedBatchReactor(Plant):
         lost = self.a_0 * (t - self.T_0)
         t_in = self.T_hot if lost >= 0 else self.T_cold
         return lost / (self.phi * abs(t_in - t)) if t_in != t else np.inf
+
+
+@dataclass(frozen=True)
+class SignedFlow(JacketedBatchReactor):
+    """The jacketed reactor with one continuous MV f in -1..1, hot water above 0 and cold below.
+
+        dT_w/dt = (phi/m_w) [k_hot (T_hot - T_w) + k_cold (T_cold - T_w)] + ...,   k = (sqrt(f^2 + LEAK^2) +- f) / 2
+
+    Every pair (k_M, mode) is one f, and every f one pair, so that nothing is gained over the real
+    reactor and nothing lost: its best is the real one's best. Only where f is near 0 both valves
+    leak LEAK / 2, which takes out a kink that no solver by derivatives passes well.
+    """
+
+    name: ClassVar[str] = "jacketed_batch_reactor_signed_flow"
+    mv_signals: ClassVar[tuple[Signal, ...]] = (Signal("flow", "-", -1.0, 1.0),)
+
+    def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
+        """dx/dt in K/s."""
+        t, t_w, flow = x[0], x[1], mv[0]
+        size = ca.sqrt(flow**2 + LEAK**2)
+        heat = 0.5 * self.phi * ((size + flow) * (self.T_hot - t_w) + (size - flow) * (self.T_cold - t_w))
+        return ca.vertcat(self.a_c * (t_w - t), heat + self.a_w * (t - t_w) + self.a_0 * (self.T_0 - t_w))
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """Everything at the temperature of the surroundings, both valves shut."""
+        return np.full(2, self.T_0), np.zeros(1)
+
+    def relaxed(self) -> SignedFlow:
+        """Itself: its MV is continuous."""
+        return self
+
+    def steady_state_at(self, cv: float) -> tuple[Array, Array]:
+        """(x (2,), flow (1,)) at the core temperature ``cv``; PlantError where full flow does not hold it."""
+        x, _ = super().steady_state_at(cv)
+        return x, np.array([self._flow(cv)])
+
+    def actual(self, mv: Array) -> Array:
+        """Throttle and mode (n, 2) of flows (n, 1); a flow within the leak keeps the mode, at first the hot one."""
+        flow = mv[:, 0]
+        mode = np.where(flow > 0, HOT, COLD)
+        known = np.maximum.accumulate(np.where(np.abs(flow) > LEAK, np.arange(len(flow)), -1))
+        return np.column_stack([np.abs(flow), np.where(known >= 0, mode[known], HOT)])
