@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -11,18 +12,21 @@ from matplotlib.figure import Figure as Canvas
 from pipeline.cases.base import Figure
 from pipeline.report.drawing import STYLE, save
 from pipeline.report.evidence import Evidence
+from pipeline.report.law_evidence import ReportError
 from pipeline.report.loop_pictures import info_picture, loops_picture, overview_picture
 from pipeline.report.model_evidence import candidates
 from pipeline.report.model_pictures import candidates_picture, one_step_picture, predictions_picture
+from pipeline.report.verdicts import CasePicture
 
 
-def draw_all(evidence: Evidence, folder: Path, models: Path) -> dict[str, str]:
+def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CasePicture] = ()) -> dict[str, str]:
     """Draw every figure that the evidence has trajectories for; returns file name -> caption.
 
     The case's own figures are ``figure_05.png`` and so on, with the best controller added;
     ``closed_loop_<law>.png`` shows each law beside the PID on the test that weighs most, and
     ``closed_loop.png`` the best one; ``candidates_<set>_<part>.png`` the search over a model's
-    size. ``models`` is work/<case>/models.
+    size; ``own`` are the pictures that only this case has. ``models`` is work/<case>/models.
+    Raises ReportError where two pictures have the same file name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, str] = {}
@@ -48,6 +52,13 @@ def draw_all(evidence: Evidence, folder: Path, models: Path) -> dict[str, str]:
             name = f"candidates_{table['model']}_{table['part']}.png"
             save(candidates_picture(table), folder / name)
             drawn[name] = f"Lags and widths tried for {table['part']} of the model {table['model']}"
+        for picture in own:
+            canvas, name = picture.draw(evidence), f"{picture.name}.png"
+            if name in drawn:
+                raise ReportError(f"picture {picture.name!r} of the claims would overwrite {name}; give another name")
+            if canvas is not None:
+                save(canvas, folder / name)
+                drawn[name] = picture.title
     for path in sorted(models.glob("*/sweep.png")):
         name = f"sweep_{path.parent.name}.png"
         shutil.copyfile(path, folder / name)

@@ -7,17 +7,22 @@ import json
 from typing import Any
 
 from pipeline.cases import NOISE_SUFFIX
+from pipeline.report.claims import CLAIMS, PLAIN
 from pipeline.report.evidence import Evidence
-from pipeline.report.words import LONG
+from pipeline.report.verdicts import Judged, Verdict, judge
+from pipeline.report.words import LONG, SHORT
 
 
-def validation(evidence: Evidence) -> dict[str, Any]:
-    """Figures by scenario and law, bounds, gate and titles; ``metric`` is the one that laws are compared by.
+def validation(evidence: Evidence, judged: Judged | None = None) -> dict[str, Any]:
+    """Figures by scenario and law, bounds, gate, verdicts and titles; ``metric`` is the one that laws are compared by.
 
     ``gate.floor`` is the standard deviation of the noise, ``gate.floors`` what it makes of each
-    scenario in the case's metric.
+    scenario in the case's metric; ``main`` is the test that weighs most. ``laws`` holds what was
+    found of a law apart from its tests. ``requirements``, ``claims`` and ``paper`` (the figures of
+    the paper's tables) are verdicts: ``holds`` is null where nothing was measured.
     """
     case = evidence.case
+    judged = judged or judge(evidence, CLAIMS.get(case.name, PLAIN))
     scenarios: dict[str, dict[str, Any]] = {}
     for name in (n + end for end in ("", NOISE_SUFFIX) for n in evidence.scenarios):
         rows = {law: _row(evidence, law, name) for law in evidence.laws if evidence.figure(law, name) is not None}
@@ -43,9 +48,28 @@ def validation(evidence: Evidence) -> dict[str, Any]:
                 for law, found in evidence.laws.items()
             },
         },
+        "main": evidence.main_test,
+        "laws": {law: _law(evidence, law) for law in evidence.laws},
+        "requirements": [_verdict(v) for v in judged.acceptance],
+        "claims": [_verdict(v) for v in judged.statements],
+        "paper": [
+            {
+                "table": table.number,
+                "label": row.label,
+                "metric": row.metric,
+                "paper": row.paper,
+                "ours": row.ours,
+                "verdict": row.verdict,
+                "holds": row.holds,
+            }
+            for table, rows in judged.tables
+            for row in rows
+        ],
         "titles": {
             "case": case.title,
             "metric": LONG[case.metric],
+            "metric_short": SHORT[case.metric],
+            "figures": dict(case.metric_words),
             "laws": {name: law.title for name, law in evidence.laws.items()},
             "scenarios": evidence.scenarios,
         },
@@ -59,6 +83,24 @@ def _row(evidence: Evidence, law: str, scenario: str) -> dict[str, Any]:
     for how in ("min", "max"):
         row[f"{evidence.case.metric}_{how}"] = evidence.figure(law, scenario, None, None, how)
     return row
+
+
+def _law(evidence: Evidence, law: str) -> dict[str, Any]:
+    found = evidence.laws[law]
+    analysis = {form or "base": dict(said) for form, said in found.analyses.items()}
+    row = {"seeds": found.seeds, "lock_ups": found.lock_ups, "step_us": found.step_us}
+    return {**row, "analysis": analysis} if analysis else row
+
+
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    """A requirement, whose ``limit`` is what was asked, or a claim, where it is an independent finding."""
+    return {
+        "what": verdict.what,
+        "limit": verdict.limit,
+        "measured": verdict.measured,
+        "holds": None if verdict.holds is None else bool(verdict.holds),
+        "because": verdict.because,
+    }
 
 
 def gate_id(evidence: Evidence) -> str:

@@ -113,11 +113,15 @@ class LawEvidence:
         found: Mapping[str, Any] | None = tree.get(scenario)
         return found
 
+    @property
+    def analyses(self) -> Mapping[str, Mapping[str, Any]]:
+        """Every form's analysis (``figures`` and ``notes``) by its variant's name; "" is the shipped law's."""
+        return {"" if form == "base" else form: said for form, said in (self.metrics.get("analysis") or {}).items()}
+
     def analysis(self, setting: Mapping[str, Any]) -> Mapping[str, Any]:
         """``figures`` and ``notes`` of the law's analysis with this setting; empty where it has none."""
         name = self.variant_of(setting)
-        found: Mapping[str, Any] = (self.metrics.get("analysis") or {}).get("base" if name == "" else name) or {}
-        return found
+        return {} if name is None else self.analyses.get(name, {})
 
     def analysis_arrays(self, setting: Mapping[str, Any]) -> Loop:
         """Arrays of the analysis by name; empty where none were kept."""

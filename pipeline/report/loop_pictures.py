@@ -1,4 +1,4 @@
-"""Closed loops drawn: set point, controlled variable and MV of several controllers, or what their info says."""
+"""Closed loops drawn: set point, controlled variable and MVs of several controllers, or what their info says."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases.base import Case, Curve, Figure
+from pipeline.cases.base import NOISE_SUFFIX, Case, Curve, Figure
 from pipeline.report.drawing import (
     BASELINE,
     SHADES,
@@ -23,30 +23,45 @@ from pipeline.report.drawing import (
 from pipeline.report.evidence import Evidence
 from pipeline.report.law_evidence import Array, Loop
 from pipeline.report.words import SHORT, law_label, number, ratio
+from serving.manifest import Signal
 
 SCALES = {"kc", "tau_i_s", "tau_d_s", "penalty"}  # info whose ratios matter, not its differences
 SHORTEST, LONGEST = 1e-3, 9e3  # periods; times below and above say that there is no such action
 ORDERS_FOR_LOG = 2.0  # powers of ten that these must span to be drawn over them
+STRIP = 0.7  # height of a discrete MV's panel, where a continuous one's is 2
+STRIP_ROOM = 0.3  # above and below its values, as a share of their range
+INCHES = 0.84  # that a height of 1 takes
 
 
 class LoopPanels:
-    """The controlled variable with its set point, the MV, and the error of the late part where a test has one."""
+    """The controlled variable with its set point, each MV, and the error of the late part where a test has one.
 
-    def __init__(self, case: Case, title: str, late_from: int = 0) -> None:
-        self.late_from = late_from
+    A discrete MV has a narrow strip with its allowed values as ticks. ``reference`` (n, 1) is the
+    course that the controlled variable should take where that is not the set point.
+    """
+
+    def __init__(self, case: Case, title: str, late_from: int = 0, reference: Array | None = None) -> None:
+        self.late_from, self.reference = late_from, reference
         # A set point that is held jumps; a recipe's course is sampled from a curve.
         self.sp_style = "default" if case.recipe else "steps-post"
-        heights = (3, 1.6, 2) if late_from else (3, 2)
-        self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + 1.2 * bool(late_from)), layout="constrained")
+        cv, mvs = case.plant_class.sp_signals[0], case.plant_class.mv_signals
+        strips = [2.0 if mv.values is None else STRIP for mv in mvs]
+        heights = [3.0, *([1.6] if late_from else []), *strips]
+        more = 1.2 * bool(late_from) + INCHES * (sum(strips) - 2.0)
+        self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + more), layout="constrained")
         panels = list(self.canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}))
-        cv, mv = case.plant_class.sp_signals[0], case.plant_class.mv_signals[0]
         self.cv: Axes = panels[0]
-        self.mv: Axes = panels[-1]
+        self.mvs: list[Axes] = panels[-len(mvs) :]
         self.error: Axes | None = panels[1] if late_from else None
         self.bottom = panels[-1]
         self.cv.set_title(title)
         self.cv.set_ylabel(axis_label(symbol(cv.name), cv.unit))
-        self.mv.set_ylabel(axis_label(symbol(mv.name), mv.unit))
+        for axes, mv in zip(self.mvs, mvs, strict=True):
+            axes.set_ylabel(axis_label(symbol(mv.name), mv.unit))
+            if mv.values is not None:
+                _allow_only(axes, mv)
+        if len(mvs) > 1:
+            self.canvas.align_ylabels(panels)
         if self.error is not None:
             self.error.set_ylabel(axis_label("error", cv.unit))
             self.error.axhline(0.0, color="black", linewidth=0.9, linestyle="--", zorder=2)
@@ -60,8 +75,8 @@ class LoopPanels:
         self.cv.plot(time, pv, label=label, color=colour, linewidth=wide, zorder=order)
         # Laws that ring fill the panel: behind the strong curve they are only hinted at.
         faint = 1.0 if strong else 0.5
-        mv = first(loop["mv"])
-        self.mv.step(time, mv, where="post", color=colour, linewidth=0.6 * wide, zorder=order, alpha=faint)
+        for axes, mv in zip(self.mvs, loop["mv"].reshape(len(time), -1).T, strict=False):
+            axes.step(time, mv, where="post", color=colour, linewidth=0.6 * wide, zorder=order, alpha=faint)
         if self.error is not None:
             late = slice(self.late_from, None)
             error = first(loop["sp"])[late] - pv[late]
@@ -72,11 +87,27 @@ class LoopPanels:
         time, words = time_axis(loop["time_s"])
         style: Any = {"drawstyle": self.sp_style, "linewidth": 0.9, "zorder": 2}
         self.cv.plot(time, first(loop["sp"]), "--", color="black", label="set point", **style)
+        if self.reference is not None and len(self.reference) == len(time):
+            self.cv.plot(time, first(self.reference), ":", color="black", linewidth=1.3, label="reference", zorder=5)
         self.cv.margins(x=0.01)
         self.bottom.set_xlabel(words)
         labels = self.cv.get_legend_handles_labels()[1]
         self.canvas.legend(loc="outside lower center", ncols=min(4, len(labels)))
         return self.canvas
+
+
+def _allow_only(axes: Axes, signal: Signal) -> None:
+    """The axis of a discrete signal: a tick at each allowed value, and room above and below for the line."""
+    values = list(signal.values or ())
+    room = STRIP_ROOM * max(values[-1] - values[0], 1.0)
+    axes.set_yticks(values, [f"{v:g}" for v in values])
+    axes.set_ylim(values[0] - room, values[-1] + room)
+
+
+def reference_of(evidence: Evidence, scenario: str) -> Array | None:
+    """What the controlled variable should do in a test (its first sequence) where it is not the set point, (n, 1)."""
+    tests = evidence.tests.get(scenario.removesuffix(NOISE_SUFFIX), ())
+    return tests[0].reference if tests else None
 
 
 def first(values: Array) -> Array:
@@ -108,7 +139,8 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     if not found:
         return None
     late = 0 if figure.hold else evidence.late_from(figure.scenario or "")
-    panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", late)
+    reference = None if figure.hold else reference_of(evidence, figure.scenario or "")
+    panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", late, reference)
     own = colours(evidence, figure)
     for curve, loop in found:
         ours, alone = curve is best, len(found) == 1
@@ -212,7 +244,7 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"
-    panels = LoopPanels(evidence.case, title, evidence.late_from(scenario))
+    panels = LoopPanels(evidence.case, title, evidence.late_from(scenario), reference_of(evidence, scenario))
     baseline = evidence.loop(Curve(BASELINE), scenario) if law != BASELINE else None
     if baseline is not None:
         error = evidence.figure(BASELINE, scenario)
@@ -224,4 +256,4 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
 def _error(value: float | None, metric: str) -> str:
     if value is None:
         return "–"
-    return f"{value:.4f}" if metric == "mae" else number(value, 4)
+    return f"{value:.4f}" if metric == "mae" and 0.01 <= value < 1.0 else number(value, 4)

@@ -3,83 +3,43 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from pipeline.cases.base import NOISE_SUFFIX
-from pipeline.report.claims import CLAIMS, PLAIN
+from pipeline.report.claims import CLAIMS, PLAIN, Claims
 from pipeline.report.evidence import Evidence
 from pipeline.report.figures import draw_all
 from pipeline.report.for_programs import validation
 from pipeline.report.model_evidence import candidates, model_rows
-from pipeline.report.verdicts import RULE, acceptance, paper_row, plain_reason, statements
-from pipeline.report.words import LONG, NO_UNIT, SHORT, number, ratio, scenario_name
+from pipeline.report.templating import REGISTRY_URL, render, write_pages
+from pipeline.report.verdicts import RULE, Judged, judge
+from pipeline.report.words import LONG, NO_UNIT, SHORT, metric_name, number, ratio, scenario_name
 
-REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 MOST_HEADLINES = 5
 
 
 def write_report(evidence: Evidence, models: Path, out: Path) -> list[Path]:
     """Write validation.json, figures/, report.html and report.md into ``out``; returns their paths."""
     out.mkdir(parents=True, exist_ok=True)
-    pictures = draw_all(evidence, out / "figures", models)
-    content = context(evidence, pictures)
-    programs = json.dumps(validation(evidence), indent=1, allow_nan=False) + "\n"
-    html, text = (
-        _environment(end == "html").get_template(f"report.{end}.j2").render(content) for end in ("html", "md")
-    )
-    files = {"validation.json": programs, "report.html": html, "report.md": text}
-    for name, body in files.items():
-        draft = out / f"{name}.draft"
-        draft.write_text(body, encoding="utf-8")
-        os.replace(draft, out / name)
-    return [*(out / name for name in files), *(out / "figures" / name for name in pictures)]
+    claims = CLAIMS.get(evidence.case.name, PLAIN)
+    judged = judge(evidence, claims)
+    pictures = draw_all(evidence, out / "figures", models, claims.pictures)
+    content = context(evidence, claims, judged, pictures)
+    programs = json.dumps(validation(evidence, judged), indent=1, allow_nan=False) + "\n"
+    pages = {name: render(f"{name}.j2", content) for name in ("report.html", "report.md")}
+    written = write_pages(out, {"validation.json": programs, **pages})
+    return [*written, *(out / "figures" / name for name in pictures)]
 
 
-def _environment(html: bool) -> Environment:
-    environment = Environment(
-        loader=PackageLoader("pipeline.report"),
-        autoescape=html,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"figure": figure, "times": times, "cell": cell}
-    return environment
-
-
-def figure(value: float | None) -> str:
-    """A number with three digits; a dash where nothing was measured."""
-    return "–" if value is None else number(value)
-
-
-def times(value: float | None) -> str:
-    """A ratio with three digits, and one more where it comes near 1."""
-    return "–" if value is None else number(value, 4 if abs(value - 1) < 0.01 else 3)
-
-
-def cell(text: str) -> str:
-    """Text that a cell of a Markdown table can hold."""
-    return text.replace("|", "\\|").replace("\n", " ")
-
-
-def context(evidence: Evidence, pictures: Mapping[str, str]) -> dict[str, Any]:
+def context(evidence: Evidence, claims: Claims, judged: Judged, pictures: Mapping[str, str]) -> dict[str, Any]:
     """Everything that the templates show."""
-    case, claims = evidence.case, CLAIMS.get(evidence.case.name, PLAIN)
-    # What is known of the paper's record says nothing of a user's own.
-    reason = plain_reason if evidence.own_data else claims.reason
-    tables = [(table, [paper_row(row, evidence, reason) for row in table.rows]) for table in case.tables]
-    accepted, said = acceptance(evidence, claims), statements(evidence, claims)
-
+    case, own = evidence.case, [f"{picture.name}.png" for picture in claims.pictures]
     models = [row for name, model in evidence.models.items() for row in model_rows(name, model)]
 
     def of_kind(start: str) -> dict[str, str]:
-        return {k: v for k, v in pictures.items() if k.startswith(start)}
+        return {k: v for k, v in pictures.items() if k.startswith(start) and k not in own}
 
     return {
         "case": case,
@@ -92,17 +52,21 @@ def context(evidence: Evidence, pictures: Mapping[str, str]) -> dict[str, Any]:
         "seeds": "" if best is None else _seeds(best.seeds),
         "headline": headline(evidence),
         "pictures": of_kind("figure_"),
+        "own_pictures": {k: v for k, v in pictures.items() if k in own},
         "loops": of_kind("closed_loop_"),
         "sweeps": of_kind("sweep_") | of_kind("candidates_"),
         "overview": pictures.get("closed_loop.png"),
         "main_test": evidence.main_words[0],
-        "tables": tables,
+        "tables": judged.tables,
         "rule": RULE,
-        "acceptance": accepted,
-        "met": sum(v.holds is True for v in accepted),
-        "statements": said,
+        "acceptance": judged.acceptance,
+        "met": sum(v.holds is True for v in judged.acceptance),
+        "statements": judged.statements,
         "laws": [_law(evidence, law) for law in evidence.laws],
         "scenarios": _rows(evidence),
+        "further": _further(evidence),
+        "analyses": _analyses(evidence),
+        "bounded": any(evidence.bound(name) is not None for name in evidence.scenarios),
         "models": models,
         "free_run": any(row["free_run"] is not None for row in models),
         "candidates": [table for name, model in evidence.models.items() for table in candidates(name, model)],
@@ -178,9 +142,52 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
         rows.append(_row(evidence, name, title, case.metric))
         if late_s := evidence.late_s(name):
             rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", "sse_late"))
-    mv = case.plant_class.mv_signals[0]
-    unit = "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
+    mv, *others = case.plant_class.mv_signals
+    unit = ", all MVs together" if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
     return [*rows, _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")]
+
+
+def _further(evidence: Evidence) -> list[dict[str, Any]]:
+    """Figures that the case has named and that its tests have, by test: each law's median, and with noise."""
+    rows = []
+    for metric in evidence.case.metric_words:
+        for name, title in evidence.scenarios.items():
+            row = _row(evidence, name, title, metric)
+            if any(cell["value"] is not None for cell in row["cells"].values()):
+                rows.append({**row, "metric": metric_name(metric, evidence.case.metric_words)})
+    return rows
+
+
+def _analyses(evidence: Evidence) -> list[dict[str, Any]]:
+    """Of each law that tells of an analysis: its figures, a column for every form, and its notes."""
+    words = evidence.case.metric_words
+    found = []
+    for law, own in evidence.laws.items():
+        forms = own.analyses
+        if not forms:
+            continue
+        names = dict.fromkeys(name for said in forms.values() for name in said.get("figures") or {})
+        notes: dict[str, list[str]] = {}
+        for form, said in forms.items():
+            for note in said.get("notes") or ():
+                notes.setdefault(note, []).append(form)
+        found.append(
+            {
+                "law": law,
+                "title": own.title,
+                "forms": [form or "as shipped" for form in forms],
+                "rows": [
+                    (metric_name(n, words), [(said.get("figures") or {}).get(n) for said in forms.values()])
+                    for n in names
+                ],
+                # A note that every form has needs no form beside it.
+                "notes": [
+                    (note, "" if len(of) == len(forms) else ", ".join(f or "as shipped" for f in of))
+                    for note, of in notes.items()
+                ],
+            }
+        )
+    return found
 
 
 def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases.base import PaperFigure, Requirement
+from pipeline.cases.base import PaperFigure, PaperTable, Requirement
 from pipeline.report.evidence import Evidence
 from pipeline.report.words import law_label, metric_name, number
 
@@ -168,6 +168,23 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict]:
     ]
     rows = [requirement(need, evidence) for need in evidence.case.requirements]
     return [*rows, *common, *(check(evidence) for check in claims.acceptance)]
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A case held against its paper: the paper's tables, what it had to show, and what the paper states."""
+
+    tables: tuple[tuple[PaperTable, tuple[Row, ...]], ...]
+    acceptance: tuple[Verdict, ...]
+    statements: tuple[Verdict, ...]
+
+
+def judge(evidence: Evidence, claims: Claims) -> Judged:
+    """All verdicts of a case; checks that take long are asked once."""
+    # What is known of the paper's record says nothing of a user's own.
+    reason = plain_reason if evidence.own_data else claims.reason
+    tables = tuple((t, tuple(paper_row(row, evidence, reason) for row in t.rows)) for t in evidence.case.tables)
+    return Judged(tables, tuple(acceptance(evidence, claims)), tuple(statements(evidence, claims)))
 
 
 def statements(evidence: Evidence, claims: Claims) -> list[Verdict]:

@@ -7,6 +7,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.cases.base import NOISE_SUFFIX
+from pipeline.report.numbers import number, ratio
+
+__all__ = [
+    "LONG",
+    "NO_UNIT",
+    "SHORT",
+    "law_label",
+    "law_name",
+    "metric_name",
+    "number",
+    "ratio",
+    "scenario_name",
+    "setting_text",
+]
 
 SHORT = {
     "mae": "MAE",
@@ -29,17 +43,6 @@ LONG = {
 """A case's metric in words."""
 NO_UNIT = frozenset({"", "-", "1"})
 """How a signal says that it is a plain number."""
-
-
-def number(value: float, digits: int = 3) -> str:
-    """``value`` with so many digits, thousands grouped and not as a power of ten."""
-    large = 10 ** min(digits, 4) <= abs(value) < 1e9
-    return f"{value:,.0f}" if large else f"{value:.{digits}g}"
-
-
-def ratio(value: float) -> str:
-    """A multiple of a bound: two decimals, and more where it comes within a hundredth of it."""
-    return f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
 
 
 def metric_name(metric: str, own: Mapping[str, str] | None = None) -> str:

@@ -1,0 +1,54 @@
+"""The templates of the reports: where they lie, and the filters that they use."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from pipeline.report.numbers import figure, kilobytes, times
+
+REGISTRY_URL = "http://127.0.0.1:5000/#/models"
+"""Where `make registry` serves the registry, unless another port was asked for."""
+
+
+def render(name: str, content: Mapping[str, Any]) -> str:
+    """A template filled in; text is escaped where it is HTML."""
+    environment = Environment(
+        loader=PackageLoader("pipeline.report"),
+        autoescape=".html" in name,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {
+        "figure": figure,
+        "times": times,
+        "cell": cell,
+        "sentence": sentence,
+        "kilobytes": kilobytes,
+    }
+    return environment.get_template(name).render(content)
+
+
+def write_pages(out: Path, files: Mapping[str, str]) -> list[Path]:
+    """Write files by renaming drafts, so that no half-written one is ever read; returns their paths."""
+    for name, body in files.items():
+        draft = out / f"{name}.draft"
+        draft.write_text(body, encoding="utf-8")
+        os.replace(draft, out / name)
+    return [out / name for name in files]
+
+
+def sentence(text: str) -> str:
+    """Text at the start of a sentence; abbreviations inside it stay as they are."""
+    return text[:1].upper() + text[1:]
+
+
+def cell(text: str) -> str:
+    """Text that a cell of a Markdown table can hold."""
+    return text.replace("|", "\\|").replace("\n", " ")
