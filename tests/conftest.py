@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import henson_seborg_cstr_parts
 import numpy as np
 import pytest
 import torch
@@ -42,9 +43,13 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
         {"forgetting": 1.0, "offset_filter": 0.0},
     ],
     "self_tuning_pid": [{"prefilter": (0.5,), "forgetting": 1.0}],
+    "local_pid_network": [{"blending": "outputs"}, {"blending": "velocity"}],
 }
 # The plant that a law is for; the others are designed over the first case's.
-PLANT_OF_LAW: dict[str, str] = {}
+PLANT_OF_LAW: dict[str, str] = {
+    "local_pid_network": "henson_seborg_cstr",
+    "auto_pid_network": "henson_seborg_cstr",
+}
 # Set points that a plant is put to rest at; of a plant that is not named, three within its range.
 AT_REST: dict[str, tuple[float, float, float]] = {"thiosulfate_cstr": (0.1, 0.66613, 0.97)}
 HORIZON = 3
@@ -135,6 +140,8 @@ def _thiosulfate_parts(plant: Plant) -> dict[str, Model]:
 
 PARTS: dict[str, Callable[[Plant], dict[str, Model]]] = {
     "thiosulfate_cstr": _thiosulfate_parts,
+    "henson_seborg_cstr": henson_seborg_cstr_parts.parts,
+    "reversible_cstr": reversible_cstr_parts.parts,
 }
 
 

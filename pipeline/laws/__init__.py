@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pipeline.laws.auto_pid_network import AutoPidNetwork
 from pipeline.laws.base import ControlLaw, LawSignals
 from pipeline.laws.gauss_newton_pid import GaussNewtonPid
 from pipeline.laws.inverse import INC, INCAD, INCADEC
 from pipeline.laws.inverse_dob import ForwardDob, InverseDob
 from pipeline.laws.linearized_pid import LinearizedPid
+from pipeline.laws.local_pid_network import LocalPidNetwork
 from pipeline.laws.minimum_variance import MinimumVariance
 from pipeline.laws.pid import PID
 from pipeline.laws.recursive_pid import RecursivePid
@@ -17,6 +19,8 @@ LAWS: dict[str, type[ControlLaw]] = {
     INCAD.name: INCAD,
     INCADEC.name: INCADEC,
     PID.name: PID,
+    LocalPidNetwork.name: LocalPidNetwork,
+    AutoPidNetwork.name: AutoPidNetwork,
     LinearizedPid.name: LinearizedPid,
     GaussNewtonPid.name: GaussNewtonPid,
     MinimumVariance.name: MinimumVariance,

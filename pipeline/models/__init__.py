@@ -13,11 +13,13 @@ from pipeline.models.network_parts import MlpPart
 from pipeline.models.nnarx_part import NnarxPart
 from pipeline.models.parts import Learnt, Part
 from pipeline.models.rbf_part import RbfPart
+from pipeline.models.state_space_part import StateSpacePart
 
 MODELS: dict[str, type[Part]] = {
     RbfPart.model.kind: RbfPart,
     MlpPart.model.kind: MlpPart,
     NnarxPart.model.kind: NnarxPart,
+    StateSpacePart.model.kind: StateSpacePart,
     ArxPart.model.kind: ArxPart,
     DomainPart.model.kind: DomainPart,
     LinearizedPart.model.kind: LinearizedPart,
