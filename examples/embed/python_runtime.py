@@ -4,8 +4,7 @@ import sys
 
 from serving import Controller
 
-file = sys.argv[1] if sys.argv[1:] else sys.exit("usage: python python_runtime.py FILE.onnx")
-controller = Controller(file)  # digest, graph and manifest are checked here
+controller = Controller(sys.argv[1] if sys.argv[1:] else sys.exit("usage: python python_runtime.py FILE.onnx"))
 m, state = controller.manifest, controller.cold_state()  # zeros: no past
 mv = [s.low for s in m.mv]  # what the plant has now
 for k in range(100):  # once every m.period_s seconds
