@@ -17,6 +17,8 @@ from pipeline.record import Record
 
 How = Literal["tied", "global", "local"]
 MODES: Mapping[int, str] = {1: "hot", 2: "cold"}
+SIGN: Mapping[str, float] = {"b_hot": 1.0, "b_cold": -1.0}
+LEAST = 0.01  # [degC a period] that full flow does at least: at its inlet's temperature a valve does nothing
 SHARE = 1e-3  # of a unit vector: from where on a coefficient has part in what the data leave open
 
 
@@ -56,6 +58,9 @@ def identify(data: Transitions, centres: Sequence[float], how: How) -> HybridFuz
     Between the outer centres sum_j beta_j c_j = T_w, so that adding d to every a1_j and -d c_j to every
     r_j changes nothing there: data cannot tell. Rules that are fitted together therefore have an r without
     slope over the centres, each counted by its share of the data; what follows T_w belongs to a1.
+
+    The hot valve heats and the cold one cools, LEAST at least, so that the model has an inverse: where the
+    jacket is as warm as the inlet, b is nothing and its estimate may have either sign.
 
     The core is one least-squares line, T(k+1) - T(k) = c_w (T_w(k) - T(k)), c_t = 1 - c_w: it exchanges
     heat with the jacket alone, so that at equal temperatures nothing moves.
@@ -134,6 +139,25 @@ def _blended(rules: Rules, columns: Array, target: Array, labels: Sequence[tuple
 
 
 def _solved(design: Array, target: Array, names: Sequence[str]) -> Array:
+    """Least squares in which every b has the sign of its valve, by fixing those that would not at LEAST.
+
+    Raises ModelError as ``_least_squares`` does.
+    """
+    sign = np.array([SIGN.get(name.rsplit("_", 1)[0], 0.0) for name in names])
+    found, free = np.zeros(len(names)), np.ones(len(names), dtype=bool)
+    while True:
+        rest = target - design[:, ~free] @ found[~free]
+        found[free] = _least_squares(
+            design[:, free], rest, [n for n, is_free in zip(names, free, strict=True) if is_free]
+        )
+        wrong = free & (sign != 0) & (sign * found < LEAST)
+        if not wrong.any():
+            return found
+        found[wrong] = LEAST * sign[wrong]
+        free &= ~wrong
+
+
+def _least_squares(design: Array, target: Array, names: Sequence[str]) -> Array:
     """Least squares, each column scaled to length 1 so that the rank is judged alike for all.
 
     Raises ModelError that names the columns with a share in a direction that the data do not see.
