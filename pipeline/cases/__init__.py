@@ -6,6 +6,7 @@ from pipeline.cases.base import NOISE_SUFFIX, Case, Scenario
 from pipeline.cases.batch_reactor import BatchReactorCase
 from pipeline.cases.ph_neutralization import PhNeutralizationCase
 from pipeline.cases.ph_neutralization_15s import PhNeutralization15sCase
+from pipeline.cases.reversible_cstr import ReversibleCstrCase
 from pipeline.cases.thiosulfate_cstr import ThiosulfateCstrCase
 
 CASES: dict[str, Case] = {
@@ -13,6 +14,7 @@ CASES: dict[str, Case] = {
     PhNeutralizationCase.name: PhNeutralizationCase(),
     PhNeutralization15sCase.name: PhNeutralization15sCase(),
     BatchReactorCase.name: BatchReactorCase(),
+    ReversibleCstrCase.name: ReversibleCstrCase(),
 }
 
 __all__ = ["CASES", "NOISE_SUFFIX", "Case", "Scenario"]

@@ -97,6 +97,7 @@ class PaperFigure:
     """One number of the paper's tables, and the same one from an independent implementation.
 
     Of a model, ``law`` names its set, ``scenario`` is empty and ``metric`` a path of the set's figures.
+    Where the paper prints no figure (``printed`` false), ``paper`` is the independent implementation's.
     """
 
     label: str
@@ -106,6 +107,7 @@ class PaperFigure:
     paper: float
     setting: Mapping[str, float | str] = field(default_factory=dict)  # of the law, such as r
     independent: float | None = None
+    printed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
