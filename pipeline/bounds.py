@@ -35,12 +35,14 @@ def bounds_path(case: Case) -> Path:
 
 
 def kinds(case: Case) -> tuple[str, ...]:
-    """The figures to compute: nmpc, offline, and nmpc_noise where it is the states that are measured.
+    """The figures to compute: nmpc, offline, and nmpc_noise where the measured states are worth stepping on.
 
-    Elsewhere the NMPC is given the state itself, which noise on the measurement does not reach; an
-    observer for it would be one more controller, and no bound.
+    Elsewhere the NMPC is given the state itself, which noise on the measurement does not reach: an
+    observer for it would be one more controller, and no bound. So it is where samples follow
+    one another quickly, and an NMPC without a filter is busy with the noise (``Effort.noisy``).
     """
-    return ("nmpc", "offline", "nmpc_noise") if measures_states(case.plant) else ("nmpc", "offline")
+    noisy = measures_states(case.plant) and case.effort.noisy
+    return ("nmpc", "offline", "nmpc_noise") if noisy else ("nmpc", "offline")
 
 
 def measures_states(plant: Plant) -> bool:
@@ -104,8 +106,8 @@ def read_stored(path: Path) -> dict[str, Any]:
 def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dict[str, float]]]:
     """The bounds by scenario: ``{"sp_a": {"nmpc": {"mae": ...}, "offline": {...}}, "sp_a_noise": {"nmpc": ...}}``.
 
-    Figures of several sequences are put ``together``. Where the PVs are not the states, the NMPC's
-    figures with noise are those without (``kinds``). Tests without bounds
+    Figures of several sequences are put ``together``. Where ``kinds`` has no ``nmpc_noise``,
+    the NMPC's figures with noise are those without. Tests without bounds
     (``bounded``) are left out. Raises LawError where figures are missing or belong to another plant,
     metric, effort or scenario than the case has now.
     """

@@ -41,6 +41,7 @@ class Effort:
     reaches: tuple[int, ...] = (1, 2, 3)  # of the rollouts that a fresh search starts from
     tail: int = 20  # periods of an offline plan beyond its set point's last sample
     every: int = 1  # samples for which the NMPC follows a plan whose predictions come true
+    noisy: bool = True  # whether the NMPC also steps on noisy states; without a filter it hunts them
 
 
 @dataclass(frozen=True, slots=True)

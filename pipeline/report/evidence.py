@@ -154,12 +154,16 @@ class Evidence:
         """Of each scenario the error that noise would hide: its deviation, or its variance times the samples.
 
         An NMPC that is told of a disturbance before it acts leaves an error of 1e-11: no yardstick.
+        Nor is one that can stay on its reference throughout, and there good loops stay well within
+        the noise. What n noisy samples still tell apart is then the yardstick, s (2/n)^(1/4): an
+        error whose square is the deviation of their mean square.
         """
         if self.case.metric == "mae":
             return dict.fromkeys(self.scenarios, self.noise)
-        return {
-            name: self.noise**2 * statistics.fmean(test.samples for test in tests) for name, tests in self.tests.items()
-        }
+        samples = {name: statistics.fmean(test.samples for test in tests) for name, tests in self.tests.items()}
+        if self.case.metric == "tracking":
+            return {name: self.noise * (2 / n) ** 0.25 for name, n in samples.items()}
+        return {name: self.noise**2 * n for name, n in samples.items()}
 
     def floor(self, scenario: str) -> float:
         """Error below which a loop of this test, with noise or without, is as good as perfect."""

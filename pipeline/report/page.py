@@ -83,6 +83,8 @@ def _floor(evidence: Evidence) -> str:
     """What the gate takes for perfect, in words."""
     if evidence.case.metric == "mae":
         return f"{evidence.noise} (the measurement noise)"
+    if evidence.case.metric == "tracking":
+        return f"what the test's samples tell apart from their noise ({evidence.noise:g} times (2/samples)^(1/4))"
     return f"what the measurement noise alone adds up to ({evidence.noise:g} squared times the samples)"
 
 
