@@ -147,7 +147,8 @@ def cost(coefficients: Array, integrand: Callable[[Array, Array], Array]) -> flo
     for _ in range(DOUBLINGS):
         x = np.hstack([x, phi @ x])
         phi = phi @ phi
-    f = integrand(GRID * np.arange(x.shape[1]), x[0])
+    times: Array = GRID * np.arange(x.shape[1], dtype=np.float64)
+    f = integrand(times, x[0])
     size = np.abs(f)
     crossed = np.flatnonzero(f[:-1] * f[1:] < 0)
     excess = size[crossed] * size[crossed + 1] / (size[crossed] + size[crossed + 1])

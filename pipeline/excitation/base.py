@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -53,12 +53,16 @@ class OpenLoop(Excitation):
     ----------
     low, high : float, optional
         Range of the MVs [unit of the MV], inside their signals' range, which is the default.
+    spacing : "linear" or "log"
+        Whether levels are spread evenly over the range, or evenly over its logarithm: where an MV acts by
+        its ratio (a flow by the time that it leaves), even levels hardly visit the low end.
     start : tuple of float
         State at sample 0; empty: where the plant's experiments start (``Plant.start``).
     """
 
     low: float | None = None
     high: float | None = None
+    spacing: Literal["linear", "log"] = "linear"
     start: tuple[float, ...] = ()
 
     @abstractmethod
@@ -68,12 +72,29 @@ class OpenLoop(Excitation):
     def run(self, plant: Plant, seed: int) -> Record:
         """The record of one run; the MVs and the noise come from ``seed``."""
         rng = np.random.default_rng(seed)
-        low, high = self.limits(plant)
-        mv = low + (high - low) * self.unit_sequence(len(low), rng)
-        # Rounding may put the last bit of a limit outside it.
-        mv = np.clip(mv, low, high)
+        mv = self.levels(plant, self.unit_sequence(len(plant.mv_signals), rng))
         x = simulate_open(plant, self.initial_state(plant), mv)[:-1]
         return Record.of(plant, measured(plant, x) + noise_draws(plant, len(x), self.noise, rng), mv)
+
+    def levels(self, plant: Plant, unit: Array) -> Array:
+        """The MVs for values on [0, 1], shape (n, n_mv): over the range, of a discrete MV its values by equal shares.
+
+        Raises ParamsError where ``low`` and ``high`` leave the signals' ranges, or leave a discrete MV no value.
+        """
+        low, high = self.limits(plant)
+        mv = low * (high / low) ** unit if self.spacing == "log" else low + (high - low) * unit
+        # Rounding may put the last bit of a limit outside it.
+        mv = np.clip(mv, low, high)
+        for i, s in enumerate(plant.mv_signals):
+            if s.values is not None:
+                allowed = np.array([v for v in s.values if low[i] <= v <= high[i]])
+                if not allowed.size:
+                    raise ParamsError(
+                        f"excitation {self.kind!r}: {s.name} may be {list(s.values)}, and none of these lies between "
+                        f"{low[i]:g} and {high[i]:g}"
+                    )
+                mv[:, i] = allowed[np.minimum((unit[:, i] * len(allowed)).astype(np.int64), len(allowed) - 1)]
+        return mv
 
     def limits(self, plant: Plant) -> tuple[Array, Array]:
         """Lowest and highest MVs, shape (n_mv,); ParamsError where they leave the signals' ranges."""
@@ -84,6 +105,11 @@ class OpenLoop(Excitation):
                 raise ParamsError(
                     f"excitation {self.kind!r}: {s.name} would run from {a:g} to {b:g} {s.unit}; "
                     f"low < high within {s.low:g} to {s.high:g} are allowed"
+                )
+            if self.spacing == "log" and not a > 0:
+                raise ParamsError(
+                    f"excitation {self.kind!r}: {s.name} runs from {a:g} {s.unit}, which has no logarithm; "
+                    "give a low above 0, or spacing: linear"
                 )
         return low, high
 

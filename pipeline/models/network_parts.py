@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +22,11 @@ def trainer_of(options: Mapping[str, Any]) -> Trainer:
     """The trainer that a part's options {kind: lm | lbfgs | adam, ...} describe; raises ParamsError."""
     rest = dict(options)
     return parse(choose(TRAINERS, rest.pop("kind", "lm"), "trainer", "trainer.kind"), rest, "trainer")
+
+
+def going_on(trainer: Trainer, iterations: int | None) -> Trainer:
+    """The same trainer, continuing from the weights that are there, for at most ``iterations``; None: as many."""
+    return replace(trainer, restarts=0, iterations=trainer.iterations if iterations is None else iterations)
 
 
 def story(model: Model, history: FitHistory) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from pipeline.metrics import fit_percent, per_region, r2, rmse
 from pipeline.models.base import Model
 from pipeline.models.fit import FitHistory, Trainer
 from pipeline.models.lag_search import SLACK, Candidate, Size, parsimonious
-from pipeline.models.network_parts import story, trainer_of
+from pipeline.models.long_run import TRAINED, LongRun, curves
+from pipeline.models.network_parts import going_on, story, trainer_of
 from pipeline.models.nnarx import NNARX
 from pipeline.models.objectives import Samples, Windows
 from pipeline.models.one_step import FORGETTING, compare_one_step
@@ -35,7 +36,11 @@ class NnarxPart(Part):
     ``search`` lists sizes, e.g. [{n_y: 2, n_u: 2}, {n_y: 3, n_u: 3, hidden: [15]}], each trained alike;
     the smallest of those whose free run over ``free_run`` periods errs at most ``slack`` (relative) more
     than the best one's stays. Measurement noise counts in that error: where it dominates, take less slack.
-    ``compared`` validation samples show the one-step predictions beside those of linear models, 0 none.
+    ``long_run`` periods of free runs, end to end over the validation data, whose fit is told for the network
+    trained on one step and for the one that is kept; 0 for none. ``free_run_iterations`` limit the second
+    training; None: as the first.
+    ``compared`` validation samples show the one-step predictions beside those of linear models; 0 none, which
+    leaves the picture to the free runs.
     """
 
     model: ClassVar[type[Model]] = NNARX
@@ -49,13 +54,15 @@ class NnarxPart(Part):
     free_run: int = 20
     search: tuple[Size, ...] = ()
     slack: float = SLACK
+    long_run: int = 0
+    free_run_iterations: int | None = None
     compared: int = 200
     forgetting: tuple[float, ...] = FORGETTING
     train_fraction: float = 0.7
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("free_run", 1), ("compared", 0), ("slack", 0.0)):
+        for name, least in (("steps", 1), ("free_run", 1), ("compared", 0), ("long_run", 0), ("slack", 0.0)):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least:g}")
 
@@ -74,7 +81,7 @@ class NnarxPart(Part):
         back = max(max(s.n_y - 1, s.n_u + s.delay - 2) for s in sizes)
         trials = [size._trial(*halves, target, back, seed) for size in sizes]
         best = parsimonious([candidate for *_, candidate in trials], self.slack)
-        model, history, candidate = trials[best]
+        model, history, runs, candidate = trials[best]
         metrics = {
             "free_run_rmse": candidate.free_run_rmse,
             **self._scored(model, halves[1], target, regions),
@@ -85,8 +92,10 @@ class NnarxPart(Part):
         }
         if self.search:
             metrics["candidates"] = [c.row(i == best) for i, (*_, c) in enumerate(trials)]
+        if runs:
+            metrics["nnarx"] = {name: run.figures([plant.pv_signals[target].name]) for name, run in runs.items()}
         if not self.compared:
-            return Learnt(model, metrics)
+            return Learnt(model, metrics, predictions=curves(runs, plant.period_s) if runs else None)
         shown = compare_one_step(
             model, longest_run(halves[1], self.compared), target=target, forgetting=self.forgetting
         )
@@ -98,7 +107,7 @@ class NnarxPart(Part):
 
     def _trial(
         self, train: Record, validation: Record, target: int, back: int, seed: int
-    ) -> tuple[NNARX, FitHistory, Candidate]:
+    ) -> tuple[NNARX, FitHistory, dict[str, LongRun], Candidate]:
         begun = time.perf_counter()
         lags = (self.n_y, self.n_u, target, self.delay)
         fitted, held = nnarx_pairs(train, *lags), nnarx_pairs(validation, *lags)
@@ -113,8 +122,11 @@ class NnarxPart(Part):
         )
         trainer = trainer_of(self.trainer)
         history = trainer.fit(model.net, Samples(fitted.x, fitted.y), Samples(held.x, held.y), seed=seed)
+        runs = {TRAINED[0]: self._long(model, validation, target)} if self.long_run else {}
         if self.steps > 1:
             history = self._run_free(model, trainer, train, validation, target, seed)
+            if self.long_run:
+                runs[TRAINED[1]] = self._long(model, validation, target)
         model.eval()
         free = Windows.of(
             validation, self.n_y, self.n_u, self.free_run, target=target, delay=self.delay, least_back=back
@@ -124,7 +136,7 @@ class NnarxPart(Part):
         size = sum(p.numel() for p in model.parameters())
         one_step = rmse(held.y, predict(model, held.x))
         seconds = time.perf_counter() - begun
-        return model, history, Candidate(self.n_y, self.n_u, self.hidden, size, one_step, error, seconds)
+        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step, error, seconds)
 
     def _run_free(
         self, model: NNARX, trainer: Trainer, train: Record, validation: Record, target: int, seed: int
@@ -135,7 +147,16 @@ class NnarxPart(Part):
             Windows.of(r, self.n_y, self.n_u, self.steps, target=target, delay=self.delay, every=self.steps)
             for r in (train, validation)
         )
-        return replace(trainer, restarts=0).fit(model.net, before, after, seed=seed)
+        return going_on(trainer, self.free_run_iterations).fit(model.net, before, after, seed=seed)
+
+    def _long(self, model: NNARX, validation: Record, target: int) -> LongRun:
+        pairs = nnarx_pairs(validation, model.n_y, model.n_u, target, model.delay)
+        cut = Windows.of(
+            validation, model.n_y, model.n_u, self.long_run, target=target, delay=model.delay, every=self.long_run
+        )
+        with torch.no_grad():
+            free = model.simulate(torch.from_numpy(cut.past), torch.from_numpy(cut.u))
+        return LongRun((pairs.y, predict(model, pairs.x)), cut.future[..., None], free[..., None].numpy())
 
     def _scored(self, model: NNARX, validation: Record, target: int, regions: Regions) -> dict[str, Any]:
         pairs = nnarx_pairs(validation, model.n_y, model.n_u, target, model.delay)

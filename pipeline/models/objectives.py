@@ -93,8 +93,8 @@ class Samples:
     def normal_equations(self, net: MLP, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, J'r, J'J)."""
         x, target, root = self._tensors(net)
-        sums = _Sums(net)
-        for rows in _chunks(len(self), chunk):
+        sums = Sums(net)
+        for rows in chunks(len(self), chunk):
             s, jac = parameter_jacobian(net, x[rows])
             sums.add((s - target[rows]) * root[rows, None], jac.mul_(root[rows, None, None]))
         return sums.result
@@ -203,9 +203,9 @@ class Windows:
         """(loss, J'r, J'J)."""
         past, u, future = (torch.from_numpy(a) for a in (self.past, self.u, self.future))
         root = _weights(self.weight, len(self), self.steps) / net.y_scale
-        sums = _Sums(net)
+        sums = Sums(net)
         n_y = self.past.shape[1]
-        for rows in _chunks(len(self), chunk):
+        for rows in chunks(len(self), chunk):
             ys = list(past[rows].unbind(1))
             sensitivities: list[Tensor] = []  # dy/dtheta of the predictions; measured PVs have none
             for step in range(self.steps):
@@ -222,7 +222,7 @@ class Windows:
         return sums.result
 
 
-class _Sums:
+class Sums:
     """Running sums of r'r, J'r and J'J."""
 
     def __init__(self, net: MLP) -> None:
@@ -243,6 +243,7 @@ class _Sums:
         hessian.addmm_(j.T, j)
 
 
-def _chunks(n: int, size: int) -> Iterator[slice]:
+def chunks(n: int, size: int) -> Iterator[slice]:
+    """Slices of at most ``size`` over ``n`` rows."""
     for start in range(0, n, size):
         yield slice(start, min(start + size, n))
