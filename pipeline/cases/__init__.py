@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pipeline.cases.base import NOISE_SUFFIX, Case, Scenario
 from pipeline.cases.batch_reactor import BatchReactorCase
+from pipeline.cases.henson_seborg_cstr import HensonSeborgCstrCase
+from pipeline.cases.jacketed_batch_reactor import JacketedBatchReactorCase
 from pipeline.cases.ph_neutralization import PhNeutralizationCase
 from pipeline.cases.ph_neutralization_15s import PhNeutralization15sCase
 from pipeline.cases.reversible_cstr import ReversibleCstrCase
@@ -14,6 +16,8 @@ CASES: dict[str, Case] = {
     PhNeutralizationCase.name: PhNeutralizationCase(),
     PhNeutralization15sCase.name: PhNeutralization15sCase(),
     BatchReactorCase.name: BatchReactorCase(),
+    HensonSeborgCstrCase.name: HensonSeborgCstrCase(),
+    JacketedBatchReactorCase.name: JacketedBatchReactorCase(),
     ReversibleCstrCase.name: ReversibleCstrCase(),
 }
 

@@ -33,14 +33,15 @@ class LocalControllers(ControlLaw):
     With rho_i(y) the weights, e = r - y, h the period, and Kp, Ki, Kd, a their blended numbers
     sum_i rho_i(y) (.)_i, the three forms are
 
-        gains      mv = Kp e + I - Kd v,                                   I += h Ki e
-        outputs    mv = sum_i rho_i(y) [ u_i + Kp_i e - Kd_i v ] + I,      I += h Ki e
+        gains      mv = Kp e + I - Kd v,                                     I += h Ki e
+        outputs    mv = sum_i rho_i(y) [ u_i + Kp_i e + Ki_i J - Kd_i v ],   J += h e
         velocity   mv(k) = mv(k-1) + Kp (e(k) - e(k-1)) + h Ki e(k) - Kd (v(k) - v(k-1))
 
     v is the filtered slope of the measurement, v(k) = a v(k-1) + (1 - a) (y(k) - y(k-1))/h with
     a_i = Tf_i/(Tf_i + h) and Tf_i = Td_i/N. The forms differ in what happens while rho moves: with
-    blended gains the integral stands in units of the MV, so at e = 0 nothing bumps; with blended
-    outputs the local biases u_i jump along; the velocity form has no memory of where it should be.
+    blended gains the integral stands in units of the MV, so at e = 0 nothing bumps; blended outputs
+    weigh the one integral J, and the local biases u_i, anew with every move of rho; the velocity
+    form has no memory of where it should be.
 
     Anti-windup: the integral keeps its value while the limited MV lies behind the request in the
     direction of the error. A cold start, and an actuator that someone else moved, set the integral
@@ -89,7 +90,7 @@ class LocalControllers(ControlLaw):
         self.blending, self.pids = blending, tuple(pids)
         self.stability = stability or StabilityTest()
         self.points = tuple(float(v) for v in models.x[:, 0])  # [CV]
-        self.n_state = 6  # started, I, the proportional part before, y(k-1), v(k-1), the last MV given
+        self.n_state = 6  # started, I or J/h, the proportional part before, y(k-1), v(k-1), the last MV given
         self.info = ("kc", "tau_i_s", "tau_d_s", "mv_requested")
 
     def forward(
@@ -104,7 +105,9 @@ class LocalControllers(ControlLaw):
         nothing = torch.zeros_like(y)
         # The velocity form remembers e(k-1) where the others remember their proportional part.
         beside = error if self.blending == "velocity" else proportional
-        fresh = torch.cat([mv_applied - beside, beside, y, nothing, mv_applied], dim=-1)
+        # What one unit of the integral is in the MV's.
+        unit = ki if self.blending == "outputs" else torch.ones_like(y)
+        fresh = torch.cat([(mv_applied - beside) / unit, beside, y, nothing, mv_applied], dim=-1)
         past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
         integral, beside1, y1, slope1, given = (past[..., i : i + 1] for i in range(5))
         followed = (mv_applied - given).abs() <= self.near
@@ -116,9 +119,9 @@ class LocalControllers(ControlLaw):
             mv = self.limited(requested, mv_applied)
             kept = nothing
         else:
-            integral = torch.where(followed, integral, mv_applied - beside1)
-            grown = integral + ki * error
-            requested = proportional - kd * slope + grown
+            integral = torch.where(followed, integral, (mv_applied - beside1) / unit)
+            grown = integral + ki / unit * error
+            requested = proportional - kd * slope + unit * grown
             mv = self.limited(requested, mv_applied)
             kept = torch.where((requested - mv) * error > 0, integral, grown)
         info = torch.cat([kp, kp / ki * self.period, kd / kp * self.period, requested], dim=-1)

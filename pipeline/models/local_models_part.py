@@ -15,7 +15,7 @@ from pipeline.metrics import fit_percent
 from pipeline.models.base import Model
 from pipeline.models.local_models import LocalModels
 from pipeline.models.parts import Learnt, Part, Regions
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.base import Array, Linearization, Plant
 from pipeline.record import Record
 from pipeline.simulate import simulate_open
 
@@ -51,7 +51,7 @@ class LocalModelsPart(Part):
         courses = {name: (mv, _plant_run(plant, mv)) for name, mv in self._courses(seed).items()}
         runs = {name: free_run(model, x[0], mv) for name, (mv, x) in courses.items()}
         metrics: dict[str, Any] = {
-            "points": [[float(v) for v in (*p.x, *p.mv)] for p in model.linearizations()],
+            "operating_points": {str(i): _point(plant, p) for i, p in enumerate(model.linearizations(), start=1)},
             "widths": [float(v) for v in model.width],
             **{name: _figures(plant, x, runs[name]) for name, (_, x) in courses.items()},
             "steady_error": self._steady_error(model, plant),
@@ -141,3 +141,8 @@ def _figures(plant: Plant, actual: Array, predicted: Array) -> dict[str, float]:
     """Fit [%] of each state, and the largest error of the controlled variable."""
     fits = {f"fit_{s.name}": fit_percent(actual[:, i], predicted[:, i]) for i, s in enumerate(plant.state_signals)}
     return {**fits, "largest_error": float(np.abs(actual[:, 0] - predicted[:, 0]).max())}
+
+
+def _point(plant: Plant, point: Linearization) -> dict[str, float]:
+    names = [s.name for s in (*plant.state_signals, *plant.mv_signals)]
+    return dict(zip(names, map(float, (*point.x, *point.mv)), strict=True))
