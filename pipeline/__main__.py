@@ -41,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     _simulate_options(commands.add_parser("simulate", help="close the loop of a controller file over its plant"))
     results = commands.add_parser("results", help="the figures of every controller, and where to look")
+    results.add_argument("case", metavar="CASE", nargs="?", help="one case, in all of its tests (default: all cases)")
     results.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="folder of the controllers")
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         if options.command == "results":
-            show_results(options.artifacts)
+            show_results(options.artifacts, case=options.case)
         else:
             _simulate(options)
     except (LoopwrightError, OSError) as error:

@@ -1,10 +1,10 @@
-"""The table that `make run` ends with: every controller, its figures, and where to look."""
+"""The table that `make run` ends with: every case and every controller, and where to look."""
 
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -13,70 +13,112 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.errors import PipelineError
+from pipeline.standing import LawStanding, Standing, tally
 
 Validation = Mapping[str, Any]
 WIDTH = 120
 
 
-def show_results(artifacts: Path, console: Console | None = None) -> None:
-    """Print a table for each artifacts/<case>/validation.json; raises PipelineError where there is none."""
+def show_results(artifacts: Path, console: Console | None = None, case: str | None = None) -> None:
+    """Print one table over all artifacts/<case>/validation.json, or that of one case with all of its tests.
+
+    Raises PipelineError where there is none.
+    """
     console = console or Console()
     if not console.is_terminal:
         # A log has no width of its own; the table is not worth cutting for one.
         console = Console(file=console.file, width=WIDTH)
-    files = sorted(artifacts.glob("*/validation.json"))
-    if not files:
+    folders = sorted(path.parent for path in artifacts.glob("*/validation.json"))
+    if not folders:
         raise PipelineError(f"{artifacts} holds no validation.json yet; run the pipeline first: make run")
-    for path in files:
-        try:
-            validation = json.loads(path.read_text(encoding="utf-8"))
-            console.print(_table(validation, path.parent))
-        except (OSError, ValueError, KeyError, AttributeError) as error:
-            raise PipelineError(f"{path} cannot be read ({error!r}); run `dvc repro`") from error
-        console.print(f"report     {path.parent / 'report.html'} (and .md, figures/, validation.json)")
-        console.print(f"try one    python -m pipeline simulate {path.parent / '<law>.onnx'}")
-        console.print(f"read one   python -m serving inspect {path.parent / '<law>.onnx'}")
+    standings = {folder.name: Standing.read(folder) for folder in folders}
+    if case is not None and case not in standings:
+        raise PipelineError(f"{artifacts} holds no case {case!r}; it has {', '.join(standings)}")
+    console.print(overview(standings.values()) if case is None else _tests(standings[case]))
+    where = artifacts / (case or "<case>")
+    if case is None:
+        console.print("*          the best of its case, chosen on sequences that are never scored")
+        console.print(f"overview   {artifacts / 'report.html'} (and .md)")
+        console.print(f"a case     {where / 'report.html'}; its tests here: python -m pipeline results CASE")
+    else:
+        console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
+    console.print(f"try one    python -m pipeline simulate {where / '<law>.onnx'}")
+    console.print(f"read one   python -m serving inspect {where / '<law>.onnx'}")
     console.print("registry   make registry, then /#/models in the browser")
 
 
-def _table(validation: Validation, folder: Path) -> Table:
-    scenarios, bounds = validation["scenarios"], validation.get("bounds", {})
-    metric = validation.get("metric", "mae")
-    weights = (validation.get("gate") or {}).get("weights") or {}
-    names = [name for name in scenarios if not name.endswith("_noise") or name in weights]
-    main = max(weights, key=lambda name: weights[name], default=names[-1])
-    words = (validation.get("titles") or {}).get("metric", "mean absolute error")
-    title = f"{validation['case']}: {words}, median over data seeds; {main} / NMPC: the bound is 1"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE)
-    table.add_column("law", no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column(f"{main} / NMPC", justify="right", no_wrap=True)
-    table.add_column("size", justify="right", no_wrap=True)
-
-    def ours(name: str, law: str) -> float | None:
-        value = scenarios.get(name, {}).get(law, {}).get(metric)
-        return None if value is None else float(value)
-
-    def bound(name: str) -> float | None:
-        value = bounds.get(name, {}).get("nmpc", {}).get(metric)
-        return None if value is None else float(value)
-
-    def key(law: str) -> float:
-        value = ours(main, law)
-        return math.inf if value is None else value
-
-    for law in sorted({law for name in names for law in scenarios[name]}, key=key):
-        file = folder / f"{law}.onnx"
-        size = f"{file.stat().st_size / 1024:.0f} kB" if file.exists() else "-"
-        table.add_row(law, *(_figure(ours(name, law)) for name in names), _ratio(ours(main, law), bound(main)), size)
-    table.add_section()
-    table.add_row("perfect NMPC", *(_figure(bound(name)) for name in names), "", "")
+def overview(standings: Iterable[Standing]) -> Table:
+    """One row a law: figure on the test that weighs most, bound, ratio, time of a step, size of the file."""
+    table = Table(box=box.SIMPLE, title_justify="left", pad_edge=False)
+    table.title = "Each case's main test, median over data seeds; the bound is the perfect-model NMPC"
+    for name, right in (
+        ("case", False), ("law (* the best)", False), ("figure", True), ("bound", True), ("ratio", True),
+        ("step", True), ("size", True),
+    ):  # fmt: skip
+        table.add_column(name, justify="right" if right else "left", no_wrap=True)
+    for standing in standings:
+        for about, law in zip_longest(_about(standing), standing.laws, fillvalue=None):
+            table.add_row(about or "", *(_row(standing, law) if law is not None else ()))
+        table.add_section()
     return table
 
 
-def _ratio(ours: float | None, bound: float | None) -> str:
-    return f"{ours / bound:.2f}" if ours and bound else "-"
+def _about(standing: Standing) -> list[str]:
+    """What stands in a case's first column, a line a row."""
+    lines = [f"[bold]{standing.case}[/bold]", f"{standing.metric}, {standing.test}"]
+    for words, (good, known) in (
+        ("requirements", tally(standing.requirements)),
+        ("claims reproduce", tally(standing.claims)),
+        ("figures reproduce", standing.reproduced),
+    ):
+        if known:
+            lines.append(f"{good} of {known} {words}")
+    return lines
+
+
+def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
+    return (
+        f"[bold]{law.law} *[/bold]" if law.best else law.law,
+        _figure(law.figure),
+        _figure(standing.bound),
+        "-" if law.ratio is None else _ratio(law.ratio),
+        "-" if law.step_us is None else f"{law.step_us:.0f} us",
+        _size(law),
+    )
+
+
+def _tests(standing: Standing) -> Table:
+    """A case's laws in all of its tests."""
+    validation: Validation = json.loads((standing.folder / "validation.json").read_text(encoding="utf-8"))
+    scenarios, bounds = validation["scenarios"], validation.get("bounds", {})
+    metric, main = validation.get("metric", "mae"), standing.test
+    weights = (validation.get("gate") or {}).get("weights") or {}
+    names = [name for name in scenarios if not name.endswith("_noise") or name in weights]
+    title = f"{standing.case}: {standing.metric_long}, median over data seeds; {main} / NMPC: the bound is 1"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE)
+    table.add_column("law", no_wrap=True)
+    for name in (*names, f"{main} / NMPC", "size"):
+        table.add_column(name, justify="right", no_wrap=True)
+
+    def ours(name: str, law: str) -> float | None:
+        return (scenarios.get(name, {}).get(law) or {}).get(metric)
+
+    for law in standing.laws:
+        shown = "-" if law.ratio is None else _ratio(law.ratio)
+        table.add_row(law.law, *(_figure(ours(name, law.law)) for name in names), shown, _size(law))
+    table.add_section()
+    nmpc = [bounds.get(name, {}).get("nmpc", {}).get(metric) for name in names]
+    table.add_row("perfect NMPC", *map(_figure, nmpc), "", "")
+    return table
+
+
+def _size(law: LawStanding) -> str:
+    return "-" if law.bytes is None else f"{law.bytes / 1024:.0f} kB"
+
+
+def _ratio(value: float) -> str:
+    """Two decimals, and more where a law comes within a hundredth of the bound."""
+    return f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
 
 
 def _figure(value: float | None) -> str:

@@ -80,7 +80,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
     repository = Copy(path)
     repository.run("git", "init", "--quiet")
     stages = repository.repro()
-    assert {s.split("@")[0] for s in stages} == {"excite", "fit", "design", "validate", "report", "publish"}
+    assert {s.split("@")[0] for s in stages} == {"excite", "fit", "design", "validate", "report", "overview", "publish"}
     return repository
 
 
@@ -89,8 +89,10 @@ def test_every_output_is_there(copy: Copy) -> None:
     for name in ("incad.onnx", "incad.json", "pid.onnx", "pid.json", "validation.json", "report.html", "report.md"):
         assert (artifacts / name).is_file(), name
     assert (copy.path / "published.json").is_file()
+    for name in ("report.html", "report.md"):
+        assert f"{CASE}-incad" in (copy.path / "artifacts" / name).read_text(), name
     assert "incad" in copy.run("python", "-m", "pipeline", "results")
-    assert "perfect NMPC" in copy.run("python", "-m", "pipeline", "results")
+    assert "perfect NMPC" in copy.run("python", "-m", "pipeline", "results", CASE)
 
 
 def test_a_second_run_does_nothing(copy: Copy) -> None:
@@ -102,7 +104,7 @@ def test_another_r_reruns_its_own_design_and_validation_only(copy: Copy) -> None
     copy.edit(("controllers", f"{CASE}-incad", "r"), 2.0)
     ran = copy.repro()
     assert {f"design@{CASE}-incad", f"validate@{CASE}-incad"} <= ran
-    assert ran <= {f"design@{CASE}-incad", f"validate@{CASE}-incad", f"report@{CASE}", "publish"}
+    assert ran <= {f"design@{CASE}-incad", f"validate@{CASE}-incad", f"report@{CASE}", "overview", "publish"}
     # Back again: DVC's cache has it, nothing is computed twice.
     copy.edit(("controllers", f"{CASE}-incad", "r"), 1.5)
     assert not {s for s in copy.repro() if s.startswith(("excite", "fit", "design"))}

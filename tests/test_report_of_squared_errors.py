@@ -268,7 +268,7 @@ def test_info_is_drawn_by_its_name_whatever_else_the_setting_tells(batch):
 def test_the_table_in_the_terminal_and_the_card_in_the_registry(written):
     out, evidence = written
     page = io.StringIO()
-    show_results(out.parent, Console(file=page))
+    show_results(out.parent, Console(file=page), evidence.case.name)
     lines = page.getvalue().splitlines()
     main = evidence.main_test
     assert f"sum of squared errors, median over data seeds; {main} / NMPC" in lines[0]

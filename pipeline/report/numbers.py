@@ -24,6 +24,16 @@ def times(value: float | None) -> str:
     return "–" if value is None else number(value, 4 if abs(value - 1) < 0.01 else 3)
 
 
+def headline(value: float | None) -> str:
+    """A case's main figure, with a digit more: the best laws come close to one another."""
+    return "–" if value is None else number(value, 4)
+
+
+def multiple(value: float | None) -> str:
+    """A multiple of a bound; a dash where there is none."""
+    return "–" if value is None else ratio(value)
+
+
 def kilobytes(value: int | None) -> str:
     """The size of a file."""
     return "–" if value is None else f"{value / 1024:.0f} kB"

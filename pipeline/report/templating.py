@@ -9,7 +9,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from pipeline.report.numbers import figure, kilobytes, times
+from pipeline.report.numbers import figure, headline, kilobytes, multiple, times
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 """Where `make registry` serves the registry, unless another port was asked for."""
@@ -30,6 +30,8 @@ def render(name: str, content: Mapping[str, Any]) -> str:
         "times": times,
         "cell": cell,
         "sentence": sentence,
+        "headline": headline,
+        "multiple": multiple,
         "kilobytes": kilobytes,
     }
     return environment.get_template(name).render(content)

@@ -45,6 +45,11 @@ def validation_folder(case: str, law: str) -> Path:
     return WORK / case / "validation" / law
 
 
+def receipt_file(case: str) -> Path:
+    """What a report leaves for the overview to wait for, in one folder because DVC cannot list a file a case."""
+    return WORK / "reports" / f"{case}.json"
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON through a temporary file, so that no half-written one stays."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from pipeline.command import run_stage
 from pipeline.params import CaseParams, choose, entries, parse, read_section
 from pipeline.report.evidence import Evidence
 from pipeline.report.page import write_report
-from pipeline.stages import ARTIFACTS, WORK
+from pipeline.stages import ARTIFACTS, WORK, receipt_file, write_json
 
 
 def report(name: str) -> None:
@@ -27,6 +28,8 @@ def report(name: str) -> None:
     evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data)
     for path in write_report(evidence, WORK / name / "models", ARTIFACTS / name):
         print(path)
+    verdicts = (ARTIFACTS / name / "validation.json").read_bytes()
+    write_json(receipt_file(name), {"validation_sha256": hashlib.sha256(verdicts).hexdigest()})
 
 
 def _is_own(data: Path, case: str) -> bool:

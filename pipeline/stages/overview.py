@@ -1,0 +1,32 @@
+"""Stage overview: one page over all cases of params.yaml, from what their reports left for programs."""
+
+from __future__ import annotations
+
+import sys
+
+from pipeline.errors import PipelineError
+from pipeline.params import sections
+from pipeline.report.overview import write_overview
+from pipeline.stages import ARTIFACTS
+from pipeline.standing import Standing
+
+
+def overview() -> None:
+    """Write artifacts/report.html and artifacts/report.md."""
+    standings = [Standing.read(ARTIFACTS / case) for case in sections("cases")]
+    for path in write_overview(standings, ARTIFACTS):
+        print(path)
+
+
+def main() -> int:
+    """The exit status: 2 and one line where it could not."""
+    try:
+        overview()
+    except (PipelineError, OSError) as error:
+        print(f"overview: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
