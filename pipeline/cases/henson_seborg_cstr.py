@@ -21,6 +21,7 @@ from pipeline.cases.base import (
     random_levels,
     stepwise,
 )
+from pipeline.horizon import Effort
 from pipeline.metrics import overshoots
 from pipeline.plants.base import Array, Plant
 from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr
@@ -60,6 +61,8 @@ class HensonSeborgCstrCase(Case):
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
     noise: ClassVar[Mapping[str, float]] = {"C": 2e-4, "T": 0.2}
     data_seeds: ClassVar[int] = 1
+    # Periods of 1.2 s: a move takes several to show, and one coarse element each is exact to 1e-5.
+    effort: ClassVar[Effort] = Effort(60, 1, 1, 2, (3, 10), tail=60, every=10, noisy=False)
     gate: ClassVar[Mapping[str, float]] = {
         "up": 0.2,
         "down": 0.15,

@@ -22,6 +22,7 @@ from pipeline.cases.base import (
     random_levels,
     stepwise,
 )
+from pipeline.horizon import Effort
 from pipeline.metrics import itae
 from pipeline.plants.base import Plant
 from pipeline.plants.reversible_cstr import ReversibleCstr
@@ -68,6 +69,8 @@ class ReversibleCstrCase(Case):
     }
     unforeseen: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 3
+    # Periods of 2 s beside a reference model of some 50 s.
+    effort: ClassVar[Effort] = Effort(40, 1, 1, 3, (1, 3), every=10, noisy=False)
     plant_class: ClassVar[type[Plant]] = ReversibleCstr
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     # A good thermometer beside the analyser; no law here reads the temperature.
