@@ -10,6 +10,7 @@ from typing import Any
 import henson_seborg_cstr_parts
 import numpy as np
 import pytest
+import reversible_cstr_parts
 import torch
 
 from pipeline.laws import LAWS, ControlLaw, LawSignals
@@ -26,6 +27,7 @@ from pipeline.simulate import simulate_batch
 # What a law's params need other than their defaults to be designed quickly; a law not named here is designed as it is.
 QUICK: dict[str, dict[str, Any]] = {
     "pid": {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613},
+    **dict.fromkeys(("model_reference", "model_reference_two_error", "pi_reference"), reversible_cstr_parts.QUICK),
 }
 # Forms of a law that its defaults do not reach, under the contract too.
 VARIANTS: dict[str, list[dict[str, Any]]] = {
@@ -43,12 +45,15 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
         {"forgetting": 1.0, "offset_filter": 0.0},
     ],
     "self_tuning_pid": [{"prefilter": (0.5,), "forgetting": 1.0}],
+    "model_reference": [{"order": 4}],
+    "pi_reference": [{"tuning": "manual", "kc": -45.0, "ti_s": 5.0, "order": 1}],
     "local_pid_network": [{"blending": "outputs"}, {"blending": "velocity"}],
 }
 # The plant that a law is for; the others are designed over the first case's.
 PLANT_OF_LAW: dict[str, str] = {
     "local_pid_network": "henson_seborg_cstr",
     "auto_pid_network": "henson_seborg_cstr",
+    **dict.fromkeys(("model_reference", "model_reference_two_error", "pi_reference"), "reversible_cstr"),
 }
 # Set points that a plant is put to rest at; of a plant that is not named, three within its range.
 AT_REST: dict[str, tuple[float, float, float]] = {"thiosulfate_cstr": (0.1, 0.66613, 0.97)}

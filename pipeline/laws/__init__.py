@@ -10,6 +10,9 @@ from pipeline.laws.inverse_dob import ForwardDob, InverseDob
 from pipeline.laws.linearized_pid import LinearizedPid
 from pipeline.laws.local_pid_network import LocalPidNetwork
 from pipeline.laws.minimum_variance import MinimumVariance
+from pipeline.laws.model_reference import ModelReference
+from pipeline.laws.model_reference_two_error import ModelReferenceTwoError
+from pipeline.laws.pi_reference import PiReference
 from pipeline.laws.pid import PID
 from pipeline.laws.recursive_pid import RecursivePid
 from pipeline.laws.self_tuning_pid import SelfTuningPid
@@ -21,6 +24,9 @@ LAWS: dict[str, type[ControlLaw]] = {
     PID.name: PID,
     LocalPidNetwork.name: LocalPidNetwork,
     AutoPidNetwork.name: AutoPidNetwork,
+    ModelReference.name: ModelReference,
+    ModelReferenceTwoError.name: ModelReferenceTwoError,
+    PiReference.name: PiReference,
     LinearizedPid.name: LinearizedPid,
     GaussNewtonPid.name: GaussNewtonPid,
     MinimumVariance.name: MinimumVariance,
