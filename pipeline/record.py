@@ -229,7 +229,7 @@ def check_time(table: Table, run: Array, time_s: Array, period_s: float) -> None
 
 
 def check_mv(table: Table, signal: Signal, mv: Array) -> None:
-    """The MV stays in its range and moves, or RecordError."""
+    """The MV stays in its range, or at its allowed values, and moves, or RecordError."""
     column = table.find(signal)
     slack = MV_TOLERANCE * (signal.high - signal.low)
     outside = np.flatnonzero((mv < signal.low - slack) | (mv > signal.high + slack))
@@ -238,6 +238,14 @@ def check_mv(table: Table, signal: Signal, mv: Array) -> None:
             f"{table.at(column, outside[0])}: {mv[outside[0]]:.6g} is outside the MV's range "
             f"{signal.low:g} to {signal.high:g} {signal.unit}; correct the cell or widen the plant's signal"
         )
+    if signal.values is not None:
+        near = np.min(np.abs(mv[:, None] - np.array(signal.values)), axis=1)
+        strange = np.flatnonzero(near > slack)
+        if strange.size:
+            raise RecordError(
+                f"{table.at(column, strange[0])}: {mv[strange[0]]:.6g} is none of the values {list(signal.values)} "
+                f"that {signal.name} may have; correct the cell"
+            )
     if mv.size and float(np.ptp(mv)) <= slack:
         raise RecordError(
             f"{table.at(column)}: the MV {signal.name} is {mv[0]:g} {signal.unit} in every row, "

@@ -16,9 +16,11 @@ from pipeline.excitation.sequences import TAPS, Aprbs, Multisine, Prbs, RandomSt
 from pipeline.models.regressors import forward_pairs, inverse_pairs
 from pipeline.params import parse
 from pipeline.plants.batch_reactor import BatchReactor
+from pipeline.plants.jacketed_batch_reactor import JacketedBatchReactor
 from pipeline.plants.thiosulfate_cstr import ThiosulfateCstr
 from pipeline.record import Record
 from pipeline.simulate import simulate_open
+from serving.manifest import Signal
 
 SMALL = {
     "random_steps": {"samples": 300},
@@ -27,7 +29,11 @@ SMALL = {
     "multisine": {"samples": 300, "cycle": 100, "lines": 10},
     "operating_point": {"samples": 300, "run_length": 120, "restarts": 50},
     "batches": {"samples": 30, "batches": 10},
+    "jacket_pulses": {"samples": 300},
 }
+# The plant that an excitation is for; the others excite the first case's.
+PLANT_OF = {"jacket_pulses": JacketedBatchReactor}
+FEEDBACK = {"operating_point", "jacket_pulses"}  # whose MVs answer to what is measured
 
 
 @pytest.fixture(scope="module")
@@ -35,50 +41,55 @@ def cstr() -> ThiosulfateCstr:
     return ThiosulfateCstr()
 
 
+@pytest.fixture
+def plant(kind):
+    return PLANT_OF.get(kind, ThiosulfateCstr)()
+
+
 # ---------------------------------------------------------------- contract of all
 
 
 @pytest.mark.parametrize("kind", EXCITATIONS)
-def test_record_is_that_of_its_seed(kind, cstr):
+def test_record_is_that_of_its_seed(kind, plant):
     excitation = EXCITATIONS[kind](**SMALL[kind])
-    a, b, other = (excitation.run(cstr, seed) for seed in (5, 5, 6))
+    a, b, other = (excitation.run(plant, seed) for seed in (5, 5, 6))
     assert isinstance(a, Record)
     assert a.digest() == b.digest()
     assert a.digest() != other.digest()
-    assert a.mv_signals == cstr.mv_signals
+    assert a.mv_signals == plant.mv_signals
 
 
 @pytest.mark.parametrize("kind", EXCITATIONS)
-def test_record_is_what_the_plant_does(kind, cstr):
-    record = EXCITATIONS[kind](**SMALL[kind]).run(cstr, 0)
+def test_record_is_what_the_plant_does(kind, plant):
+    record = EXCITATIONS[kind](**SMALL[kind]).run(plant, 0)
     for run in np.unique(record.run):
         rows = record.run == run
         pv, mv = record.pv[rows], record.mv[rows]
-        assert np.allclose(simulate_open(cstr, pv[0], mv)[:-1], pv, rtol=1e-9, atol=1e-9)
+        assert np.allclose(simulate_open(plant, pv[0], mv)[:-1], pv, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", EXCITATIONS)
-def test_mv_stays_in_its_range_and_moves(kind, cstr, tmp_path):
-    record = EXCITATIONS[kind](**SMALL[kind]).run(cstr, 1)
+def test_mv_stays_in_its_range_and_moves(kind, plant, tmp_path):
+    record = EXCITATIONS[kind](**SMALL[kind]).run(plant, 1)
     record.write(tmp_path / "r.parquet")
     # Reading checks range, movement, time and runs.
     again = Record.read(
-        tmp_path / "r.parquet", pv=cstr.pv_signals, mv=cstr.mv_signals, dv=cstr.dv_signals, period_s=cstr.period_s
+        tmp_path / "r.parquet", pv=plant.pv_signals, mv=plant.mv_signals, dv=plant.dv_signals, period_s=plant.period_s
     )
     assert again.digest() == record.digest()
 
 
 @pytest.mark.parametrize("kind", EXCITATIONS)
-def test_noise_is_of_the_given_size(kind, cstr):
+def test_noise_is_of_the_given_size(kind, plant):
     quiet = EXCITATIONS[kind](**SMALL[kind])
-    noisy = dataclasses.replace(quiet, noise=(0.0, 0.5)).run(cstr, 2)
-    if kind != "operating_point":  # there the feedback sees the noise, and the plant goes another way
-        plain = quiet.run(cstr, 2)
+    noisy = dataclasses.replace(quiet, noise=(0.0, 0.5)).run(plant, 2)
+    if kind not in FEEDBACK:  # there the feedback sees the noise, and the plant goes another way
+        plain = quiet.run(plant, 2)
         assert np.array_equal(plain.mv, noisy.mv)
         assert np.array_equal(plain.pv[:, 0], noisy.pv[:, 0])
         assert (noisy.pv - plain.pv)[:, 1].std() == pytest.approx(0.5, rel=0.15)
     rows = noisy.starts(1)
-    after = np.array([simulate_open(cstr, noisy.pv[k], noisy.mv[[k]])[1] for k in rows[:40]])
+    after = np.array([simulate_open(plant, noisy.pv[k], noisy.mv[[k]])[1] for k in rows[:40]])
     assert np.abs(after - noisy.pv[rows[:40] + 1])[:, 1].max() > 0.3
 
 
@@ -173,6 +184,26 @@ def test_several_mvs_each_in_its_own_range(kind):
     for column, signal in zip(record.mv.T, Mixer.mv_signals, strict=True):
         assert signal.low <= column.min() < column.max() <= signal.high
         assert np.ptp(column) > 0.8 * (signal.high - signal.low)
+
+
+@pytest.mark.parametrize("kind", [k for k, e in EXCITATIONS.items() if issubclass(e, OpenLoop)])
+def test_a_discrete_mv_takes_its_values_and_no_others(kind):
+    small = {"order": 7} if kind in {"prbs", "aprbs"} else {}
+    record = EXCITATIONS[kind](**{**SMALL[kind], **small}).run(JacketedBatchReactor(), 0)
+    mode = record.mv[:, 1]
+    assert set(np.unique(mode)) == {1.0, 2.0}
+    assert (mode == 1.0).mean() == pytest.approx(0.5, abs=0.2)
+    assert np.ptp(record.mv[:, 0]) > 0.8
+
+
+class Valve(Lag):
+    mv_signals = (Signal("valve", "-", 0.0, 10.0, values=(0.0, 10.0)),)
+
+
+def test_a_range_without_a_value_of_a_discrete_mv_is_refused():
+    with pytest.raises(ParamsError, match=r"valve may be \[0\.0, 10\.0\], and none of these lies between 2 and 8"):
+        RandomSteps(samples=10, low=2.0, high=8.0).run(Valve(), 0)
+    assert set(np.unique(RandomSteps(samples=99, low=2.0).run(Valve(), 0).mv)) == {10.0}
 
 
 def test_range_may_be_narrowed_but_not_left(cstr):

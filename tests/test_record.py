@@ -209,6 +209,18 @@ def test_mv_outside_its_range(tmp_path, frame):
     assert Record.read(tmp_path / "f.csv", **PLANT).pv[2, 1] == 1e4
 
 
+def test_a_discrete_mv_has_its_allowed_values_only(tmp_path, frame):
+    valve = Signal("valve", "-", 1.0, 2.0, values=(1.0, 2.0))
+    frame["valve [-]"] = [1, 1, 2, 2, 1, 2, 1 + 1e-12, 2]
+    frame.to_csv(tmp_path / "f.csv", index=False)
+    with_valve = PLANT | {"mv": (*MV, valve)}
+    assert Record.read(tmp_path / "f.csv", **with_valve).mv[3, 1] == 2
+    frame.loc[4, "valve [-]"] = 1.5
+    frame.to_csv(tmp_path / "f.csv", index=False)
+    with pytest.raises(RecordError, match=r"line 6: 1\.5 is none of the values \[1\.0, 2\.0\] that valve may have"):
+        Record.read(tmp_path / "f.csv", **with_valve)
+
+
 def test_files_that_are_no_tables(tmp_path, frame):
     for name, text, said in (
         ("a.csv", "", "cannot be read as csv"),

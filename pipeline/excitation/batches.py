@@ -67,9 +67,7 @@ class Batches(OpenLoop):
         Raises ParamsError for a spread that does not fit the plant's states.
         """
         rng = np.random.default_rng(seed)
-        low, high = self.limits(plant)
-        # Rounding may put the last bit of a limit outside it.
-        mv = np.clip(low + (high - low) * self.unit_sequence(len(low), rng), low, high)
+        mv = self.levels(plant, self.unit_sequence(len(plant.mv_signals), rng))
         moves = mv.reshape(self.batches, self.samples, -1)
         x = simulate_batch(plant, self.initial_states(plant, rng), moves)[:, :-1]
         pv = measured(plant, x.reshape(len(mv), -1)) + noise_draws(plant, len(mv), self.noise, rng)
