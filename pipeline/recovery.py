@@ -98,7 +98,7 @@ def _batch(plant: Plant, n: int) -> tuple[Any, Array, Array]:
     return plant.transition.map(n), dv, np.tile(plant.parameters()[:, None], (1, n))
 
 
-def other_rests(plant: Plant, samples: int = 3_000, moving: float = 1e-9) -> Array:
+def other_rests(plant: Plant, samples: int = 1_500, moving: float = 1e-9) -> Array:
     """States (n, n_x) at which the plant rests, the MV at one of its ends, outside the range of its set point.
 
     Found from the corners of the states' ranges: a reactor that has gone out, or run away. Empty
