@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from threading import Event
 
 import pytest
 
+from pipeline import parallel
 from pipeline.errors import PipelineError
 from pipeline.parallel import parallel_map
 
@@ -65,8 +67,49 @@ def give_up(here: int, item: int) -> int:
 
 def test_a_helper_that_dies_is_an_error_and_no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    with pytest.raises(Exception, match="worker process managed by the executor was unexpectedly terminated"):
+    with pytest.raises(PipelineError, match=r"exits: a helper process died \(exit code 3"):
         parallel_map(partial(give_up, os.getpid()), range(2_000), "exits")
+    assert multiprocessing.active_children() == []
+
+
+class TwoPartError(Exception):
+    """An error that pickle cannot make again."""
+
+    def __init__(self, one: str, other: str) -> None:
+        super().__init__(f"{one} {other}")
+
+
+def fail_elsewhere(here: int, kind: str, item: int) -> object:
+    Event().wait(0.05)
+    if os.getpid() == here:
+        return item
+    if kind == "result":
+        return lambda: item
+    raise TwoPartError("two", "parts") if kind == "two parts" else ValueError("of its own")
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "text"),
+    [
+        ("plain", ValueError, "of its own"),
+        ("two parts", PipelineError, "TwoPartError: two parts"),
+        ("result", Exception, "pickle"),
+    ],
+)
+def test_what_a_helper_raises_arrives(
+    monkeypatch: pytest.MonkeyPatch, kind: str, error: type[Exception], text: str
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with pytest.raises(error, match=text):
+        parallel_map(partial(fail_elsewhere, os.getpid(), kind), range(100), "failures")
+    assert multiprocessing.active_children() == []
+
+
+def test_where_a_fork_is_not_safe_helpers_start_afresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "CONTEXT", multiprocessing.get_context("spawn"))
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert parallel_map(math.sqrt, [4.0, 1.0, 9.0], "roots") == [2.0, 1.0, 3.0]
+    assert multiprocessing.active_children() == []
 
 
 def test_a_cluster_without_its_package_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
