@@ -27,4 +27,5 @@ PY
 fi
 
 say "installing into $venv (a few minutes the first time)"
-"$venv/bin/python" -m pip install --quiet -c constraints.txt "$torch" -e '.[pipeline,dev]'
+# Python compiles on first use what is used, a third of the files: pip would compile all of them, one by one.
+"$venv/bin/python" -m pip install --quiet --no-compile -c constraints.txt "$torch" -e '.[pipeline,dev]'
