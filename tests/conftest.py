@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any
 
 import henson_seborg_cstr_parts
+import jacketed_batch_reactor_parts
 import numpy as np
 import pytest
 import reversible_cstr_parts
@@ -54,6 +55,7 @@ PLANT_OF_LAW: dict[str, str] = {
     "local_pid_network": "henson_seborg_cstr",
     "auto_pid_network": "henson_seborg_cstr",
     **dict.fromkeys(("model_reference", "model_reference_two_error", "pi_reference"), "reversible_cstr"),
+    **dict.fromkeys(jacketed_batch_reactor_parts.LAWS, "jacketed_batch_reactor"),
 }
 # Set points that a plant is put to rest at; of a plant that is not named, three within its range.
 AT_REST: dict[str, tuple[float, float, float]] = {"thiosulfate_cstr": (0.1, 0.66613, 0.97)}
@@ -146,6 +148,7 @@ def _thiosulfate_parts(plant: Plant) -> dict[str, Model]:
 PARTS: dict[str, Callable[[Plant], dict[str, Model]]] = {
     "thiosulfate_cstr": _thiosulfate_parts,
     "henson_seborg_cstr": henson_seborg_cstr_parts.parts,
+    "jacketed_batch_reactor": jacketed_batch_reactor_parts.parts,
     "reversible_cstr": reversible_cstr_parts.parts,
 }
 

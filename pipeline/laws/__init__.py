@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pipeline.laws.auto_pid_network import AutoPidNetwork
 from pipeline.laws.base import ControlLaw, LawSignals
+from pipeline.laws.fuzzy_feedforward import FuzzyFeedforward
+from pipeline.laws.fuzzy_feedforward_observer import FuzzyFeedforwardObserver
+from pipeline.laws.fuzzy_feedforward_pi import FuzzyFeedforwardPi
 from pipeline.laws.gauss_newton_pid import GaussNewtonPid
 from pipeline.laws.inverse import INC, INCAD, INCADEC
 from pipeline.laws.inverse_dob import ForwardDob, InverseDob
@@ -32,6 +35,9 @@ LAWS: dict[str, type[ControlLaw]] = {
     MinimumVariance.name: MinimumVariance,
     RecursivePid.name: RecursivePid,
     SelfTuningPid.name: SelfTuningPid,
+    FuzzyFeedforward.name: FuzzyFeedforward,
+    FuzzyFeedforwardPi.name: FuzzyFeedforwardPi,
+    FuzzyFeedforwardObserver.name: FuzzyFeedforwardObserver,
     InverseDob.name: InverseDob,
     ForwardDob.name: ForwardDob,
 }

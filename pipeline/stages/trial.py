@@ -123,10 +123,12 @@ def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
 
 
 def together(rows: Iterable[Metrics]) -> Metrics:
-    """Mean over the sequences of a test; of the largest steady error, the largest."""
+    """Mean over the sequences of a test; of a figure that is a largest or a smallest one, again that (max_asse)."""
     table = list(rows)
-    found = {key: statistics.fmean(row[key] for row in table) for key in table[0]}
-    return found | {"max_asse": max(row["max_asse"] for row in table)}
+    reduce = {"max": max, "min": min}
+    return {
+        key: float(reduce.get(key.partition("_")[0], statistics.fmean)(row[key] for row in table)) for key in table[0]
+    }
 
 
 def step_us(controller: Controller, loop: Trajectory) -> dict[str, float]:
