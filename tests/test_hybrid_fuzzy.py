@@ -248,6 +248,16 @@ def test_the_tied_models_parameters_are_those_of_the_physics(reactor_record: Rec
     assert printed["physics"]["b_cold_20"] / printed["parameters"]["b_cold_20"] == pytest.approx(3.7, abs=0.4)
 
 
+def test_measurement_noise_hardly_moves_the_tied_parameters() -> None:
+    plant = JacketedBatchReactor()
+    noisy = JacketPulses(samples=12_000, noise=(0.05, 0.1)).run(plant, 0)
+    found = HybridFuzzyPart(identification="tied").learn(noisy, plant, {}, 0).metrics
+    for key in ("a1_hot_20", "a1_hot_40", "a1_hot_60"):
+        assert found["parameters"][key] == pytest.approx(found["physics"][key], abs=0.01)
+    for key in ("b_hot_20", "b_hot_40", "b_cold_40", "b_cold_60"):
+        assert found["parameters"][key] == pytest.approx(found["physics"][key], rel=0.1)
+
+
 def test_physics_of_the_linear_part_are_the_matrix_exponential() -> None:
     plant = JacketedBatchReactor()
     truth = coefficients(printed_model(), plant)["physics"]
