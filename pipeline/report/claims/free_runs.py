@@ -32,17 +32,21 @@ def free_run_picture(model_set: str, pv: str, unit: str) -> Callable[[Evidence],
     """Error one step ahead against error running free, a point a data seed; a line joins a network's two trainings."""
 
     def draw(evidence: Evidence) -> Canvas | None:
+        known = {
+            kind: {t: f for t in TRAINED if (f := free_run_figures(evidence, model_set, kind, t, pv))}
+            for kind in NETWORKS
+        }
+        if not any(known.values()):
+            return None
         canvas = Canvas(figsize=(SIZE[0], 4.4), layout="constrained")
         axes = canvas.subplots()
-        drawn = False
-        for kind, (name, colour) in NETWORKS.items():
-            stages = {t: f for t in TRAINED if (f := free_run_figures(evidence, model_set, kind, t, pv))}
+        for kind, stages in known.items():
+            name, colour = NETWORKS[kind]
             for trained, found in stages.items():
                 words, mark = TRAINED[trained]
                 x, y = found["one_step_rmse"], found["free_run_rmse"]
                 label = f"{name}, trained on {words}: fit {statistics.median(found['free_run_fit']):.2f} %"
                 axes.plot(x, y, mark, color=colour, fillstyle="full" if mark == "o" else "none", label=label, zorder=3)
-                drawn = True
             for first, then in pairwise(stages.values()):
                 for key in range(len(first["one_step_rmse"])):
                     ends = [(run["one_step_rmse"][key], run["free_run_rmse"][key]) for run in (first, then)]
@@ -52,7 +56,7 @@ def free_run_picture(model_set: str, pv: str, unit: str) -> Callable[[Evidence],
         axes.set_xlabel(f"RMSE one step ahead [{unit}]")
         axes.set_ylabel(f"RMSE running free [{unit}]")
         axes.legend(loc="upper left", title="median fit of the free run")
-        return canvas if drawn else None
+        return canvas
 
     return draw
 
