@@ -119,10 +119,11 @@ def _chosen(models: Mapping[str, Model], part: str | None, law: str) -> HybridFu
     known = ", ".join(sorted(fuzzy)) or "none"
     if part is None and len(fuzzy) == 1:
         return next(iter(fuzzy.values()))
+    needs = f"law {law!r} needs a part of kind 'hybrid_fuzzy'"
     if part is None:
-        raise LawError(f"law {law!r} needs one model of kind 'hybrid_fuzzy'; the set's are {known}: name one as `part`")
+        raise LawError(f"{needs}; name it as `part`: the model set has {known}")
     if part not in fuzzy:
-        raise LawError(f"law {law!r} has the part {part!r}; the set's of kind 'hybrid_fuzzy' are {known}")
+        raise LawError(f"{needs}, which {part!r} is not; the model set has {known}")
     return fuzzy[part]
 
 
