@@ -276,14 +276,6 @@ def test_the_printed_gap_is_what_was_found_independently() -> None:
     assert found["gap"] == pytest.approx(1.4, abs=0.1)
 
 
-def test_the_free_runs_of_all_identifications_are_kept(reactor_record: Record) -> None:
-    learnt = HybridFuzzyPart(identification="tied", compared=200).learn(reactor_record, JacketedBatchReactor(), {}, 0)
-    assert learnt.predictions is not None
-    assert set(learnt.predictions) == {"time_s", "measured", "tied", "global", "local", "printed"}
-    assert {len(v) for v in learnt.predictions.values()} == {199}
-    assert learnt.predictions["time_s"][0] == 10.0
-
-
 def test_only_the_printed_model_needs_no_record(reactor_record: Record) -> None:
     plant = JacketedBatchReactor()
     assert "gap" in HybridFuzzyPart(identification="printed").learn(None, plant, {}, 0).metrics

@@ -14,13 +14,12 @@ from pipeline.models.base import Model
 from pipeline.models.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
 from pipeline.models.hybrid_fuzzy_identification import MODES, Transitions, identify
 from pipeline.models.parts import Learnt, Part, Regions, predict
-from pipeline.models.time_split import longest_run, split_in_time
+from pipeline.models.time_split import split_in_time
 from pipeline.plants.base import Array, Plant
 from pipeline.plants.fuzzy_batch_reactor import CENTRES, FuzzyBatchReactor
 from pipeline.record import Record
 
 Identification = Literal["printed", "tied", "global", "local"]
-ALL: tuple[Identification, ...] = ("tied", "global", "local", "printed")
 GRID_DEGC = 0.5  # of the search for gaps
 
 
@@ -30,8 +29,7 @@ class HybridFuzzyPart(Part):
 
     ``identification`` printed takes the paper's matrices and needs no data; tied, global and local are least
     squares over a record (hybrid_fuzzy_identification). ``centres`` are the rules' jacket temperatures [degC],
-    of the identified models. ``free_run`` is the length of the free runs whose error is reported [samples]; over
-    ``compared`` samples the free runs of all four identifications are kept for a picture, 0 none.
+    of the identified models. ``free_run`` is the length of the free runs whose error is reported [samples].
     """
 
     model: ClassVar[type[Model]] = HybridFuzzy
@@ -39,12 +37,10 @@ class HybridFuzzyPart(Part):
     centres: tuple[float, ...] = tuple(map(float, CENTRES))
     train_fraction: float = 0.7
     free_run: int = 360
-    compared: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("free_run", 1), ("compared", 0)):
-            if not getattr(self, name) >= least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        if self.free_run < 1:
+            raise ValueError(f"free_run is {self.free_run}; it must be at least 1")
 
     def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
         """The model; its figures are over the last part of the record, which no identification saw."""
@@ -58,21 +54,15 @@ class HybridFuzzyPart(Part):
             return Learnt(model, {**gap(model, plant), **coefficients(model, plant)})
         train, validation = split_in_time(record, self.train_fraction)
         data = Transitions.of(train)
-        model = self._identified(data, self.identification)
+        how = self.identification
+        model = printed_model() if how == "printed" else identify(data, self.centres, how)
         metrics = {
             **self._scored(model, validation),
             "n_train": len(data.row),
             **gap(model, plant),
             **coefficients(model, plant),
         }
-        if not self.compared:
-            return Learnt(model, metrics)
-        shown = longest_run(validation, self.compared)
-        runs = {how: model if how == self.identification else self._identified(data, how) for how in ALL}
-        return Learnt(model, metrics, predictions=_free_runs(runs, shown))
-
-    def _identified(self, data: Transitions, how: Identification) -> HybridFuzzy:
-        return printed_model() if how == "printed" else identify(data, self.centres, how)
+        return Learnt(model, metrics)
 
     def _scored(self, model: HybridFuzzy, validation: Record) -> dict[str, float]:
         """Errors of the jacket and of the core, one step ahead and running free [degC]."""
@@ -160,11 +150,3 @@ def _plant_line(plant: Plant, at: float, opening: float = 0.25, step: float = 0.
         b = (jacket(at, at, opening, q) - base) / opening
         rows.append([a1, a2, b, base - (a1 + a2) * at])
     return np.array(rows)
-
-
-def _free_runs(models: dict[Identification, HybridFuzzy], record: Record) -> dict[str, Array]:
-    """Jacket temperature measured, and as each model runs free from the first sample, arrays (n - 1,)."""
-    curves = {"time_s": record.time_s[1:] - record.time_s[0], "measured": record.pv[1:, 1]}
-    x0, mv = torch.from_numpy(record.pv[0]), torch.from_numpy(record.mv[:-1])
-    with torch.no_grad():
-        return curves | {how: model.simulate(x0, mv)[:, 1].numpy() for how, model in models.items()}
