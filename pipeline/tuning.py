@@ -69,6 +69,24 @@ class AllPole:
         values = np.linalg.eigvals(a).astype(np.complex128)
         return cls(markov[-1], values[np.argsort(-values.real)])
 
+    @classmethod
+    def near(cls, lin: Linearization, pv: int = 0, mv: int = 0) -> AllPole:
+        """G as ``of`` gives it; where a stable plant has a zero, the lag of its initial slope and final gain.
+
+        For tunings that are then judged in closed loop over the plant itself. Raises LawError where slope
+        and gain differ in sign: no lag resembles that plant.
+        """
+        try:
+            return cls.of(lin, pv, mv)
+        except LawError as error:
+            slope = float(lin.c[pv] @ lin.b[:, mv])
+            gain = -float(lin.c[pv] @ np.linalg.solve(lin.a, lin.b[:, mv]))
+            if lin.eigenvalues[0].real >= 0 or not slope * gain > 0:
+                raise LawError(
+                    f"{error}; its step response starts with a slope of {slope:.3g}, ends at {gain:.3g}"
+                ) from None
+            return cls(slope, np.array([-slope / gain + 0j]))
+
 
 def imc_pid(process: AllPole, lambda_s: float) -> PidSettings:
     """The PID that internal model control gives for one or two poles without zeros.

@@ -34,7 +34,8 @@ DISTURBED, DISTURBED_AT, DISTURBED_SAMPLES = 0.46, 20, 300  # [mol/l], samples
 RANDOM_LEVELS, RANDOM_HOLD, RANDOM_RANGE = 8, 100, (0.32, 0.57)
 ORDER, WN = 2, 0.05  # of the reference model, [rad/s]
 
-PRINTED = Curve("pid", {"printed": True})
+PRINTED, TUNED = Curve("pid"), Curve("pid", {"tuned": True})
+PRINTED_SIGN = Curve("pid", {"printed_sign": True})
 NETWORK, PLAIN, PI = Curve("model_reference"), Curve("model_reference_two_error"), Curve("pi_reference")
 ON_TEST = Curve("pi_reference", {"tuned_on_the_levels": True})
 

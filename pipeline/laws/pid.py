@@ -147,7 +147,7 @@ class PID(ControlLaw):
                 return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
 
             base = PidSettings(0.0, 1.0, **rest)
-            settings = tuning.optimized_imc(AllPole.of(lin), signals.period_s, cost, base, optimize_weight=free)
+            settings = tuning.optimized_imc(AllPole.near(lin), signals.period_s, cost, base, optimize_weight=free)
             return cls(signals, settings, p.mv_rate)
         else:
             raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")

@@ -15,8 +15,9 @@ from pipeline.models.state_space import StateSpace
 
 Array = NDArray[np.float64]
 
-NEWTON_STEPS = 30
-INSET = 0.02  # of the MV's range: set points whose steady MV is nearer to an end are not trained on
+LONGEST, AT_REST = 20_000, 1e-10  # periods until a free run rests, and the relative change of a period that is rest
+CURVE = 200  # steady states, between which are drawn
+INSET = 0.02  # of the MV's range: steady states nearer to its ends are not trained on
 LOADED = (0.1, 0.8)  # of a hold: when a load may come
 
 
@@ -76,23 +77,23 @@ class PlantNetwork:
         jac[:, each, each] += 1.0
         return a @ weight + bias + x, jac
 
-    def rest(self, cv: Array, x: Array, u: Array) -> tuple[Array, Array]:
-        """Steady states (B, n_x) and MVs (B, 1) at the controlled variables cv (B,), by Newton's method from x, u.
+    def steady_curve(self, start: Array, mv: Array) -> tuple[Array, Array]:
+        """States (n, n_x) and MVs (n, 1) at rest, the smallest CV first, by running free under each of mv (n,).
 
-        NaN where it does not converge.
+        Raises LawError where a run does not come to rest, or the CV has an extremum over the MV.
         """
-        found = np.concatenate([np.broadcast_to(x, (len(cv), self.n_x)), np.broadcast_to(u, (len(cv), 1))], axis=1)
-        found[:, 0] = cv
-        for _ in range(NEWTON_STEPS):
-            after, jac = self.step(found[:, :-1], found[:, -1:])
-            by_state = jac.transpose(0, 2, 1)[:, :, 1:].copy()
-            by_state[:, :, :-1] -= np.eye(self.n_x)[:, 1:]
-            move = np.linalg.solve(by_state, (after - found[:, :-1])[:, :, None])[:, :, 0]
-            found[:, 1:] -= move
-        after, _ = self.step(found[:, :-1], found[:, -1:])
-        far = np.abs(after - found[:, :-1]).max(axis=1) > 1e-9 * np.abs(found).max()
-        found[far] = np.nan
-        return found[:, :-1], found[:, -1:]
+        x, u = np.tile(start, (len(mv), 1)), mv[:, None]
+        for _ in range(LONGEST):
+            before, x = x, self.step(x, u)[0]
+            if np.abs(x - before).max() < AT_REST * np.abs(x).max():
+                break
+        else:
+            raise LawError("the plant's network does not come to rest under a held MV: it cannot be trained through")
+        slopes = np.diff(x[:, 0])
+        if not (np.all(slopes > 0) or np.all(slopes < 0)):
+            raise LawError("the gain of the plant's network changes its sign over the MV's range: narrow that range")
+        order = np.argsort(x[:, 0])
+        return x[order], u[order]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,30 +110,30 @@ class Loops:
     def drawn(cls, plant: PlantNetwork, signals: LawSignals, options: Training, rng: np.random.Generator) -> Self:
         """Loops as ``options`` says, at set points that the plant's network can hold.
 
-        Raises LawError where it can hold hardly any.
+        Raises LawError where it can hold none.
         """
-        sp, mv, pv = signals.sp[0], signals.mv[0], signals.pv
-        count = options.lanes * (options.holds + 1)
-        wanted = rng.uniform(sp.low, sp.high, 4 * count)
-        middle = np.array([(s.low + s.high) / 2 for s in pv])
-        with np.errstate(all="ignore"):
-            xs, us = plant.rest(wanted, middle, np.array([mv.middle]))
+        mv, pv = signals.mv[0], signals.pv
         inset = INSET * (mv.high - mv.low)
-        held = (us[:, 0] >= mv.low + inset) & (us[:, 0] <= mv.high - inset)
-        if held.sum() < count:
+        middle = np.array([(s.low + s.high) / 2 for s in pv])
+        states, mvs = plant.steady_curve(middle, np.linspace(mv.low + inset, mv.high - inset, CURVE))
+        sp = signals.sp[0]
+        low, high = max(states[0, 0], sp.low), min(states[-1, 0], sp.high)
+        if not low < high:
             raise LawError(
-                f"the plant's network holds {held.sum()} of {len(wanted)} set points from {sp.low:g} to {sp.high:g} "
-                f"{sp.unit} with {mv.name} in its range: learn it from a record over that range"
+                f"the plant's network rests at {states[0, 0]:g} to {states[-1, 0]:g} {sp.unit}, beyond the set "
+                f"points' range of {sp.low:g} to {sp.high:g}: learn it from a record over that range"
             )
-        pick = np.flatnonzero(held)[:count].reshape(options.holds + 1, options.lanes)
-        levels, lanes = wanted[pick[1:]], np.arange(options.lanes)
+        levels, lanes = rng.uniform(low, high, (options.holds + 1, options.lanes)), np.arange(options.lanes)
+        at_rest = [np.interp(levels.ravel(), states[:, 0], column) for column in (*states.T, mvs[:, 0])]
+        x, u = np.stack(at_rest[:-1], axis=1), at_rest[-1][:, None]
+        x0, u0 = x[: options.lanes], u[: options.lanes]
+        levels, x, u = levels[1:], x[options.lanes :], u[options.lanes :]
         n = options.holds * options.hold
         noise = options.noise * rng.standard_normal((n, options.lanes)) * (lanes % 3 == 0)
-        x, u = xs[pick[1:].ravel()], us[pick[1:].ravel()]
         _, jac = plant.step(x, u)
         missing = (jac[:, -1] * u).reshape(options.holds, options.lanes, -1)
         shares = rng.uniform(-options.load, options.load, levels.shape) * (lanes % 3 == 1)
         begins = rng.uniform(*LOADED, levels.shape) * options.hold
         on = np.arange(options.hold)[None, :, None] >= begins[:, None, :]
         load = (on[..., None] * (shares[..., None] * missing)[:, None]).reshape(n, options.lanes, -1)
-        return cls(xs[pick[0]], us[pick[0]], np.repeat(levels, options.hold, axis=0), noise, load)
+        return cls(x0, u0, np.repeat(levels, options.hold, axis=0), noise, load)
