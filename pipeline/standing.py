@@ -83,7 +83,9 @@ class Standing:
         yardstick = bound if bound is not None and bound >= floor else None
         names = dict.fromkeys(law for rows in scenarios.values() for law in rows)
         laws = [_law(tree, law, (scenarios.get(test) or {}).get(law) or {}, metric, yardstick, folder) for law in names]
-        judged = [row["holds"] for row in tree.get("paper") or () if row["holds"] is not None]
+        # A row of a figure that the paper does not print stands beside another implementation's alone.
+        printed = [row for row in tree.get("paper") or () if row["paper"] is not None]
+        judged = [row["holds"] for row in printed if row["holds"] is not None]
         return cls(
             case=tree["case"],
             folder=folder,

@@ -88,7 +88,7 @@ def write_json(path: Path, tree: Any) -> None:
 
 
 def figures(error: float, metric: str = "mae") -> dict[str, float]:
-    mae = error if metric == "mae" else (error / 150) ** 0.5
+    mae = (error / 150) ** 0.5 if metric == "sse" else error
     late = {"sse_late": error / 1000} if error > 1000 else {}
     return {
         "mae": mae,
@@ -100,6 +100,7 @@ def figures(error: float, metric: str = "mae") -> dict[str, float]:
         "overshoot": mae,
         "settling": 8.0,
         "mv_travel": 3000.0,
+        metric: error,
     }
 
 
@@ -120,8 +121,9 @@ def trajectory(case: Case, scenario: Scenario, quality: float, adaptive: bool = 
         now += (float(scenario.sp[k, 0]) - now) * 0.5 / quality
     pv = np.stack([cv, 300 + 60 * (1 - cv)], axis=1)[:, : len(plant.pv_signals)]
     error = scenario.sp[:, 0] - cv
-    mv = (low + high) / 2 + (high - low) / 4 * np.tanh(error)
-    found = {"time_s": np.arange(n) * plant.period_s, "sp": scenario.sp, "pv": pv, "mv": mv[:, None]}
+    mv = [(low + high) / 2 + (high - low) / 4 * np.tanh(error)]
+    mv += [np.where(error > 0, s.low, s.high) for s in plant.mv_signals[1:]]
+    found = {"time_s": np.arange(n) * plant.period_s, "sp": scenario.sp, "pv": pv, "mv": np.stack(mv, axis=1)}
     if adaptive:
         kc, tau_i = 30 / (1 + np.abs(error)), 40 + 3000 * np.tanh(error**2)
         found["info"] = np.stack([kc, tau_i, 20 + 5 * error, 1 + 40 * np.abs(error), np.abs(error) / 10], axis=1)

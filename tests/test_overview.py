@@ -39,7 +39,12 @@ def a_case(name: str, metric: str, bound: float | None, errors: dict[str, float]
         "laws": {law: {"seeds": 3, "lock_ups": 0, "step_us": 20.0} for law in errors},
         "requirements": [verdict("fast", True), verdict("exact", False, "noise"), verdict("cheap", None)],
         "claims": [verdict(f"{name} is <stable>", False), verdict("it is quick", True)],
-        "paper": [{"holds": True}, {"holds": None}, {"holds": False}],
+        "paper": [
+            {"paper": 1.0, "holds": True},
+            {"paper": 1.0, "holds": None},
+            {"paper": 1.0, "holds": False},
+            {"paper": None, "holds": True},  # printed nowhere
+        ],
         "titles": {
             "case": f"The {name}",
             "metric": "error in words",

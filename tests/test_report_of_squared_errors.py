@@ -24,6 +24,7 @@ from pipeline.report.loop_pictures import info_picture
 from pipeline.report.model_evidence import candidates, model_figure
 from pipeline.report.page import headline, write_report
 from pipeline.report.verdicts import paper_row, plain_reason, requirement, statements
+from pipeline.report.words import ratio
 from pipeline.results import show_results
 from pipeline.tracking.card import version_description
 from pipeline.tracking.gate import Gate
@@ -276,7 +277,7 @@ def test_the_table_in_the_terminal_and_the_card_in_the_registry(written):
     own, bound = evidence.figure("gauss_newton_pid", main), evidence.bound(main)
     assert own is not None
     assert bound is not None
-    assert f"{own / bound:.2f}" in row
+    assert ratio(own / bound) in row
     tree = validation(evidence)
     card = version_description(tree, Gate.of(tree, "gauss_newton_pid"), "run", None)
     assert "Scenario (sum of squared errors)" in card

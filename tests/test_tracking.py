@@ -57,6 +57,9 @@ def root(tmp_path, monkeypatch, empty_store) -> Path:
     made_up.write_case(tmp_path, {law: made_up.QUALITY[law] for law in LAWS})
     made_up.write_lock(tmp_path, LAWS)
     write_evidence(tmp_path, SCORES)
+    evidence = tmp_path / "artifacts" / CASE / "validation.json"
+    told = {"inverse_dob": {"analysis": {"base": {"figures": {"spectral_radius": 0.93}, "notes": ["Not <proved>."]}}}}
+    made_up.write_json(evidence, {**json.loads(evidence.read_text()), "laws": told})
     picture = tmp_path / "artifacts" / CASE / "figures" / "closed_loop_pid.png"
     picture.parent.mkdir()
     picture.write_bytes(b"\x89PNG made up")
@@ -101,6 +104,9 @@ def test_a_store_is_filled_once_and_rebuilt_from_nothing(root, empty_store, monk
         assert version.tags["gate_score"] == "1.1"
         assert "<table>" in version.description
         assert "|" not in version.description
+        assert version.tags["analysis_spectral_radius"] == "0.93"
+        assert "spectral radius" in version.description
+        assert "Not &lt;proved&gt;." in version.description
         pid = versions(client, f"{CASE}-pid")[0]
         assert f'src="get-artifact?path=closed_loop.png&run_uuid={pid.run_id}"' in pid.description
         assert "<img" not in version.description  # no picture was drawn of it

@@ -75,10 +75,15 @@ class Evidence:
     @cached_property
     def scenarios(self) -> dict[str, str]:
         """Title of each scenario, without those with noise."""
-        several = "held-out recipes" if self.case.recipe else "held-out sequences of random set points"
-        return {
-            name: tests[0].title if len(tests) == 1 else f"{len(tests)} {several}" for name, tests in self.tests.items()
-        }
+        return {name: self._title(tests) for name, tests in self.tests.items()}
+
+    def _title(self, tests: tuple[Scenario, ...]) -> str:
+        titles = {test.title for test in tests}
+        if len(tests) == 1:
+            return titles.pop()
+        if len(titles) == 1:  # one test, repeated with other random numbers
+            return f"{titles.pop()}, {len(tests)} draws"
+        return f"{len(tests)} {'held-out recipes' if self.case.recipe else 'held-out sequences of random set points'}"
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:

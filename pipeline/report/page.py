@@ -116,7 +116,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     metric = "sse_late" if late_s else case.metric
     own, pid = (evidence.figure(law, evidence.main_test, metric) for law in (best, "pid"))
     if own and pid and own < pid:
-        what = "less error" if case.metric == "mae" else "less squared error"
+        what = "less squared error" if case.metric == "sse" else "less error"
         where = scenario_name(evidence.main_test, case.recipe) + (f", from {late_s:g} s on" if late_s else "")
         rows.append((f"{100 * (1 - own / pid):.0f} %", f"{what} than the PID on {where}"))
     return rows
@@ -150,14 +150,18 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
 
 
 def _further(evidence: Evidence) -> list[dict[str, Any]]:
-    """Figures that the case has named and that its tests have, by test: each law's median, and with noise."""
-    rows = []
-    for metric in evidence.case.metric_words:
-        for name, title in evidence.scenarios.items():
-            row = _row(evidence, name, title, metric)
-            if any(cell["value"] is not None for cell in row["cells"].values()):
-                rows.append({**row, "metric": metric_name(metric, evidence.case.metric_words)})
-    return rows
+    """Of each test the figures that the case has named beside its own: each law's median, and with noise."""
+    words, found = evidence.case.metric_words, []
+    for name, title in evidence.scenarios.items():
+        rows = [
+            (metric_name(metric, words), _row(evidence, name, title, metric)["cells"])
+            for metric in words
+            if metric != evidence.case.metric
+        ]
+        rows = [(metric, cells) for metric, cells in rows if any(c["value"] is not None for c in cells.values())]
+        if rows:
+            found.append({"name": name, "title": title, "rows": rows})
+    return found
 
 
 def _analyses(evidence: Evidence) -> list[dict[str, Any]]:

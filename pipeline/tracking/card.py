@@ -31,8 +31,8 @@ def model_description(case: str, law: str, validation: Mapping[str, Any]) -> str
 
 
 def version_description(validation: Mapping[str, Any], gate: Gate, run_id: str, picture: str | None) -> str:
-    """A version's description: verdict, closed-loop evidence per scenario, picture of the loop."""
-    parts = [_verdict(gate), _table(validation, gate.law)]
+    """A version's description: verdict, closed-loop evidence per scenario, analysis, picture of the loop."""
+    parts = [_verdict(gate), _table(validation, gate.law), _analysis(validation, gate.law)]
     if picture:
         alt = "Closed loop on the test that weighs most, beside the PID"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
@@ -81,6 +81,30 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
     head = "".join(f"<th>{cell}{GAP}</th>" for cell in heads)
     body = "".join("<tr>" + "".join(f"<td>{cell}{GAP}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def analysis_figures(validation: Mapping[str, Any], law: str) -> dict[str, float]:
+    """What the shipped form of a law found apart from its tests, by name; empty where it has no analysis."""
+    return dict(_analysed(validation, law).get("figures") or {})
+
+
+def _analysed(validation: Mapping[str, Any], law: str) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = ((validation.get("laws") or {}).get(law) or {}).get("analysis") or {}
+    return found.get("base") or {}
+
+
+def _analysis(validation: Mapping[str, Any], law: str) -> str:
+    words = (validation.get("titles") or {}).get("figures") or {}
+    figures, notes = analysis_figures(validation, law), _analysed(validation, law).get("notes") or ()
+    if not figures and not notes:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(str(words.get(name, name.replace('_', ' '))))}{GAP}</td><td>{_figure(value)}</td></tr>"
+        for name, value in figures.items()
+    )
+    table = f"<table><thead><tr><th>Analysis{GAP}</th><th></th></tr></thead><tbody>{rows}</tbody></table>"
+    listed = "".join(f"<li>{escape(str(note))}</li>" for note in notes)
+    return (table if rows else "<p>Analysis</p>") + (f"<ul>{listed}</ul>" if listed else "")
 
 
 def _figure(value: float | None) -> str:

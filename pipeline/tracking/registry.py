@@ -79,7 +79,8 @@ def register(
         "period_s": str(manifest.get("period_s", "")),
     }
     description = card.version_description(validation, gate, run_id, picture)
-    tags = {**tags, **own, **gate.tags()}
+    analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
+    tags = {**tags, **own, **gate.tags(), **analysis}
     if known is None:
         number, before = _log(client, name, path, run_id, description, tags), tags
         client.set_registered_model_alias(name, CANDIDATE, number)
