@@ -125,12 +125,6 @@ class HensonSeborgCstrCase(Case):
     )
     figures: ClassVar[tuple[Figure, ...]] = (
         Figure(8, "Local controller network, set points up", (GAINS, PID_1), "up"),
-        Figure(81, "The same, set points down", (GAINS, PID_1), "down"),
-        Figure(82, "One jump over the range", (GAINS, PID_1), "jump"),
-        Figure(86, "One jump back", (GAINS, PID_1), "jump_down"),
-        Figure(83, "What is blended, set points up", (GAINS, OUTPUTS, VELOCITY), "up"),
-        Figure(84, "PIDs 2 to 5 alone, set points up", (PID_1, *ALONE), "up"),
-        Figure(85, "Feed temperature up and down, unmeasured", (GAINS, AUTO, PID_1), "feed_temperature"),
     )
     requirements: ClassVar[tuple[Requirement, ...]] = (
         Requirement("local_pid_network", "up", "iae", 0.0365 * 1.05, low=0.0365 * 0.95),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from pipeline.report.claims import batch_reactor, ph_neutralization, thiosulfate_cstr
+from pipeline.report.claims import batch_reactor, henson_seborg_cstr, ph_neutralization, thiosulfate_cstr
 from pipeline.report.verdicts import Claims, plain_reason
 
 CLAIMS: dict[str, Claims] = {
     "thiosulfate_cstr": thiosulfate_cstr.CLAIMS,
     "ph_neutralization": ph_neutralization.CLAIMS,
     "batch_reactor": batch_reactor.CLAIMS,
+    "henson_seborg_cstr": henson_seborg_cstr.CLAIMS,
 }
 PLAIN = Claims(plain_reason)
 
