@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,11 +48,13 @@ def nmpc_median_us(case_name: str, samples: int) -> float:
     """Median step [us] of the NMPC in closed loop over the first samples of the case's first scenario."""
     case = CASES[case_name]
     scenario = next(iter(case.scenarios().values()))[0]
-    nmpc, plant = PerfectNmpc(case.plant, metric=case.metric), case.plant
+    plant, ahead = (scenario.plant or case.plant).relaxed(), case.recipe or case.metric == "tracking"
+    nmpc = PerfectNmpc(plant, case.metric, replace(case.effort, every=1))
+    course = scenario.sp if scenario.reference is None or not ahead else scenario.reference
     simulate, p, x, times = plant.stepper(), plant.parameters(), scenario.x0, []
     for k in range(min(samples, scenario.samples)):
         # Given a recipe it sees what comes; without, each new set point would start its search afresh.
-        sp = scenario.sp[min(k + 1, scenario.samples - 1) :] if case.recipe else scenario.sp[k]
+        sp = course[min(k + 1, scenario.samples - 1) :] if ahead else course[k]
         begun = time.perf_counter_ns()
         mv = nmpc.step(x, sp)
         times.append((time.perf_counter_ns() - begun) / 1e3)

@@ -113,7 +113,7 @@ def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dic
     """
     path = path or bounds_path(case)
     stored = read_stored(path)
-    remedy = f"run `python -m pipeline.oracle {case.name}` (about ten minutes on an idle core)"
+    remedy = f"run `python -m pipeline.oracle {case.name}` (some minutes on an idle core)"
     if not stored:
         raise LawError(f"{path} holds no bounds of case {case.name!r}; {remedy}")
     current = problem(case)
