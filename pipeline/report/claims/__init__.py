@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from pipeline.report.claims import batch_reactor, henson_seborg_cstr, ph_neutralization, thiosulfate_cstr
+from pipeline.report.claims import (
+    batch_reactor,
+    henson_seborg_cstr,
+    ph_neutralization,
+    reversible_cstr,
+    thiosulfate_cstr,
+)
 from pipeline.report.verdicts import Claims, plain_reason
 
 CLAIMS: dict[str, Claims] = {
@@ -10,6 +16,7 @@ CLAIMS: dict[str, Claims] = {
     "ph_neutralization": ph_neutralization.CLAIMS,
     "batch_reactor": batch_reactor.CLAIMS,
     "henson_seborg_cstr": henson_seborg_cstr.CLAIMS,
+    "reversible_cstr": reversible_cstr.CLAIMS,
 }
 PLAIN = Claims(plain_reason)
 
