@@ -283,5 +283,10 @@ def test_only_the_printed_model_needs_no_record(reactor_record: Record) -> None:
         HybridFuzzyPart(identification="tied").learn(None, plant, {}, 0)
     assert MODELS["hybrid_fuzzy"] is HybridFuzzyPart
     odd = Record.of(plant, reactor_record.pv[:50], np.full((50, 2), 1.5))
-    with pytest.raises(ModelError, match=r"mode is 1\.5 somewhere; it must be 1 or 2"):
+    with pytest.raises(ModelError, match=r"mode is 1\.5 somewhere; it must be 1 \(hot\) or 2 \(cold\)"):
         Transitions.of(odd)
+    always = Record.of(plant, reactor_record.pv[:50], np.column_stack([reactor_record.mv[:50, 0], np.ones(50)]))
+    with pytest.raises(ModelError, match=r"mode is never 2 \(cold\); record pulses of both modes"):
+        Transitions.of(always)
+    with pytest.raises(ModelError, match="give two or more, ascending"):
+        identify(Transitions.of(reactor_record), (20.0, 20.0, 40.0), "tied")

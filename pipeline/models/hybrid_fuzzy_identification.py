@@ -19,6 +19,7 @@ How = Literal["tied", "global", "local"]
 MODES: Mapping[int, str] = {1: "hot", 2: "cold"}
 SIGN: Mapping[str, float] = {"b_hot": 1.0, "b_cold": -1.0}
 LEAST = 0.01  # [degC a period] that full flow does at least: at its inlet's temperature a valve does nothing
+ROUNDING = 1e-6  # of a mode that went through a file
 SHARE = 1e-3  # of a unit vector: from where on a coefficient has part in what the data leave open
 
 
@@ -36,11 +37,15 @@ class Transitions:
         if record.pv.shape[1] != 2 or record.mv.shape[1] != 2:
             names = ", ".join(s.name for s in (*record.pv_signals, *record.mv_signals))
             raise ModelError(f"a hybrid fuzzy model needs the PVs T, T_w and the MVs k_M, mode; the record has {names}")
-        strange = np.setdiff1d(record.mv[:, 1], list(MODES))
+        name, mode = record.mv_signals[1].name, np.rint(record.mv[:, 1])
+        strange = record.mv[~np.isin(mode, list(MODES)) | (np.abs(record.mv[:, 1] - mode) > ROUNDING), 1]
         if strange.size:
-            raise ModelError(f"the record's {record.mv_signals[1].name} is {strange[0]:g} somewhere; it must be 1 or 2")
+            raise ModelError(f"the record's {name} is {strange[0]:g} somewhere; it must be 1 (hot) or 2 (cold)")
         k = record.starts(1)
-        return cls(np.hstack([record.pv[k], record.mv[k]]), record.pv[k + 1], k)
+        missing = [f"{q} ({word})" for q, word in MODES.items() if q not in mode[k]]
+        if missing:
+            raise ModelError(f"the record's {name} is never {missing[0]}; record pulses of both modes")
+        return cls(np.column_stack([record.pv[k], record.mv[k, 0], mode[k]]), record.pv[k + 1], k)
 
 
 def identify(data: Transitions, centres: Sequence[float], how: How) -> HybridFuzzy:
@@ -65,11 +70,13 @@ def identify(data: Transitions, centres: Sequence[float], how: How) -> HybridFuz
     The core is one least-squares line, T(k+1) - T(k) = c_w (T_w(k) - T(k)), c_t = 1 - c_w: it exchanges
     heat with the jacket alone, so that at equal temperatures nothing moves.
 
-    Raises ModelError where the pairs leave a coefficient undetermined.
+    Raises ModelError where the pairs leave a coefficient undetermined, or the centres do not ascend.
 
     Source: seed 003_9cd6247d31a7c2db.txt, section 5.2, which leaves the identification to its
     reference [8]: rows multiplied by their membership, rule by rule.
     """
+    # Refuses centres that cannot be, before anything is divided by their distances.
+    HybridFuzzy(centres, np.zeros((1, len(COEFFICIENTS), len(centres))).tolist(), (0.0, 1.0))
     t, t_w, k_m, mode = data.before.T
     target = data.after[:, 1]
     rules = Rules(np.asarray(centres, dtype=np.float64), t_w)
