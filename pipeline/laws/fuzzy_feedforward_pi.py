@@ -49,9 +49,9 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         switch_penalty: float = 2.0
         mv_rate: float | None = None
         kc: float = 12.0
-        ti_s: float = 700.0
+        ti_s: float = 500.0
         approach: float = 0.2
-        k_jacket: float = 0.5
+        k_jacket: float = 0.8
 
         def __post_init__(self) -> None:
             if not (self.kc >= 0 and self.ti_s > 0):
