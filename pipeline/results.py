@@ -37,6 +37,8 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     console.print(overview(standings.values()) if case is None else _tests(standings[case]))
     where = artifacts / (case or "<case>")
     if case is None:
+        if any(standing.hidden for standing in standings.values()):
+            console.print("n          the bound is less than noise would hide: the ratio is to that, and at least 1")
         console.print("*          the best of its case, chosen on sequences that are never scored")
         console.print(f"overview   {artifacts / 'report.html'} (and .md)")
         console.print(f"a case     {where / 'report.html'}; its tests here: python -m pipeline results CASE")
@@ -81,7 +83,7 @@ def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
         f"[bold]{law.law} *[/bold]" if law.best else law.law,
         _figure(law.figure),
         _figure(standing.bound),
-        "-" if law.ratio is None else _ratio(law.ratio),
+        _multiple(standing, law),
         "-" if law.step_us is None else f"{law.step_us:.0f} us",
         _size(law),
     )
@@ -104,8 +106,8 @@ def _tests(standing: Standing) -> Table:
         return (scenarios.get(name, {}).get(law) or {}).get(metric)
 
     for law in standing.laws:
-        shown = "-" if law.ratio is None else _ratio(law.ratio)
-        table.add_row(law.law, *(_figure(ours(name, law.law)) for name in names), shown, _size(law))
+        shown = (*(_figure(ours(name, law.law)) for name in names), _multiple(standing, law), _size(law))
+        table.add_row(law.law, *shown)
     table.add_section()
     nmpc = [bounds.get(name, {}).get("nmpc", {}).get(metric) for name in names]
     table.add_row("perfect NMPC", *map(_figure, nmpc), "", "")
@@ -116,15 +118,19 @@ def _size(law: LawStanding) -> str:
     return "-" if law.bytes is None else f"{law.bytes / 1024:.0f} kB"
 
 
-def _ratio(value: float) -> str:
-    """Two decimals, and more where a law comes within a hundredth of the bound."""
-    return f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
+def _multiple(standing: Standing, law: LawStanding) -> str:
+    """Two decimals, and more where a law comes within a hundredth of the bound; n: of noise, which hides the bound."""
+    if law.ratio is None:
+        return "-"
+    if standing.hidden:
+        return f"{law.ratio:.2f}n"
+    return f"{law.ratio:.3f}" if abs(law.ratio - 1) < 0.01 else f"{law.ratio:.2f}"
 
 
 def _figure(value: float | None) -> str:
-    """Four digits behind the point for a small figure, thousands grouped for a large one."""
+    """Four digits behind the point, three digits of a smaller figure, thousands grouped in a large one."""
     if value is None:
         return "-"
     if abs(value) >= 100:
         return f"{value:,.0f}"
-    return f"{value:.4f}" if value >= 1e-3 else f"{value:.0e}"
+    return f"{value:.4f}" if abs(value) >= 0.01 else f"{value:.3g}"

@@ -26,7 +26,7 @@ class LawStanding:
     high: float | None
     seeds: int | None
     lock_ups: int | None
-    ratio: float | None  # to the bound; None also where the bound is less than noise would hide
+    ratio: float | None  # to the bound, or to what noise would hide where the bound is less: ``Standing.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
 
@@ -54,6 +54,7 @@ class Standing:
     test: str
     test_title: str
     bound: float | None  # of the perfect-model NMPC
+    hidden: bool  # the bound is less than measurement noise would hide, which takes its place in the ratios
     laws: tuple[LawStanding, ...]
     requirements: tuple[Statement, ...]
     claims: tuple[Statement, ...]
@@ -80,9 +81,9 @@ class Standing:
         bare = test.removesuffix(NOISE)
         bound = ((tree.get("bounds") or {}).get(test) or {}).get("nmpc", {}).get(metric)
         floor = (gate.get("floors") or {}).get(bare, gate.get("floor", 0.0))
-        yardstick = bound if bound is not None and bound >= floor else None
         names = dict.fromkeys(law for rows in scenarios.values() for law in rows)
-        laws = [_law(tree, law, (scenarios.get(test) or {}).get(law) or {}, metric, yardstick, folder) for law in names]
+        rows = {law: (scenarios.get(test) or {}).get(law) or {} for law in names}
+        laws = [_law(tree, law, row, metric, bound, floor, folder) for law, row in rows.items()]
         # A row of a figure that the paper does not print stands beside another implementation's alone.
         printed = [row for row in tree.get("paper") or () if row["paper"] is not None]
         judged = [row["holds"] for row in printed if row["holds"] is not None]
@@ -95,6 +96,7 @@ class Standing:
             test=test,
             test_title=(titles.get("scenarios") or {}).get(bare, bare) + (" with noise" if test != bare else ""),
             bound=bound,
+            hidden=bound is not None and bound < floor,
             laws=tuple(sorted(laws, key=lambda law: math.inf if law.figure is None else law.figure)),
             requirements=_statements(tree.get("requirements")),
             claims=_statements(tree.get("claims")),
@@ -114,7 +116,13 @@ def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:
 
 
 def _law(
-    tree: Mapping[str, Any], law: str, row: Mapping[str, Any], metric: str, bound: float | None, folder: Path
+    tree: Mapping[str, Any],
+    law: str,
+    row: Mapping[str, Any],
+    metric: str,
+    bound: float | None,
+    floor: float,
+    folder: Path,
 ) -> LawStanding:
     told = (tree.get("laws") or {}).get(law) or {}
     file = folder / f"{law}.onnx"
@@ -128,10 +136,17 @@ def _law(
         high=row.get(f"{metric}_max"),
         seeds=told.get("seeds", row.get("seeds")),
         lock_ups=told.get("lock_ups"),
-        ratio=own / bound if own is not None and bound else None,
+        ratio=None if own is None or bound is None else _ratio(own, bound, floor),
         step_us=told.get("step_us"),
         bytes=file.stat().st_size if file.exists() else None,
     )
+
+
+def _ratio(own: float, bound: float, floor: float) -> float | None:
+    """Error over the bound's; where noise would hide the bound, over what it would hide, and no less than 1."""
+    if bound >= floor:
+        return own / bound if bound else None
+    return max(own, floor) / floor
 
 
 def _statements(rows: Any) -> tuple[Statement, ...]:

@@ -89,12 +89,18 @@ def test_a_standing_is_what_programs_were_told(artifacts: Path) -> None:
     assert all(law.ratio is None for law in reactor.laws)
 
 
-def test_there_is_no_ratio_to_a_bound_that_noise_would_hide(tmp_path: Path) -> None:
-    tree = a_case("tank", "mae", 0.02, {"alpha": 0.03}, floor=0.021)
-    (tmp_path / "validation.json").write_text(json.dumps(tree))
-    standing = Standing.read(tmp_path)
-    assert standing.bound == 0.02
-    assert standing.laws[0].ratio is None
+def test_where_noise_would_hide_the_bound_the_ratio_is_to_what_it_hides(tmp_path: Path) -> None:
+    tree = a_case("tank", "mae", 1e-8, {"alpha": 0.03, "beta": 1e-5}, floor=0.02)
+    (tmp_path / "tank").mkdir()
+    (tmp_path / "tank" / "validation.json").write_text(json.dumps(tree))
+    standing = Standing.read(tmp_path / "tank")
+    assert (standing.bound, standing.hidden) == (1e-8, True)
+    assert [law.ratio for law in standing.laws] == pytest.approx([1.0, 1.5])
+    text = "\n".join(shown(tmp_path))
+    assert "1.50n" in text
+    assert "n          the bound is less than noise would hide" in text
+    html, _ = write_overview([standing], tmp_path)
+    assert "1.50 †" in html.read_text()
 
 
 def test_the_page_shows_every_law_and_links_to_what_exists(artifacts: Path) -> None:

@@ -69,6 +69,6 @@ def _verdict(standing: Standing) -> str:
     best = standing.best
     if best is None:
         return "No law qualifies as best controller."
-    if best.ratio is None:
+    if best.ratio is None or standing.hidden:
         return f"Best controller: {best.title}."
     return f"Best controller: {best.title}, {ratio(best.ratio)} × the perfect-model NMPC's {standing.metric}."
