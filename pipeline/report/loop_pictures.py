@@ -239,8 +239,8 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     own = evidence.loop(Curve(law), scenario)
     if own is None:
         return None
-    error, bound = evidence.figure(law, scenario), evidence.bound(scenario)
-    beside = "" if not bound or error is None else f", {ratio(error / bound)} × perfect-model NMPC"
+    error, times = evidence.figure(law, scenario), evidence.ratio(law, scenario)
+    beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
     late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"

@@ -69,6 +69,8 @@ def _verdict(standing: Standing) -> str:
     best = standing.best
     if best is None:
         return "No law qualifies as best controller."
-    if best.ratio is None or standing.hidden:
+    if best.ratio is None:
         return f"Best controller: {best.title}."
+    if standing.hidden:
+        return f"Best controller: {best.title}, {ratio(best.ratio)} × the {standing.metric} that noise would hide."
     return f"Best controller: {best.title}, {ratio(best.ratio)} × the perfect-model NMPC's {standing.metric}."

@@ -76,7 +76,7 @@ def context(evidence: Evidence, claims: Claims, judged: Judged, pictures: Mappin
 
 
 def _seeds(count: int) -> str:
-    return "one data seed" if count == 1 else f"{count} data seeds, each with networks of its own"
+    return "one data seed" if count == 1 else f"{count} data seeds, each with models of its own"
 
 
 def _floor(evidence: Evidence) -> str:
