@@ -21,7 +21,7 @@ from pipeline.cases.base import (
     random_levels,
     stepwise,
 )
-from pipeline.horizon import Effort
+from pipeline.cases.effort import Effort
 from pipeline.metrics import overshoots
 from pipeline.plants.base import Array, Plant
 from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr
@@ -86,10 +86,10 @@ class HensonSeborgCstrCase(Case):
         "neighbour_pairs": "neighbour pairs",
         "lyapunov_contraction": "slowest contraction per period",
         "starts": "Monte Carlo starts",
-        "recovered": "share that recovered",
-        "left_range": "share that went out",
+        "recovered": "of them recovered",
+        "left_range": "of them went out",
         "recovery_min": "median time to recover [min]",
-        "states_of_no_return": "rest states that it does not leave",
+        "states_of_no_return": "states from which it does not return",
     }
     tables: ClassVar[tuple[PaperTable, ...]] = (
         PaperTable(

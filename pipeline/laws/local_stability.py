@@ -98,8 +98,8 @@ def _recoveries(
     out = np.array(plant.measure(ended.end.T))[0] > sp.high + 0.5 * (sp.high - sp.low)
     figures = {
         "starts": float(n),
-        "recovered": float(ended.arrived.mean()),
-        "left_range": float((out & ~ended.arrived).mean()),
+        "recovered": float(ended.arrived.sum()),
+        "left_range": float((out & ~ended.arrived).sum()),
     }
     if ended.arrived.any():
         figures["recovery_min"] = minutes * float(np.median(ended.samples[ended.arrived]))
@@ -115,16 +115,14 @@ def _recoveries(
         return figures, arrays, []
     middle = 0.5 * (edges[0] + edges[-1])
     back = run(Starts(rests, np.full((len(rests), 1), middle), np.full((len(rests), 1), mv.low)), len(rests))
-    kept = rests[~back.arrived]
-    arrays |= {
-        "other_rest": rests,
-        "other_rest_arrived": back.arrived.astype(float),
-        "other_rest_courses": back.courses,
-    }
+    arrays |= {"other_rest": rests, "other_rest_arrived": back.arrived.astype(float)}
+    arrays["other_rest_courses"] = back.courses
+    # Several of them may lead to one: a reactor that has gone out rests elsewhere under another MV.
+    kept = {tuple(f"{v:.4g}" for v in state) for state in back.end[~back.arrived]}
     figures["states_of_no_return"] = float(len(kept))
     names = ", ".join(s.name for s in plant.state_signals)
-    where = "; ".join(", ".join(f"{v:.4g}" for v in state) for state in kept)
+    where = "; ".join(", ".join(state) for state in sorted(kept))
     told = (
-        f"The plant also rests outside its set point's range: from ({names}) = {where} the law does not bring it back."
+        f"Beyond the set point's range the plant has a state from which the law does not return: ({names}) = {where}."
     )
-    return figures, arrays, [told] if len(kept) else []
+    return figures, arrays, [told] if kept else []

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Canvas
 from pipeline.cases.base import Curve
 from pipeline.report.drawing import PALETTE, SIZE, axis_label, colour_of, symbol, time_axis
 from pipeline.report.evidence import Evidence
-from pipeline.report.law_evidence import Array, Loop
+from pipeline.report.law_evidence import Loop
 
 PLANT, NETWORK = "black", PALETTE[0]
 RECOVERED, LOST, ROAD = PALETTE[1], PALETTE[0], "#bbbbbb"
@@ -54,7 +54,7 @@ def phase_picture(evidence: Evidence) -> Canvas | None:
     found = [(law, arrays) for law, arrays in found if "start" in arrays]
     if not found:
         return None
-    canvas = Canvas(figsize=(SIZE[0], 5.0), layout="constrained")
+    canvas = Canvas(figsize=(SIZE[0], 5.4), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(1, len(found), sharex=True, sharey=True)))
     cvs, xs, _ = evidence.case.plant.steady_curve
     for axes, (law, arrays) in zip(panels, found, strict=True):
@@ -62,15 +62,16 @@ def phase_picture(evidence: Evidence) -> Canvas | None:
         start = arrays["start"]
         for course in arrays["courses"]:
             axes.plot(course[:, 0], course[:, 1], color=ROAD, linewidth=0.5, zorder=1)
-        axes.plot(*start[good].T, ".", color=RECOVERED, markersize=1.6, zorder=2, label=f"recovered: {good.sum()}")
-        axes.plot(*start[~good].T, "x", color=LOST, markersize=7, zorder=5, label=f"did not: {(~good).sum()}")
-        axes.plot(cvs, xs[:, 1], color="black", linewidth=1.6, zorder=3, label="steady states")
+        axes.plot(*start[good].T, ".", color=RECOVERED, markersize=1.6, zorder=2, label="recovered")
+        axes.plot(*start[~good].T, "x", color=LOST, markersize=7, zorder=5, label="did not")
+        axes.plot(cvs, xs[:, 1], color="black", linewidth=1.6, zorder=3, label="steady states of the range")
         _other_rests(axes, arrays)
         axes.set_xscale("log")
-        axes.set_title(evidence.laws[law].title)
+        axes.set_title(f"{evidence.laws[law].title}\n{good.sum()} of {len(good)} recovered")
         axes.set_xlabel(_label(evidence, 0))
-        axes.legend(loc="upper right", markerscale=1.5)
     panels[0].set_ylabel(_label(evidence, 1))
+    handles, labels = panels[0].get_legend_handles_labels()
+    canvas.legend(handles, labels, loc="outside lower center", ncols=3, markerscale=1.5)
     return canvas
 
 
@@ -79,8 +80,8 @@ def _other_rests(axes: Axes, arrays: Loop) -> None:
     courses = arrays.get("other_rest_courses", np.empty((0, 1, 2)))
     for course in courses:
         axes.plot(course[:, 0], course[:, 1], color="black", linewidth=0.8, linestyle=":", zorder=4)
-    axes.plot(*rests[~back].T, "s", color=LOST, markersize=6, zorder=6, label="at rest, for good: gone out")
-    axes.plot(*rests[back].T, "s", color=RECOVERED, markersize=6, zorder=6, label="at rest, comes back: too hot")
+    axes.plot(*rests[~back].T, "s", color=LOST, markersize=6, zorder=6, label="gone out: at rest for good")
+    axes.plot(*rests[back].T, "s", color=RECOVERED, markersize=6, zorder=6, label="too hot, comes back")
 
 
 def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
@@ -116,13 +117,13 @@ def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
 
 
 def responses_picture(tests: Sequence[tuple[str, str]], curves: Sequence[tuple[Curve, str]]) -> Draw:
-    """Controlled variable above, MV below, a column a test ``(name, words)``; ``curves`` with their words."""
+    """Controlled variable, its error and the MV, a column a test ``(name, words)``; ``curves`` with their words."""
 
     def draw(evidence: Evidence) -> Canvas | None:
         if not any(evidence.loop(curve, name) for curve, _ in curves for name, _ in tests):
             return None
-        canvas = Canvas(figsize=(SIZE[0], 5.4), layout="constrained")
-        panels = canvas.subplots(2, len(tests), sharex="col", sharey="row", height_ratios=(3, 2), squeeze=False)
+        canvas = Canvas(figsize=(SIZE[0], 6.4), layout="constrained")
+        panels = canvas.subplots(3, len(tests), sharex="col", sharey="row", height_ratios=(3, 2, 2), squeeze=False)
         for column, (name, words) in zip(panels.T, tests, strict=True):
             for i, (curve, label) in enumerate(curves):
                 loop = evidence.loop(curve, name)
@@ -132,18 +133,22 @@ def responses_picture(tests: Sequence[tuple[str, str]], curves: Sequence[tuple[C
             column[0].legend(loc="best", fontsize="small")
         mv = evidence.case.plant_class.mv_signals[0]
         panels[0, 0].set_ylabel(_label(evidence, 0))
-        panels[1, 0].set_ylabel(axis_label(symbol(mv.name), mv.unit))
+        panels[1, 0].set_ylabel("error")
+        panels[2, 0].set_ylabel(axis_label(symbol(mv.name), mv.unit))
+        canvas.align_ylabels(list(panels[:, 0]))
         return canvas
 
     return draw
 
 
-def _response(column: Array, loop: Loop, colour: str, label: str) -> None:
+def _response(column: Sequence[Axes], loop: Loop, colour: str, label: str) -> None:
     time, words = time_axis(loop["time_s"])
-    above, below = column
+    above, middle, below = column
+    sp, cv = np.ravel(loop["sp"]), loop["pv"][:, 0]
     if not above.lines:
-        above.plot(time, np.ravel(loop["sp"]), "--", color="black", linewidth=0.9, drawstyle="steps-post")
-    above.plot(time, loop["pv"][:, 0], color=colour, linewidth=1.1, label=label)
+        above.plot(time, sp, "--", color="black", linewidth=0.9, drawstyle="steps-post")
+    above.plot(time, cv, color=colour, linewidth=1.1, label=label)
+    middle.plot(time, sp - cv, color=colour, linewidth=0.9)
     below.step(time, np.ravel(loop["mv"]), where="post", color=colour, linewidth=0.8)
     below.set_xlabel(words)
     above.margins(x=0.01)
