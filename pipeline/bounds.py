@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.cases import NOISE_SUFFIX, Case, Scenario
+from pipeline.cases.effort import Effort
 from pipeline.errors import LawError
-from pipeline.horizon import Effort
 from pipeline.plants.base import Plant
 
 SCHEMA = 1

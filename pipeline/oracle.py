@@ -55,8 +55,9 @@ from pipeline.bounds import (
     together,
 )
 from pipeline.cases import CASES, Case, Scenario
+from pipeline.cases.effort import Effort
 from pipeline.errors import PlantError
-from pipeline.horizon import Effort, Horizon, Plan
+from pipeline.horizon import Horizon, Plan
 from pipeline.metrics import closed_loop_metrics
 from pipeline.plants.base import Plant
 from pipeline.simulate import measured, noise_draws

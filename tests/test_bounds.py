@@ -14,10 +14,10 @@ import pytest
 from pipeline import oracle
 from pipeline.bounds import DEFAULTS, bounded, bounds_path, load_bounds, plant_digest, problem
 from pipeline.cases import CASES, Scenario
+from pipeline.cases.effort import Effort
 from pipeline.cases.ph_neutralization import PhNeutralizationCase
 from pipeline.cases.thiosulfate_cstr import ThiosulfateCstrCase
 from pipeline.errors import LawError
-from pipeline.horizon import Effort
 from pipeline.metrics import closed_loop_metrics
 from pipeline.plants.ph_neutralization import PhNeutralization
 from pipeline.plants.thiosulfate_cstr import ThiosulfateCstr

@@ -13,8 +13,9 @@ import pytest
 from pipeline import oracle
 from pipeline.bounds import load_bounds, plant_digest
 from pipeline.cases.base import Array, Case, Scenario, held
+from pipeline.cases.effort import Effort
 from pipeline.errors import PlantError
-from pipeline.horizon import Effort, Horizon
+from pipeline.horizon import Horizon
 from pipeline.oracle import PerfectNmpc, run_nmpc, run_offline
 from pipeline.plants import PLANTS
 from pipeline.plants.base import Plant

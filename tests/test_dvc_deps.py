@@ -20,6 +20,7 @@ CARRIERS = {
     "pipeline/params.py",
     "pipeline/stages/__init__.py",
     "pipeline/cases/__init__.py",
+    "pipeline/cases/effort.py",
     "serving/errors.py",
     "serving/manifest.py",
 }

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 
 from pipeline import oracle
 from pipeline.cases import CASES, Case, Scenario
+from pipeline.cases.effort import Effort
 from pipeline.errors import PlantError
-from pipeline.horizon import Effort, Horizon
+from pipeline.horizon import Horizon
 from pipeline.metrics import mae
 from pipeline.oracle import PerfectNmpc, run_nmpc, run_offline, search
 from pipeline.plants.base import Plant

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.cases.effort import Effort
 from pipeline.errors import ParamsError, PlantError
-from pipeline.horizon import Effort
 from pipeline.metrics import closed_loop_metrics, rmse
 from pipeline.plants.base import Plant
 

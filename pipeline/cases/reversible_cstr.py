@@ -22,7 +22,7 @@ from pipeline.cases.base import (
     random_levels,
     stepwise,
 )
-from pipeline.horizon import Effort
+from pipeline.cases.effort import Effort
 from pipeline.metrics import itae
 from pipeline.plants.base import Plant
 from pipeline.plants.reversible_cstr import ReversibleCstr
@@ -67,6 +67,15 @@ class ReversibleCstrCase(Case):
         "itae": "ITAE [mol/l s²]",
         "tracking": "RMS from the reference model [mol/l]",
         "max_asse": "largest end offset [mol/l]",
+        "training_rms": "RMS from the reference model, training loops [mol/l]",
+        "validation_rms": "the same, validation loops [mol/l]",
+        "iterations": "iterations of the training",
+        "other_roots": "points at rest with a move of the wrong sign",
+        "least_gain": "least move at rest over error [l/s per mol/l]",
+        "largest_gain": "largest move at rest over error [l/s per mol/l]",
+        "mv_at_zero_errors": "F at zero errors [l/s]",
+        "kc": "Kc [l/s per mol/l]",
+        "ti_s": "Ti [s]",
     }
     unforeseen: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 3
@@ -100,20 +109,21 @@ class ReversibleCstrCase(Case):
         Requirement("model_reference", "held_out_noise", "tracking", 0.002),
         Requirement("model_reference", "levels", "max_asse", 2e-4),
         Requirement("model_reference", "tin", "iae", 0.35),
-        Requirement("model_reference", "k", "iae", 0.35),
         Requirement("model_reference", "held_out", "tracking", 0.0015),
     )
     claims: ClassVar[Mapping[str, str]] = {
         "feedback brings the reaction almost to complete conversion": "cannot be: the equilibrium is at 0.60 to 0.75",
         "the temperature of the open loop rises without end": "does not reproduce: it rises by 4.9 K",
         "the best PID setting has Kc = +3.15": "saturates: the plant's gain is negative; with Kc = -3.15 it holds",
-        "the network follows random set points without overshoot, the PID overshoots": "reproduces",
+        "the network follows random set points without overshoot, the PID overshoots": "not measured",
         "under a hotter feed the network returns sooner than the PID": "reproduces: IAE 0.25 to 0.30 against 1.09",
         "with 20 % of the heat of reaction the network is far slower than the PID": "no test: it moves CB by 2e-4",
         "a network of two errors needs no integral action": "does not reproduce: an end offset of 0.019",
-        "a network follows set points better than a controller with fixed gains": "not where PI follows the same model",
+        "a network follows set points better than a controller with fixed gains": (
+            "does not reproduce: PI on the same model 3.5e-4 from it, networks 8e-4 to 1.4e-3"
+        ),
         "a small one-step error makes a good plant model": "does not hold: free runs fit 36 to 95 % at 1.2e-5",
-        "a random search finds better reference models than the tables in use": "reproduces",
+        "a random search finds better reference models than the tables in use": "reproduces: for every order",
     }
 
     @property
