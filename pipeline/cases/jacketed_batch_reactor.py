@@ -24,7 +24,6 @@ END_S, TAIL_S = 500.0, 1500.0  # of each level: where its offset is taken, and i
 CHANGE = 500  # sample of the recipe at which a disturbance sets in
 FEEDS = {"T_hot": 70.0, "T_cold": 15.0}
 FOULED = 0.85
-CLEANED, HOTTER = 1.1, 80.0  # of the development
 OBSERVER, PI, FEEDFORWARD = "fuzzy_feedforward_observer", "fuzzy_feedforward_pi", "fuzzy_feedforward"
 PRINTED: Mapping[str, float | str] = {"part": "printed"}
 ROUNDING = 1e-9  # [deg C]
@@ -112,7 +111,7 @@ class JacketedBatchReactorCase(Case):
         held_back = {
             name: stepwise(SAMPLES, (0, float(getattr(self.plant, name))), (CHANGE, v)) for name, v in FEEDS.items()
         }
-        loss = float(getattr(self.plant, "a_0"))
+        loss = JacketedBatchReactor.a_0
         fouled = {name: np.full(SAMPLES, FOULED * float(getattr(self.plant, name))) for name in ("a_c", "a_w")}
         return {
             "profile": (self._recipe("profile", "The recipe 62, 26, 35 deg C on the reactor"),),
@@ -130,14 +129,11 @@ class JacketedBatchReactorCase(Case):
         }
 
     def development(self) -> tuple[Scenario, ...]:
-        """Random recipes of other seeds on the reactor: as it is, with a hotter feed, with more heat transfer."""
-        n = LEVELS * HOLD
-        clean = {name: np.full(n, CLEANED * float(getattr(self.plant, name))) for name in ("a_c", "a_w")}
-        changes = ({}, {"T_hot": np.full(n, HOTTER)}, clean)
-        return tuple(
-            self._random("development", seed, change)
-            for seed, change in zip(self.development_seeds, changes, strict=True)
-        )
+        """Random recipes of other seeds on the reactor.
+
+        Not on one that is off: a law that lets the jacket past its limits there is the faster one for it.
+        """
+        return tuple(self._random("development", seed) for seed in self.development_seeds)
 
     def score(self, test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
         """The usual figures, and those by level of the recipe [deg C].
@@ -181,10 +177,10 @@ class JacketedBatchReactorCase(Case):
         sp = stepwise(SAMPLES, *RECIPE)[:, None]
         return Scenario(name, title, sp, x0, mv0, changes or {}, seed=seed, plant=plant)
 
-    def _random(self, name: str, seed: int, changes: Mapping[str, Array] | None = None) -> Scenario:
+    def _random(self, name: str, seed: int) -> Scenario:
         x0, mv0 = self.plant.start
         sp = np.repeat(random_levels(seed, LEVELS, LOWEST, HIGHEST), HOLD)[:, None]
-        return Scenario(name, f"Random recipe, seed {seed}", sp, x0, mv0, changes or {}, seed=seed)
+        return Scenario(name, f"Random recipe, seed {seed}", sp, x0, mv0, seed=seed)
 
 
 @cache
