@@ -269,11 +269,9 @@ def test_info_is_drawn_by_its_name_whatever_else_the_setting_tells(batch):
 def test_the_table_in_the_terminal_and_the_card_in_the_registry(written):
     out, evidence = written
     page = io.StringIO()
-    show_results(out.parent, Console(file=page), evidence.case.name)
-    lines = page.getvalue().splitlines()
+    show_results(out.parent, Console(file=page))
     main = evidence.main_test
-    assert f"sum of squared errors, median over data seeds; {main} / NMPC" in lines[0]
-    (row,) = (line.split() for line in lines if line.split()[:1] == ["gauss_newton_pid"])
+    (row,) = (line.split() for line in page.getvalue().splitlines() if " gauss_newton_pid *" in line)
     own, bound = evidence.figure("gauss_newton_pid", main), evidence.bound(main)
     assert own is not None
     assert bound is not None

@@ -30,7 +30,6 @@ SHORTEST, LONGEST = 1e-3, 9e3  # periods; times below and above say that there i
 ORDERS_FOR_LOG = 2.0  # powers of ten that these must span to be drawn over them
 STRIP = 0.7  # height of a discrete MV's panel, where a continuous one's is 2
 STRIP_ROOM = 0.3  # above and below its values, as a share of their range
-LINE = 92  # characters that stand side by side above a picture
 INCHES = 0.84  # that a height of 1 takes
 
 
@@ -185,17 +184,17 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
             axes.axvline(at, color="#b0b0b0", linewidth=0.8, linestyle=":", zorder=1)
         axes.margins(x=0.01)
     canvas.align_ylabels(panels)
-    title = f"Figure {figure.number}. {figure.title}"
-    panels[0].set_title(title)
+    title = panels[0].set_title(f"Figure {figure.number}. {figure.title}")
     if len(found) > 1:
         handles, labels = panels[0].get_legend_handles_labels()
         canvas.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
     else:
         words = _label(found[0][0]) + ("; gaps: no such action" if gaps else "")
-        if len(title) + len(words) > LINE:
-            panels[0].set_title(f"{title}\n{words}")
-        else:
-            panels[0].set_title(words, loc="right", fontweight="normal", fontsize="medium")
+        beside = panels[0].set_title(words, loc="right", fontweight="normal", fontsize="medium")
+        canvas.draw_without_rendering()
+        if title.get_window_extent().x1 > beside.get_window_extent().x0:
+            title.set_text(f"{title.get_text()}\n{words}")
+            beside.set_text("")
     return canvas
 
 
