@@ -40,7 +40,7 @@ class Recovery:
     arrived: NDArray[np.bool_]  # (n,) within the band for the whole of the holding time
     samples: Array  # (n,) from the start until the band was entered for good; all of them where not arrived
     end: Array  # (n, n_x) last state seen
-    courses: Array  # (watched, 1 + samples / every, n_x) of the first loops; NaN after they arrived
+    courses: Array  # (watched, samples / every, n_x) of the first loops; NaN after they arrived
 
 
 def recover(
@@ -64,7 +64,7 @@ def recover(
     """
     n, n_x = starts.x.shape
     arrived, taken, end = np.zeros(n, dtype=bool), np.full(n, float(samples)), starts.x.copy()
-    courses = np.full((watched, samples // every + 1, n_x), np.nan)
+    courses = np.full((watched, -(-samples // every), n_x), np.nan)
     at = np.arange(n)  # the loops that still run
     x, sp, state = starts.x.T.copy(), torch.from_numpy(starts.sp), torch.zeros(n, n_state, dtype=torch.float64)
     mv, inside = torch.from_numpy(starts.mv), np.zeros(n)

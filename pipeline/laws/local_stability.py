@@ -13,6 +13,8 @@ from pipeline.plants.base import Array, Plant
 from pipeline.recovery import Recovery, Starts, other_rests, recover
 from pipeline.stability import FrozenLoops, pairwise_contraction, spectral_radius
 
+SAME = 1e-3  # relative difference of two states that count as one
+
 
 @dataclass(frozen=True, slots=True)
 class StabilityTest:
@@ -118,10 +120,13 @@ def _recoveries(
     arrays |= {"other_rest": rests, "other_rest_arrived": back.arrived.astype(float)}
     arrays["other_rest_courses"] = back.courses
     # Several of them may lead to one: a reactor that has gone out rests elsewhere under another MV.
-    kept = {tuple(f"{v:.4g}" for v in state) for state in back.end[~back.arrived]}
+    kept: list[Array] = []
+    for state in back.end[~back.arrived]:
+        if all(np.abs(state / known - 1).max() > SAME for known in kept):
+            kept.append(state)
     figures["states_of_no_return"] = float(len(kept))
     names = ", ".join(s.name for s in plant.state_signals)
-    where = "; ".join(", ".join(state) for state in sorted(kept))
+    where = "; ".join(", ".join(f"{v:.4g}" for v in state) for state in kept)
     told = (
         f"Beyond the set point's range the plant has a state from which the law does not return: ({names}) = {where}."
     )

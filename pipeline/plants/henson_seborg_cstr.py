@@ -19,7 +19,7 @@ class HensonSeborgCstr(Plant):
         dT/dt = (q/V) (T_f - T) + K1 C exp(-(E/R)/T) + K2 q_c (1 - exp(-K3/q_c)) (T_cf - T)
 
     States C [mol/l] and T [K] are both measured; q_c [l/min] is the MV. Time in minutes. More
-    coolant means less conversion, so the gain is positive. Between 13.1 and 119.7 l/min there are
+    coolant means less conversion, so the gain is positive. Between 11.1 and 119.7 l/min there are
     three steady states, one of them extinguished at C about 0.96 mol/l; the ignited branch loses
     its stability at C = 0.140 mol/l (a Hopf point).
 
