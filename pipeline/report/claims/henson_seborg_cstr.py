@@ -23,7 +23,6 @@ from pipeline.report.claims.timing import faster_than_nmpc, step_within
 from pipeline.report.evidence import Evidence
 from pipeline.report.verdicts import CasePicture, Check, Claims, Verdict, plain_reason
 from pipeline.report.words import number
-from pipeline.stability import spectral_radius
 
 SET = "local_models"
 SMALL = 0.10  # of a step: an overshoot that deserves the name
@@ -162,7 +161,7 @@ def ultimate_gain(lin: Linearization, period_s: float) -> float:
     phi, gamma = lin.sampled(period_s)
 
     def beyond(log_gain: float) -> float:
-        return float(spectral_radius((phi - 10**log_gain * gamma @ lin.c[:1])[None])[0]) - 1.0
+        return float(np.abs(np.linalg.eigvals(phi - 10**log_gain * gamma @ lin.c[:1])).max()) - 1.0
 
     return float(10 ** optimize.brentq(beyond, 1.0, np.log10(ULTIMATE)))
 
