@@ -29,9 +29,10 @@ class Training:
     ``hold`` samples: a third of them with measurement noise of deviation ``noise`` [pv], a third with a load
     that comes within each hold, as large as if up to ``load`` of the steady MV were missing, and a third as
     they are. ``move_weight`` weighs the MV's changes against the distance from the reference model, both in
-    their ranges. At most ``iterations`` of Levenberg-Marquardt for each of ``restarts`` draws of weights,
-    ending after ``patience`` without a gain on the validation loops, which are others of the same kind.
-    ``seed`` is that of the training loops; those of validation and weights follow from it.
+    their ranges; ``decay`` each weight's distance from where it started: where the loops do not go, a network
+    stays the slow controller that it was. At most ``iterations`` of Levenberg-Marquardt for each of ``restarts``
+    draws of weights, ending after ``patience`` without a gain on the validation loops, which are others of the
+    same kind. ``seed`` is that of the training loops; those of validation and weights follow from it.
     """
 
     hidden: int = 6
@@ -41,6 +42,7 @@ class Training:
     noise: float = 0.0
     load: float = 0.3
     move_weight: float = 0.02
+    decay: float = 5e-4
     iterations: int = 60
     patience: int = 10
     restarts: int = 2
@@ -50,7 +52,7 @@ class Training:
         for name in ("hidden", "lanes", "holds", "hold", "iterations", "patience", "restarts"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("noise", "load", "move_weight"):
+        for name in ("noise", "load", "move_weight", "decay"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
 

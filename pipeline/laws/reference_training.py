@@ -131,8 +131,20 @@ def _descend(
     held: list[Loops],
     options: Training,
 ) -> Trained:
+    start, cv = theta, policy.signals.sp[0]
+    pull = (options.decay * (cv.high - cv.low)) ** 2
+
     def sums(at: Array, which: int) -> Sums:
-        return follow(policy, at, plant, reference, held[which], options.move_weight, derivatives=which == 0)
+        found = follow(policy, at, plant, reference, held[which], options.move_weight, derivatives=which == 0)
+        if which:
+            return found
+        # Weights stay near those of a slow controller where the loops do not ask for others.
+        count, moved = held[which].sp.size, at - start
+        return found._replace(
+            cost=found.cost + pull * float(moved @ moved),
+            square=found.square + count * pull * np.eye(policy.size),
+            slope=found.slope - count * pull * moved,
+        )
 
     now, judged = sums(theta, 0), sums(theta, 1)
     rows = [(now.tracking, judged.tracking)]

@@ -80,7 +80,7 @@ def disturbances_picture(scenarios: Sequence[str], curves: Mapping[str, Curve], 
             axes.set_title(evidence.scenarios[name])
             axes.set_ylabel(axis_label(f"{symbol(cv.name)} less set point", cv.unit))
             axes.set_xlabel("time [s]")
-            axes.legend(fontsize=7.5)
+            axes.legend(fontsize=7.5, frameon=True, framealpha=0.8, edgecolor="none")
         for axes in panels[len(known) :]:
             axes.axis("off")
         return canvas
