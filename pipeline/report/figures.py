@@ -46,7 +46,7 @@ def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CaseP
             save(canvas, folder / name)
             drawn[name] = f"{evidence.laws[law].title} on {where}"
             if law == evidence.best:
-                save(canvas, folder / "closed_loop.png")
+                shutil.copyfile(folder / name, folder / "closed_loop.png")
                 drawn["closed_loop.png"] = f"{evidence.laws[law].title} on {untuned}"
         for table in (t for name, model in evidence.models.items() for t in candidates(name, model)):
             name = f"candidates_{table['model']}_{table['part']}.png"
