@@ -41,6 +41,8 @@ LONG = {
     "tracking": "RMS distance from the reference model",
 }
 """A case's metric in words."""
+WORDS = frozenset({"two"})
+"""Short words in the names of laws that are no abbreviations."""
 NO_UNIT = frozenset({"", "-", "1"})
 """How a signal says that it is a plain number."""
 
@@ -58,7 +60,7 @@ def metric_name(metric: str, own: Mapping[str, str] | None = None) -> str:
 def law_name(law: str) -> str:
     """``linearized_pid`` as linearized PID, ``inc`` as INC: a law's abbreviations are upper-case."""
     parts = law.split("_")
-    return " ".join(p.upper() if len(p) <= 3 or len(parts) == 1 else p for p in parts)
+    return " ".join(p.upper() if (len(p) <= 3 or len(parts) == 1) and p not in WORDS else p for p in parts)
 
 
 def law_label(law: str, setting: Mapping[str, Any]) -> str:
