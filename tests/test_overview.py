@@ -16,6 +16,7 @@ from rich.console import Console
 from pipeline.errors import PipelineError
 from pipeline.report.overview import write_overview
 from pipeline.results import show_results
+from pipeline.stages.overview import main
 from pipeline.standing import Standing, tally
 
 
@@ -128,6 +129,24 @@ def test_the_page_shows_every_law_and_links_to_what_exists(artifacts: Path) -> N
     missed = html[html.index('id="missed"') : html.index('id="claims"')]
     assert missed.count("<td>exact") == 2
     assert "cheap" not in missed
+
+
+def test_the_stage_shows_the_cases_that_params_yaml_lists(
+    artifacts: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(artifacts)
+    (artifacts / "artifacts").mkdir()
+    for name in ("tank", "reactor"):
+        (artifacts / name).rename(artifacts / "artifacts" / name)
+    (artifacts / "params.yaml").write_text("cases: {reactor: {noise_seed: 1}}\n")
+    assert main() == 0
+    assert "reactor-alpha" in (page := (artifacts / "artifacts" / "report.html").read_text())
+    assert "tank" not in page  # a folder that an earlier run left
+    (artifacts / "params.yaml").write_text("cases: {reactor: {}, mill: {}}\n")
+    assert main() == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "validation.json cannot be read" in said
 
 
 def shown(artifacts: Path, case: str | None = None) -> list[str]:
