@@ -10,7 +10,7 @@ from pipeline.cases import CASES
 from pipeline.cases.henson_seborg_cstr import HELD_OUT_RANGE, HOLD
 from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr
 from pipeline.report.claims import CLAIMS
-from pipeline.report.claims.henson_seborg_cstr import hopf_point, ultimate_gain
+from pipeline.report.claims.henson_seborg_cstr import hopf_point, rekindling_flow, ultimate_gain
 from pipeline.report.evidence import Evidence
 
 CASE = CASES["henson_seborg_cstr"]
@@ -89,6 +89,17 @@ def test_three_steady_states_one_of_them_gone_out(plant, q_c, count):
     temperatures = np.linspace(351.0, 560.0, 2_000)
     signs = np.sign([balance(plant, float(t), q_c) for t in temperatures])
     assert len(np.nonzero(np.diff(signs))[0]) == count
+
+
+def test_less_coolant_than_the_actuator_allows_would_rekindle_it(plant):
+    least = rekindling_flow(plant)
+    assert least == pytest.approx(11.10, abs=0.01)
+    gone_out = np.array([0.9448, 359.2])
+    for q_c, burns in ((0.95 * least, True), (1.05 * least, False)):
+        x, step = gone_out, plant.stepper()
+        for _ in range(4000):
+            x = step(x, np.array([q_c]), plant.dv_nominal, plant.parameters())
+        assert (x[0] < 0.05) == burns
 
 
 def test_only_the_sampling_gives_the_local_models_an_ultimate_gain(plant):

@@ -121,7 +121,9 @@ def _recoveries(
     arrays["other_rest_courses"] = back.courses
     # Several of them may lead to one: a reactor that has gone out rests elsewhere under another MV.
     kept: list[Array] = []
-    for state in back.end[~back.arrived]:
+    cv = np.array(plant.measure(back.end.T))[0]
+    # What swings within the range does not arrive either, and yet came back.
+    for state in back.end[~back.arrived & ((cv < sp.low) | (cv > sp.high))]:
         if all(np.abs(state / known - 1).max() > SAME for known in kept):
             kept.append(state)
     figures["states_of_no_return"] = float(len(kept))

@@ -106,6 +106,25 @@ def hopf_point(plant: Plant) -> tuple[float, float]:
     return cv, float(plant.steady_state_at(cv)[1][0])
 
 
+def rekindling_flow(plant: Plant) -> float:
+    """The coolant flow [l/min] below which the reactor cannot stay gone out: the least steady flow of that branch.
+
+    At temperature T the concentration is steady at C = 1/(1 + (V/q) K0 exp(-(E/R)/T)) C_f; what coolant
+    then holds T is the steady flow, and the branch gone out ends where that is least.
+    """
+    of = dict(zip(plant.parameter_names(), plant.parameters(), strict=True))
+
+    def flow(t: float) -> float:
+        c = of["C_f"] / (1 + of["V"] / of["q"] * of["K0"] * np.exp(-of["E_R"] / t))
+
+        def growth(q_c: float) -> float:
+            return float(np.array(plant.rate([c, t], [q_c], [], plant.parameters()))[1, 0])
+
+        return float(optimize.brentq(growth, 1e-3, 1e3))
+
+    return float(optimize.minimize_scalar(flow, bounds=(of["T_f"] + 5.0, of["T_f"] + 40.0), method="bounded").fun)
+
+
 def _second_point(evidence: Evidence) -> Verdict:
     ours = evidence.figure(SET, "", "operating_points.2.q_c")
     if ours is None:
@@ -224,8 +243,11 @@ def _gone_out(evidence: Evidence) -> Verdict:
     known = {law: v for law, v in found.items() if v is not None}
     if len(known) < len(found):
         return Verdict(what, limit, "not measured", None)
-    mv = evidence.case.plant_class.mv_signals[0]
-    because = f"there the law asks for the least {mv.name}, {mv.low:g} {mv.unit}, and that still cools too much"
+    plant, mv = evidence.case.plant, evidence.case.plant_class.mv_signals[0]
+    because = (
+        f"there the law asks for the least {mv.name}, {mv.low:g} {mv.unit}; to take fire again by itself the reactor "
+        f"needs less than {rekindling_flow(plant):.1f} {mv.unit}"
+    )
     shown = ", ".join(f"{n} {v:.0f}" for n, v in known.items())
     return Verdict(what, limit, shown, set(known.values()) == {1.0}, because)
 
