@@ -72,8 +72,8 @@ def _simulate_options(parser: argparse.ArgumentParser) -> None:
     )
     add("--disturbance", metavar="NAME=VALUE[@S]", type=named, action="append", default=[], help="plant parameter")
     add("--noise", metavar="PV=STD", type=named, action="append", default=[], help="measurement noise")
-    add("--manual", metavar="S..S[=MV]", type=partial(_argument, parse_manual), action="append", default=[],
-        help="MANUAL between two times")  # fmt: skip
+    add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
+        help="MANUAL between two times, with one value an MV")  # fmt: skip
     add("--duration", metavar="S", type=_positive, help="length of the run")
     add("--speed", metavar="X", type=_positive, help="times real time, 1 is real time (default: as fast as possible)")
     add("--seed", metavar="N", type=_seed, default=0, help="of the noise (0)")
@@ -96,6 +96,7 @@ def _simulate(options: argparse.Namespace) -> None:
         duration_s=options.duration,
         seed=options.seed,
     )
+    plant = run.plant  # a scenario may have one of its own
     title = f"{controller.manifest.law} on {plant.title}"
     history = close_loop(controller, plant, run, title=title, speed=options.speed)
     print(summary(plant, history, "mae" if case is None else case.metric))

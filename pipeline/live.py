@@ -188,7 +188,7 @@ def sparkline(values: Array, low: float, high: float, width: int = WIDTH) -> str
 def _values(plant: Plant, pv: Array, command: Snapshot) -> str:
     parts = [f"SP {s.name} {v:.4g}" for s, v in zip(plant.sp_signals, command.sp, strict=True)]
     parts += [
-        f"{s.name} {v:.5g} {s.unit}"
+        f"{s.name} {v:.5g}" + ("" if s.unit == "-" else f" {s.unit}")
         for s, v in zip((*plant.pv_signals, *plant.mv_signals), (*pv, *command.mv), strict=True)
     ]
     return "  ".join(parts)

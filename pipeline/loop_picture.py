@@ -17,6 +17,7 @@ from pipeline.metrics import mae, mv_travel, sse
 from pipeline.plants.base import Plant
 
 Array = NDArray[np.float64]
+STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
 
 
 @dataclass(slots=True, eq=False)
@@ -33,7 +34,7 @@ class History:
 
 
 def summary(plant: Plant, history: History, metric: str = "mae") -> str:
-    """The error of each controlled variable in the case's metric, and at the end, MV travel, faults; one line each."""
+    """The error of each controlled variable in the case's metric and at the end, MV travel, faults; one line each."""
     sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
     lines = []
     for i, s in enumerate(plant.sp_signals):
@@ -43,7 +44,10 @@ def summary(plant: Plant, history: History, metric: str = "mae") -> str:
             error = f"SSE {s.name} {sse(sp[:, i], pv[:, i]):.6g}, {error}"
         lines.append(f"{error}, final error {sp[-1, i] - pv[-1, i]:.3g}{unit}")
     for i, s in enumerate(plant.mv_signals):
-        lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g}" + ("" if s.unit == "-" else f" {s.unit}"))
+        if s.values is None:
+            lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g}" + ("" if s.unit == "-" else f" {s.unit}"))
+        else:
+            lines.append(f"changes of {s.name} {np.count_nonzero(np.diff(mv[:, i]))}")
     faults = sum(map(bool, history.reason))
     if faults:
         lines.append(f"{faults} scans with a fault, the last one: {next(r for r in reversed(history.reason) if r)}")
@@ -76,10 +80,10 @@ def draw(path: Path, plant: Plant, history: History, title: str, marks: Mapping[
 
     time_s = np.array(history.time_s)
     sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
-    rows = len(plant.sp_signals) + len(plant.mv_signals)
-    figure = Figure(figsize=(9, 1.0 + 2.4 * rows), layout="constrained")
+    heights = [1.0] * len(plant.sp_signals) + [1.0 if s.values is None else STRIP for s in plant.mv_signals]
+    figure = Figure(figsize=(9, 1.0 + 2.4 * sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     figure.suptitle(title)
     for i, (ax, s) in enumerate(zip(axes, plant.sp_signals, strict=False)):
         ax.step(time_s, sp[:, i], where="post", color="0.35", linestyle="--", linewidth=1, label="set point")
@@ -89,7 +93,11 @@ def draw(path: Path, plant: Plant, history: History, title: str, marks: Mapping[
     for i, s in enumerate(plant.mv_signals):
         ax = axes[len(plant.sp_signals) + i]
         ax.step(time_s, mv[:, i], where="post", color="C3", linewidth=1)
-        ax.set_ylabel(f"{s.name} [{s.unit}]")
+        ax.set_ylabel(s.name if s.unit == "-" else f"{s.name} [{s.unit}]")
+        if s.values is not None:
+            room = 0.3 * (s.high - s.low)
+            ax.set_yticks(s.values, [f"{v:g}" for v in s.values])
+            ax.set_ylim(s.low - room, s.high + room)
     for ax in axes:
         ax.grid(alpha=0.3)
         for at in marks:

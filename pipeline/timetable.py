@@ -31,17 +31,18 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class ManualSpan:
-    """The operator's hands on the MV from ``start_s`` to ``end_s`` [s]; None keeps the MV as it was."""
+    """The operator's hands on the MVs from ``start_s`` to ``end_s`` [s]; None keeps them as they were."""
 
     start_s: float
     end_s: float
-    mv: float | None = None
+    mv: tuple[float, ...] | None = None  # one value an MV
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timetable:
-    """A run: set points, start, plant parameters, noise and manual spans, all by sample."""
+    """A run: the plant, set points, start, plant parameters, noise and manual spans, all by sample."""
 
+    plant: Plant
     sp: Array  # (n, n_sp)
     x0: Array  # (n_x,)
     mv0: Array  # (n_mv,)
@@ -69,15 +70,16 @@ def parse_event(text: str, *, named: bool) -> Event:
 
 
 def parse_manual(text: str) -> ManualSpan:
-    """``START..END`` or ``START..END=MV``."""
-    form = "START..END or START..END=MV"
+    """``START..END`` or ``START..END=MV``, several MVs as ``MV,MV``."""
+    form = "START..END or START..END=MV (of several MVs all: MV,MV)"
     match = re.fullmatch(r"([^.=]+(?:\.\d+)?)\.\.([^=]+)(?:=(.+))?", text)
     if match is None:
         raise ParamsError(f"{text!r} is not of the form {form}")
     start, end = (_number(match[i], text, form) for i in (1, 2))
     if not 0 <= start < end:
         raise ParamsError(f"{text!r}: it must start at 0 or later and end after that")
-    return ManualSpan(start, end, None if match[3] is None else _number(match[3], text, form))
+    values = None if match[3] is None else tuple(_number(value, text, form) for value in match[3].split(","))
+    return ManualSpan(start, end, values)
 
 
 def timetable(
@@ -97,7 +99,7 @@ def timetable(
 
     Without set points the scenario's are taken, or those of the case's first scenario where none is
     named. A run with set points of its own starts at the steady state of ``start_cv``, or at that
-    in the middle of the set point's range.
+    in the middle of the set point's range; a scenario that has a plant of its own is run on that.
     """
     sp_signal = plant.sp_signals[0]
     if set_points and scenario is not None:
@@ -122,6 +124,7 @@ def timetable(
             sp[_sample(plant, event, n) :] = event.value
     else:
         chosen = _scenario(case, scenario)
+        plant = plant if chosen.plant is None else chosen.plant
         n = _samples(plant, duration_s, chosen.samples)
         x0, mv0 = (chosen.x0, chosen.mv0) if start_cv is None else plant.steady_state_at(start_cv)
         sp = _stretched(chosen.sp, n)
@@ -141,13 +144,27 @@ def timetable(
         at = k * plant.period_s
         marks[at] = f"{marks[at]}, {text}" if at in marks else text
     for span in manual:
-        mv = plant.mv_signals[0]
-        if span.mv is not None and (len(plant.mv_signals) > 1 or not mv.low <= span.mv <= mv.high):
-            raise ParamsError(
-                f"manual {mv.name} = {span.mv:g} {mv.unit} is outside [{mv.low:g}, {mv.high:g}] {mv.unit}"
-            )
+        _check_manual(plant, span)
         marks.setdefault(span.start_s, "manual")
-    return Timetable(sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks)
+    return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks)
+
+
+def _check_manual(plant: Plant, span: ManualSpan) -> None:
+    """ParamsError unless the span has one value an MV, each in its range or among its allowed values."""
+    if span.mv is None:
+        return
+    signals = plant.mv_signals
+    if len(span.mv) != len(signals):
+        raise ParamsError(
+            f"manual has {len(span.mv)} value{'s' * (len(span.mv) > 1)}; plant {plant.name!r} has the MVs "
+            f"{', '.join(s.name for s in signals)}: give {','.join(s.name for s in signals)}"
+        )
+    for s, value in zip(signals, span.mv, strict=True):
+        unit = "" if s.unit == "-" else f" {s.unit}"
+        if s.values is not None and value not in s.values:
+            raise ParamsError(f"manual {s.name} = {value:g} is none of {', '.join(f'{v:g}' for v in s.values)}")
+        if not s.low <= value <= s.high:
+            raise ParamsError(f"manual {s.name} = {value:g}{unit} is outside [{s.low:g}, {s.high:g}]{unit}")
 
 
 def _number(text: str, whole: str, form: str) -> float:

@@ -12,11 +12,12 @@ from serving.errors import (
     OutputError,
     SampleError,
 )
-from serving.guard import Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
+from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
 from serving.loop import Command, ControlLoop, Mode, RunReport
 from serving.manifest import Manifest, Signal
 
 __all__ = [
+    "Allowed",
     "ArtifactError",
     "Clock",
     "Command",

@@ -38,7 +38,8 @@ def bench(
     """
     m, rng = controller.manifest, np.random.default_rng(0)
     middle = {n: np.array([s.middle for s in m.signals(n)]) for n in ("sp", "pv", "dv", "mv_applied")}
-    span = {n: np.array([s.high - s.low for s in m.signals(n)]) for n in middle}
+    # A discrete signal has no values a little away from another.
+    span = {n: np.array([0.0 if s.values else s.high - s.low for s in m.signals(n)]) for n in middle}
     count = max(steps, loop_steps)
     feeds = [{n: middle[n] + 0.01 * span[n] * rng.uniform(-1, 1, len(span[n])) for n in middle} for _ in range(count)]
 

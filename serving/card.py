@@ -45,7 +45,7 @@ def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
     rows = []
     for s in signals:
         allowed = f"{s.low:g} .. {s.high:g}" if s.values is None else f"one of {', '.join(f'{v:g}' for v in s.values)}"
-        rows.append(f"  {s.name:<{width}}  {allowed} {s.unit}")
+        rows.append(f"  {s.name:<{width}}  {allowed}{'' if s.unit == '-' else f' {s.unit}'}")
     return ["", title, *rows]
 
 

@@ -83,6 +83,27 @@ class InRange:
 
 
 @dataclass(frozen=True, slots=True)
+class Allowed:
+    """Every discrete applied MV has a value that it may have.
+
+    A valve that is read back half way between open and shut has done neither over the last period:
+    no law knows what the plant received.
+    """
+
+    signals: tuple[Signal, ...]
+    memory: int = field(default=0, init=False)
+
+    def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
+        """Why not: the actuator is on its way, or broken."""
+        if sample.mv_applied is None:
+            return None
+        for s, value in zip(self.signals, sample.mv_applied.tolist(), strict=True):
+            if s.values is not None and value not in s.values:
+                return f"applied MV {s.name} is {value:.6g}, none of {', '.join(f'{v:g}' for v in s.values)}"
+        return None
+
+
+@dataclass(frozen=True, slots=True)
 class Frozen:
     """No PV repeats itself to the bit for ``samples`` samples: a live sensor has noise.
 
@@ -142,5 +163,6 @@ class Rate:
 
 
 def default_guards(manifest: Manifest) -> tuple[Guard, ...]:
-    """The guards that suit every plant: values there and finite, PVs in range, no sample older than a period."""
-    return (Complete(manifest), InRange(manifest.pv), Fresh(manifest.period_s))
+    """The guards that suit every plant: values there and allowed, PVs in range, no sample older than a period."""
+    discrete = (Allowed(manifest.mv),) if any(s.values for s in manifest.mv) else ()
+    return (Complete(manifest), *discrete, InRange(manifest.pv), Fresh(manifest.period_s))

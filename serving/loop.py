@@ -286,8 +286,9 @@ def _within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
         names = ", ".join(f"{s.name} [{s.unit}]" for s in signals)
         raise LoopError(f"the {what} has the shape {vector.shape}; it needs ({len(signals)},): {names}")
     for s, value in zip(signals, vector.tolist(), strict=True):
-        if not s.low <= value <= s.high:
-            raise LoopError(f"the {what} {s.name} = {value} {s.unit} is outside [{s.low:g}, {s.high:g}] {s.unit}")
         if s.values is not None and value not in s.values:
-            raise LoopError(f"the {what} {s.name} = {value} is none of {list(s.values)}")
+            raise LoopError(f"the {what} {s.name} = {value:g} is none of {', '.join(f'{v:g}' for v in s.values)}")
+        if not s.low <= value <= s.high:
+            unit = "" if s.unit == "-" else f" {s.unit}"
+            raise LoopError(f"the {what} {s.name} = {value}{unit} is outside [{s.low:g}, {s.high:g}]{unit}")
     return vector
