@@ -24,6 +24,7 @@ DEFAULTS: dict[str, Any] = {
     "metric": "mae",
     "recipe": False,
     "unforeseen": False,
+    "limits": {},
     "effort": json.loads(json.dumps(asdict(Effort()))),
 }
 """What a file means that does not say."""
@@ -52,9 +53,9 @@ def measures_states(plant: Plant) -> bool:
 
 def problem(case: Case) -> dict[str, Any]:
     """What the bounds of a whole case depend on, beside the scenarios: stored, and compared with what is stored."""
-    found = {key: getattr(case, key) for key in DEFAULTS if key != "effort"}
-    effort = json.loads(json.dumps(asdict(case.effort)))  # as it comes back from the file
-    return {"plant": plant_digest(case.plant), **found, "effort": effort}
+    found = {key: getattr(case, key) for key in DEFAULTS} | {"limits": dict(case.limits), "effort": asdict(case.effort)}
+    as_read: dict[str, Any] = json.loads(json.dumps(found))
+    return {"plant": plant_digest(case.plant), **as_read}
 
 
 def bounded(case: Case, scenarios: Sequence[Scenario]) -> bool:

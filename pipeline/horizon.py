@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,9 @@ class Horizon:
     errors are variables as well, s = r - y: the cost is then convex, and a strongly curved output
     stands in a constraint, which takes the solver half the iterations.
 
+    ``limits`` are ranges of states, by their names, to be kept at the samples. A state that a
+    disturbance has carried out of its range may still be out at the first one, but no farther.
+
     The small weight w chooses among equal tracking errors: an MV that rings between samples, on
     the sampled plant's zero outside the unit circle, costs no error at the samples.
     """
@@ -60,6 +63,7 @@ class Horizon:
         n: int,
         *,
         metric: str = "mae",
+        limits: Mapping[str, tuple[float, float]] | None = None,
         elements: int = 3,
         degree: int = 3,
         move_weight: float | None = None,
@@ -120,6 +124,12 @@ class Horizon:
         self._solver = ca.nlpsol("horizon", "ipopt", problem, options)
         low, high = np.zeros((rows, n)), np.ones((rows, n))
         low[:n_z], high[:n_z] = -MARGIN, 1 + MARGIN
+        self._limited: list[tuple[int, int]] = []  # a state, and where its value at sample 1 stands
+        for name, kept in (limits or {}).items():
+            state = self._state(name)
+            end = n_z - self._n_x + state
+            low[end], high[end] = (np.array(kept)[:, None] - self._x_low[state]) / self._x_span[state]
+            self._limited.append((state, end))
         low[n_z + self._n_mv :] = -np.inf if self._squared else 0.0
         high[n_z + self._n_mv :] = np.inf
         self._bounds = {"lbx": low.ravel("F"), "ubx": high.ravel("F")}
@@ -127,6 +137,12 @@ class Horizon:
         slack = np.zeros(n_s) if self._squared else np.full(2 * n_s, np.inf)
         upper = np.concatenate([np.zeros(n_z * n), slack])
         self._bounds |= {"lbg": np.zeros(upper.size), "ubg": upper}
+
+    def _state(self, name: str) -> int:
+        names = [s.name for s in self.plant.state_signals]
+        if name not in names:
+            raise PlantError(f"plant {self.plant.name!r} has no state {name!r} to limit; it has {', '.join(names)}")
+        return names.index(name)
 
     def _collocation(self, elements: int, degree: int) -> ca.Function:
         """Defects of one period, scaled: (x, z, u, p) -> (n_x * points,)."""
@@ -187,8 +203,14 @@ class Horizon:
 
         Not being solved is told by the plan, not raised: the caller has an older plan to go on with.
         """
-        given = np.concatenate([(x0 - self._x_low) / self._x_span, (sp / self._cv_span).ravel(), p.ravel()])
+        scaled = (x0 - self._x_low) / self._x_span
+        given = np.concatenate([scaled, (sp / self._cv_span).ravel(), p.ravel()])
         arguments = {"x0": start.values.ravel("F"), "p": given, **self._bounds}
+        if self._limited:
+            low, high = self._bounds["lbx"].copy(), self._bounds["ubx"].copy()
+            for state, end in self._limited:
+                low[end], high[end] = min(low[end], scaled[state]), max(high[end], scaled[state])
+            arguments |= {"lbx": low, "ubx": high}
         if start.multipliers is not None:
             arguments |= {"lam_x0": start.multipliers[0], "lam_g0": start.multipliers[1]}
         found = self._solver(**arguments)
@@ -213,6 +235,29 @@ class Horizon:
         error = np.abs(sp - cv) / self._cv_span
         cost = float(np.sum(error**2 if self._squared else error))
         return Plan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), iterations, values, multipliers)
+
+    def _kept(self, x: Array, fraction: float, mv: Array, p: Array, step: Callable[..., Array]) -> float:
+        """The fraction of the first MV's range nearest to ``fraction`` that keeps the limits over a period.
+
+        By bisection from either end; the fraction itself where neither end keeps them.
+        """
+
+        def keeps(trial: float) -> bool:
+            moved = np.array([self._mv_low[0] + trial * self._mv_span[0], *mv[1:]])
+            after = (step(x, moved, self.plant.dv_nominal, p) - self._x_low) / self._x_span
+            low, high = self._bounds["lbx"], self._bounds["ubx"]
+            return all(low[end] <= after[state] <= high[end] for state, end in self._limited)
+
+        if keeps(fraction):
+            return fraction
+        for inside in (1.0, 0.0):
+            if keeps(inside):
+                outside = fraction
+                for _ in range(12):
+                    middle = 0.5 * (inside + outside)
+                    inside, outside = (middle, outside) if keeps(middle) else (inside, middle)
+                return inside
+        return fraction
 
     def shifted(self, plan: Plan) -> Plan:
         """The rest of a plan, its last period repeated: where the next sample's solve starts."""
@@ -249,8 +294,7 @@ class Horizon:
             for _ in range(12 if low < high else 0):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if miss(middle) * at_low > 0 else (low, middle)
-            fraction = 0.5 * (low + high)
-            mv[0] = self._mv_low[0] + fraction * self._mv_span[0]
+            mv[0] = self._mv_low[0] + self._kept(x, 0.5 * (low + high), mv, p[k], step) * self._mv_span[0]
             trace = np.array(self._trace(x, mv, p[k])).T
             x = trace[-1]
             values[:n_z, k] = ((trace - self._x_low) / self._x_span).ravel()

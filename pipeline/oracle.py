@@ -16,7 +16,7 @@ A case whose set point follows a recipe is another matter: its controllers may k
 NMPC sees it as far as it looks ahead, and the offline optimum is one plan for the whole test. The
 same holds where tracking counts, of the reference in the set point's place.
 
-Both minimize the case's metric: absolute or squared errors.
+Both minimize the case's metric, absolute or squared errors, and keep its ``limits``.
 
 A plant with a discrete MV is replaced by its ``relaxed()``, the figures' MVs being those that stand
 for its own. A test on a plant in discrete time has no bounds.
@@ -33,7 +33,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,6 +70,8 @@ Array = NDArray[np.float64]
 Score = Callable[[Scenario, Array, Array], dict[str, float]]
 """Figures of a closed loop, from the test, PVs (n, n_pv) and MVs (n, n_mv): ``Case.score``."""
 
+Limits = Mapping[str, tuple[float, float]]
+
 DEFAULT = Effort()
 CAME_TRUE = 1e-5  # of the states' ranges: how far a prediction may be off
 NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
@@ -86,10 +88,13 @@ class PerfectNmpc:
     which nothing can be solved applies that plan's next move and counts in ``failures``.
     """
 
-    def __init__(self, plant: Plant, metric: str = "mae", effort: Effort = DEFAULT) -> None:
+    def __init__(
+        self, plant: Plant, metric: str = "mae", effort: Effort = DEFAULT, limits: Limits | None = None
+    ) -> None:
         self.plant, self._every = plant, effort.every
         self._reaches = effort.reaches
-        self._horizon = Horizon(plant, effort.periods, metric=metric, elements=effort.elements, degree=effort.degree)
+        fineness = {"elements": effort.elements, "degree": effort.degree}
+        self._horizon = Horizon(plant, effort.periods, metric=metric, limits=limits, **fineness)
         self._simulate = plant.stepper()
         self._span = np.array([s.high - s.low for s in plant.state_signals])
         self.reset()
@@ -205,6 +210,7 @@ def run_offline(
     recipe: bool = False,
     effort: Effort = DEFAULT,
     score: Score | None = None,
+    limits: Limits | None = None,
 ) -> dict[str, float]:
     """Closed-loop metrics of the offline optimum, and how many of its plans were not solved.
 
@@ -215,7 +221,7 @@ def run_offline(
     edges = [0] if recipe else [0, *np.flatnonzero(np.any(np.diff(scenario.sp, axis=0) != 0, axis=1)) + 1]
     lengths = np.diff([*edges, scenario.samples])
     n = int(lengths.max()) + (0 if recipe else effort.tail)
-    horizon = Horizon(plant, n, metric=metric, elements=effort.fine, degree=effort.degree)
+    horizon = Horizon(plant, n, metric=metric, limits=limits, elements=effort.fine, degree=effort.degree)
     everything, simulate = scenario.parameters(plant), plant.stepper()
     x, states, mv, failures = scenario.x0, [], [], 0
     for k, length in zip(edges, lengths, strict=True):
@@ -249,9 +255,9 @@ def _compute(case: Case, job: Job) -> tuple[Job, dict[str, float], float]:
     ahead = case.recipe or case.metric == "tracking"
     with threadpool_limits(1):
         if job.kind == "offline":
-            figures = run_offline(plant, job.scenario, case.metric, ahead, case.effort, case.score)
+            figures = run_offline(plant, job.scenario, case.metric, ahead, case.effort, case.score, case.limits)
         else:
-            nmpc = PerfectNmpc(plant, case.metric, case.effort)
+            nmpc = PerfectNmpc(plant, case.metric, case.effort, case.limits)
             noise, draws = (case.noise_std.tolist(), case.noise_draws) if job.kind == "nmpc_noise" else (None, 1)
             seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
             know = (ahead, case.unforeseen, case.score)

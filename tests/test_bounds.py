@@ -167,7 +167,13 @@ def test_noise_does_not_reach_an_nmpc_that_is_given_the_state(tank: Path) -> Non
 
 @pytest.mark.parametrize(
     ("key", "other"),
-    [("metric", "mae"), ("recipe", True), ("unforeseen", False), ("effort", Effort(periods=4, tail=3))],
+    [
+        ("metric", "mae"),
+        ("recipe", True),
+        ("unforeseen", False),
+        ("limits", {"h": (0.0, 30.0)}),
+        ("effort", Effort(periods=4, tail=3)),
+    ],
 )
 def test_figures_for_another_aim_are_refused_and_computed_anew(
     tank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str, other: Any

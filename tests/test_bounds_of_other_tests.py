@@ -91,6 +91,42 @@ def test_the_nmpc_over_the_signed_flow_is_ahead_of_any_switching_by_hand(vessel:
     assert float(np.mean(np.abs(sp - real))) == pytest.approx(found["mae"], rel=1e-3)
 
 
+@pytest.mark.parametrize("every", [1, 5])
+def test_limits_of_a_state_are_kept_by_nmpc_and_offline_optimum(vessel: JacketedBatchReactor, every: int) -> None:
+    signed, limits = vessel.relaxed(), {"T_w": (20.0, 50.0)}
+    sp = np.repeat([23.0, 21.0], [50, 40])[:, None]
+    test = Scenario("up and down", "", sp, np.full(2, 20.0), np.array([0.0, HOT]))
+    seen: list[Array] = []
+
+    def score(test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
+        seen.append(pv)
+        return {"mae": float(np.mean(np.abs(test.sp - pv[:, :1])))}
+
+    effort = replace(QUICK, every=every)
+    free = run_nmpc(PerfectNmpc(signed, "mae", effort), test, score=score)
+    kept = run_nmpc(PerfectNmpc(signed, "mae", effort, limits), test, score=score)
+    best = run_offline(signed, test, "mae", False, effort, score, limits)
+    assert kept["failures"] == best["failures"] == 0
+    assert seen[0][:, 1].max() > 60
+    assert seen[0][:, 1].min() < 19
+    for pv in seen[1:]:
+        assert pv[:, 1].max() <= 50.001
+        assert pv[:, 1].min() >= 19.999
+    assert free["mae"] < best["mae"] == pytest.approx(kept["mae"], rel=1e-3)
+
+
+def test_a_state_that_is_out_of_its_limits_comes_back(vessel: JacketedBatchReactor) -> None:
+    signed = vessel.relaxed()
+    horizon = Horizon(signed, 12, limits={"T_w": (20.0, 50.0)}, elements=1, degree=2)
+    x0, sp, p = np.array([40.0, 55.0]), np.full((12, 1), 60.0), np.tile(signed.parameters(), (12, 1))
+    plan = horizon.solve(x0, sp, p, horizon.rollout(x0, sp, p, 3, signed.stepper()))
+    assert plan.solved
+    assert plan.x[1, 1] <= 55.0 + 1e-6
+    assert np.all(plan.x[2:, 1] <= 50.0 + 1e-6)
+    with pytest.raises(PlantError, match="has no state 'T_j' to limit; it has T, T_w"):
+        Horizon(signed, 5, limits={"T_j": (0.0, 1.0)})
+
+
 def test_a_discrete_mv_without_relaxation_is_refused(vessel: JacketedBatchReactor) -> None:
     with pytest.raises(PlantError, match="no horizon for the discrete MV 'mode' of plant 'jacketed_batch_reactor'"):
         Horizon(vessel, 5)

@@ -185,6 +185,7 @@ class Case(ABC):
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
     data_seeds: ClassVar[int] = 5  # that the best law must come from; 1 where nothing is learnt from data
     effort: ClassVar[Effort] = Effort()  # how far and how finely the bounds are searched
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> the range that its laws and bounds keep it in
     noise_draws: ClassVar[int] = 1  # closed loops with noise are run this many times, and their figures averaged
     development_noise: ClassVar[bool] = False  # the plant is never measured without noise: nor is it for development
 

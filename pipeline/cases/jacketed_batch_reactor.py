@@ -47,6 +47,7 @@ class JacketedBatchReactorCase(Case):
     unforeseen: ClassVar[bool] = True
     development_noise: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 3
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = {"T_w": (20.0, 70.0)}
     # Periods of 10 s, of which the core's time constant is 300.
     effort: ClassVar[Effort] = Effort(40, 1, 1, 2, (1, 3), tail=60, every=10, noisy=False)
     plant_class: ClassVar[type[Plant]] = JacketedBatchReactor
