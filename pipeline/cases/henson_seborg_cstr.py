@@ -29,8 +29,9 @@ from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr
 HOLD = 500  # samples: 10 min
 LEVELS = [0.02, 0.02, 0.04, 0.06, 0.08, 0.10, 0.12, 0.13]  # [mol/l]
 HELD_OUT_LEVELS, HELD_OUT_HOLD, HELD_OUT_RANGE = 8, 250, (0.012, 0.135)
-T_F = (350.0, 353.0, 347.0)  # [K] feed temperature, 7, 9 and 9 min
-C_F = (1.0, 1.03, 0.97)  # [mol/l] feed concentration, as long
+FED = 1200  # samples: 24 min, a quarter as it was, a quarter changed one way, a half the other
+T_F = (350.0, 353.0, 347.0)  # [K] feed temperature, at a set point where the plant hardly damps itself
+C_F = (1.0, 1.03, 0.97)  # [mol/l] feed concentration, at one where it does
 
 GAINS, OUTPUTS, VELOCITY = (Curve("local_pid_network", {"blending": b}) for b in ("gains", "outputs", "velocity"))
 AUTO, PID_1 = Curve("auto_pid_network"), Curve("pid")
@@ -159,18 +160,16 @@ class HensonSeborgCstrCase(Case):
             # Holds as long as the time before a jump, so that it begins one of them.
             from_rest(plant, "jump", "One jump from 0.02 to 0.13 mol/l", jumps[0], hold=HOLD // 2),
             from_rest(plant, "jump_down", "One jump from 0.13 to 0.02 mol/l", jumps[1], hold=HOLD // 2),
-            self._fed("feed_temperature", "Feed 3 K warmer, then 3 K colder", "T_f", T_F),
-            self._fed("feed_concentration", "Feed 3 % stronger, then 3 % weaker", "C_f", C_F),
+            self._fed("feed_temperature", "Feed 3 K warmer, then 3 K colder", "T_f", T_F, 0.12),
+            self._fed("feed_concentration", "Feed 3 % stronger, then 3 % weaker", "C_f", C_F, 0.04),
         )
         fixed = {scenario.name: (scenario,) for scenario in found}
         return {**fixed, "held_out": tuple(self._random("held_out", seed) for seed in self.held_out_seeds)}
 
-    def _fed(self, name: str, title: str, parameter: str, values: tuple[float, ...]) -> Scenario:
-        """A change of the feed at two set points, one where the plant is well damped and one where it hardly is."""
-        half = 1250
-        course = stepwise(half, *zip((0, 350, 800), values, strict=True))
-        sp = held([0.04, 0.12], half)
-        return from_rest(self.plant, name, title, sp, hold=half, changes={parameter: np.tile(course, 2)})
+    def _fed(self, name: str, title: str, parameter: str, values: tuple[float, ...], cv: float) -> Scenario:
+        """A change of the feed at a set point that stays."""
+        course = stepwise(FED, *zip((0, FED // 4, FED // 2), values, strict=True))
+        return from_rest(self.plant, name, title, held([cv], FED), changes={parameter: course})
 
     def _random(self, name: str, seed: int) -> Scenario:
         levels = held(random_levels(seed, HELD_OUT_LEVELS, *HELD_OUT_RANGE), HELD_OUT_HOLD)

@@ -296,7 +296,7 @@ CLAIMS = Claims(
         CasePicture(
             "jumps",
             "One jump over the range, and back",
-            responses_picture((("jump", "jump"), ("jump_down", "jump down")), NETWORKS),
+            responses_picture((("jump", "jump"), ("jump_down", "jump down")), NETWORKS, (4.5, 9.0)),
         ),
         CasePicture(
             "feed",

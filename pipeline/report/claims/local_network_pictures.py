@@ -116,8 +116,13 @@ def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
     return draw
 
 
-def responses_picture(tests: Sequence[tuple[str, str]], curves: Sequence[tuple[Curve, str]]) -> Draw:
-    """Controlled variable, its error and the MV, a column a test ``(name, words)``; ``curves`` with their words."""
+def responses_picture(
+    tests: Sequence[tuple[str, str]], curves: Sequence[tuple[Curve, str]], window: tuple[float, float] | None = None
+) -> Draw:
+    """Controlled variable, its error and the MV, a column a test ``(name, words)``; ``curves`` with their words.
+
+    ``window`` is the time [min] that is shown; None all of it.
+    """
 
     def draw(evidence: Evidence) -> Canvas | None:
         if not any(evidence.loop(curve, name) for curve, _ in curves for name, _ in tests):
@@ -131,9 +136,11 @@ def responses_picture(tests: Sequence[tuple[str, str]], curves: Sequence[tuple[C
                     _response(column, loop, _colour(evidence, curves, i), _with_figure(evidence, curve, name, label))
             column[0].set_title(words)
             column[0].legend(loc="best", fontsize="small")
+            if window is not None:
+                column[0].set_xlim(*window)
         mv = evidence.case.plant_class.mv_signals[0]
         panels[0, 0].set_ylabel(_label(evidence, 0))
-        panels[1, 0].set_ylabel("error")
+        panels[1, 0].set_ylabel(axis_label("error", evidence.case.plant_class.sp_signals[0].unit))
         panels[2, 0].set_ylabel(axis_label(symbol(mv.name), mv.unit))
         canvas.align_ylabels(list(panels[:, 0]))
         return canvas
@@ -142,7 +149,7 @@ def responses_picture(tests: Sequence[tuple[str, str]], curves: Sequence[tuple[C
 
 
 def _response(column: Sequence[Axes], loop: Loop, colour: str, label: str) -> None:
-    time, words = time_axis(loop["time_s"])
+    time = loop["time_s"] / 60.0
     above, middle, below = column
     sp, cv = np.ravel(loop["sp"]), loop["pv"][:, 0]
     if not above.lines:
@@ -150,7 +157,7 @@ def _response(column: Sequence[Axes], loop: Loop, colour: str, label: str) -> No
     above.plot(time, cv, color=colour, linewidth=1.1, label=label)
     middle.plot(time, sp - cv, color=colour, linewidth=0.9)
     below.step(time, np.ravel(loop["mv"]), where="post", color=colour, linewidth=0.8)
-    below.set_xlabel(words)
+    below.set_xlabel("time [min]")
     above.margins(x=0.01)
 
 
