@@ -30,8 +30,8 @@ HOLD = 500  # samples: 10 min
 LEVELS = [0.02, 0.02, 0.04, 0.06, 0.08, 0.10, 0.12, 0.13]  # [mol/l]
 HELD_OUT_LEVELS, HELD_OUT_HOLD, HELD_OUT_RANGE = 8, 250, (0.012, 0.135)
 FED = 1200  # samples: 24 min, a quarter as it was, a quarter changed one way, a half the other
-T_F = (350.0, 353.0, 347.0)  # [K] feed temperature, at a set point where the plant hardly damps itself
-C_F = (1.0, 1.03, 0.97)  # [mol/l] feed concentration, at one where it does
+T_F = (350.0, 360.0, 340.0)  # [K] feed temperature, at a set point where the plant hardly damps itself
+C_F = (1.0, 1.1, 0.9)  # [mol/l] feed concentration, at one where it does
 
 GAINS, OUTPUTS, VELOCITY = (Curve("local_pid_network", {"blending": b}) for b in ("gains", "outputs", "velocity"))
 AUTO, PID_1 = Curve("auto_pid_network"), Curve("pid")
@@ -160,8 +160,8 @@ class HensonSeborgCstrCase(Case):
             # Holds as long as the time before a jump, so that it begins one of them.
             from_rest(plant, "jump", "One jump from 0.02 to 0.13 mol/l", jumps[0], hold=HOLD // 2),
             from_rest(plant, "jump_down", "One jump from 0.13 to 0.02 mol/l", jumps[1], hold=HOLD // 2),
-            self._fed("feed_temperature", "Feed 3 K warmer, then 3 K colder", "T_f", T_F, 0.12),
-            self._fed("feed_concentration", "Feed 3 % stronger, then 3 % weaker", "C_f", C_F, 0.04),
+            self._fed("feed_temperature", "Feed 10 K warmer, then 10 K colder", "T_f", T_F, 0.12),
+            self._fed("feed_concentration", "Feed 10 % stronger, then 10 % weaker", "C_f", C_F, 0.04),
         )
         fixed = {scenario.name: (scenario,) for scenario in found}
         return {**fixed, "held_out": tuple(self._random("held_out", seed) for seed in self.held_out_seeds)}
