@@ -211,6 +211,9 @@ def test_settings_find_their_variant(root):
     assert evidence.loop(Curve("inc"), "sp_a", 7) is None
     plain = PaperFigure("x", "pid", "sp_a", "mae", 0.2)
     assert "times the paper's" in paper_row(plain, evidence, PLAIN.reason).verdict
+    row = paper_row(replace(plain, printed=False), evidence, PLAIN.reason)
+    assert row.paper is None  # nor does it count among the paper's figures
+    assert "times the independent implementation's" in row.verdict
 
 
 def test_nothing_to_report_is_one_clear_error(tmp_path):

@@ -68,7 +68,7 @@ class Row:
 
     label: str
     metric: str
-    paper: float
+    paper: float | None
     ours: float | None
     low: float | None
     high: float | None
@@ -84,7 +84,7 @@ def close(ours: float, paper: float) -> bool:
 
 def plain_reason(row: PaperFigure, ours: float, evidence: Evidence) -> str:
     """The words where nobody knows more than the two numbers."""
-    return f"it is {_times(ours, row.paper)} the paper's"
+    return f"it is {_times(ours, row.paper)} {'the paper' if row.printed else 'the independent implementation'}'s"
 
 
 def _times(ours: float, paper: float) -> str:
@@ -107,7 +107,8 @@ def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Row:
         if row.independent is not None and close(median, row.independent):
             verdict += f"; an independent implementation found {number(row.independent, 4)} too"
     metric = metric_name(row.metric, evidence.case.metric_words)
-    return Row(row.label, metric, row.paper, median, ours("min"), ours("max"), row.independent, verdict, holds)
+    paper = row.paper if row.printed else None
+    return Row(row.label, metric, paper, median, ours("min"), ours("max"), row.independent, verdict, holds)
 
 
 def _unmeasured(row: PaperFigure) -> str:
