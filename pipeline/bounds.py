@@ -42,13 +42,8 @@ def kinds(case: Case) -> tuple[str, ...]:
     observer for it would be one more controller, and no bound. So it is where samples follow
     one another quickly, and an NMPC without a filter is busy with the noise (``Effort.noisy``).
     """
-    noisy = measures_states(case.plant) and case.effort.noisy
+    noisy = case.plant.measures_states and case.effort.noisy
     return ("nmpc", "offline", "nmpc_noise") if noisy else ("nmpc", "offline")
-
-
-def measures_states(plant: Plant) -> bool:
-    """Whether the plant's PVs are its states."""
-    return type(plant).output is Plant.output
 
 
 def problem(case: Case) -> dict[str, Any]:
@@ -77,7 +72,7 @@ def plant_digest(plant: Plant) -> str:
         function.body = function.body[1:]
     names = dict(zip(plant.parameter_names(), plant.parameters().tolist(), strict=True))
     what = [ast.unparse(source), names, plant.period_s, plant.time_unit_s, plant.substeps]
-    if not measures_states(plant):
+    if not plant.measures_states:
         what.append(_probe(plant))
     if any(s.values is not None for s in plant.mv_signals):
         what.append(_probe(plant.relaxed()))

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.collocation import collocation, scaling, trace
 from pipeline.errors import PlantError
 from pipeline.plants.base import Plant
-from serving.manifest import Signal
 
 Array = NDArray[np.float64]
 
@@ -80,9 +80,9 @@ class Horizon:
         self.plant, self.n, self._squared = plant, n, metric in SQUARED
         self._n_x, self._n_mv, self._n_cv = len(plant.state_signals), len(plant.mv_signals), len(plant.sp_signals)
         self._points = elements * degree
-        self._x_low, self._x_span = _range(plant.state_signals)
-        self._mv_low, self._mv_span = _range(plant.mv_signals)
-        self._cv_span = _range(plant.sp_signals)[1]
+        self._x_low, self._x_span = scaling(plant.state_signals)
+        self._mv_low, self._mv_span = scaling(plant.mv_signals)
+        self._cv_span = scaling(plant.sp_signals)[1]
         n_z = self._n_x * self._points
         rows = self._rows = n_z + self._n_mv + self._n_cv
 
@@ -94,8 +94,8 @@ class Horizon:
         p = ca.MX.sym("p", len(plant.parameter_names()), n)
         ends = z[n_z - self._n_x :, :]
         starts = ca.horzcat(x0, ends[:, :-1])
-        self._trace = self._dense(elements, degree)
-        defects = self._collocation(elements, degree).map(n)(starts, z, u, p)
+        self._trace = trace(plant, elements, degree)
+        defects = collocation(plant, elements, degree).map(n)(starts, z, u, p)
         error = sp - self._controlled().map(n)(ends)
         moves = u[:, 1:] - u[:, :-1]
         weight = MOVE_WEIGHT[metric] if move_weight is None else move_weight
@@ -143,51 +143,6 @@ class Horizon:
         if name not in names:
             raise PlantError(f"plant {self.plant.name!r} has no state {name!r} to limit; it has {', '.join(names)}")
         return names.index(name)
-
-    def _collocation(self, elements: int, degree: int) -> ca.Function:
-        """Defects of one period, scaled: (x, z, u, p) -> (n_x * points,)."""
-        plant = self.plant
-        x = ca.SX.sym("x", self._n_x)
-        z = ca.SX.sym("z", self._n_x, self._points)
-        u = ca.SX.sym("u", self._n_mv)
-        p = ca.SX.sym("p", len(plant.parameter_names()))
-        differentiate, _, _ = ca.collocation_coeff(ca.collocation_points(degree, "radau"))
-        h = plant.period_s / plant.time_unit_s / elements
-        mv = self._mv_low + self._mv_span * u
-        defects, start = [], x
-        for element in range(elements):
-            inside = z[:, element * degree : (element + 1) * degree]
-            rate = ca.horzcat(
-                *(
-                    plant.rate(self._x_low + self._x_span * inside[:, j], mv, plant.dv_nominal, p) / self._x_span
-                    for j in range(degree)
-                )
-            )
-            defects.append(ca.vec(ca.horzcat(start, inside) @ differentiate - h * rate))
-            start = inside[:, -1]
-        return ca.Function("collocation", [x, ca.vec(z), u, p], [ca.vertcat(*defects)])
-
-    def _dense(self, elements: int, degree: int) -> ca.Function:
-        """States at the collocation points of one period by RK4: (x, mv, p) -> (n_x, points)."""
-        plant = self.plant
-        x = ca.SX.sym("x", self._n_x)
-        mv = ca.SX.sym("mv", self._n_mv)
-        p = ca.SX.sym("p", len(plant.parameter_names()))
-        points = np.array(ca.collocation_points(degree, "radau"))
-        times = np.concatenate([e + points for e in range(elements)]) / elements
-        period = plant.period_s / plant.time_unit_s
-        state, found = x, []
-        for span in np.diff(times, prepend=0.0):
-            substeps = int(np.ceil(span * plant.substeps))
-            h = span * period / substeps
-            for _ in range(substeps):
-                k1 = plant.rate(state, mv, plant.dv_nominal, p)
-                k2 = plant.rate(state + h / 2 * k1, mv, plant.dv_nominal, p)
-                k3 = plant.rate(state + h / 2 * k2, mv, plant.dv_nominal, p)
-                k4 = plant.rate(state + h * k3, mv, plant.dv_nominal, p)
-                state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            found.append(state)
-        return ca.Function("trace", [x, mv, p], [ca.horzcat(*found)])
 
     def _controlled(self) -> ca.Function:
         """Controlled variables in fractions of their ranges, from a scaled state."""
@@ -295,15 +250,10 @@ class Horizon:
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if miss(middle) * at_low > 0 else (low, middle)
             mv[0] = self._mv_low[0] + self._kept(x, 0.5 * (low + high), mv, p[k], step) * self._mv_span[0]
-            trace = np.array(self._trace(x, mv, p[k])).T
-            x = trace[-1]
-            values[:n_z, k] = ((trace - self._x_low) / self._x_span).ravel()
+            passed = np.array(self._trace(x, mv, p[k])).T
+            x = passed[-1]
+            values[:n_z, k] = ((passed - self._x_low) / self._x_span).ravel()
             values[n_z : n_z + self._n_mv, k] = (mv - self._mv_low) / self._mv_span
             error = (sp[k] - np.array(self.plant.measure(x))[: self._n_cv, 0]) / self._cv_span
             values[n_z + self._n_mv :, k] = error if self._squared else np.abs(error)
         return self._plan(np.asarray(x0), sp, values)
-
-
-def _range(signals: tuple[Signal, ...]) -> tuple[Array, Array]:
-    low = np.array([s.low for s in signals])
-    return low, np.array([s.high for s in signals]) - low

@@ -16,7 +16,7 @@ from pipeline.cases.base import Array, Case, Scenario, held
 from pipeline.cases.effort import Effort
 from pipeline.errors import PlantError
 from pipeline.horizon import Horizon
-from pipeline.oracle import PerfectNmpc, run_nmpc, run_offline
+from pipeline.perfect import PerfectNmpc, run_nmpc, run_offline
 from pipeline.plants import PLANTS
 from pipeline.plants.base import Plant
 from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr

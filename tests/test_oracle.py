@@ -15,7 +15,7 @@ from pipeline.cases.effort import Effort
 from pipeline.errors import PlantError
 from pipeline.horizon import Horizon
 from pipeline.metrics import mae
-from pipeline.oracle import PerfectNmpc, run_nmpc, run_offline, search
+from pipeline.perfect import PerfectNmpc, run_nmpc, run_offline, search
 from pipeline.plants.base import Plant
 from pipeline.plants.batch_reactor import BatchReactor
 from pipeline.simulate import simulate_closed

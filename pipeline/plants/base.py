@@ -55,6 +55,11 @@ class Plant(ABC):
         return x
 
     @property
+    def measures_states(self) -> bool:
+        """Whether the process variables are the states."""
+        return type(self).output is Plant.output
+
+    @property
     def dv_nominal(self) -> Array:
         """Nominal measured disturbances, shape (n_dv,)."""
         return np.zeros(len(self.dv_signals))
