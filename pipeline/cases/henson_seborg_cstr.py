@@ -41,7 +41,9 @@ ALONE = tuple(Curve("pid", {"printed": float(i)}) for i in (2, 3, 4, 5))
 def _iae(label: str, curve: Curve, *found: float) -> tuple[PaperFigure, ...]:
     """Rows of IAE up, down and after the jump; the figures are those of an independent implementation."""
     tests = zip(("up", "down", "jump"), found, strict=False)
-    return tuple(PaperFigure(f"{label}, {t}", curve.law, t, "iae", v, curve.setting, v) for t, v in tests)
+    return tuple(
+        PaperFigure(f"{label}, {t}", curve.law, t, "iae", v, curve.setting, v, printed=False) for t, v in tests
+    )
 
 
 @dataclass(frozen=True)
