@@ -5,6 +5,7 @@ from __future__ import annotations
 from pipeline.report.claims import (
     batch_reactor,
     henson_seborg_cstr,
+    jacketed_batch_reactor,
     ph_neutralization,
     reversible_cstr,
     thiosulfate_cstr,
@@ -16,6 +17,7 @@ CLAIMS: dict[str, Claims] = {
     "ph_neutralization": ph_neutralization.CLAIMS,
     "batch_reactor": batch_reactor.CLAIMS,
     "henson_seborg_cstr": henson_seborg_cstr.CLAIMS,
+    "jacketed_batch_reactor": jacketed_batch_reactor.CLAIMS,
     "reversible_cstr": reversible_cstr.CLAIMS,
 }
 PLAIN = Claims(plain_reason)
