@@ -19,8 +19,8 @@ RELATIVE = 0.25
 ABSOLUTE = 1e-4
 RULE = (
     f"A figure reproduces when it lies within {100 * RELATIVE:g} % of the paper's or within {ABSOLUTE:g} of it "
-    "(in its own unit). Ours are medians over the data seeds, whose networks were each trained "
-    "on another record."
+    "(in its own unit). Ours are medians over the data seeds, whose models were each learnt "
+    "from another record."
 )
 
 
