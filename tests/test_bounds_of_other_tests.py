@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -240,6 +241,17 @@ def test_tests_on_other_plants_have_their_own_bounds_and_those_on_a_map_none(tmp
     assert bounds["own"]["nmpc"]["hot_samples"] == 5
     assert bounds["own"]["nmpc"]["mae"] < bounds["cool"]["nmpc"]["mae"]
     assert bounds["own_noise"]["nmpc"] == bounds["own"]["nmpc"]
+
+
+def test_a_fixed_test_that_changed_leaves_no_figures_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case, path = Vessels(), tmp_path / "vessels.json"
+    list(oracle.compute(case, ["own", "cool"], path=path))
+    tests = case.scenarios()
+    longer = replace(tests["own"][0], sp=np.full((6, 1), 22.0))
+    monkeypatch.setattr(Vessels, "scenarios", lambda self: {"own": (longer,)})
+    list(oracle.compute(case, ["own"], path=path))
+    figures = json.loads(path.read_text())["figures"]
+    assert {name: list(rows) for name, rows in figures.items()} == {"own": [longer.digest()]}
 
 
 # ---------------------------------------------------------------------- yardsticks
