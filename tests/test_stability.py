@@ -78,6 +78,15 @@ def test_a_law_that_does_not_rest_has_no_frozen_loop(plant):
         FrozenLoops.of(plant, drifting, 1, np.array([0.1]))
 
 
+def test_a_pid_tells_of_its_loops_where_it_is_asked_to(plant, settings):
+    asked = {"tuning": "manual", "kc": settings.kc, "ti_s": settings.ti_s, "td_s": settings.td_s, "filter_s": 1.32}
+    signals = LawSignals.of(plant)
+    told = PID.design(PID.Params(**asked, examined_cv=(0.015, 0.13)), {}, signals, plant).analysis(plant)
+    assert told.figures["frozen_radius"] == pytest.approx(told.arrays["frozen_radius"].max())
+    assert 3 < told.figures["gain_margin"] < 4
+    assert not PID.design(PID.Params(**asked), {}, signals, plant).analysis(plant).figures
+
+
 def rotation(angle: float, size: float = 1.0) -> np.ndarray:
     return size * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 

@@ -6,17 +6,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pipeline import tuning
 from pipeline.development import DevelopmentLoops
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.base import Analysis, ControlLaw, LawSignals, require_single_loop
 from pipeline.models.base import Model
 from pipeline.plants.base import Array, Linearization, Plant
 from pipeline.reduction import LagWithDeadTime
+from pipeline.stability import FrozenLoops, spectral_radius
 from pipeline.tuning import AllPole, PidSettings
+
+EXAMINED = 40  # linear closed loops over a range of the CV
 
 
 @runtime_checkable
@@ -63,8 +67,9 @@ class PID(ControlLaw):
         ``linearized``; None is the middle of the set point's range. The development set points
         are drawn for the optimization alone, ``development_set_points`` of them for each seed,
         each held for ``development_hold`` samples. ``sampling`` is what ``itae`` counts of a period as
-        dead time: 0.5 is the textbook's, 1 more cautious. ``mv_rate`` [mv] is the largest change a
-        sample, None unlimited.
+        dead time: 0.5 is the textbook's, 1 more cautious. ``examined_cv`` [pv] is the range over which
+        the linear closed loops are examined; None: not at all. ``mv_rate`` [mv] is the largest change
+        a sample, None unlimited.
         """
 
         tuning: Literal["optimized", "imc", "simc", "itae", "manual"] = "optimized"
@@ -81,6 +86,7 @@ class PID(ControlLaw):
         development_set_points: int = 12
         development_hold: int = 60
         sampling: float = 0.5
+        examined_cv: tuple[float, float] | None = None
         mv_rate: float | None = None
 
     kc: Tensor  # (..., 1)
@@ -90,6 +96,8 @@ class PID(ControlLaw):
     weight: Tensor  # b
     fade: Tensor  # 1 - h/Tt
     near: Tensor  # [mv] an actuator this close to the limited request has followed it
+
+    examined_cv: tuple[float, float] | None = None
 
     def __init__(
         self, signals: LawSignals, settings: PidSettings | Sequence[PidSettings], mv_rate: float | None = None
@@ -121,6 +129,12 @@ class PID(ControlLaw):
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         """The PID tuned as ``params`` says, on part ``linearized`` or on the plant; raises LawError."""
+        law = cls._tuned(params, models, signals, plant)
+        law.examined_cv = params.examined_cv
+        return law
+
+    @classmethod
+    def _tuned(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         require_single_loop(signals, cls.name)
         p = params
         weight = 1.0 if p.set_point_weight is None else p.set_point_weight
@@ -169,6 +183,15 @@ class PID(ControlLaw):
         requested = mv_applied + self.fade * unmet + self.kc * move
         mv = self.limited(requested, mv_applied)
         return mv, torch.cat([torch.ones_like(p), p, y, d, requested, mv], dim=-1), requested
+
+    def analysis(self, plant: Plant) -> Analysis:
+        """Stability and gain margin of the linear closed loops over ``examined_cv``; nothing where that is None."""
+        if self.examined_cv is None:
+            return Analysis()
+        loops = FrozenLoops.of(plant, self, self.n_state, np.linspace(*self.examined_cv, EXAMINED))
+        radius = spectral_radius(loops.matrices())
+        figures = {"frozen_radius": float(radius.max()), "gain_margin": loops.gain_margin()}
+        return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius})
 
 
 def _linearization(params: Any, models: Mapping[str, Model], plant: Plant) -> Linearization:

@@ -35,7 +35,8 @@ FITS = {"fit_C": 96.0, "fit_T": 98.0}
 RADIUS = 0.98
 RECOVERED = 0.99
 TUNED = Curve("pid", {"tuned": True})
-ROUGH = Curve("auto_pid_network", {"wc": 7.0})
+FAST = Curve("auto_pid_network", {"wc": 7.0})
+MARGINS = (("PID 1", PID_1), ("a PID tuned in closed loop", TUNED), ("one knob", AUTO), ("wc = 7", FAST))
 TESTS = ("up", "down", "jump", "jump_down", "feed_temperature", "feed_concentration", "held_out")
 ULTIMATE = 1e12  # [l^2/(min mol)] the largest gain that is tried
 
@@ -145,14 +146,18 @@ def _ahead(evidence: Evidence) -> Verdict:
             wins.append(test)
     if not known:
         return _missing()
-    tuned = evidence.figure(TUNED.law, "up", "iae", TUNED.setting)
-    because = f"ahead on {', '.join(wins) or 'none'}" + (
-        ""
-        if tuned is None
-        else f"; one PID tuned in closed loop has {number(tuned)} on up, the one-knob network "
-        f"{number(evidence.figure(AUTO.law, 'up', 'iae') or float('nan'))}, with wc = 7 "
-        f"{number(evidence.figure(ROUGH.law, 'up', 'iae', ROUGH.setting) or float('nan'))}"
-    )
+    beside = [
+        f"{words} {number(iae)} with a gain margin of {number(margin)}"
+        for words, curve in (
+            ("PID 1", PID_1),
+            ("a PID tuned in closed loop", TUNED),
+            ("one knob", AUTO),
+            ("wc = 7", FAST),
+        )
+        if (iae := evidence.figure(curve.law, "up", "iae", curve.setting)) is not None
+        and (margin := _said(evidence, curve).get("gain_margin")) is not None
+    ]
+    because = f"ahead on {', '.join(wins) or 'none'}" + (f"; on up, {', '.join(beside)}" if beside else "")
     return Verdict("", "", "IAE network : PID 1 alone, " + ", ".join(shown), 2 * len(wins) > known, because)
 
 
@@ -316,7 +321,15 @@ CLAIMS = Claims(
         CasePicture(
             "frozen_loops",
             "Linear closed loops over the set point, and what Lyapunov functions of neighbours prove",
-            frozen_picture(((GAINS, "printed, gains"), (AUTO, "one knob, gains"), (OUTPUTS, "printed, outputs"))),
+            frozen_picture(
+                (
+                    (GAINS, "printed, gains"),
+                    (AUTO, "one knob, gains"),
+                    (OUTPUTS, "printed, outputs"),
+                    (PID_1, "PID 1"),
+                    (TUNED, "PID tuned in closed loop"),
+                )
+            ),
         ),
         CasePicture("phase_plane", "Where 2,000 starts go, and the state from which none returns", phase_picture),
     ),

@@ -95,8 +95,11 @@ def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
         canvas = Canvas(figsize=(SIZE[0], 4.6), layout="constrained")
         axes = canvas.subplots()
         for i, (words, arrays) in enumerate(found):
-            colour, proved = PALETTE[i % len(PALETTE)], ~np.isnan(arrays["contraction"])
+            colour = PALETTE[i % len(PALETTE)]
             axes.plot(arrays["frozen_cv"], arrays["frozen_radius"], color=colour, linewidth=1.5, label=words, zorder=3)
+            if "contraction" not in arrays:
+                continue
+            proved = ~np.isnan(arrays["contraction"])
             for (a, b), rate in zip(pairwise(arrays["points"]), arrays["contraction"], strict=True):
                 axes.plot([a, b], [rate, rate], color=colour, linewidth=4, alpha=0.35, solid_capstyle="butt", zorder=2)
             axes.plot(
