@@ -59,7 +59,7 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         k_jacket: float = 0.3
         l_jacket: float = 0.05
         k_core: float = 0.1
-        l_core: float = 0.0015
+        l_core: float = 0.003
         core_gain: float = 0.04
         approach: float = 0.2
 

@@ -33,7 +33,7 @@ def recipe_picture(curve: Curve, scenario: str) -> Draw:
         core.step(time, loop["sp"][:, 0], where="post", color="#888888", linewidth=0.9, label="set point")
         core.plot(time, loop["pv"][:, 0], color=PALETTE[1], linewidth=2.0, label="core")
         core.plot(time[AHEAD:], told["adjusted_reference"][:-AHEAD], "--", color="black", linewidth=1.0,
-                  label="adjusted reference, two samples ahead")  # fmt: skip
+                  label="adjusted reference")  # fmt: skip
         jacket.plot(time[1:], told["wanted_jacket"][:-1], color="#888888", linewidth=0.8, label="wanted of the jacket")
         jacket.plot(time, loop["pv"][:, 1], color=PALETTE[0], linewidth=1.2, label="jacket")
         throttle.step(time, loop["mv"][:, 0], where="post", color="black", linewidth=0.9)
@@ -105,6 +105,7 @@ def offsets_picture(laws: Sequence[str], scenarios: Mapping[str, str]) -> Draw:
                 axes.annotate(number(value, 2), (x, value), xytext=(0, 3), textcoords="offset points",
                               ha="center", fontsize="small")  # fmt: skip
         axes.set_yscale("log")
+        axes.set_axisbelow(True)
         axes.set_ylim(SMALLEST, None)
         axes.set_xticks(range(len(scenarios)), list(scenarios.values()))
         axes.set_ylabel("offset at the end of a level [°C]:\nmean (bar) and largest")
