@@ -23,8 +23,12 @@ SMALL: dict[str, Any] = {
     "partitions": 10,
     "sweep": [4, 8],
     "hidden": [6, 6],
+    "steps": 20,
+    "free_run_iterations": 5,
+    "sizes": [3, 5],
 }
 TRAINER = {"kind": "lm", "iterations": 15}
+TRAINING = {"iterations": 3, "restarts": 1}  # of laws that learn in closed loop
 
 
 def reduced(tree: dict[str, Any]) -> dict[str, Any]:
@@ -37,8 +41,10 @@ def shrunk(tree: Any) -> Any:
     if not isinstance(tree, dict):
         return tree
     found = {key: _small(key, value) for key, value in tree.items()}
-    if found.get("kind") == "mlp":
+    if found.get("kind") == "mlp" or "trainer" in found:
         found["trainer"] = TRAINER
+    if "training" in found:
+        found["training"] |= TRAINING
     if "search" in found:
         found["search"] = found["search"][:2]
     if "variants" in found:
