@@ -25,6 +25,7 @@ SMALL: dict[str, Any] = {
     "hidden": [6, 6],
     "steps": 20,
     "free_run_iterations": 5,
+    "long_run": 200,
     "sizes": [3, 5],
 }
 TRAINER = {"kind": "lm", "iterations": 15}
