@@ -53,16 +53,16 @@ class FuzzyFeedforward(FuzzyLaw):
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
-        started = state[..., :1]
+        started, t, line = torch.split(state, [1, 1, 4], dim=-1)
         side = self.side(started, mv_applied)
-        course = torch.cat([state[..., 1:2], self.followed(state[..., 2:], side, mv_applied)], dim=-1)
+        course = torch.cat([t, self.followed(line, side, mv_applied)], dim=-1)
         # A measurement that is not a number stops this law like any other, although it needs only the first.
         x = torch.where(started > 0, course, pv) + 0.0 * pv
-        t, t_w = x[..., :1], x[..., 1:]
+        t, t_w = torch.split(x, 1, dim=-1)
         t_next = self.model.core_next(t, t_w)
         wanted = self.allowed(self.wanted(sp, t_next))
-        line = self.model.jacket(t, t_w)
-        mv, reached = self.move(line, wanted, side, mv_applied)
+        reach = self.model.jacket(t, t_w)
+        mv, reached = self.move(reach, wanted, side, mv_applied)
         adjusted = self.model.core_next(t_next, reached)
-        state = torch.cat([torch.ones_like(t), t_next, line.base, line.gain], dim=-1)
+        state = torch.cat([torch.ones_like(t), t_next, *reach], dim=-1)
         return mv, state, torch.cat([adjusted, wanted, reached, mv[..., 1:]], dim=-1)

@@ -98,23 +98,23 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
-        started, offsets = state[..., :1], state[..., 7:]
+        started, t, reference, line, offsets = torch.split(state, [1, 1, 1, 4, 2], dim=-1)
         side = self.side(started, mv_applied)
-        predicted = torch.cat([state[..., 1:2], self.followed(state[..., 3:7], side, mv_applied)], dim=-1)
+        predicted = torch.cat([t, self.followed(line, side, mv_applied)], dim=-1)
         predicted = torch.where(started > 0, predicted, pv)
         innovation = pv - predicted
         x = predicted + self.correct * innovation
         offsets = offsets + self.learn * innovation
-        core_offset, jacket_offset = offsets[..., :1], offsets[..., 1:]
-        t, t_w = x[..., :1], x[..., 1:]
+        core_offset, jacket_offset = torch.split(offsets, 1, dim=-1)
+        t, t_w = torch.split(x, 1, dim=-1)
         t_next = self.model.core_next(t, t_w) + core_offset
-        reference = torch.where(started > 0, state[..., 2:3], t_next)
+        reference = torch.where(started > 0, reference, t_next)
         spent = self.core_gain * (reference - t_next) - core_offset
         target = reference + self.approach * (sp - reference)
         wanted = self.allowed(self.wanted(target + spent, reference))
-        line = self.model.jacket(t, t_w)
-        line = JacketAffine(line.base + jacket_offset, line.gain)
-        mv, reached = self.move(line, wanted, side, mv_applied)
+        reach = self.model.jacket(t, t_w)
+        reach = JacketAffine(reach.base + jacket_offset, reach.gain)
+        mv, reached = self.move(reach, wanted, side, mv_applied)
         adjusted = self.model.core_next(reference, reached) - spent
-        state = torch.cat([torch.ones_like(t), t_next, adjusted, line.base, line.gain, offsets], dim=-1)
+        state = torch.cat([torch.ones_like(t), t_next, adjusted, *reach, offsets], dim=-1)
         return mv, state, torch.cat([adjusted, wanted, reached, mv[..., 1:], offsets], dim=-1)

@@ -82,19 +82,20 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
-        started, t = state[..., :1], pv[..., :1]
+        started, now, reference, integral, line = torch.split(state, [1, 1, 1, 1, 4], dim=-1)
+        t, measured = torch.split(pv, 1, dim=-1)
         side = self.side(started, mv_applied)
-        t_w = torch.where(started > 0, self.followed(state[..., 4:], side, mv_applied), pv[..., 1:])
-        t_w = t_w + self.k_jacket * (pv[..., 1:] - t_w)
-        now = torch.where(started > 0, state[..., 1:2], t)
-        reference = torch.where(started > 0, state[..., 2:3], self.model.core_next(t, t_w))
+        t_w = torch.where(started > 0, self.followed(line, side, mv_applied), measured)
+        t_w = t_w + self.k_jacket * (measured - t_w)
+        now = torch.where(started > 0, now, t)
+        reference = torch.where(started > 0, reference, self.model.core_next(t, t_w))
         error = now - t
-        integral = state[..., 3:4] + self.integral * error
+        integral = integral + self.integral * error
         u = self.kc * error + integral
         target = reference + self.approach * (sp - reference)
         wanted = self.allowed(self.wanted(target, reference) + u)
-        line = self.model.jacket(t, t_w)
-        mv, reached = self.move(line, wanted, side, mv_applied)
+        reach = self.model.jacket(t, t_w)
+        mv, reached = self.move(reach, wanted, side, mv_applied)
         adjusted = self.model.core_next(reference, reached - u)
-        state = torch.cat([torch.ones_like(t), reference, adjusted, integral, line.base, line.gain], dim=-1)
+        state = torch.cat([torch.ones_like(t), reference, adjusted, integral, *reach], dim=-1)
         return mv, state, torch.cat([adjusted, wanted, reached, mv[..., 1:], integral], dim=-1)

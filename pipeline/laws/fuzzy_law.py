@@ -91,27 +91,25 @@ class FuzzyLaw(ControlLaw):
 
     def followed(self, line: Tensor, side: Tensor, mv_applied: Tensor) -> Tensor:
         """T_w (..., 1) after the applied MVs, from both modes' bases and gains, ``line`` (..., 4)."""
+        base, base_2, gain, gain_2 = torch.split(line, 1, dim=-1)
         second = side > 0
-        base = torch.where(second, line[..., 1:2], line[..., 0:1])
-        gain = torch.where(second, line[..., 3:4], line[..., 2:3])
-        return base + gain * mv_applied[..., :1]
+        return torch.where(second, base_2, base) + torch.where(second, gain_2, gain) * mv_applied[..., :1]
 
     def move(self, line: JacketAffine, wanted: Tensor, side: Tensor, mv_applied: Tensor) -> Move:
         """Mode and throttle for a wanted jacket temperature (..., 1) within its limits."""
         other_end = line.base + line.gain
         low, high = torch.minimum(line.base, other_end), torch.maximum(line.base, other_end)
         nearest = torch.minimum(torch.maximum(wanted, low), high)
-        missed = (nearest - wanted).abs()
-        ahead = missed[..., 0:1] - missed[..., 1:2] + self.stay * side
+        missed, missed_2 = torch.split((nearest - wanted).abs(), 1, dim=-1)
+        ahead = missed - missed_2 + self.stay * side
         second = ahead > 0
-        throttle = (nearest - line.base) / line.gain
-        k_m = torch.where(second, throttle[..., 1:2], throttle[..., 0:1])
+        throttle, throttle_2 = torch.split((nearest - line.base) / line.gain, 1, dim=-1)
+        k_m = torch.where(second, throttle_2, throttle)
         # What is not a number must not become a mode.
         mode = torch.where(second, self.modes[1:], self.modes[:1]) + 0.0 * ahead
         mv = self.limited(torch.cat([k_m, mode], dim=-1), mv_applied)
-        base = torch.where(second, line.base[..., 1:2], line.base[..., 0:1])
-        gain = torch.where(second, line.gain[..., 1:2], line.gain[..., 0:1])
-        return Move(mv, base + gain * mv[..., :1])
+        (base, base_2), (gain, gain_2) = (torch.split(values, 1, dim=-1) for values in line)
+        return Move(mv, torch.where(second, base_2, base) + torch.where(second, gain_2, gain) * mv[..., :1])
 
 
 def _chosen(models: Mapping[str, Model], part: str | None, law: str) -> HybridFuzzy:
