@@ -6,7 +6,7 @@ import shutil
 import statistics
 import sys
 from collections.abc import Mapping
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +30,14 @@ def fit(name: str) -> None:
     folder = model_folder(params.case, params.model)
     shutil.rmtree(folder, ignore_errors=True)
     data = data_files(params.data)
-    results = parallel_map(partial(_learn, parts, case, folder), list(data.items()), f"fit {name}")
-    digests = {str(seed): digest for seed, (digest, _) in zip(data, results, strict=True)}
+    work = [(seed, part) for seed in data for part in parts]
+    results = dict(
+        zip(work, parallel_map(partial(_learn, parts, data, case, folder), work, f"fit {name}"), strict=True)
+    )
+    digests = {str(seed): digest for (seed, _), (digest, _, _) in results.items()}
     metrics: dict[str, Any] = {"model": params.model, "data": digests, "parts": {}}
     for part, description in parts.items():
-        per_seed = {str(seed): found[part] for seed, (_, found) in zip(data, results, strict=True)}
+        per_seed = {str(seed): results[seed, part][1] for seed in data}
         fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
         metrics["parts"][part] = {
             "kind": description.model.kind,
@@ -42,6 +45,9 @@ def fit(name: str) -> None:
             "per_seed": per_seed,
             "median": _median(per_seed),
         }
+        predictions = results[0, part][2] if 0 in data else None
+        if predictions is not None:
+            np.savez(folder / "predictions.npz", **predictions)
     write_json(folder / "metrics.json", metrics)
 
 
@@ -68,23 +74,24 @@ def data_files(data: Path) -> dict[int, Path | None]:
 
 
 def _learn(
-    parts: Mapping[str, Part], case: Case, folder: Path, item: tuple[int, Path | None]
-) -> tuple[str | None, dict[str, Any]]:
-    seed, path = item
+    parts: Mapping[str, Part], data: Mapping[int, Path | None], case: Case, folder: Path, item: tuple[int, str]
+) -> tuple[str | None, dict[str, Any], Mapping[str, Any] | None]:
+    seed, name = item
+    record = _record(data[seed], case)
+    learnt = parts[name].learn(record, case.plant, case.regions, seed)
+    learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
+    if learnt.sweep is not None:
+        learnt.sweep.save(folder / "sweep.json")
+        learnt.sweep.plot(folder / "sweep.png")
+    return None if record is None else record.digest(), learnt.metrics, learnt.predictions
+
+
+@lru_cache(maxsize=1)
+def _record(path: Path | None, case: Case) -> Record | None:
+    """The record of a file; the last one is kept, because a seed's parts follow each other."""
     plant = case.plant
     signals = {"pv": plant.pv_signals, "mv": plant.mv_signals, "dv": plant.dv_signals}
-    record = None if path is None else Record.read(path, **signals, period_s=plant.period_s)
-    found = {}
-    for name, part in parts.items():
-        learnt = part.learn(record, plant, case.regions, seed)
-        learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
-        found[name] = learnt.metrics
-        if learnt.sweep is not None:
-            learnt.sweep.save(folder / "sweep.json")
-            learnt.sweep.plot(folder / "sweep.png")
-        if learnt.predictions is not None and seed == 0:
-            np.savez(folder / "predictions.npz", **learnt.predictions)  # type: ignore[arg-type]
-    return None if record is None else record.digest(), found
+    return None if path is None else Record.read(path, **signals, period_s=plant.period_s)
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
