@@ -193,6 +193,23 @@ def test_what_reproduces(ours, paper, same):
     assert close(ours, paper) is same
 
 
+def test_a_figure_may_say_how_near_ours_must_be(root):
+    """A slip of 0.1 % in what follows from equations alone would pass under a quarter of the figure."""
+    evidence, row = load(root), PaperFigure("x", "pid", "sp_a", "mae", 0.0)
+    ours = evidence.figure("pid", "sp_a", "mae")
+    assert ours is not None
+
+    def judged(paper: float, within: float | None):
+        return paper_row(replace(row, paper=paper, within=within), evidence, PLAIN.reason)
+
+    assert judged(ours * 1.001, None).verdict == "reproduces"
+    slip = judged(ours * 1.001, 5e-4 * ours)
+    assert slip.holds is False
+    assert slip.digits > judged(ours, None).digits
+    assert re.search(r"it is -\S+ from the paper's, where \S+ is allowed", slip.verdict)
+    assert judged(ours * 1.0004, 5e-4 * ours).verdict.startswith("reproduces within")
+
+
 def test_settings_find_their_variant(root):
     evidence = load(root)
     assert parse_setting("r=10, back") == {"r": 10.0, "back": True}

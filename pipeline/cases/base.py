@@ -97,7 +97,10 @@ class PaperFigure:
     """One number of the paper's tables, and the same one from an independent implementation.
 
     Of a model, ``law`` names its set, ``scenario`` is empty and ``metric`` a path of the set's figures.
+    Without a scenario a law's name stands for what its analysis says, where no set is called so.
     Where the paper prints no figure (``printed`` false), ``paper`` is the independent implementation's.
+    ``within`` is how near ours must be, in the figure's unit, where a quarter would let anything pass:
+    half a unit of the last printed digit, for what follows from equations alone.
     """
 
     label: str
@@ -108,6 +111,7 @@ class PaperFigure:
     setting: Mapping[str, float | str] = field(default_factory=dict)  # of the law, such as r
     independent: float | None = None
     printed: bool = True
+    within: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

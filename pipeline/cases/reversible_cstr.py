@@ -53,7 +53,7 @@ class ReversibleCstrCase(Case):
     """Seed 001_4ed8acfa2fdd36af.txt, section "Simulation Result and Discussion", which prints curves and no figure.
 
     The levels of its random set points and everything in its tables here come from an independent
-    implementation. Its 20 % of the heat of reaction hardly acts on this reactor, so that slower
+    implementation. Its 20 % change of the heat of reaction hardly acts on this reactor, so that slower
     reactions and a larger heat loss stand beside it. Each law follows the same reference model.
     """
 
@@ -117,7 +117,9 @@ class ReversibleCstrCase(Case):
         "the best PID setting has Kc = +3.15": "saturates: the plant's gain is negative; with Kc = -3.15 it holds",
         "the network follows random set points without overshoot, the PID overshoots": "not measured",
         "under a hotter feed the network returns sooner than the PID": "reproduces: IAE 0.25 to 0.30 against 1.09",
-        "with 20 % of the heat of reaction the network is far slower than the PID": "no test: it moves CB by 2e-4",
+        "with a 20 % change of the heat of reaction the network is far slower than the PID": (
+            "no test: it moves CB by 2e-4"
+        ),
         "a network of two errors needs no integral action": "does not reproduce: an end offset of 0.019",
         "a network follows set points better than a controller with fixed gains": (
             "does not reproduce: PI on the same model 3.5e-4 from it, networks 8e-4 to 1.4e-3"

@@ -133,9 +133,13 @@ class Evidence:
     ) -> float | None:
         """One figure over the data seeds (median, min or max); None where it was not measured.
 
-        Without a scenario ``law`` names a model set and ``metric`` a path of its figures.
+        Without a scenario ``law`` names a model set and ``metric`` a path of its figures, or a law
+        and a figure of its analysis, which is one and has no range.
         """
         metric = metric or self.case.metric
+        if not scenario and law in self.laws and law not in self.models:
+            said = (self.laws[law].analysis(setting or {}).get("figures") or {}).get(metric)
+            return None if said is None or how != "median" else float(said)
         if not scenario:
             return model_figure(self.models.get(law, {}), metric, how)
         if law not in self.laws:

@@ -14,9 +14,9 @@ def ratio(value: float) -> str:
     return f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
 
 
-def figure(value: float | None) -> str:
-    """A number with three digits; a dash where nothing was measured."""
-    return "–" if value is None else number(value)
+def figure(value: float | None, digits: int = 3) -> str:
+    """A number with so many digits; a dash where nothing was measured."""
+    return "–" if value is None else number(value, digits)
 
 
 def times(value: float | None) -> str:

@@ -1,6 +1,7 @@
 """Does it reproduce? The paper's figures, the requirements and the claims against what was measured.
 
-A figure reproduces when it lies within ``RELATIVE`` of the paper's, or within ``ABSOLUTE`` of it.
+A figure reproduces when it lies within ``RELATIVE`` of the paper's, or within ``ABSOLUTE`` of it;
+one that says itself how near it must be (``PaperFigure.within``) within that alone.
 What a row says when it does not is chosen by what was measured, never written down beforehand.
 """
 
@@ -17,10 +18,11 @@ from pipeline.report.words import law_label, metric_name, number
 
 RELATIVE = 0.25
 ABSOLUTE = 1e-4
+FINE = 5  # digits shown of a figure that has to be near
 RULE = (
     f"A figure reproduces when it lies within {100 * RELATIVE:g} % of the paper's or within {ABSOLUTE:g} of it "
-    "(in its own unit). Ours are medians over the data seeds, whose models were each learnt "
-    "from another record."
+    "(in its own unit), or within what its row names. Ours are medians over the data seeds, whose models were each "
+    "learnt from another record."
 )
 
 
@@ -75,16 +77,20 @@ class Row:
     independent: float | None
     verdict: str
     holds: bool | None
+    digits: int = 3  # to be shown of its numbers
 
 
-def close(ours: float, paper: float) -> bool:
-    """Whether a figure reproduces the paper's."""
-    return abs(ours - paper) <= max(RELATIVE * abs(paper), ABSOLUTE)
+def close(ours: float, paper: float, within: float | None = None) -> bool:
+    """Whether a figure reproduces the paper's; ``within`` is its own tolerance, where it has one."""
+    return abs(ours - paper) <= (max(RELATIVE * abs(paper), ABSOLUTE) if within is None else within)
 
 
 def plain_reason(row: PaperFigure, ours: float, evidence: Evidence) -> str:
     """The words where nobody knows more than the two numbers."""
-    return f"it is {_times(ours, row.paper)} {'the paper' if row.printed else 'the independent implementation'}'s"
+    whose = f"{'the paper' if row.printed else 'the independent implementation'}'s"
+    if row.within is not None:
+        return f"it is {ours - row.paper:+.2g} from {whose}, where {row.within:.2g} is allowed"
+    return f"it is {_times(ours, row.paper)} {whose}"
 
 
 def _times(ours: float, paper: float) -> str:
@@ -97,22 +103,23 @@ def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Row:
     def ours(how: str) -> float | None:
         return evidence.figure(row.law, row.scenario, row.metric, row.setting, how)
 
-    median = ours("median")
+    median, digits = ours("median"), 3 if row.within is None else FINE
     if median is None:
         verdict, holds = f"not measured: {_unmeasured(row)}", None
-    elif close(median, row.paper):
-        verdict, holds = "reproduces", True
+    elif close(median, row.paper, row.within):
+        verdict, holds = "reproduces" + ("" if row.within is None else f" within {row.within:.2g}"), True
     else:
         verdict, holds = f"does not, because {reason(row, median, evidence)}", False
-        if row.independent is not None and close(median, row.independent):
-            verdict += f"; an independent implementation found {number(row.independent, 4)} too"
+        if row.independent is not None and close(median, row.independent, row.within):
+            verdict += f"; an independent implementation found {number(row.independent, max(digits, 4))} too"
     metric = metric_name(row.metric, evidence.case.metric_words)
     paper = row.paper if row.printed else None
-    return Row(row.label, metric, paper, median, ours("min"), ours("max"), row.independent, verdict, holds)
+    low, high = ours("min"), ours("max")
+    return Row(row.label, metric, paper, median, low, high, row.independent, verdict, holds, digits)
 
 
 def _unmeasured(row: PaperFigure) -> str:
-    return "this setting was not validated" if row.scenario else f"no such figure in the model set {row.law}"
+    return "this setting was not validated" if row.scenario else f"no such figure of {row.law}"
 
 
 def requirement(need: Requirement, evidence: Evidence) -> Verdict:

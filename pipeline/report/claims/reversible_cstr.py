@@ -202,7 +202,7 @@ CLAIMS = Claims(
         "the best PID setting has Kc = +3.15": _sign,
         "the network follows random set points without overshoot, the PID overshoots": _overshoot,
         "under a hotter feed the network returns sooner than the PID": _hotter,
-        "with 20 % of the heat of reaction the network is far slower than the PID": _heat,
+        "with a 20 % change of the heat of reaction the network is far slower than the PID": _heat,
         "a network of two errors needs no integral action": _no_memory,
         "a network follows set points better than a controller with fixed gains": _ahead,
         "a small one-step error makes a good plant model": _one_step,
