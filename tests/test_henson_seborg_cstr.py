@@ -12,6 +12,7 @@ from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr
 from pipeline.report.claims import CLAIMS
 from pipeline.report.claims.henson_seborg_cstr import hopf_point, rekindling_flow, ultimate_gain
 from pipeline.report.evidence import Evidence
+from pipeline.report.verdicts import close
 
 CASE = CASES["henson_seborg_cstr"]
 
@@ -70,6 +71,18 @@ def test_score_adds_iae_overshoots_and_the_last_error(tests):
     assert found["overshoot_last"] == found["overshoot_max"] == pytest.approx(0.1)
     assert found["last_error"] == pytest.approx(1e-4)
     assert set(found) >= {"mae", "max_asse"}
+
+
+def test_operating_points_are_held_to_their_last_printed_digit(plant):
+    """Table 1 can fail: the coolant flows printed for points 2 to 4 do not follow from their temperatures."""
+    (table,) = (t for t in CASE.tables if t.number == 1)
+    assert len(table.rows) == 15
+    assert all(row.within is not None and row.within <= 5e-3 * row.paper for row in table.rows)
+    at = [plant.steady_state_at(cv) for cv in local_models(plant).x[:, 0].tolist()]
+    for signal, ours, wrong in (("T", [x[1] for x, _ in at], ()), ("q_c", [mv[0] for _, mv in at], (2, 3, 4))):
+        rows = [row for row in table.rows if row.label.startswith(signal)]
+        apart = [i for i, (row, v) in enumerate(zip(rows, ours, strict=True), 1) if not close(v, row.paper, row.within)]
+        assert apart == list(wrong)
 
 
 def test_hopf_point_is_not_the_printed_one(plant):
