@@ -26,7 +26,7 @@ from typing import Any
 
 from pipeline.start import VARIABLE, run_here, served
 
-# What stages import for long; one that is missing here costs time alone.
+# What stages import for long; one that is missing or broken here costs time alone.
 LIBRARIES = (
     *("numpy", "scipy.linalg", "scipy.optimize", "scipy.signal", "scipy.sparse.linalg", "pandas", "pyarrow.parquet"),
     *("yaml", "joblib", "cloudpickle", "threadpoolctl", "rich.progress", "casadi", "jinja2", "matplotlib.figure"),
@@ -75,7 +75,7 @@ class _Server:
     def run(self) -> int:
         """Serve until the command ends."""
         for name in LIBRARIES:  # while the command starts; stages that come meanwhile wait at the door
-            with contextlib.suppress(ImportError):
+            with contextlib.suppress(Exception):
                 importlib.import_module(name)
         try:
             while self.command.poll() is None:

@@ -6,9 +6,11 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from pipeline.cases import CASES, NOISE_SUFFIX, Case, Scenario
 from pipeline.errors import ParamsError, PlantError
@@ -185,3 +187,12 @@ def test_cases_do_not_load_torch() -> None:
     code = "import sys, json, pipeline.cases; print(json.dumps('torch' in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) is False
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_a_champion_has_something_to_beat(name: str) -> None:
+    """The case's baseline is one of its controllers: without it, no version of the case could become champion."""
+    tree = yaml.safe_load((Path(__file__).parent.parent / "params.yaml").read_text())
+    laws = {c["law"] for c in tree["controllers"].values() if c["case"] == name}
+    assert CASES[name].baseline in laws
+    assert len(laws) > 1

@@ -121,3 +121,9 @@ def test_variants_run_without_noise_where_the_plant_does(monkeypatch: pytest.Mon
     monkeypatch.setattr(Proportional, "step", lambda self, **kw: (kw["mv_applied"], kw["state"], np.zeros(2)))
     found = try_file(case, "p", 0, ("penalty=20", 0))
     assert list(found.metrics) == ["set_point", "disturbance", "buffer", "base"]
+
+
+def test_the_worst_of_several_sequences_stays_the_worst() -> None:
+    rows = [{"overshoot_max": 0.05, "max_asse": 3.0, "min_jacket": 20.0, "mae": 1.0}]
+    rows.append({"overshoot_max": 0.25, "max_asse": 1.0, "min_jacket": 19.0, "mae": 2.0})
+    assert together(rows) == {"overshoot_max": 0.25, "max_asse": 3.0, "min_jacket": 19.0, "mae": 1.5}

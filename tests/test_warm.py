@@ -49,8 +49,10 @@ def folder(tmp_path: Path) -> Path:
 def begin(folder: Path, script: str) -> subprocess.Popen[str]:
     """A shell script under a warm process, in a session of its own, as a terminal has it."""
     command = [sys.executable, "-c", SERVER, "bash", "-c", script.replace("python", sys.executable)]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    pipe = subprocess.PIPE  # stdin too: at the end of another one's, a shell's `read` would not wait
+    return subprocess.Popen(
+        command, cwd=folder, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
 
 
 def run(folder: Path, script: str) -> tuple[int, str, str]:

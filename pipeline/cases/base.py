@@ -187,6 +187,8 @@ class Case(ABC):
     metric_words: ClassVar[Mapping[str, str]] = {}
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
+    seen: ClassVar[str] = ""  # in words for the report: which scored figures were looked at while numbers were chosen
+    baseline: ClassVar[str] = "pid"  # the law that a champion must beat, and that reports compare with
     data_seeds: ClassVar[int] = 5  # that the best law must come from; 1 where nothing is learnt from data
     effort: ClassVar[Effort] = Effort()  # how far and how finely the bounds are searched
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> the range that its laws and bounds keep it in

@@ -36,8 +36,10 @@ class JacketedBatchReactorCase(Case):
     The printed test runs on the printed fuzzy model (``same_model``). What the paper leaves open is
     tested beside it: the same recipe on the reactor that is behind the model (``profile``), with
     other feed temperatures, a greater heat loss and a fouled jacket; on ten printed models each of
-    whose coefficients is off by up to 10 or 20 % (of a1 its distance to 1: of a1 itself, most would
-    not be stable); and random recipes. Each with measurement noise, too.
+    whose jacket coefficients is off by up to 10 or 20 % (of a1 its distance to 1: of a1 itself, most
+    would not be stable; the core's two stay as they are); and random recipes. Each with measurement
+    noise, too. The shipped laws have an identified model (``tied``) there, too, which is off on every
+    printed model: an independent implementation's had the printed one.
     """
 
     held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
@@ -47,6 +49,13 @@ class JacketedBatchReactorCase(Case):
     unforeseen: ClassVar[bool] = True
     development_noise: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 3
+    seen: ClassVar[str] = (
+        "the observers' l_core and the PI's limits followed figures of fouling and theta_10, the observers' approach "
+        "one of profile; fouling itself was set to a change whose levels can be reached in time. The PI's switch "
+        "penalty was chosen on other recipes, plants and noise, but chosen anew because it had failed in "
+        "profile_noise and held_out_noise. held_out served no choice among numbers."
+    )
+    baseline: ClassVar[str] = "fuzzy_feedforward"  # the paper's own law; no PID moves a valve that is open or shut
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {"T_w": (20.0, 70.0)}
     # Periods of 10 s, of which the core's time constant is 300.
     effort: ClassVar[Effort] = Effort(40, 1, 1, 2, (1, 3), tail=60, every=10, noisy=False)
@@ -86,8 +95,7 @@ class JacketedBatchReactorCase(Case):
         Requirement(OBSERVER, "theta_10_noise", "max_overshoot", 0.1),
         Requirement(PI, "theta_10_noise", "max_asse", 0.05),
         Requirement(PI, "theta_10_noise", "max_overshoot", 0.4),
-        Requirement(OBSERVER, "profile", "switches", 10.0),
-        Requirement(PI, "profile", "switches", 10.0),
+        *(Requirement(law, test, "switches", 10.0) for test in ("profile", "profile_noise") for law in (OBSERVER, PI)),
         Requirement(FEEDFORWARD, "profile", "switches", 10.0),
         Requirement(None, "held_out_noise", "max_asse", 0.05),
         Requirement(None, "feed_noise", "max_asse", 0.05),
@@ -103,8 +111,6 @@ class JacketedBatchReactorCase(Case):
         ),
         "the jacket stays between 20 and 70 degC": "reproduces where the model is the plant",
         "an extreme input gives an extreme output in each mode": "holds: hot at least 1.69, cold at most -0.070",
-        "between them the two modes leave nothing out of reach": "does not hold: a gap of up to 1.4 degC a step",
-        "the printed matrices are the reactor's own": "the cold authority at 20 degC is about 3.6 times too weak",
     }
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
@@ -163,7 +169,7 @@ class JacketedBatchReactorCase(Case):
         }
 
     def _perturbed(self, name: str, share: float) -> tuple[Scenario, ...]:
-        title = f"The recipe on a printed model whose coefficients are off by up to {100 * share:g} %"
+        title = f"The recipe on a printed model whose jacket's coefficients are off by up to {100 * share:g} %"
         return tuple(self._recipe(name, title, plant=_printed(seed, share), seed=seed) for seed in range(PERTURBED))
 
     def _recipe(
@@ -186,7 +192,7 @@ class JacketedBatchReactorCase(Case):
 
 @cache
 def _printed(seed: int, share: float) -> FuzzyBatchReactor:
-    """The printed fuzzy model, each coefficient times a factor uniform in 1 -+ ``share``; of a1, what it lacks to 1."""
+    """The printed fuzzy model, the jacket's coefficients (a1: 1 - a1) times factors uniform in 1 -+ ``share``."""
     plant, rng = FuzzyBatchReactor(), np.random.default_rng(seed)
     changed = {}
     for name, value in zip(plant.parameter_names(), plant.parameters().tolist(), strict=True):

@@ -62,6 +62,10 @@ class ThiosulfateCstrCase(Case):
     held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
 
     name: ClassVar[str] = "thiosulfate_cstr"
+    seen: ClassVar[str] = (
+        "horizon, widths and partitions of three_periods were chosen with an eye on sp_a and ua. "
+        "held_out served no choice."
+    )
     title: ClassVar[str] = "Thiosulfate CSTR"
     plant_class: ClassVar[type[Plant]] = ThiosulfateCstr
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)

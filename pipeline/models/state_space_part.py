@@ -28,8 +28,9 @@ class StateSpacePart(Part):
     """A state-space network over all process variables, which must be the plant's whole state.
 
     ``hidden`` widths. ``steps`` the periods of the free runs that are trained on after the fit of one step;
-    1 leaves it at that. ``free_run_iterations`` limit the second training; None: as the first. ``long_run`` the periods of the free runs, end to end over the validation data, by
-    whose fit the networks are judged before and after. ``trainer`` {kind: lm | lbfgs | adam, and its options}.
+    1 leaves it at that. ``free_run_iterations`` limit the second training; None: as the first. ``long_run``
+    the periods of the free runs, end to end over the validation data, by whose fit the networks are judged
+    before and after. ``trainer`` {kind: lm | lbfgs | adam, and its options}.
     """
 
     model: ClassVar[type[Model]] = StateSpace

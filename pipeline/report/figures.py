@@ -23,7 +23,7 @@ def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CaseP
     """Draw every figure that the evidence has trajectories for; returns file name -> caption.
 
     The case's own figures are ``figure_05.png`` and so on, with the best controller added;
-    ``closed_loop_<law>.png`` shows each law beside the PID on the test that weighs most, and
+    ``closed_loop_<law>.png`` shows each law beside the case's baseline on the test that weighs most, and
     ``closed_loop.png`` the best one; ``candidates_<set>_<part>.png`` the search over a model's
     size; ``own`` are the pictures that only this case has. ``models`` is work/<case>/models.
     Raises ReportError where two pictures have the same file name.

@@ -10,7 +10,7 @@ from pipeline.cases import NOISE_SUFFIX
 from pipeline.report.claims import CLAIMS, PLAIN
 from pipeline.report.evidence import Evidence
 from pipeline.report.verdicts import Judged, Verdict, judge
-from pipeline.report.words import LONG, SHORT
+from pipeline.report.words import LONG, SHORT, law_name
 
 
 def validation(evidence: Evidence, judged: Judged | None = None) -> dict[str, Any]:
@@ -37,6 +37,8 @@ def validation(evidence: Evidence, judged: Judged | None = None) -> dict[str, An
         "gate": {
             "id": gate_id(evidence),
             "weights": dict(case.gate),
+            "baseline": case.baseline,
+            "baseline_name": law_name(case.baseline),
             "floor": evidence.noise,
             "floors": evidence.floors,
             "laws": {

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure as Canvas
 
 from pipeline.cases.base import NOISE_SUFFIX, Case, Curve, Figure
 from pipeline.report.drawing import (
-    BASELINE,
     SHADES,
     SIZE,
     axis_label,
@@ -238,7 +237,7 @@ def info_label(case: Case, name: str) -> str:
 
 
 def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
-    """A law beside the PID on the test that weighs most in the gate (its first sequence), with the figures over all."""
+    """A law beside the baseline on the first sequence of the test that weighs most, with the figures over all."""
     scenario, metric = evidence.main_test, evidence.case.metric
     own = evidence.loop(Curve(law), scenario)
     if own is None:
@@ -249,10 +248,12 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"
     panels = LoopPanels(evidence.case, title, evidence.late_from(scenario), reference_of(evidence, scenario))
-    baseline = evidence.loop(Curve(BASELINE), scenario) if law != BASELINE else None
+    other = evidence.case.baseline
+    baseline = evidence.loop(Curve(other), scenario) if law != other else None
     if baseline is not None:
-        error = evidence.figure(BASELINE, scenario)
-        panels.add(baseline, f"PID, {SHORT[metric]} {_error(error, metric)}", colour_of(BASELINE, evidence.laws))
+        error = evidence.figure(other, scenario)
+        label = f"{law_label(other, {})}, {SHORT[metric]} {_error(error, metric)}"
+        panels.add(baseline, label, colour_of(other, evidence.laws))
     panels.add(own, law, colour_of(law, evidence.laws), strong=True)
     return panels.finish(own)
 

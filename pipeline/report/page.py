@@ -15,7 +15,7 @@ from pipeline.report.for_programs import validation
 from pipeline.report.model_evidence import candidates, model_rows
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import RULE, Judged, judge
-from pipeline.report.words import LONG, NO_UNIT, SHORT, metric_name, number, ratio, scenario_name
+from pipeline.report.words import LONG, NO_UNIT, SHORT, law_name, metric_name, number, ratio, scenario_name
 
 MOST_HEADLINES = 5
 
@@ -92,7 +92,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     """The figures that stand at the top: value and what it is.
 
     The best controller beside the bound on the test that weighs most, then on each test of the
-    case's requirements for it, and beside the PID.
+    case's requirements for it, and beside the case's baseline.
     """
     best, case = evidence.best, evidence.case
     if best is None:
@@ -114,11 +114,11 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     rows = rows[:MOST_HEADLINES]
     late_s = evidence.late_s(evidence.main_test)
     metric = "sse_late" if late_s else case.metric
-    own, pid = (evidence.figure(law, evidence.main_test, metric) for law in (best, "pid"))
-    if own and pid and own < pid:
+    own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
+    if own and other and own < other:
         what = "less squared error" if case.metric == "sse" else "less error"
         where = scenario_name(evidence.main_test, case.recipe) + (f", from {late_s:g} s on" if late_s else "")
-        rows.append((f"{100 * (1 - own / pid):.0f} %", f"{what} than the PID on {where}"))
+        rows.append((f"{100 * (1 - own / other):.0f} %", f"{what} than the {law_name(case.baseline)} on {where}"))
     return rows
 
 

@@ -38,11 +38,10 @@ APART = {
     "fit": {("", "pipeline.cases.base"), ("", "serving.manifest")},
     "design": {
         ("", "pipeline.cases.base"),
-        ("", "serving.manifest"),
         # What trained the models has had its effect.
         *(("pipeline.models", f"pipeline.{name}") for name in ("metrics", "record", "record_file")),
         # The parity gate says whether the runtime agrees with the law, and changes nothing.
-        *(("", f"serving.{name}") for name in ("controller", "digest", "graph_audit")),
+        *(("", f"serving.{name}") for name in ("controller", "graph_audit")),
     },
 }
 # Of these packages, which list the cases, a stage runs its own case's module and what that one is made of.

@@ -123,12 +123,14 @@ def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
 
 
 def together(rows: Iterable[Metrics]) -> Metrics:
-    """Mean over the sequences of a test; of a figure that is a largest or a smallest one, again that (max_asse)."""
+    """Mean over the sequences of a test; of a figure with max or min in its name (max_asse), the largest or least."""
     table = list(rows)
-    reduce = {"max": max, "min": min}
-    return {
-        key: float(reduce.get(key.partition("_")[0], statistics.fmean)(row[key] for row in table)) for key in table[0]
-    }
+
+    def reduce(key: str, values: list[float]) -> float:
+        words = key.split("_")
+        return max(values) if "max" in words else min(values) if "min" in words else statistics.fmean(values)
+
+    return {key: float(reduce(key, [row[key] for row in table])) for key in table[0]}
 
 
 def step_us(controller: Controller, loop: Trajectory) -> dict[str, float]:

@@ -11,7 +11,7 @@ from html import escape
 from typing import Any
 
 from pipeline.cases.base import NOISE_SUFFIX
-from pipeline.tracking.gate import BASELINE, Gate
+from pipeline.tracking.gate import Gate
 
 GAP = "&nbsp;" * 4
 """Cells have no padding there and may not be styled."""
@@ -19,22 +19,23 @@ GAP = "&nbsp;" * 4
 
 def model_description(case: str, law: str, validation: Mapping[str, Any]) -> str:
     """The registered model's description: what the controller is and what the aliases mean."""
-    titles = validation.get("titles") or {}
+    titles, gate = validation.get("titles") or {}, Gate.of(validation, law)
     title = (titles.get("laws") or {}).get(law, law)
     return (
         f"<p><b>{escape(str(title))}</b> for {escape(str(titles.get('case', case)))}.</p>"
         "<p>Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup. "
-        "<b>candidate</b>: the newest version. <b>champion</b>: the best version that beat the PID in closed loop "
-        "without a lock-up. <b>case_champion</b>: on the best controller of the case only.</p>"
+        "<b>candidate</b>: the newest version. <b>champion</b>: the best version that beat the "
+        f"{escape(gate.baseline_name)} in closed loop without a lock-up. "
+        " <b>case_champion</b>: on the best controller of the case only.</p>"
         f"<p>Take it: <code>python -m pipeline.tracking fetch {escape(case)}-{escape(law)} FOLDER</code></p>"
     )
 
 
 def version_description(validation: Mapping[str, Any], gate: Gate, run_id: str, picture: str | None) -> str:
     """A version's description: verdict, closed-loop evidence per scenario, analysis, picture of the loop."""
-    parts = [_verdict(gate), _table(validation, gate.law), _analysis(validation, gate.law)]
+    parts = [_verdict(gate), _table(validation, gate), _analysis(validation, gate.law)]
     if picture:
-        alt = "Closed loop on the test that weighs most, beside the PID"
+        alt = f"Closed loop on the test that weighs most, beside the {escape(gate.baseline_name)}"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
     return "\n".join(filter(None, parts))
 
@@ -43,12 +44,14 @@ def _verdict(gate: Gate) -> str:
     """The first line, without markup: lists of versions show it as it is."""
     if gate.score is None:
         return "No closed-loop evidence yet: the report stage of its case has not run.\n"
-    beside = f", PID {gate.baseline:.3f}" if gate.baseline is not None and gate.law != BASELINE else ""
+    other = gate.baseline is not None and gate.law != gate.baseline_law
+    beside = f", {gate.baseline_name} {gate.baseline:.3f}" if other else ""
     locks = "no lock-up" if not gate.lock_ups else f"{gate.lock_ups} lock-ups"
     return f"Gate score {gate.score:.3f} (1 = perfect-model NMPC{beside}), {locks}.\n"
 
 
-def _table(validation: Mapping[str, Any], law: str) -> str:
+def _table(validation: Mapping[str, Any], shown: Gate) -> str:
+    law = shown.law
     scenarios = validation.get("scenarios") or {}
     bounds = validation.get("bounds") or {}
     titles = (validation.get("titles") or {}).get("scenarios") or {}
@@ -56,7 +59,7 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
     gate = validation.get("gate") or {}
     floors = gate.get("floors") or {}
     words = (validation.get("titles") or {}).get("metric", "mean absolute error")
-    heads = [f"Scenario ({words})", "this law", "range over seeds", "with noise", "PID", "NMPC", "ratio"]
+    heads = [f"Scenario ({words})", "this law", "range over seeds", "with noise", shown.baseline_name, "NMPC", "ratio"]
     rows = []
     for name, laws in scenarios.items():
         own = laws.get(law)
@@ -71,7 +74,7 @@ def _table(validation: Mapping[str, Any], law: str) -> str:
                 _figure(own.get(metric)),
                 "" if None in spread else " … ".join(map(_figure, spread)),
                 _figure((scenarios.get(name + NOISE_SUFFIX) or {}).get(law, {}).get(metric)),
-                _figure((laws.get(BASELINE) or {}).get(metric)),
+                _figure((laws.get(shown.baseline_law) or {}).get(metric)),
                 _figure(bound),
                 f"{own[metric] / bound:.2f}" if bound and bound >= floor and own.get(metric) is not None else "",
             ]

@@ -11,9 +11,10 @@ Aliases:
 ``candidate``
     the newest version of a controller.
 ``champion``
-    of one registered model: the best version that beat the PID. It moves only to a version that
-    did not lock up in any run, whose score is below the PID's of the same validation, and below
-    the present champion's. The PID has nobody else to beat than its own former version.
+    of one registered model: the best version that beat the case's baseline, a PID where the case has
+    no better yardstick. It moves only to a version that did not lock up in any run, whose score is
+    below the baseline's of the same validation, and below the present champion's. The baseline has
+    nobody else to beat than its own former version.
 ``case_champion``
     one in a case: the champion with the lowest score among the case's registered models.
 """
@@ -24,7 +25,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-BASELINE = "pid"
+BASELINE = "pid"  # of a validation that names none
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +35,11 @@ class Gate:
     law: str
     id: str
     score: float | None
-    baseline: float | None  # the PID's score on the same test
+    baseline: float | None  # the baseline's score on the same test
     lock_ups: int | None
     ratios: dict[str, float]
+    baseline_law: str = BASELINE
+    baseline_name: str = "PID"
 
     @classmethod
     def of(cls, validation: Mapping[str, Any], law: str) -> Self:
@@ -44,13 +47,16 @@ class Gate:
         gate = validation.get("gate") or {}
         laws = gate.get("laws") or {}
         own = laws.get(law) or {}
+        baseline = str(gate.get("baseline", BASELINE))
         return cls(
             law=law,
             id=str(gate.get("id", "")),
             score=own.get("score"),
-            baseline=(laws.get(BASELINE) or {}).get("score"),
+            baseline=(laws.get(baseline) or {}).get("score"),
             lock_ups=own.get("lock_ups"),
             ratios=dict(own.get("ratios") or {}),
+            baseline_law=baseline,
+            baseline_name=str(gate.get("baseline_name", baseline.upper())),
         )
 
     def tags(self) -> dict[str, str]:
@@ -58,7 +64,8 @@ class Gate:
         rows: dict[str, Any] = {
             "gate_id": self.id,
             "gate_score": self.score,
-            "gate_pid_score": self.baseline,
+            "gate_baseline": self.baseline_law,
+            "gate_baseline_score": self.baseline,
             "lock_ups": self.lock_ups,
             **{f"gate_{scenario}": ratio for scenario, ratio in self.ratios.items()},
         }
@@ -70,12 +77,12 @@ class Gate:
             return "its validation has no gate score"
         if self.lock_ups:
             return f"it locked up in {self.lock_ups} of its closed loops"
-        if self.law == BASELINE:
+        if self.law == self.baseline_law:
             return None
         if self.baseline is None:
-            return "no PID was validated beside it"
+            return f"no {self.baseline_name} was validated beside it"
         if self.score >= self.baseline:
-            return f"its gate score {self.score:.4g} does not beat the PID's {self.baseline:.4g}"
+            return f"its gate score {self.score:.4g} does not beat the {self.baseline_name}'s {self.baseline:.4g}"
         return None
 
     def refusal_against(self, champion: Mapping[str, str]) -> str | None:

@@ -201,7 +201,7 @@ def promote(client: MlflowClient, name: str, number: str, alias: str) -> str:
         elect_case_champion(client, version.tags["case"])
     said = f"{version.name} version {version.version} is now @{alias}"
     if alias == CHAMPION:
-        said += " by hand; the gate (no lock-up, better than the PID and than the last champion) was not asked"
+        said += " by hand; the gate (no lock-up, better than the baseline and than the last champion) was not asked"
     return said
 
 
