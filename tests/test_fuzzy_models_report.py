@@ -7,13 +7,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from pipeline.excitation.jacket_pulses import JacketPulses
-from pipeline.models.hybrid_fuzzy_part import HybridFuzzyPart
+from pipeline.models.hybrid_fuzzy_part import HybridFuzzyPart, printed_model
 from pipeline.plants.jacketed_batch_reactor import JacketedBatchReactor
 from pipeline.report.claims.fuzzy_models import (
     coefficients_picture,
     cold_authority,
+    drift_when_shut,
     one_step_errors_as,
     printed_gap,
     reach_picture,
@@ -58,6 +60,17 @@ def test_other_figures_do_not_hold(measured: dict[str, Any]) -> None:
     other["parts"]["printed"]["median"]["gap"] = 0.5
     other["parts"]["printed"]["median"]["parameters"]["b_cold_20"] = -2.6
     assert [check(told({"fuzzy": other})).holds for check in CHECKS] == [False] * 4
+
+
+def test_a_shut_throttle_drifts_by_what_the_coefficients_say(measured: dict[str, Any]) -> None:
+    """Between two centres, in both modes; tied modes drift alike."""
+    evidence, part = told({"fuzzy": measured}), printed_model()
+    now = torch.tensor([[26.0]], dtype=torch.float64)
+    expected = part.jacket(now, now).base[0] - 26.0
+    assert drift_when_shut(evidence, "fuzzy", "printed", 26.0) == pytest.approx(tuple(expected.tolist()))
+    hot, cold = drift_when_shut(evidence, "fuzzy", "tied", 26.0) or (0.0, 1.0)
+    assert hot == pytest.approx(cold)
+    assert drift_when_shut(told({}), "fuzzy", "tied", 26.0) is None
 
 
 def test_nothing_measured_is_no_verdict(measured: dict[str, Any]) -> None:

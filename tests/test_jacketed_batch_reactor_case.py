@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from pipeline.cases import CASES
 from pipeline.cases.base import Scenario
 from pipeline.plants.fuzzy_batch_reactor import FuzzyBatchReactor
 from pipeline.report.claims import CLAIMS
+from pipeline.report.claims.jacketed_batch_reactor import _quiet
 from pipeline.report.evidence import Evidence
 from pipeline.report.verdicts import acceptance, statements
 from pipeline.stages.trial import together
@@ -76,6 +79,33 @@ def test_where_nothing_was_measured_nothing_is_claimed() -> None:
     assert [v.what for v in statements(empty, claims) if v.holds is not None] == [known]
     assert all(v.holds is None for v in acceptance(empty, claims) if not v.what.startswith("best controller,"))
     assert all(picture.draw(empty) is None for picture in claims.pictures)
+
+
+def told(switches: dict[str, float], a1_hot: float = 1.01) -> Any:
+    """Evidence of the feedforward's switches over each identification; shut, mode cold cools the jacket at 26 deg C."""
+    line = {"a1": (a1_hot, 0.99), "a2": (0.0, 0.0), "r": (0.0, 0.0)}
+    parameters = {
+        f"{name}_{mode}_{centre}": value
+        for name, both in line.items()
+        for mode, value in zip(("hot", "cold"), both, strict=True)
+        for centre in (20, 40, 70)
+    }
+    parts = {how: {"median": {"parameters": parameters}} for how in switches}
+    return SimpleNamespace(
+        models={"hybrid_fuzzy": {"parts": parts}},
+        figure=lambda law, scenario, metric, setting: switches.get(setting["part"]),
+    )
+
+
+def test_a_model_that_alternates_falls_short_and_says_where() -> None:
+    few = _quiet(told({"tied": 6.0, "global": 6.0, "local": 8.0}))
+    assert (few.holds, few.because) == (True, "")
+    many = _quiet(told({"tied": 6.0, "global": 6.0, "local": 214.0}))
+    assert many.holds is False
+    assert "local: at 26 °C a shut throttle moves the jacket by +0.26 °C a period in mode hot and -0.26" in many.because
+    assert "tied" not in many.because
+    assert _quiet(told({"tied": 6.0, "global": 6.0, "local": 214.0}, a1_hot=0.99)).because == ""
+    assert _quiet(told({"tied": 6.0})).holds is None
 
 
 def test_pictures_of_a_recipe_need_what_the_law_tells(tmp_path: Path) -> None:

@@ -118,6 +118,23 @@ def coefficients_picture(model_set: str) -> Callable[[Evidence], Canvas | None]:
     return draw
 
 
+def drift_when_shut(evidence: Evidence, model_set: str, how: str, at: float) -> tuple[float, float] | None:
+    """What an identification has a shut throttle do to a jacket as warm as its core, ``at`` degC, in mode hot and cold.
+
+    [degC a period]. Above 0 in the one and below it in the other, neither holds the temperature, nor
+    does any throttle: an open one moves it further away.
+    """
+    found = _parts(evidence, model_set).get(how)
+    if found is None:
+        return None
+    hot, cold = (
+        {name: float(np.interp(at, *_over_centres(found["parameters"], name, mode))) for name in ("a1", "a2", "r")}
+        for mode in MODES
+    )
+    moved = [(c["a1"] + c["a2"] - 1.0) * at + c["r"] for c in (hot, cold)]
+    return moved[0], moved[1]
+
+
 def one_step_errors_as(model_set: str, independent: Mapping[str, float]) -> Check:
     """A check of the identifications' one-step errors [deg C] against those of an independent implementation."""
 
