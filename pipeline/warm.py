@@ -90,7 +90,8 @@ class _Server:
         finally:
             for pid in self.stages:
                 os.kill(pid, signal.SIGTERM)
-        return self.command.returncode
+        code = self.command.returncode
+        return 128 - code if code < 0 else code  # of a command that a signal ended, as a shell counts
 
     def _begin(self) -> None:
         """Fork for the stage that asks at the door."""
