@@ -10,14 +10,16 @@ import torch
 from henson_seborg_cstr_parts import local_models
 
 from pipeline.cases import CASES
-from pipeline.errors import LawError
+from pipeline.errors import LawError, ParamsError
 from pipeline.laws import LAWS, LawSignals
 from pipeline.laws.auto_pid_network import one_knob
 from pipeline.laws.local_controllers import LocalControllers
 from pipeline.laws.local_stability import StabilityTest
+from pipeline.params import parse
 from pipeline.plants.base import Linearization
 from pipeline.plants.henson_seborg_cstr import HensonSeborgCstr
 from pipeline.stability import FrozenLoops, spectral_radius
+from pipeline.tuning import PidSettings, sampled_loop
 
 CASE = CASES["henson_seborg_cstr"]
 TESTS = ("up", "down", "jump")
@@ -200,13 +202,55 @@ def test_a_knob_that_cannot_be_is_an_error(model, wc, words):
 @pytest.mark.parametrize(
     ("name", "params", "words"),
     [
-        ("local_pid_network", {"kc": (1.0,)}, "as many of each"),
         ("local_pid_network", {"kc": (1.0,), "ti_s": (1.0,), "td_s": (0.0,)}, "1 local controllers for 5"),
         ("local_pid_network", {"blending": "both"}, "allowed are gains"),
-        ("local_pid_network", {"derivative_limit": 0.0}, "derivative_limit"),
-        ("auto_pid_network", {"wc": -1.0}, "wc is -1"),
+        ("auto_pid_network", {"stability": StabilityTest(low=(0.1,), high=(0.2,))}, "have 1 numbers.* has 2 states"),
     ],
 )
 def test_senseless_settings_are_errors(name, params, words):
     with pytest.raises(LawError, match=words):
         designed(name, **params)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("local_pid_network", {"kc": [1.0]}, "1 kc, 5 ti_s and 5 td_s"),
+        ("local_pid_network", {"kc": [1.0, 2.0, 0.0, 4.0, 5.0]}, "kc is .* none may be 0"),
+        ("local_pid_network", {"ti_s": [1.0, 2.0, 0.0, 4.0, 5.0]}, "ti_s is .* above 0 s"),
+        ("local_pid_network", {"td_s": [1.0, 2.0, -3.0, 4.0, 5.0]}, "td_s is .* 0 s or above"),
+        ("local_pid_network", {"derivative_limit": 0.0}, "derivative_limit is 0.0"),
+        ("auto_pid_network", {"derivative_limit": -1.0}, "derivative_limit is -1.0"),
+        ("auto_pid_network", {"wc": -1.0}, "wc is -1"),
+        ("auto_pid_network", {"stability": {"low": [0.005]}}, "low is .*0.005.* for every state"),
+        ("auto_pid_network", {"stability": {"low": [0.3, 400.0]}}, "each low below its high"),
+        ("auto_pid_network", {"stability": {"between": 1}}, "between is 1; it must be at least 2"),
+        ("auto_pid_network", {"stability": {"starts": -1}}, "starts is -1"),
+        ("auto_pid_network", {"stability": {"band": 0.0}}, "band is 0.0"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused_where_they_stand(name, values, words):
+    with pytest.raises(ParamsError, match=f"here.*: .*{words}"):
+        parse(LAWS[name].Params, values, "here")
+
+
+def test_blended_gains_lose_stability_where_plain_pids_with_those_gains_do(plant):
+    """The gain margin anew, from a PID's own difference equations: nothing of the network's module or its slopes."""
+    at = np.linspace(0.0146, 0.1298, 41)
+    for name, found in (("local_pid_network", 3.595), ("auto_pid_network", 6.079)):
+        law = designed(name)
+        margin = FrozenLoops.of(plant, law, law.n_state, at).gain_margin()
+        assert margin == pytest.approx(found, rel=5e-3)
+        blended = (law.validity(torch.from_numpy(at)[:, None]) @ law.table).numpy()
+
+        def radius(gain: float, rows: np.ndarray = blended) -> float:
+            loops = []
+            for cv, (kp, ki, kd, keep, _) in zip(at, rows, strict=True):
+                lin = plant.linearize(*plant.steady_state_at(float(cv)))
+                one = Linearization(lin.x, lin.mv, lin.a, gain * lin.b, lin.c[:1])
+                h = plant.period_s
+                filter_s = h * keep / (1 - keep)
+                loops.append(sampled_loop(one, PidSettings(kp, kp / ki * h, kd / kp * h, filter_s=filter_s), h))
+            return float(spectral_radius(np.array(loops)).max())
+
+        assert radius(0.99 * margin) < 1 < radius(1.01 * margin)

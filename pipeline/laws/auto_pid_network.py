@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from pipeline.errors import LawError
 from pipeline.laws.base import LawSignals, require_kind
-from pipeline.laws.local_controllers import Blending, LocalControllers, LocalPid
-from pipeline.laws.local_stability import StabilityTest
+from pipeline.laws.local_controllers import BlendedParams, LocalControllers, LocalPid
 from pipeline.models.base import Model
 from pipeline.models.local_models import LocalModels
 from pipeline.plants.base import Linearization, Plant
@@ -71,35 +70,22 @@ class AutoPidNetwork(LocalControllers):
     title: ClassVar[str] = "Local controller network, one knob"
 
     @dataclass(frozen=True, slots=True)
-    class Params:
-        """``wc`` [rad/min] is the one knob: how fast the closed loop shall be at every operating point.
-
-        ``blending``, ``derivative_limit``, ``stability`` and ``mv_rate`` as in the network with given gains.
-        """
+    class Params(BlendedParams):
+        """``wc`` [rad/min] is the one knob: how fast the closed loop shall be at every operating point."""
 
         wc: float = 5.0
-        blending: Blending = "gains"
-        derivative_limit: float = 10.0
-        stability: StabilityTest = field(default_factory=StabilityTest)
-        mv_rate: float | None = None
+
+        def __post_init__(self) -> None:
+            BlendedParams.__post_init__(self)
+            if not self.wc > 0:
+                raise ValueError(f"wc is {self.wc}; give the wanted speed in rad/min, above 0")
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         """The law over the part ``local_models``; raises LawError."""
-        p = params
         local = require_kind(models, LocalModels, cls.name)
-        if not p.wc > 0:
-            raise LawError(f"law {cls.name!r}: wc is {p.wc}; give the wanted speed in rad/min, above 0")
-        pids = [one_knob(_of_first_pv(lin), p.wc / 60.0) for lin in local.linearizations()]
-        return cls(
-            signals,
-            local,
-            pids,
-            blending=p.blending,
-            derivative_limit=p.derivative_limit,
-            stability=p.stability,
-            mv_rate=p.mv_rate,
-        )
+        pids = [one_knob(_of_first_pv(lin), params.wc / 60.0) for lin in local.linearizations()]
+        return cls.blended(params, signals, local, pids, plant)
 
 
 def _of_first_pv(lin: Linearization) -> Linearization:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, Self
 
 import torch
 from torch import Tensor
@@ -25,6 +25,25 @@ class LocalPid:
     kp: float  # [mv/pv]
     ki: float  # [mv/(pv s)]
     kd: float = 0.0  # [mv s/pv]
+
+
+@dataclass(frozen=True, slots=True)
+class BlendedParams:
+    """What a user sets of any local controller network, however its local controllers are tuned.
+
+    ``blending``: what is blended (``gains``, ``outputs`` or ``velocity``, see LocalControllers).
+    ``derivative_limit`` is N of the derivative's filter, Tf = Td/N. ``stability`` says how the
+    closed loop is examined. ``mv_rate`` [mv] is the largest change a sample, None unlimited.
+    """
+
+    blending: Blending = "gains"
+    derivative_limit: float = 10.0
+    stability: StabilityTest = field(default_factory=StabilityTest)
+    mv_rate: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.derivative_limit > 0:
+            raise ValueError(f"derivative_limit is {self.derivative_limit}; give N above 0, as 10")
 
 
 class LocalControllers(ControlLaw):
@@ -76,8 +95,6 @@ class LocalControllers(ControlLaw):
             )
         if blending not in ("gains", "outputs", "velocity"):
             raise LawError(f"law {self.name!r}: blending is {blending!r}; allowed are gains, outputs, velocity")
-        if not derivative_limit > 0:
-            raise LawError(f"law {self.name!r}: derivative_limit is {derivative_limit}; give N above 0, as 10")
         h = signals.period_s
         rows = []
         for pid, bias in zip(pids, models.mv[:, 0].tolist(), strict=True):
@@ -92,6 +109,27 @@ class LocalControllers(ControlLaw):
         self.points = tuple(float(v) for v in models.x[:, 0])  # [CV]
         self.n_state = 6  # started, I or J/h, the proportional part before, y(k-1), v(k-1), the last MV given
         self.info = ("kc", "tau_i_s", "tau_d_s", "mv_requested")
+
+    @classmethod
+    def blended(
+        cls, params: BlendedParams, signals: LawSignals, models: LocalModels, pids: Sequence[LocalPid], plant: Plant
+    ) -> Self:
+        """The law with these local controllers, the rest as ``params`` says; raises LawError."""
+        states, given = len(plant.state_signals), len(params.stability.low)
+        if params.stability.starts and given != states:
+            raise LawError(
+                f"law {cls.name!r}: stability.low and stability.high have {given} numbers; plant {plant.name!r} has "
+                f"{states} states, give one of each for every state"
+            )
+        return cls(
+            signals,
+            models,
+            pids,
+            blending=params.blending,
+            derivative_limit=params.derivative_limit,
+            stability=params.stability,
+            mv_rate=params.mv_rate,
+        )
 
     def forward(
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor

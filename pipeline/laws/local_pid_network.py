@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
-from pipeline.errors import LawError
 from pipeline.laws.base import LawSignals, require_kind
-from pipeline.laws.local_controllers import Blending, LocalControllers, LocalPid
-from pipeline.laws.local_stability import StabilityTest
+from pipeline.laws.local_controllers import BlendedParams, LocalControllers, LocalPid
 from pipeline.models.base import Model
 from pipeline.models.local_models import LocalModels
 from pipeline.plants.base import Plant
@@ -27,40 +25,33 @@ class LocalPidNetwork(LocalControllers):
     title: ClassVar[str] = "Local controller network, printed gains"
 
     @dataclass(frozen=True, slots=True)
-    class Params:
+    class Params(BlendedParams):
         """``kc`` [mv/pv], ``ti_s`` and ``td_s`` [s] of each local controller, in the order of the local models.
 
-        ``blending``: what is blended (``gains``, ``outputs`` or ``velocity``, see LocalControllers).
-        ``derivative_limit`` is N of the derivative's filter, Tf = Td/N. ``stability`` says how the
-        closed loop is examined. ``mv_rate`` [mv] is the largest change a sample, None unlimited.
         The defaults are the printed settings.
         """
 
         kc: tuple[float, ...] = (2550.0, 331.0, 404.2, 2080.0, 20100.0)
         ti_s: tuple[float, ...] = (57.54, 30.72, 16.02, 26.04, 32.1)
         td_s: tuple[float, ...] = (13.2, 0.0, 0.0, 0.0, 0.0)
-        blending: Blending = "gains"
-        derivative_limit: float = 10.0
-        stability: StabilityTest = field(default_factory=StabilityTest)
-        mv_rate: float | None = None
+
+        def __post_init__(self) -> None:
+            BlendedParams.__post_init__(self)
+            if not len(self.kc) == len(self.ti_s) == len(self.td_s):
+                raise ValueError(
+                    f"there are {len(self.kc)} kc, {len(self.ti_s)} ti_s and {len(self.td_s)} td_s; give as many of "
+                    "each as there are local models"
+                )
+            if not all(abs(k) > 0 for k in self.kc):
+                raise ValueError(f"kc is {list(self.kc)}; none may be 0, or its controller would not act")
+            if not all(t > 0 for t in self.ti_s):
+                raise ValueError(f"ti_s is {list(self.ti_s)}; each must be above 0 s")
+            if not all(t >= 0 for t in self.td_s):
+                raise ValueError(f"td_s is {list(self.td_s)}; each must be 0 s or above, 0 for a PI")
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         """The law over the part ``local_models``; raises LawError."""
-        p = params
         local = require_kind(models, LocalModels, cls.name)
-        if not len(p.kc) == len(p.ti_s) == len(p.td_s) or not all(t > 0 for t in p.ti_s):
-            raise LawError(
-                f"law {cls.name!r} has {len(p.kc)} kc, {len(p.ti_s)} ti_s and {len(p.td_s)} td_s; give as many of "
-                "each, every ti_s above 0"
-            )
-        pids = [LocalPid(k, k / ti, k * td) for k, ti, td in zip(p.kc, p.ti_s, p.td_s, strict=True)]
-        return cls(
-            signals,
-            local,
-            pids,
-            blending=p.blending,
-            derivative_limit=p.derivative_limit,
-            stability=p.stability,
-            mv_rate=p.mv_rate,
-        )
+        settings = zip(params.kc, params.ti_s, params.td_s, strict=True)
+        return cls.blended(params, signals, local, [LocalPid(k, k / ti, k * td) for k, ti, td in settings], plant)

@@ -37,6 +37,18 @@ class StabilityTest:
     samples: int = 1_000
     watched: int = 60
 
+    def __post_init__(self) -> None:
+        for name, least in (("between", 2), ("starts", 0), ("holding", 1), ("samples", 1), ("watched", 0)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        if not self.band > 0:
+            raise ValueError(f"band is {self.band}; give the width in the CV's unit, above 0")
+        if len(self.low) != len(self.high) or not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError(
+                f"low is {list(self.low)} and high is {list(self.high)}; give a number of each for every state of the "
+                "plant, each low below its high"
+            )
+
 
 def stability_analysis(law: ControlLaw, plant: Plant, points: Sequence[float], test: StabilityTest) -> Analysis:
     """Frozen loops, Lyapunov functions of neighbouring points, and recoveries from many starts.
