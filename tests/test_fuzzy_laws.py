@@ -228,3 +228,39 @@ def test_parts_signals_and_numbers_that_cannot_be_are_refused() -> None:
         parse(cls.Params, {"core_gain": 1.5}, "controllers.x")
     with pytest.raises(ParamsError, match="ti_s 0"):
         parse(LAWS["fuzzy_feedforward_pi"].Params, {"ti_s": 0.0}, "controllers.x")
+
+
+@pytest.mark.parametrize("law", jacketed_batch_reactor_parts.LAWS)
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ({"jacket_low": 70.0, "jacket_high": 20.0}, "the lower one first"),
+        ({"jacket_low": 30.0, "jacket_high": 30.0}, "the lower one first"),
+        ({"jacket_low": np.nan}, "jacket_low is nan"),
+        ({"jacket_high": np.inf}, "jacket_high inf"),
+        ({"switch_penalty": -0.1}, r"switch_penalty is -0\.1; it must be 0 or above"),
+        ({"switch_penalty": np.nan}, "switch_penalty is nan"),
+    ],
+)
+def test_numbers_of_the_cascade_that_make_no_sense_are_refused(law: str, numbers: dict[str, float], told: str) -> None:
+    with pytest.raises(ParamsError, match=told):
+        parse(LAWS[law].Params, numbers, "controllers.x")
+
+
+@pytest.mark.parametrize(
+    ("law", "numbers", "told"),
+    [
+        ("fuzzy_feedforward_pi", {"kc": -1.0}, r"kc is -1\.0"),
+        ("fuzzy_feedforward_pi", {"kc": np.nan}, "kc is nan"),
+        ("fuzzy_feedforward_pi", {"ti_s": np.inf}, "ti_s inf"),
+        ("fuzzy_feedforward_pi", {"approach": 0.0}, "no set point is ever approached"),
+        ("fuzzy_feedforward_pi", {"k_jacket": 1.1}, r"k_jacket is 1\.1"),
+        ("fuzzy_feedforward_observer", {"approach": 0.0}, "no set point is ever approached"),
+        ("fuzzy_feedforward_observer", {"approach": np.nan}, "approach is nan"),
+        ("fuzzy_feedforward_observer", {"l_core": -0.1}, r"l_core is -0\.1"),
+        ("fuzzy_feedforward_observer", {"k_jacket": 2.0}, r"k_jacket is 2\.0"),
+    ],
+)
+def test_numbers_of_a_feedback_that_make_no_sense_are_refused(law: str, numbers: dict[str, float], told: str) -> None:
+    with pytest.raises(ParamsError, match=told):
+        parse(LAWS[law].Params, numbers, "controllers.x")

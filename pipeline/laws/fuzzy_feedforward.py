@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.base import LawSignals
-from pipeline.laws.fuzzy_law import FuzzyLaw
+from pipeline.laws.fuzzy_law import FuzzyLaw, require_numbers
 from pipeline.models.hybrid_fuzzy import HybridFuzzy
 
 
@@ -43,6 +43,9 @@ class FuzzyFeedforward(FuzzyLaw):
         jacket_high: float = 70.0
         switch_penalty: float = 0.0
         mv_rate: float | None = None
+
+        def __post_init__(self) -> None:
+            require_numbers(self)
 
     def __init__(self, signals: LawSignals, model: HybridFuzzy, params: Params) -> None:
         super().__init__(signals, model, params)

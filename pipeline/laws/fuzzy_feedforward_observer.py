@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.base import LawSignals
-from pipeline.laws.fuzzy_law import FuzzyLaw
+from pipeline.laws.fuzzy_law import FuzzyLaw, require_numbers, require_shares
 from pipeline.models.hybrid_fuzzy import HybridFuzzy, JacketAffine
 
 
@@ -48,7 +48,7 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         ``k_jacket``, ``k_core`` are the shares of an innovation that correct an estimate, ``l_jacket``,
         ``l_core`` those that go into its offset; ``core_gain`` (c) is the share of the core's distance to
         its adjusted reference, ``approach`` (g) that of the reference's to the set point, to be made up in
-        a sample; all in 0..1 [-].
+        a sample; all in 0..1 [-], g above 0.
         """
 
         part: str | None = None
@@ -64,9 +64,8 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         approach: float = 0.2
 
         def __post_init__(self) -> None:
-            for name in ("k_jacket", "l_jacket", "k_core", "l_core", "core_gain", "approach"):
-                if not 0 <= getattr(self, name) <= 1:
-                    raise ValueError(f"{name} is {getattr(self, name)}; it must be within 0..1")
+            require_numbers(self)
+            require_shares(self, "k_jacket", "l_jacket", "k_core", "l_core", "core_gain", "approach")
 
     correct: Tensor  # (2,) shares of the innovations (core, jacket) for the estimates
     learn: Tensor  # (2,) and for the offsets

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from pipeline.laws.base import LawSignals
-from pipeline.laws.fuzzy_law import FuzzyLaw
+from pipeline.laws.fuzzy_law import FuzzyLaw, require_numbers, require_shares
 from pipeline.models.hybrid_fuzzy import HybridFuzzy
 
 
@@ -40,7 +41,7 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         """Numbers of the law; the first five as in ``fuzzy_feedforward``.
 
         ``kc`` [degC of the jacket per degC of the core] and ``ti_s`` [s] are the PI controller's,
-        ``approach`` (g) and ``k_jacket`` the shares above, in 0..1 [-].
+        ``approach`` (g) and ``k_jacket`` the shares above, in 0..1 [-], g above 0.
         """
 
         part: str | None = None
@@ -54,11 +55,10 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         k_jacket: float = 0.8
 
         def __post_init__(self) -> None:
-            if not (self.kc >= 0 and self.ti_s > 0):
-                raise ValueError(f"kc is {self.kc} and ti_s {self.ti_s}; give kc >= 0 and ti_s > 0")
-            for name in ("approach", "k_jacket"):
-                if not 0 <= getattr(self, name) <= 1:
-                    raise ValueError(f"{name} is {getattr(self, name)}; it must be within 0..1")
+            require_numbers(self)
+            require_shares(self, "approach", "k_jacket")
+            if not (isfinite(self.kc) and self.kc >= 0 and isfinite(self.ti_s) and self.ti_s > 0):
+                raise ValueError(f"kc is {self.kc} and ti_s {self.ti_s}; give kc of 0 or above and ti_s above 0")
 
     kc: Tensor  # (1,)
     integral: Tensor  # (1,) kc h / ti

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -110,6 +111,30 @@ class FuzzyLaw(ControlLaw):
         mv = self.limited(torch.cat([k_m, mode], dim=-1), mv_applied)
         (base, base_2), (gain, gain_2) = (torch.split(values, 1, dim=-1) for values in line)
         return Move(mv, torch.where(second, base_2, base) + torch.where(second, gain_2, gain) * mv[..., :1])
+
+
+def require_numbers(params: Any) -> None:
+    """Refuse numbers that every law of this family has and that make no sense; raises ValueError.
+
+    ``mv_rate`` is every law's, and refused by ``ControlLaw``.
+    """
+    low, high = params.jacket_low, params.jacket_high
+    if not (isfinite(low) and isfinite(high) and low < high):
+        raise ValueError(f"jacket_low is {low} and jacket_high {high}; give two temperatures, the lower one first")
+    if not (isfinite(params.switch_penalty) and params.switch_penalty >= 0):
+        raise ValueError(f"switch_penalty is {params.switch_penalty}; it must be 0 or above")
+
+
+def require_shares(params: Any, *names: str) -> None:
+    """Refuse a share that is not within 0..1, and an approach of 0, which never aims at a set point; raises ValueError.
+
+    Any observer of such shares is stable over a model that is: 0 learns nothing, 1 takes all.
+    """
+    for name in names:
+        if not 0 <= getattr(params, name) <= 1:
+            raise ValueError(f"{name} is {getattr(params, name)}; it must be within 0..1")
+    if not params.approach > 0:
+        raise ValueError(f"approach is {params.approach}; it must be above 0, or no set point is ever approached")
 
 
 def _chosen(models: Mapping[str, Model], part: str | None, law: str) -> HybridFuzzy:
