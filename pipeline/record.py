@@ -159,8 +159,8 @@ class Record:
         ------
         RecordError
             Naming file, column and row: a missing column, another unit, a cell that is not a
-            finite number, time that is not uniform or not at ``period_s``, a run in pieces, an MV
-            outside its range or one that never changes.
+            finite number, time that is not uniform or not at ``period_s``, a run in pieces, a PV
+            mostly outside its range, an MV outside its own or one that never changes.
         """
         table = read_table(Path(path))
         runs = table.numbers("run") if "run" in table.header else np.zeros(table.rows)
@@ -168,6 +168,8 @@ class Record:
         time_s = table.numbers("time_s")
         values = {s: table.numbers(table.find(s)) for s in (*pv, *mv, *dv)}
         check_time(table, runs, time_s, period_s)
+        for signal in pv:
+            check_pv(table, signal, values[signal])
         for signal in mv:
             check_mv(table, signal, values[signal])
 
@@ -226,6 +228,16 @@ def check_time(table: Table, run: Array, time_s: Array, period_s: float) -> None
     raise RecordError(
         f"{table.at('time_s', row + 1)}: time steps by {step[row]:.6g} s where {period_s:g} s is wanted; {advice}"
     )
+
+
+def check_pv(table: Table, signal: Signal, pv: Array) -> None:
+    """Most of the PV lies in its range, or RecordError: a few values may not, a wrong unit moves all of them."""
+    outside = np.flatnonzero((pv < signal.low) | (pv > signal.high))
+    if 2 * outside.size > pv.size:
+        raise RecordError(
+            f"{table.at(table.find(signal), outside[0])}: {pv[outside[0]]:.6g}, like most of its column, is outside the PV's range "
+            f"{signal.low:g} to {signal.high:g} {signal.unit}; check the unit, or widen the plant's signal"
+        )
 
 
 def check_mv(table: Table, signal: Signal, mv: Array) -> None:

@@ -112,12 +112,18 @@ def timetable(
                 f"set point {sp_signal.name} = {event.value:g} {sp_signal.unit} is outside "
                 f"[{sp_signal.low:g}, {sp_signal.high:g}] {sp_signal.unit}"
             )
+    cv = plant.pv_signals[0]
+    if start_cv is not None and not cv.low <= start_cv <= cv.high:
+        raise ParamsError(
+            f"a start at {cv.name} = {start_cv:g} {cv.unit} is outside [{cv.low:g}, {cv.high:g}] {cv.unit}"
+        )
     changes: dict[str, Array] = {}
     marks: dict[float, str] = {}
     if set_points:
         start = (sp_signal.low + sp_signal.high) / 2 if start_cv is None else start_cv
         x0, mv0 = plant.steady_state_at(start)
-        last = max(e.time_s for e in (*set_points, *disturbances))
+        spans = [t for s in manual for t in (s.start_s, s.end_s) if math.isfinite(t)]
+        last = max([*spans, *(e.time_s for e in (*set_points, *disturbances))])
         n = _samples(plant, duration_s, round(last / plant.period_s) + SETTLE_SAMPLES)
         sp = np.full((n, 1), start)
         for event in sorted(set_points, key=lambda e: e.time_s):
@@ -145,6 +151,10 @@ def timetable(
         marks[at] = f"{marks[at]}, {text}" if at in marks else text
     for span in manual:
         _check_manual(plant, span)
+        if span.start_s >= n * plant.period_s:
+            raise ParamsError(
+                f"manual from {span.start_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s"
+            )
         marks.setdefault(span.start_s, "manual")
     return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks)
 

@@ -31,7 +31,7 @@ def make(runs: list[int], *, dv: tuple[Signal, ...] = (), seed: int = 0) -> Reco
         dv,
         run,
         position_in_run(run) * 0.5,
-        rng.uniform(0, 1, (n, 2)) * [1, 400],
+        rng.uniform(0, 1, (n, 2)) * [1, 300] + [0, 250],
         rng.uniform(0, 500, (n, 1)),
         rng.uniform(200, 400, (n, len(dv))),
     )
@@ -207,6 +207,14 @@ def test_mv_outside_its_range(tmp_path, frame):
     frame.loc[2, "T [K]"] = 1e4  # a measured PV may stray
     frame.to_csv(tmp_path / "f.csv", index=False)
     assert Record.read(tmp_path / "f.csv", **PLANT).pv[2, 1] == 1e4
+
+
+def test_a_pv_in_another_unit_is_found_by_its_range(tmp_path, frame):
+    frame["C_A [mol/l]"] *= 1000  # mmol/l under the old name
+    text = fault(tmp_path / "f.csv", frame)
+    assert "like most of its column, is outside the PV's range" in text
+    assert "C_A" in text
+    assert "check the unit" in text
 
 
 def test_a_discrete_mv_has_its_allowed_values_only(tmp_path, frame):

@@ -49,10 +49,8 @@ def folder(tmp_path: Path) -> Path:
 def begin(folder: Path, script: str) -> subprocess.Popen[str]:
     """A shell script under a warm process, in a session of its own, as a terminal has it."""
     command = [sys.executable, "-c", SERVER, "bash", "-c", script.replace("python", sys.executable)]
-    pipe = subprocess.PIPE  # stdin too: at the end of another one's, a shell's `read` would not wait
-    return subprocess.Popen(
-        command, cwd=folder, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True
-    )
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
 
 
 def run(folder: Path, script: str) -> tuple[int, str, str]:
@@ -124,13 +122,15 @@ def test_without_a_warm_process_a_stage_starts_by_itself(folder: Path, how: str)
 def test_a_stage_that_nobody_waits_for_ends(folder: Path) -> None:
     (folder / "pipeline" / "stages" / "probe.py").write_text(WAIT)
     process = begin(
-        folder, "python -m pipeline.start probe & while [ ! -s pid ]; do sleep 0.05; done; kill -9 $!; read"
+        folder,
+        "python -m pipeline.start probe & while [ ! -s pid ]; do sleep 0.05; done; kill -9 $!; exec tail -f /dev/null",
     )
     assert within(20, lambda: (folder / "pid").exists() and (folder / "pid").read_text() != "")
     assert within(20, lambda: not lives(int((folder / "pid").read_text())))
     process.terminate()
-    process.communicate(timeout=20)
-    assert process.returncode == 128 + signal.SIGTERM  # the command's own status, as a shell counts
+    _, told = process.communicate(timeout=20)
+    # The command's own status, as a shell counts.
+    assert process.returncode == 128 + signal.SIGTERM, told
 
 
 def test_ctrl_c_ends_everything(folder: Path) -> None:

@@ -158,13 +158,14 @@ def _who(need: Requirement, law: str | None) -> str:
 def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict]:
     """The whole acceptance list: the case's requirements, what every case must show, and its own checks."""
     best = evidence.laws[evidence.best] if evidence.best else None
+    seeds = 1 if evidence.own_data else evidence.case.data_seeds  # a plant's own record is one
     locked = {name: law.lock_ups for name, law in evidence.laws.items()}
     common = [
         Verdict(
             "best controller, data seeds",
-            f"≥ {evidence.case.data_seeds}",
+            f"≥ {seeds}",
             "none is without a lock-up" if best is None else str(best.seeds),
-            best is not None and best.seeds >= evidence.case.data_seeds,
+            best is not None and best.seeds >= seeds,
         ),
         Verdict(
             "best controller, lock-ups over all seeds and scenarios",
