@@ -34,7 +34,9 @@ T_F = (350.0, 360.0, 340.0)  # [K] feed temperature, at a set point where the pl
 C_F = (1.0, 1.1, 0.9)  # [mol/l] feed concentration, at one where it does
 
 GAINS, OUTPUTS, VELOCITY = (Curve("local_pid_network", {"blending": b}) for b in ("gains", "outputs", "velocity"))
-AUTO, SLOW, PID_1 = Curve("auto_pid_network"), Curve("auto_pid_network", {"wc": 3.0}), Curve("pid")
+AUTO, PID_1 = Curve("auto_pid_network"), Curve("pid")
+# By its bandwidth: what an independent implementation measured is of this one, whatever params.yaml ships.
+FIVE, SLOW = (Curve("auto_pid_network", {"wc": wc}) for wc in (5.0, 3.0))
 ALONE = tuple(Curve("pid", {"printed": float(i)}) for i in (2, 3, 4, 5))
 
 
@@ -154,16 +156,16 @@ class HensonSeborgCstrCase(Case):
                 *_iae("Outputs blended", OUTPUTS, 0.0606, 0.0632, 0.0605),
                 *_iae("Velocity form", VELOCITY, 0.0749, 0.0408, 0.0823),
                 *_iae("PID 1 alone", PID_1, 0.0360, 0.0349, 0.0462),
-                *_iae("One knob, wc = 5", AUTO, 0.0302, 0.0296, 0.0452),
+                *_iae("One knob, wc = 5", FIVE, 0.0302, 0.0296, 0.0452),
                 *_iae("One knob, wc = 3", SLOW, 0.058),
                 *_overshoot("Gains blended, one integrator", GAINS, 0.13, 0.28),
                 *_overshoot("Outputs blended", OUTPUTS, 0.60, 0.61),
                 *_overshoot("Velocity form", VELOCITY, 1.35, 0.27),
                 *_overshoot("PID 1 alone", PID_1, 0.08, 0.08),
-                *_overshoot("One knob, wc = 5", AUTO, 0.18, 0.19),
+                *_overshoot("One knob, wc = 5", FIVE, 0.18, 0.19),
                 *_overshoot("One knob, wc = 3", SLOW, 0.08, 0.07),
                 _margin("Gains blended, one integrator", GAINS, 3.9),
-                _margin("One knob, wc = 5", AUTO, 6.6),
+                _margin("One knob, wc = 5", FIVE, 6.6),
             ),
         ),
     )

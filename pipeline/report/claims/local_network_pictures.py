@@ -80,7 +80,7 @@ def _other_rests(axes: Axes, arrays: Loop) -> None:
     courses = arrays.get("other_rest_courses", np.empty((0, 1, 2)))
     for course in courses:
         axes.plot(course[:, 0], course[:, 1], color="black", linewidth=0.8, linestyle=":", zorder=4)
-    axes.plot(*rests[~back].T, "s", color=LOST, markersize=6, zorder=6, label="gone out: at rest for good")
+    axes.plot(*rests[~back].T, "s", color=LOST, markersize=6, zorder=6, label="gone out: does not return")
     axes.plot(*rests[back].T, "s", color=RECOVERED, markersize=6, zorder=6, label="too hot, comes back")
 
 
