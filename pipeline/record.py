@@ -236,7 +236,8 @@ def check_pv(table: Table, signal: Signal, pv: Array) -> None:
     if 2 * outside.size > pv.size:
         raise RecordError(
             f"{table.at(table.find(signal), outside[0])}: {pv[outside[0]]:.6g}, like most of its column, is outside "
-            f"the PV's range {signal.low:g} to {signal.high:g} {signal.unit}; check the unit or widen the plant's signal"
+            f"the PV's range {signal.low:g} to {signal.high:g} {signal.unit}; "
+            "check the unit, or widen the plant's signal"
         )
 
 

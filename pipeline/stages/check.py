@@ -38,7 +38,7 @@ def mistakes() -> list[str]:
                 check(name)
             except (PipelineError, OSError) as error:
                 found.append(" ".join(str(error).split()))
-    return found
+    return list(dict.fromkeys(found))  # a record that cannot be read is met by every model set
 
 
 def _case(name: str) -> None:

@@ -21,13 +21,14 @@ def model_description(case: str, law: str, validation: Mapping[str, Any]) -> str
     """The registered model's description: what the controller is and what the aliases mean."""
     titles, gate = validation.get("titles") or {}, Gate.of(validation, law)
     title = (titles.get("laws") or {}).get(law, law)
+    beaten = f"that beat the {gate.baseline_name} " if law != gate.baseline_law else ""
     return (
         f"<p><b>{escape(str(title))}</b> for {escape(str(titles.get('case', case)))}.</p>"
         "<p>Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup. "
-        "<b>candidate</b>: the newest version. <b>champion</b>: the best version that beat the "
-        f"{escape(gate.baseline_name)} in closed loop without a lock-up. "
-        " <b>case_champion</b>: on the best controller of the case only.</p>"
-        f"<p>Take it: <code>python -m pipeline.tracking fetch {escape(case)}-{escape(law)} FOLDER</code></p>"
+        f"<b>candidate</b>: the newest version. <b>champion</b>: the best version {escape(beaten)}"
+        "in closed loop without a lock-up. <b>case_champion</b>: on the best controller of the case only.</p>"
+        f"<p>Take its champion: <code>python -m pipeline.tracking fetch {escape(case)}-{escape(law)} FOLDER</code>, or "
+        f"the newest version: <code>{escape(case)}-{escape(law)}@candidate</code> in its place.</p>"
     )
 
 
