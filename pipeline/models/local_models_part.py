@@ -49,12 +49,13 @@ class LocalModelsPart(Part):
         if not (self.points and self.overlap > 0 and self.mv_low < self.mv_high and self.mv_step > 0):
             raise ValueError(
                 f"points is {list(self.points)}, overlap {self.overlap}, mv_low..mv_high {self.mv_low}..{self.mv_high} "
-                f"in steps of {self.mv_step}; give one or more points, an overlap and a step above 0, and mv_low < mv_high"
+                f"in steps of {self.mv_step}; give one or more points, an overlap and a step above 0, "
+                "and mv_low < mv_high"
             )
         if self.hold < 2 or self.random_steps < 1 or any(n < 2 for n in self.sizes):
             raise ValueError(
-                f"hold is {self.hold}, random_steps {self.random_steps}, sizes {list(self.sizes)}; a hold and every size "
-                "must be at least 2, and there must be a random step"
+                f"hold is {self.hold}, random_steps {self.random_steps}, sizes {list(self.sizes)}; a hold and "
+                "every size must be at least 2, and there must be a random step"
             )
 
     def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
