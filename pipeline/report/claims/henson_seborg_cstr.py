@@ -102,7 +102,10 @@ def _hopf(evidence: Evidence) -> Verdict:
     at = hopf_point(evidence.case.plant)
     measured = f"the eigenvalues cross the imaginary axis at C = {at[0]:.5f} mol/l, q_c = {at[1]:.2f} l/min"
     holds = all(abs(ours - printed) <= NEAR * printed for ours, printed in zip(at, PRINTED_HOPF, strict=True))
-    return Verdict("", "", measured, holds, f"within {100 * NEAR:g} %; the printed point is still a stable one")
+    plant = evidence.case.plant
+    stable = plant.linearize(*plant.steady_state_at(PRINTED_HOPF[0])).eigenvalues[0].real < 0
+    because = f"within {100 * NEAR:g} %; the printed point is {'still a stable' if stable else 'an unstable'} one"
+    return Verdict("", "", measured, holds, because)
 
 
 def hopf_point(plant: Plant) -> tuple[float, float]:

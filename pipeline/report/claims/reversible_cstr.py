@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.cases.base import Curve, PaperFigure
 from pipeline.cases.reversible_cstr import HOLD, NETWORK, PI, PLAIN, PRINTED, PRINTED_SIGN, TUNED
+from pipeline.metrics import overshoots
 from pipeline.plants.reversible_cstr import R, ReversibleCstr
 from pipeline.report.claims.free_runs import free_run_fit_at_least, free_run_picture, one_step_says_little
 from pipeline.report.claims.reference_models import beats_the_classic_tables, reference_models_picture
@@ -104,7 +105,10 @@ def _sign(evidence: Evidence) -> Verdict:
         f"{number(offset[0])} mol/l; with -3.15 up to {number(settled[0], 2)}"
     )
     holds = share < SATURATED and offset[0] <= settled[0]
-    return Verdict("", "", measured, holds, "the plant's gain is negative, -0.02 to -0.17 mol/l per l/s")
+    cvs, _, mvs = evidence.case.plant.steady_curve
+    gains = np.gradient(cvs, mvs)[(mvs >= mv.low) & (mvs <= mv.high)]
+    because = f"the plant's gain lies between {gains.min():.2f} and {gains.max():.2f} mol/l per {mv.unit}"
+    return Verdict("", "", measured, holds, because)
 
 
 def _overshoot(evidence: Evidence) -> Verdict:
@@ -113,7 +117,12 @@ def _overshoot(evidence: Evidence) -> Verdict:
         return _missing()
     network, pid = found
     measured = f"mean overshoot on the levels: network {100 * network:.1f} % of the step, PID {100 * pid:.1f} %"
-    because = "the network's is the reference model's own, 2.8 %"
+    (test,) = evidence.tests["levels"]
+    if test.reference is None:
+        return _missing()
+    sp = evidence.case.plant.sp_signals[0]
+    asked = np.mean(overshoots(test.sp[:, 0], test.reference[:, 0], test.hold, sp.high - sp.low))
+    because = f"the reference model's own is {100 * asked:.1f} %"
     return Verdict("", "", measured, network <= OVERSHOOT < pid, because)
 
 
