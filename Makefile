@@ -24,7 +24,7 @@ $(STAMP): pyproject.toml constraints.txt tools/setup.sh
 
 run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, publish
 	@python -m pipeline.stages.check
-	@python -m pipeline.warm dvc repro
+	@python -m pipeline.engine.warm dvc repro
 	@python -m pipeline results
 
 test: check ## formatting, lint, types, import rules, tests

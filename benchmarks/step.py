@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.cases import CASES
-from pipeline.perfect import PerfectNmpc
+from pipeline.optimal.perfect import PerfectNmpc
 from serving import Controller, LoopwrightError
 from serving.bench import bench
 

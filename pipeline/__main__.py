@@ -10,14 +10,16 @@ from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
-from pipeline.cases import CASES, Case
+from pipeline.cases import CASES, PLANTS
+from pipeline.config.params import choose, nearest
 from pipeline.errors import ParamsError
-from pipeline.live import SimulatedPlant, view_of
-from pipeline.loop_picture import History, draw, summary, write_csv
-from pipeline.params import nearest
-from pipeline.plants import PLANTS, Plant
-from pipeline.results import show_results
-from pipeline.timetable import Timetable, parse_event, parse_manual, timetable
+from pipeline.evaluation.case import Case
+from pipeline.pictures.loop_picture import History, draw, summary, write_csv
+from pipeline.plants.base import Plant
+from pipeline.report.results import show_results
+from pipeline.simulation.live import SimulatedPlant, view_of
+from pipeline.simulation.scenario import Scenario
+from pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
 from serving.clock import MonotonicClock, VirtualClock
 from serving.controller import Controller
 from serving.errors import LoopwrightError
@@ -81,14 +83,23 @@ def _simulate_options(parser: argparse.ArgumentParser) -> None:
     add("--csv", metavar="FILE", type=Path, help="write every sample there")
 
 
+def _test_of(case: Case | None, name: str | None) -> Scenario | None:
+    """The first sequence of the case's test ``name``, or of its first test; None where the plant has no case."""
+    tests = {} if case is None else case.scenarios()
+    if case is None or not tests:
+        return None
+    return choose(tests, next(iter(tests)) if name is None else name, "scenario", f"case {case.name!r}")[0]
+
+
 def _simulate(options: argparse.Namespace) -> None:
+    if options.sp and options.scenario is not None:
+        raise ParamsError("give set points or a scenario, not both")
     controller = Controller(options.file)
     plant, case = _plant_of(controller.manifest)
     run = timetable(
         plant,
-        case,
+        None if options.sp else _test_of(case, options.scenario),
         set_points=options.sp,
-        scenario=options.scenario,
         disturbances=options.disturbance,
         noise=options.noise,
         manual=options.manual,

@@ -14,16 +14,17 @@ import pytest
 import reversible_cstr_parts
 import torch
 
+from pipeline.cases import PLANTS
 from pipeline.laws import LAWS, ControlLaw, LawSignals
 from pipeline.models import Model
-from pipeline.models.arx import ARX
-from pipeline.models.fit import LevenbergMarquardt
-from pipeline.models.fuzzy_means import FuzzyMeansRBF
-from pipeline.models.leverage_domain import LeverageDomain
-from pipeline.models.nnarx import NNARX
-from pipeline.models.objectives import Samples
-from pipeline.plants import PLANTS, Plant
-from pipeline.simulate import simulate_batch
+from pipeline.models.lagged.arx import ARX
+from pipeline.models.lagged.nnarx import NNARX
+from pipeline.models.static.fuzzy_means import FuzzyMeansRBF
+from pipeline.models.static.leverage_domain import LeverageDomain
+from pipeline.models.training.fit import LevenbergMarquardt
+from pipeline.models.training.objectives import Samples
+from pipeline.plants.base import Plant
+from pipeline.simulation.simulate import simulate_batch
 
 # What a law's params need other than their defaults to be designed quickly; a law not named here is designed as it is.
 QUICK: dict[str, dict[str, Any]] = {

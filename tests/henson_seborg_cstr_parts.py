@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pipeline.models import Model
-from pipeline.models.local_models import LocalModels
-from pipeline.models.local_models_part import operating_cv
-from pipeline.plants import Plant
+from pipeline.models.local.local_models import LocalModels
+from pipeline.models.local.local_models_part import operating_cv
+from pipeline.plants.base import Plant
 
 POINTS = ({"q_c": 110.0}, {"T": 442.0}, {"T": 450.0}, {"T": 465.0}, {"T": 481.0})
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
 from pipeline.models import Model
-from pipeline.models.hybrid_fuzzy import HybridFuzzy
-from pipeline.plants import Plant
-from pipeline.plants.fuzzy_batch_reactor import CENTRES, FuzzyBatchReactor
+from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from pipeline.plants.base import Plant
 
 LAWS = ("fuzzy_feedforward", "fuzzy_feedforward_pi", "fuzzy_feedforward_observer")
 

@@ -18,7 +18,13 @@ import numpy as np
 import yaml
 from onnx import TensorProto, helper
 
-from pipeline.cases import CASES, NOISE_SUFFIX, Case, Scenario
+from pipeline.cases import CASES, beside
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.for_programs import validation
+from pipeline.evaluation.verdicts import PLAIN, Claims, judge
+from pipeline.report.page import write_report
+from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 SEEDS = (0, 1, 2)
 GAINS = ("kc", "tau_i_s", "tau_d_s", "penalty", "linearization_error")
@@ -312,3 +318,19 @@ def write_case(root: Path, quality: Mapping[str, float] | None = None, mini: Min
     write_models(root) if mini is THIOSULFATE else write_nnarx_models(root, mini)
     for law, value in (quality or mini.quality).items():
         write_validation(root, law, value, mini=mini)
+
+
+def claims_of(case: str) -> Claims:
+    """What is known of the case with this name."""
+    claims: Claims = beside(CASES[case], "paper", "CLAIMS", PLAIN)
+    return claims
+
+
+def report(evidence: Evidence, models: Path, out: Path) -> None:
+    """The report with what is known of the case, as its stage writes it."""
+    write_report(evidence, claims_of(evidence.case.name), models, out)
+
+
+def for_programs(evidence: Evidence) -> dict[str, Any]:
+    """validation.json with what is known of the case."""
+    return validation(evidence, judge(evidence, claims_of(evidence.case.name)))

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipeline.cases import Case
-from pipeline.cases.base import Scenario
+from pipeline.evaluation.case import Case
 from pipeline.excitation import Excitation
 from pipeline.laws import LAWS, ControlLaw, LawSignals
 from pipeline.models import MODELS, Model
-from pipeline.models.nnarx import NNARX
-from pipeline.plants import Plant
-from pipeline.simulate import Trajectory, simulate_closed
+from pipeline.models.lagged.nnarx import NNARX
+from pipeline.plants.base import Plant
+from pipeline.simulation.scenario import Scenario
+from pipeline.simulation.simulate import Trajectory, simulate_closed
 from serving.manifest import Signal
 
 DV = torch.zeros(0, dtype=torch.float64)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.export import export
+from pipeline.export.gate import export
 from pipeline.laws import ControlLaw, LawSignals
 from serving import Controller, Signal
 

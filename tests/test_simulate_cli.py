@@ -15,12 +15,12 @@ from rich.console import Console
 
 from pipeline.__main__ import main
 from pipeline.cases import CASES
-from pipeline.export import export
+from pipeline.export.gate import export
 from pipeline.laws import LAWS, LawSignals
-from pipeline.live import TerminalView, sparkline
 from pipeline.metrics import mae
-from pipeline.plants import Plant
-from pipeline.simulate import simulate_closed
+from pipeline.plants.base import Plant
+from pipeline.simulation.live import TerminalView, sparkline
+from pipeline.simulation.simulate import simulate_closed
 from serving import Command, Controller, Mode
 
 CASE = "thiosulfate_cstr"

@@ -1,15 +1,24 @@
-"""Cases by name: adding one is a file in this folder and a line here."""
+"""The cases by name, and their plants: adding one is a folder here and a line below.
+
+What a case draws or claims stands in its ``paper`` module, own kinds of model and excitations in
+``models`` and ``excitations``; ``beside`` loads them, so that the list itself needs neither torch nor matplotlib.
+"""
 
 from __future__ import annotations
 
-from pipeline.cases.base import NOISE_SUFFIX, Case, Scenario
-from pipeline.cases.batch_reactor import BatchReactorCase
-from pipeline.cases.henson_seborg_cstr import HensonSeborgCstrCase
-from pipeline.cases.jacketed_batch_reactor import JacketedBatchReactorCase
-from pipeline.cases.ph_neutralization import PhNeutralizationCase
-from pipeline.cases.ph_neutralization_15s import PhNeutralization15sCase
-from pipeline.cases.reversible_cstr import ReversibleCstrCase
-from pipeline.cases.thiosulfate_cstr import ThiosulfateCstrCase
+import importlib
+import importlib.util
+from typing import Any
+
+from pipeline.cases.batch_reactor.case import BatchReactorCase
+from pipeline.cases.henson_seborg_cstr.case import HensonSeborgCstrCase
+from pipeline.cases.jacketed_batch_reactor.case import JacketedBatchReactorCase
+from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from pipeline.cases.ph_neutralization.case_15s import PhNeutralization15sCase
+from pipeline.cases.reversible_cstr.case import ReversibleCstrCase
+from pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
+from pipeline.evaluation.case import Case
+from pipeline.plants.base import Plant
 
 CASES: dict[str, Case] = {
     ThiosulfateCstrCase.name: ThiosulfateCstrCase(),
@@ -21,4 +30,19 @@ CASES: dict[str, Case] = {
     ReversibleCstrCase.name: ReversibleCstrCase(),
 }
 
-__all__ = ["CASES", "NOISE_SUFFIX", "Case", "Scenario"]
+PLANTS: dict[str, type[Plant]] = {
+    plant.name: plant for case in CASES.values() for plant in (case.plant_class, *case.further_plants)
+}
+
+
+def beside(case: Case, module: str, name: str, default: Any) -> Any:
+    """``name`` in the module that stands beside the case: ``paper`` of case.py, ``paper_15s`` of case_15s.py.
+
+    ``default`` where there is no such module.
+    """
+    package, _, own = type(case).__module__.rpartition(".")
+    path = f"{package}.{own.replace('case', module, 1)}".lstrip(".")
+    return default if importlib.util.find_spec(path) is None else getattr(importlib.import_module(path), name)
+
+
+__all__ = ["CASES", "PLANTS", "beside"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pipeline.excitation.base import Excitation, OpenLoop
 from pipeline.excitation.batches import Batches
-from pipeline.excitation.jacket_pulses import JacketPulses
 from pipeline.excitation.operating_point import OperatingPoint
 from pipeline.excitation.sequences import Aprbs, Multisine, Prbs, RandomSteps
 
@@ -15,7 +14,6 @@ EXCITATIONS: dict[str, type[Excitation]] = {
     Multisine.kind: Multisine,
     OperatingPoint.kind: OperatingPoint,
     Batches.kind: Batches,
-    JacketPulses.kind: JacketPulses,
 }
 
 __all__ = ["EXCITATIONS", "Excitation", "OpenLoop"]

@@ -10,8 +10,8 @@ import numpy as np
 
 from pipeline.errors import ParamsError
 from pipeline.plants.base import Array, Plant
-from pipeline.record import Record
-from pipeline.simulate import measured, noise_draws, simulate_open
+from pipeline.records.record import Record
+from pipeline.simulation.simulate import measured, noise_draws, simulate_open
 
 
 @dataclass(frozen=True, kw_only=True)

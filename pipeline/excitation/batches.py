@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pipeline.errors import ParamsError
 from pipeline.excitation.base import OpenLoop
 from pipeline.plants.base import Array, Plant
-from pipeline.record import Record
-from pipeline.simulate import measured, noise_draws, simulate_batch
+from pipeline.records.record import Record
+from pipeline.simulation.simulate import measured, noise_draws, simulate_batch
 
 
 @dataclass(frozen=True, kw_only=True)

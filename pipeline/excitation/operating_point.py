@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pipeline.errors import PlantError
 from pipeline.excitation.base import Excitation
 from pipeline.plants.base import Array, Plant
-from pipeline.record import Record
-from pipeline.simulate import measured, noise_draws, simulate_batch
-from pipeline.tuning import AllPole, PidSettings, imc_pid
+from pipeline.records.record import Record
+from pipeline.simulation.simulate import measured, noise_draws, simulate_batch
+from pipeline.tuning.rules import AllPole, PidSettings, imc_pid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,9 +10,9 @@ from scipy.special import chdtri
 from torch import Tensor, nn
 
 from pipeline.errors import LawError
-from pipeline.gain_update import PidForm, gain_update
 from pipeline.laws.base import LawSignals
-from pipeline.memory import Named, Slot, constant
+from pipeline.laws.gain_update import PidForm, gain_update
+from pipeline.models.memory import Named, Slot, constant
 
 Three = tuple[float, float, float]
 CONFIDENCE = 0.99  # of the update criterion: noise alone trips it in one sample of a hundred

@@ -1,6 +1,4 @@
-"""The report: the paper's tables beside ours, verdicts, pictures, and validation.json for programs.
+"""The pages of a case and the page over all cases, and the table in the terminal.
 
-Everything is computed from what the stages left in work/<case>/ and from the case itself; no model,
-no store and no runtime is loaded. ``pipeline.stages.report`` writes it to artifacts/<case>/.
-``overview`` makes one page over all cases of the validation.json of each, and imports none of the rest.
+It knows no case by name, and loads no model, no store and no runtime.
 """

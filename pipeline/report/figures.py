@@ -9,14 +9,14 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases.base import Figure
-from pipeline.report.drawing import STYLE, save
-from pipeline.report.evidence import Evidence
-from pipeline.report.law_evidence import ReportError
-from pipeline.report.loop_pictures import info_picture, loops_picture, overview_picture
-from pipeline.report.model_evidence import candidates
-from pipeline.report.model_pictures import candidates_picture, one_step_picture, predictions_picture
-from pipeline.report.verdicts import CasePicture
+from pipeline.evaluation.case import Figure
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.law_evidence import ReportError
+from pipeline.evaluation.model_evidence import candidates
+from pipeline.evaluation.verdicts import CasePicture
+from pipeline.pictures.drawing import STYLE, save
+from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
+from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
 
 
 def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CasePicture] = ()) -> dict[str, str]:

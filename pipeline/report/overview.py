@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.report.numbers import ratio
+from pipeline.evaluation.standing import LawStanding, Standing, tally
+from pipeline.pictures.numbers import ratio
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
-from pipeline.standing import LawStanding, Standing, tally
 
 Count = tuple[int, int]
 

@@ -7,23 +7,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.cases.base import NOISE_SUFFIX
-from pipeline.report.claims import CLAIMS, PLAIN, Claims
-from pipeline.report.evidence import Evidence
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.for_programs import validation
+from pipeline.evaluation.model_evidence import candidates, model_rows
+from pipeline.evaluation.verdicts import RULE, Claims, Judged, judge
+from pipeline.pictures.words import LONG, NO_UNIT, SHORT, law_name, metric_name, number, ratio, scenario_name
 from pipeline.report.figures import draw_all
-from pipeline.report.for_programs import validation
-from pipeline.report.model_evidence import candidates, model_rows
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
-from pipeline.report.verdicts import RULE, Judged, judge
-from pipeline.report.words import LONG, NO_UNIT, SHORT, law_name, metric_name, number, ratio, scenario_name
+from pipeline.simulation.scenario import NOISE_SUFFIX
 
 MOST_HEADLINES = 5
 
 
-def write_report(evidence: Evidence, models: Path, out: Path) -> list[Path]:
+def write_report(evidence: Evidence, claims: Claims, models: Path, out: Path) -> list[Path]:
     """Write validation.json, figures/, report.html and report.md into ``out``; returns their paths."""
     out.mkdir(parents=True, exist_ok=True)
-    claims = CLAIMS.get(evidence.case.name, PLAIN)
     judged = judge(evidence, claims)
     pictures = draw_all(evidence, out / "figures", models, claims.pictures)
     content = context(evidence, claims, judged, pictures)

@@ -9,7 +9,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from pipeline.report.numbers import figure, headline, kilobytes, multiple, times
+from pipeline.pictures.numbers import figure, headline, kilobytes, multiple, times
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 """Where `make registry` serves the registry, unless another port was asked for."""

@@ -11,11 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases import CASES
-from pipeline.errors import ParamsError, PipelineError
-from pipeline.excitation import EXCITATIONS
-from pipeline.laws import LAWS
-from pipeline.models.network_parts import trainer_of
-from pipeline.params import (
+from pipeline.config.params import (
     CaseParams,
     ControllerParams,
     ModelParams,
@@ -25,8 +21,12 @@ from pipeline.params import (
     read_section,
     sections,
 )
-from pipeline.stages import WORK, record_folder
+from pipeline.errors import ParamsError, PipelineError
+from pipeline.laws import LAWS
+from pipeline.models.training.network_parts import trainer_of
+from pipeline.stages.excite import excitations
 from pipeline.stages.fit import part_of
+from pipeline.stages.paths import WORK, record_folder
 
 
 def mistakes() -> list[str]:
@@ -49,14 +49,14 @@ def _case(name: str) -> None:
 def _record(name: str) -> None:
     params, where = RecordParams.read(name), f"records.{name}"
     _known_case(params.case, where)
-    parse(choose(EXCITATIONS, params.kind, "excitation", where), params.excitation, where)
+    parse(choose(excitations(CASES[params.case]), params.kind, "excitation", where), params.excitation, where)
 
 
 def _model(name: str) -> None:
     params, where = ModelParams.read(name), f"models.{name}"
     _known_case(params.case, where)
     for part, values in params.parts.items():
-        found = part_of(values, f"{where}.parts.{part}")
+        found = part_of(CASES[params.case], values, f"{where}.parts.{part}")
         trainer = getattr(found, "trainer", None)
         if isinstance(trainer, Mapping):
             try:

@@ -1,56 +1,48 @@
-"""Stage code: ``python -m pipeline.stages.code`` lists what every other stage runs, file by file.
+"""Stage code: ``python -m pipeline.stages.code`` lists the files that every other stage runs.
 
 work/code/<stage>-<case>.json (<stage>.json of a stage over all cases) holds the sha256 of each file
 of ``pipeline`` and ``serving`` that the stage imports, at whatever depth. The stage depends on that
-one file, so that an edit runs again what it has a part in and nothing else. Named one by one in
-dvc.yaml they would be 20 entries a stage, in a dvc.lock that DVC reads and writes again after every
-stage.
+one file, so an edit runs again what it has a part in and nothing else. One file for each stage keeps
+dvc.lock short, which DVC reads and writes after every stage.
 """
 
 from __future__ import annotations
 
-import ast
-import hashlib
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from pipeline.stages import WORK, write_json
+import grimp
+
+from pipeline.cases import CASES
+from pipeline.files import sha256, write_json
+from pipeline.stages.paths import WORK
 
 PACKAGES = ("pipeline", "serving")
 STAGES = ("excite", "fit", "design", "validate", "report")  # of one case each
 LAST = ("overview", "publish")
 # What carries a stage's work from place to place and has no part in its result.
-CARRIERS = {
-    "pipeline",
-    "pipeline.command",
-    "pipeline.errors",
-    "pipeline.parallel",
-    "pipeline.params",
-    "pipeline.stages",
-    "serving",
-    "serving.errors",
-}
-# Stage -> modules that have no part in its result, by what imports them ("" is anything).
+CARRIERS = (
+    *("pipeline", "pipeline.config", "pipeline.engine", "pipeline.errors", "pipeline.files", "pipeline.stages.paths"),
+    *("serving", "serving.errors"),
+)
+# A stage asks a case for its plant before it is validated: which tests the case has changes nothing.
+TESTS = ("pipeline.evaluation", "pipeline.simulation.scenario")
+# Stage -> what it imports without a part in its result: by whom ("" is anybody), and what, with all that is in it.
 APART = {
-    # Which tests a case has does not change its plant.
-    "excite": {("", "pipeline.cases.base"), ("", "serving.manifest")},
-    "fit": {("", "pipeline.cases.base"), ("", "serving.manifest")},
+    "excite": {("", what) for what in (*TESTS, "serving.manifest")},
+    "fit": {("", what) for what in (*TESTS, "serving.manifest")},
     "design": {
-        ("", "pipeline.cases.base"),
+        *(("", what) for what in TESTS),
         # What trained the models has had its effect.
-        *(("pipeline.models", f"pipeline.{name}") for name in ("metrics", "record", "record_file")),
+        *(("pipeline.models", what) for what in ("pipeline.metrics", "pipeline.records")),
         # The parity gate says whether the runtime agrees with the law, and changes nothing.
-        *(("", f"serving.{name}") for name in ("controller", "graph_audit")),
+        *(("", what) for what in ("serving.controller", "serving.graph_audit")),
     },
 }
-# Of these packages, which list the cases, a stage runs its own case's module and what that one is made of.
-BY_CASE = {"pipeline.cases", "pipeline.report.claims"}
+# Stage -> the modules beside case.py that it loads.
+BESIDE = {"excite": ("excitations",), "fit": ("models",), "report": ("paper",)}
 # Files that are read and not imported.
-DATA = {
-    "report": ("pipeline/report/templates/*", "pipeline/cases/{case}.bounds.json"),
-    "overview": ("pipeline/report/templates/*",),
-}
+TEMPLATES = "pipeline/report/templates/*"
 
 
 def code() -> None:
@@ -58,66 +50,62 @@ def code() -> None:
     root = Path.cwd()
     for stage in LAST:
         write_json(WORK / "code" / f"{stage}.json", listing(root, stage))
-    for case in cases(root):
+    for case in CASES:
         for stage in STAGES:
             write_json(WORK / "code" / f"{stage}-{case}.json", listing(root, stage, case))
 
 
-def cases(root: Path) -> list[str]:
-    """The cases, by the modules that their list imports."""
-    named = (m.removeprefix("pipeline.cases.") for m in imports(root, "pipeline.cases"))
-    return sorted(name for name in named if name != "base")
-
-
 def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:
     """Path -> sha256 of every file that the stage runs or reads (for the case)."""
-    found = {path_of(root, module) for module in modules(root, stage, case)}
-    for pattern in DATA.get(stage, ()):
-        found |= set(root.glob(pattern.format(case=case)))
-    return {p.relative_to(root).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(found)}
+    found = {path_of(root, module) for module in modules(stage, case)}
+    if stage in {"report", "overview"}:
+        found |= set(root.glob(TEMPLATES))
+    if stage == "report":
+        found |= {path for path in [path_of(root, beside(case, "bounds")).with_suffix(".json")] if path.exists()}
+    return {p.relative_to(root).as_posix(): sha256(p) for p in sorted(found)}
 
 
-def modules(root: Path, stage: str, case: str = "") -> set[str]:
+def modules(stage: str, case: str = "") -> set[str]:
     """The modules that have a part in the stage's result, by what imports what."""
-    apart = APART.get(stage, set())
+    imports = graph()
     found: set[str] = set()
     todo = [f"pipeline.stages.{stage}"]
+    if case:
+        own = [beside(case, name) for name in ("case", *BESIDE.get(stage, ()))]
+        todo += [module for module in own if module in imports.modules]
     while todo:
         module = todo.pop()
         found.add(module)
-        used = imports(root, module)
-        own = {f"{package}.{case}" for package in BY_CASE if package in used}
-        used |= {m for m in own if path_of(root, m).exists()}
-        left = (
-            m
-            for m in used - found - CARRIERS - BY_CASE
-            if not any(module.startswith(w) and m == what for w, what in apart)
-        )
-        todo += left
+        # The list of cases imports them all; this stage runs its own alone.
+        used = imports.find_modules_directly_imported_by(module) if module != "pipeline.cases" else set()
+        todo += [m for m in used - found if not _within(m, CARRIERS) and not _apart(stage, module, m)]
     return found
 
 
 @cache
-def imports(root: Path, module: str) -> frozenset[str]:
-    """The modules of this repository that a module imports, wherever in its text."""
-    tree = ast.parse(path_of(root, module).read_text(encoding="utf-8"))
-    return frozenset(m for m in _named(root, tree) if m.partition(".")[0] in PACKAGES)
+def graph() -> grimp.ImportGraph:
+    """What imports what, wherever in a module's text."""
+    return grimp.build_graph(*PACKAGES, cache_dir=None)
 
 
-def _named(root: Path, tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                yield inner if path_of(root, inner).exists() else node.module
+def beside(case: str, name: str) -> str:
+    """The module ``name`` beside the case's own: paper_15s beside case_15s."""
+    package, _, own = type(CASES[case]).__module__.rpartition(".")
+    return f"{package}.{own.replace('case', name, 1)}"
 
 
 def path_of(root: Path, module: str) -> Path:
     """The file of a module, whether there or not; of a package its __init__.py."""
     path = root.joinpath(*module.split("."))
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _apart(stage: str, importer: str, imported: str) -> bool:
+    return any(importer.startswith(who) and _within(imported, (what,)) for who, what in APART.get(stage, ()))
+
+
+def _within(module: str, packages: tuple[str, ...]) -> bool:
+    return any(module == p or (module.startswith(p + ".") and p not in PACKAGES) for p in packages)
 
 
 if __name__ == "__main__":

@@ -15,16 +15,18 @@ from typing import Any
 import numpy as np
 
 from pipeline.cases import CASES
-from pipeline.command import run_stage
+from pipeline.config.params import ControllerParams, choose, digest, parse
+from pipeline.engine.command import run_stage
+from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
-from pipeline.export import export
+from pipeline.evaluation.trial import BASE
+from pipeline.export.gate import export
+from pipeline.files import read_json, write_json
 from pipeline.laws import LAWS, ControlLaw, LawSignals
 from pipeline.models import load_model
-from pipeline.parallel import parallel_map
-from pipeline.params import ControllerParams, choose, digest, parse
 from pipeline.plants.base import Array, Plant
-from pipeline.simulate import measured
-from pipeline.stages import BASE, analysis_file, controller_file, design_folder, model_folder, read_json, write_json
+from pipeline.simulation.simulate import measured
+from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder
 
 
 def design(name: str) -> None:

@@ -7,13 +7,15 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from pipeline.cases import CASES
-from pipeline.command import run_stage
+from pipeline.cases import CASES, beside
+from pipeline.config.params import RecordParams, choose, parse
+from pipeline.engine.command import run_stage
+from pipeline.engine.parallel import parallel_map
+from pipeline.evaluation.case import Case
 from pipeline.excitation import EXCITATIONS, Excitation
-from pipeline.parallel import parallel_map
-from pipeline.params import RecordParams, choose, parse
+from pipeline.files import write_json
 from pipeline.plants.base import Plant
-from pipeline.stages import record_folder, write_json
+from pipeline.stages.paths import record_folder
 
 
 def excite(name: str) -> None:
@@ -21,12 +23,17 @@ def excite(name: str) -> None:
     params = RecordParams.read(name)
     where = f"records.{name}"
     case = choose(CASES, params.case, "case", where)
-    kind = choose(EXCITATIONS, params.kind, "excitation", where)
+    kind = choose(excitations(case), params.kind, "excitation", where)
     excitation = parse(kind, params.excitation, where)
     folder = record_folder(params.case, params.record)
     shutil.rmtree(folder, ignore_errors=True)
     rows = parallel_map(partial(_record, excitation, case.plant, folder), params.seeds, f"excite {name}")
     write_json(folder / "metrics.json", {"record": params.record, "per_seed": dict(rows)})
+
+
+def excitations(case: Case) -> dict[str, type[Excitation]]:
+    """The kinds of excitation that a record of the case may have: the general ones and its own."""
+    return {**EXCITATIONS, **beside(case, "excitations", "EXCITATIONS", {})}
 
 
 def _record(excitation: Excitation, plant: Plant, folder: Path, seed: int) -> tuple[str, dict[str, object]]:

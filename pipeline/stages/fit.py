@@ -12,21 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import CASES, Case
-from pipeline.command import run_stage
+from pipeline.cases import CASES, beside
+from pipeline.config.params import ModelParams, choose, parse
+from pipeline.engine.command import run_stage
+from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ParamsError
+from pipeline.evaluation.case import Case
+from pipeline.files import write_json
 from pipeline.models import MODELS, Part
-from pipeline.parallel import parallel_map
-from pipeline.params import ModelParams, choose, parse
-from pipeline.record import Record
-from pipeline.stages import model_folder, write_json
+from pipeline.pictures.sweep_plot import draw
+from pipeline.records.record import Record
+from pipeline.stages.paths import model_folder
 
 
 def fit(name: str) -> None:
     """Train the parts of ``models.<name>`` on each data seed; write them, metrics.json and the sweep."""
     params = ModelParams.read(name)
     case = choose(CASES, params.case, "case", f"models.{name}")
-    parts = {part: part_of(values, f"models.{name}.parts.{part}") for part, values in params.parts.items()}
+    parts = {part: part_of(case, values, f"models.{name}.parts.{part}") for part, values in params.parts.items()}
     folder = model_folder(params.case, params.model)
     shutil.rmtree(folder, ignore_errors=True)
     data = data_files(params.data)
@@ -51,10 +54,12 @@ def fit(name: str) -> None:
     write_json(folder / "metrics.json", metrics)
 
 
-def part_of(values: Mapping[str, Any], where: str) -> Part:
+def part_of(case: Case, values: Mapping[str, Any], where: str) -> Part:
     """The description of one part of a set; ParamsError says what of it cannot be."""
     options = dict(values)
-    kind = choose(MODELS, options.pop("kind", None), "kind of part", f"{where}.kind")
+    kind = choose(
+        {**MODELS, **beside(case, "models", "MODELS", {})}, options.pop("kind", None), "kind of part", f"{where}.kind"
+    )
     return parse(kind, options, where)
 
 
@@ -82,7 +87,7 @@ def _learn(
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:
         learnt.sweep.save(folder / "sweep.json")
-        learnt.sweep.plot(folder / "sweep.png")
+        draw(learnt.sweep, folder / "sweep.png")
     return None if record is None else record.digest(), learnt.metrics, learnt.predictions
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 
+from pipeline.config.params import sections
 from pipeline.errors import PipelineError
-from pipeline.params import sections
+from pipeline.evaluation.standing import Standing
 from pipeline.report.overview import write_overview
-from pipeline.stages import ARTIFACTS
-from pipeline.standing import Standing
+from pipeline.stages.paths import ARTIFACTS
 
 
 def overview() -> None:

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from pipeline.errors import PipelineError
-from pipeline.stages import write_json
+from pipeline.files import write_json
 from pipeline.tracking.publish import publish
 
 RECEIPT = Path("published.json")

@@ -6,13 +6,15 @@ import hashlib
 import sys
 from pathlib import Path
 
-from pipeline.bounds import bounds_path, load_bounds
-from pipeline.cases import CASES
-from pipeline.command import run_stage
-from pipeline.params import CaseParams, choose, entries, parse, read_section
-from pipeline.report.evidence import Evidence
+from pipeline.cases import CASES, beside
+from pipeline.config.params import CaseParams, choose, entries, parse, read_section
+from pipeline.engine.command import run_stage
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.verdicts import PLAIN
+from pipeline.files import write_json
+from pipeline.optimal.bounds import bounds_path, load_bounds
 from pipeline.report.page import write_report
-from pipeline.stages import ARTIFACTS, WORK, receipt_file, write_json
+from pipeline.stages.paths import ARTIFACTS, WORK, receipt_file
 
 
 def report(name: str) -> None:
@@ -22,11 +24,13 @@ def report(name: str) -> None:
     # A new case has no bounds until the oracle has run; stale ones are an error, never shown.
     bounds = load_bounds(case) if bounds_path(case).exists() else {}
     if not bounds:
-        print(f"report {name}: no bounds yet; `python -m pipeline.oracle {name}` computes them", file=sys.stderr)
+        print(f"report {name}: no bounds yet; `python -m pipeline.stages.bounds {name}` computes them", file=sys.stderr)
     laws, models = entries("controllers", name, "law"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
     evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data)
-    for path in write_report(evidence, WORK / name / "models", ARTIFACTS / name):
+    for path in write_report(
+        evidence, beside(case, "paper", "CLAIMS", PLAIN), WORK / name / "models", ARTIFACTS / name
+    ):
         print(path)
     verdicts = (ARTIFACTS / name / "validation.json").read_bytes()
     write_json(receipt_file(name), {"validation_sha256": hashlib.sha256(verdicts).hexdigest()})

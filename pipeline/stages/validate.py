@@ -12,23 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import CASES, NOISE_SUFFIX, Case
-from pipeline.command import run_stage
-from pipeline.controller_file import with_evidence
+from pipeline.cases import CASES
+from pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section
+from pipeline.engine.command import run_stage
+from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
-from pipeline.parallel import parallel_map
-from pipeline.params import CaseParams, ControllerParams, choose, parse, read_section
-from pipeline.stages import (
-    ARTIFACTS,
-    BASE,
-    analysis_file,
-    controller_file,
-    design_folder,
-    read_json,
-    validation_folder,
-    write_json,
-)
-from pipeline.stages.trial import Metrics, Trial, step_us, try_file
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.trial import BASE, Metrics, Trial, step_us, try_file
+from pipeline.export.controller_file import with_evidence
+from pipeline.files import read_json, write_json
+from pipeline.simulation.scenario import NOISE_SUFFIX
+from pipeline.stages.paths import ARTIFACTS, analysis_file, controller_file, design_folder, validation_folder
 from serving.controller import Controller
 
 FIELDS = ("time_s", "sp", "pv", "mv", "info")  # of the trajectories that are kept
@@ -44,8 +38,9 @@ def validate(name: str) -> None:
     )
     if not seeds:
         raise LawError(f"controllers.{name} has no exported files; run its design stage first")
-    work = [(form, seed) for form in (BASE, *params.variants) for seed in seeds]
-    trials = parallel_map(partial(try_file, case, params.law, choices.noise_seed), work, f"validate {name}")
+    forms = (BASE, *params.variants)
+    work = [(form, seed, controller_file(params.case, params.law, form, seed)) for form in forms for seed in seeds]
+    trials = parallel_map(partial(try_file, case, choices.noise_seed), work, f"validate {name}")
     base = [t for t in trials if t.form == BASE]
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from pipeline.cases.base import NOISE_SUFFIX
+from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.tracking.gate import Gate
 
 GAP = "&nbsp;" * 4

@@ -1,0 +1,1 @@
+"""Exothermic batch reactor A -> B -> C."""

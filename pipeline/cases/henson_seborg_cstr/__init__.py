@@ -1,0 +1,1 @@
+"""CSTR held by its coolant."""

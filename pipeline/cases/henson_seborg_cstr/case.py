@@ -1,0 +1,228 @@
+"""The tests of the CSTR held by its coolant flow: steps up and down, one jump, disturbances that nobody measures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
+from pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
+from pipeline.evaluation.closed_loop import overshoots
+from pipeline.evaluation.effort import Effort
+from pipeline.plants.base import Array, Plant
+from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
+
+HOLD = 500  # samples: 10 min
+LEVELS = [0.02, 0.02, 0.04, 0.06, 0.08, 0.10, 0.12, 0.13]  # [mol/l]
+HELD_OUT_LEVELS, HELD_OUT_HOLD, HELD_OUT_RANGE = 8, 250, (0.012, 0.135)
+FED = 1200  # samples: 24 min, a quarter as it was, a quarter changed one way, a half the other
+T_F = (350.0, 360.0, 340.0)  # [K] feed temperature, at a set point where the plant hardly damps itself
+C_F = (1.0, 1.1, 0.9)  # [mol/l] feed concentration, at one where it does
+
+GAINS, OUTPUTS, VELOCITY = (Curve("local_pid_network", {"blending": b}) for b in ("gains", "outputs", "velocity"))
+AUTO, PID_1 = Curve("auto_pid_network"), Curve("pid")
+# By its bandwidth: what an independent implementation measured is of this one, whatever params.yaml ships.
+FIVE, SLOW = (Curve("auto_pid_network", {"wc": wc}) for wc in (5.0, 3.0))
+ALONE = tuple(Curve("pid", {"printed": float(i)}) for i in (2, 3, 4, 5))
+
+
+POINTS = (  # as printed, C [mol/l], T [K] and q_c [l/min]; beside them what an independent implementation found
+    (("0.12980", 0.129825), ("432.95", 432.949), ("110", 110.0)),
+    (("0.085060", 0.08506), ("442", 442.0), ("98.899", 98.984)),
+    (("0.05854", 0.05854), ("450", 450.0), ("88.291", 88.324)),
+    (("0.029468", 0.02947), ("465", 465.0), ("68.788", 68.791)),
+    (("0.014630", 0.01463), ("481", 481.0), ("50.438", 50.438)),
+)
+
+
+def _operating_points() -> tuple[PaperFigure, ...]:
+    """Rows of the operating points, which follow from balances alone: to half a unit of the last printed digit."""
+    return tuple(
+        PaperFigure(
+            f"{signal}, point {i}",
+            "local_models",
+            "",
+            f"operating_points.{i}.{signal}",
+            float(printed),
+            {},
+            other,
+            within=0.5 * 10.0 ** -len(printed.partition(".")[2]),
+        )
+        for i, row in enumerate(POINTS, start=1)
+        for signal, (printed, other) in zip(("C", "T", "q_c"), row, strict=True)
+    )
+
+
+def _iae(label: str, curve: Curve, *found: float) -> tuple[PaperFigure, ...]:
+    """Rows of IAE up, down and after the jump; the figures are those of an independent implementation."""
+    tests = zip(("up", "down", "jump"), found, strict=False)
+    return tuple(
+        PaperFigure(f"{label}, {t}", curve.law, t, "iae", v, curve.setting, v, printed=False) for t, v in tests
+    )
+
+
+def _overshoot(label: str, curve: Curve, *found: float) -> tuple[PaperFigure, ...]:
+    """Rows of the largest overshoot up and down, of the same implementation."""
+    tests = zip(("up", "down"), found, strict=True)
+    return tuple(
+        PaperFigure(f"{label}, {t}", curve.law, t, "overshoot_max", v, curve.setting, v, printed=False)
+        for t, v in tests
+    )
+
+
+def _margin(label: str, curve: Curve, found: float) -> PaperFigure:
+    """A row of the upper gain margin, of the same implementation, to its last digit."""
+    return PaperFigure(label, curve.law, "", "gain_margin", found, curve.setting, found, printed=False, within=0.05)
+
+
+@dataclass(frozen=True)
+class HensonSeborgCstrCase(Case):
+    """Seed 004_643aaacd7e46828e.txt, section IV, whose figures show one course up through the range.
+
+    Made precise, and extended by the way back, by one jump over the whole range, by random set points
+    a little beyond the paper's range, and by changes of the feed's temperature and concentration that
+    no controller measures; each test again with measurement noise. Set points end where the plant
+    loses its stability, at C = 0.140 mol/l.
+    """
+
+    held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
+
+    name: ClassVar[str] = "henson_seborg_cstr"
+    title: ClassVar[str] = "Exothermic CSTR under coolant flow"
+    plant_class: ClassVar[type[Plant]] = HensonSeborgCstr
+    development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
+    noise: ClassVar[Mapping[str, float]] = {"C": 2e-4, "T": 0.2}
+    seen: ClassVar[str] = (
+        "gains and bandwidth are the paper's and an independent implementation's; the feed's changes were enlarged "
+        "after their errors had turned out to be less than noise hides. held_out served no choice."
+    )
+    data_seeds: ClassVar[int] = 1
+    unforeseen: ClassVar[bool] = True  # nobody measures the feed
+    # Periods of 1.2 s: a move takes several to show, and one coarse element each is exact to 1e-5.
+    effort: ClassVar[Effort] = Effort(60, 1, 1, 2, (3, 10), tail=60, every=10, noisy=False)
+    gate: ClassVar[Mapping[str, float]] = {
+        "up": 0.2,
+        "down": 0.15,
+        "jump": 0.1,
+        "jump_down": 0.05,
+        "held_out": 0.3,
+        "feed_temperature": 0.1,
+        "feed_concentration": 0.1,
+    }
+    metric_words: ClassVar[Mapping[str, str]] = {
+        "iae": "IAE [mol/l min]",
+        "overshoot_max": "largest overshoot",
+        "overshoot_last": "overshoot of the last step",
+        "last_error": "error at the end [mol/l]",
+        "fit_C": "fit of C [%]",
+        "fit_T": "fit of T [%]",
+        "frozen_radius": "largest spectral radius of the frozen loops",
+        "frozen_radius_over_range": "the same over all set points",
+        "gain_margin": "upper gain margin",
+        "lyapunov_pairs": "neighbour pairs with a Lyapunov function",
+        "neighbour_pairs": "neighbour pairs",
+        "lyapunov_contraction": "slowest contraction per period",
+        "starts": "Monte Carlo starts",
+        "recovered": "of them recovered",
+        "left_range": "of them went out",
+        "recovery_min": "median time to recover [min]",
+        "states_of_no_return": "states from which it does not return",
+    }
+    tables: ClassVar[tuple[PaperTable, ...]] = (
+        PaperTable(
+            1,
+            "Operating points as printed, to their last digit",
+            _operating_points(),
+        ),
+        PaperTable(
+            2,
+            "The forms and single PIDs; the paper prints no figures, so an independent implementation's stand here",
+            (
+                *_iae("Gains blended, one integrator", GAINS, 0.0365, 0.0392, 0.0613),
+                *_iae("Outputs blended", OUTPUTS, 0.0606, 0.0632, 0.0605),
+                *_iae("Velocity form", VELOCITY, 0.0749, 0.0408, 0.0823),
+                *_iae("PID 1 alone", PID_1, 0.0360, 0.0349, 0.0462),
+                *_iae("One knob, wc = 5", FIVE, 0.0302, 0.0296, 0.0452),
+                *_iae("One knob, wc = 3", SLOW, 0.058),
+                *_overshoot("Gains blended, one integrator", GAINS, 0.13, 0.28),
+                *_overshoot("Outputs blended", OUTPUTS, 0.60, 0.61),
+                *_overshoot("Velocity form", VELOCITY, 1.35, 0.27),
+                *_overshoot("PID 1 alone", PID_1, 0.08, 0.08),
+                *_overshoot("One knob, wc = 5", FIVE, 0.18, 0.19),
+                *_overshoot("One knob, wc = 3", SLOW, 0.08, 0.07),
+                _margin("Gains blended, one integrator", GAINS, 3.9),
+                _margin("One knob, wc = 5", FIVE, 6.6),
+            ),
+        ),
+    )
+    figures: ClassVar[tuple[Figure, ...]] = (
+        Figure(8, "Local controller network, set points up", (GAINS, PID_1), "up"),
+    )
+    requirements: ClassVar[tuple[Requirement, ...]] = (
+        Requirement("local_pid_network", "up", "iae", 0.0365 * 1.05, low=0.0365 * 0.95),
+        Requirement("local_pid_network", "up", "overshoot_last", 0.10),
+        Requirement("local_pid_network", "up", "last_error", 1e-6),
+        Requirement("auto_pid_network", "up", "iae", 0.0302 * 1.05),
+        Requirement("auto_pid_network", "down", "iae", 0.0296 * 1.05),
+        Requirement("auto_pid_network", "jump", "iae", 0.0452 * 1.05),
+        Requirement(None, "held_out", "max_asse", 1e-4),
+        Requirement(None, "feed_temperature", "max_asse", 1e-4),
+        Requirement(None, "feed_concentration", "max_asse", 1e-4),
+    )
+    claims: ClassVar[Mapping[str, str]] = {
+        "only a small overshoot at C = 0.13": "reproduces: 8.4 % of the step",
+        "the network matches the plant with high accuracy": "only roughly: fit 96.6 %, steady error to -5.4 %",
+        "five local models are the best tradeoff": "not examined by the independent implementation",
+        "stable for C below 0.13566 and q_c below 110.8": "does not reproduce: C = 0.14028, q_c = 111.77",
+        "the second operating point has q_c = 98.899": "a slip: the balances give 98.984 at T = 442 K",
+        "the network is ahead of a single PID": "does not reproduce: PID 1 alone is, except on the jump down",
+        "the local PIDs are from Ziegler-Nichols' ultimate gain": "impossible on these models: relative degree 2",
+    }
+
+    def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        """up, down, jump, jump_down, feed_temperature, feed_concentration (one each) and held_out (one a seed)."""
+        plant = self.plant
+        up, down = held(LEVELS, HOLD), held([LEVELS[-1], *LEVELS[:0:-1]], HOLD)
+        low, high = LEVELS[0], LEVELS[-1]
+        jumps = [stepwise(3 * HOLD, (0, a), (HOLD // 2, b))[:, None] for a, b in ((low, high), (high, low))]
+        found = (
+            from_rest(plant, "up", "Set points 0.02 to 0.13 mol/l in steps", up, hold=HOLD),
+            from_rest(plant, "down", "Set points 0.13 to 0.02 mol/l in steps", down, hold=HOLD),
+            # Holds as long as the time before a jump, so that it begins one of them.
+            from_rest(plant, "jump", "One jump from 0.02 to 0.13 mol/l", jumps[0], hold=HOLD // 2),
+            from_rest(plant, "jump_down", "One jump from 0.13 to 0.02 mol/l", jumps[1], hold=HOLD // 2),
+            self._fed("feed_temperature", "Feed 10 K warmer, then 10 K colder", "T_f", T_F, 0.12),
+            self._fed("feed_concentration", "Feed 10 % stronger, then 10 % weaker", "C_f", C_F, 0.04),
+        )
+        fixed = {scenario.name: (scenario,) for scenario in found}
+        return {**fixed, "held_out": tuple(self._random("held_out", seed) for seed in self.held_out_seeds)}
+
+    def _fed(self, name: str, title: str, parameter: str, values: tuple[float, ...], cv: float) -> Scenario:
+        """A change of the feed at a set point that stays."""
+        course = stepwise(FED, *zip((0, FED // 4, FED // 2), values, strict=True))
+        return from_rest(self.plant, name, title, held([cv], FED), changes={parameter: course})
+
+    def _random(self, name: str, seed: int) -> Scenario:
+        levels = held(random_levels(seed, HELD_OUT_LEVELS, *HELD_OUT_RANGE), HELD_OUT_HOLD)
+        return from_rest(self.plant, name, f"Random set points, seed {seed}", levels, hold=HELD_OUT_HOLD, seed=seed)
+
+    def development(self) -> tuple[Scenario, ...]:
+        """Random sequences of other seeds."""
+        return tuple(self._random("development", seed) for seed in self.development_seeds)
+
+    def score(self, test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
+        """Also the IAE in mol/l min, overshoots step by step, and the error of the last sample."""
+        found = super().score(test, pv, mv)
+        minutes = self.plant.period_s / 60.0
+        sp, cv = test.sp[:, 0], pv[:, 0]
+        error = sp - cv
+        found["iae"] = minutes * float(np.abs(error).sum())
+        span = self.plant.sp_signals[0].high - self.plant.sp_signals[0].low
+        over = overshoots(sp, cv, test.hold, span)
+        found["overshoot_max"] = float(over.max()) if over.size else 0.0
+        found["overshoot_last"] = float(over[-1]) if over.size else 0.0
+        found["last_error"] = float(abs(error[-1]))
+        return found

@@ -1,0 +1,1 @@
+"""Batch vessel with a throttled jacket and a hot or cold valve."""

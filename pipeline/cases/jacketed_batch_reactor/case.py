@@ -1,0 +1,204 @@
+"""The jacketed batch reactor's tests: recipes of held temperatures, on the reactor and on its printed fuzzy model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+
+from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
+from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement
+from pipeline.evaluation.effort import Effort
+from pipeline.plants.base import Plant
+from pipeline.simulation.scenario import Scenario, random_levels, stepwise
+
+RECIPE = ((0, 62.0), (800, 26.0), (1600, 35.0))  # first sample, core temperature [deg C]
+SAMPLES = 2000
+# Random recipes: each level is within reach in its time, whichever came before.
+LEVELS, HOLD, LOWEST, HIGHEST = 3, 700, 26.0, 62.0
+PERTURBED = 10  # plants of theta_10 and of theta_20
+END_S, TAIL_S = 500.0, 1500.0  # of each level: where its offset is taken, and its error's root mean square
+CHANGE = 500  # sample of the recipe at which a disturbance sets in
+FEEDS = {"T_hot": 70.0, "T_cold": 15.0}
+FOULED = 0.85
+OBSERVER, PI, FEEDFORWARD = "fuzzy_feedforward_observer", "fuzzy_feedforward_pi", "fuzzy_feedforward"
+PRINTED: Mapping[str, float | str] = {"part": "printed"}
+ROUNDING = 1e-9  # [deg C]
+
+
+@dataclass(frozen=True)
+class JacketedBatchReactorCase(Case):
+    """Seed 003_9cd6247d31a7c2db.txt, section 5, at a period of 10 s, which its core's time constant fits.
+
+    The printed test runs on the printed fuzzy model (``same_model``). What the paper leaves open is
+    tested beside it: the same recipe on the reactor that is behind the model (``profile``), with
+    other feed temperatures, a greater heat loss and a fouled jacket; on ten printed models each of
+    whose jacket coefficients is off by up to 10 or 20 % (of a1 its distance to 1: of a1 itself, most
+    would not be stable; the core's two stay as they are); and random recipes. Each with measurement
+    noise, too. The shipped laws have an identified model (``tied``) there, too, which is off on every
+    printed model: an independent implementation's had the printed one.
+    """
+
+    held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
+
+    name: ClassVar[str] = "jacketed_batch_reactor"
+    title: ClassVar[str] = "Batch reactor with a hot and a cold valve"
+    unforeseen: ClassVar[bool] = True
+    development_noise: ClassVar[bool] = True
+    data_seeds: ClassVar[int] = 3
+    seen: ClassVar[str] = (
+        "the observers' l_core and the PI's limits followed figures of fouling and theta_10, the observers' approach "
+        "one of profile; fouling itself was set to a change whose levels can be reached in time. The PI's switch "
+        "penalty was chosen on other recipes, plants and noise, but chosen anew because it had failed in "
+        "profile_noise and held_out_noise. held_out served no choice among numbers."
+    )
+    baseline: ClassVar[str] = "fuzzy_feedforward"  # the paper's own law; no PID moves a valve that is open or shut
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = {"T_w": (20.0, 70.0)}
+    # Periods of 10 s, of which the core's time constant is 300.
+    effort: ClassVar[Effort] = Effort(40, 1, 1, 2, (1, 3), tail=60, every=10, noisy=False)
+    plant_class: ClassVar[type[Plant]] = JacketedBatchReactor
+    further_plants = (FuzzyBatchReactor,)
+    development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
+    noise: ClassVar[Mapping[str, float]] = {"T": 0.05, "T_w": 0.1}
+    gate: ClassVar[Mapping[str, float]] = {"profile": 0.3, "held_out": 0.4, "feed": 0.1, "loss": 0.1, "fouling": 0.1}
+    metric_words: ClassVar[Mapping[str, str]] = {
+        "masse": "offset [°C]",
+        "max_asse": "largest offset [°C]",
+        "max_overshoot": "largest overshoot [°C]",
+        "tail_rms": "tail RMS [°C]",
+        "switches": "switches of the mode",
+        "min_jacket": "lowest jacket [°C]",
+        "max_jacket": "highest jacket [°C]",
+    }
+    figures: ClassVar[tuple[Figure, ...]] = (
+        Figure(
+            4,
+            "Feedforward on the printed model itself: core temperature and inputs",
+            (Curve(FEEDFORWARD, PRINTED),),
+            "same_model",
+        ),
+        Figure(
+            5,
+            "Jacket temperature that is wanted, and that the model reaches",
+            (Curve(FEEDFORWARD, PRINTED),),
+            "same_model",
+            info=("wanted_jacket", "reached_jacket"),
+        ),
+    )
+    requirements: ClassVar[tuple[Requirement, ...]] = (
+        Requirement(FEEDFORWARD, "same_model", "switches", 6.0, low=6.0, setting=PRINTED),
+        Requirement(FEEDFORWARD, "same_model", "min_jacket", 70.0, low=20.0 - ROUNDING, setting=PRINTED),
+        Requirement(FEEDFORWARD, "same_model", "max_jacket", 70.0 + ROUNDING, low=20.0, setting=PRINTED),
+        Requirement(OBSERVER, "theta_10_noise", "max_asse", 0.05),
+        Requirement(OBSERVER, "theta_10_noise", "max_overshoot", 0.1),
+        Requirement(PI, "theta_10_noise", "max_asse", 0.05),
+        Requirement(PI, "theta_10_noise", "max_overshoot", 0.4),
+        *(Requirement(law, test, "switches", 10.0) for test in ("profile", "profile_noise") for law in (OBSERVER, PI)),
+        Requirement(FEEDFORWARD, "profile", "switches", 10.0),
+        Requirement(None, "held_out_noise", "max_asse", 0.05),
+        Requirement(None, "feed_noise", "max_asse", 0.05),
+        Requirement(None, "loss_noise", "max_asse", 0.05),
+        Requirement(None, "fouling_noise", "max_asse", 0.05),
+    )
+    claims: ClassVar[Mapping[str, str]] = {
+        "feedforward follows its adjusted reference ideally where the model is the plant": (
+            "reproduces: to 1.4e-14, 251 of 2,000 steps adjusted"
+        ),
+        "a simple feedback part is enough where it is not": (
+            "at 10 %: feedforward 2.14 (8.9), with a PI 0.019 (0.04), with observers 0.008 (0.025)"
+        ),
+        "the jacket stays between 20 and 70 degC": "reproduces where the model is the plant",
+        "an extreme input gives an extreme output in each mode": "holds: hot at least 1.69, cold at most -0.070",
+    }
+
+    def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        """same_model, profile, feed, loss, fouling (one scenario each), theta_10, theta_20 and held_out (several)."""
+        held_back = {
+            name: stepwise(SAMPLES, (0, float(getattr(self.plant, name))), (CHANGE, v)) for name, v in FEEDS.items()
+        }
+        loss = JacketedBatchReactor.a_0
+        fouled = {name: np.full(SAMPLES, FOULED * float(getattr(self.plant, name))) for name in ("a_c", "a_w")}
+        return {
+            "profile": (self._recipe("profile", "The recipe 62, 26, 35 deg C on the reactor"),),
+            "same_model": (
+                self._recipe("same_model", "The recipe on the printed fuzzy model itself", plant=_printed(0, 0.0)),
+            ),
+            "feed": (self._recipe("feed", "Hot water 5 deg C colder, cold water 3 deg C warmer", held_back),),
+            "loss": (
+                self._recipe("loss", "Twice the heat loss", {"a_0": stepwise(SAMPLES, (0, loss), (CHANGE, 2 * loss))}),
+            ),
+            "fouling": (self._recipe("fouling", "15 % less heat transfer between jacket and core", fouled),),
+            "theta_10": self._perturbed("theta_10", 0.1),
+            "theta_20": self._perturbed("theta_20", 0.2),
+            "held_out": tuple(self._random("held_out", seed) for seed in self.held_out_seeds),
+        }
+
+    def development(self) -> tuple[Scenario, ...]:
+        """Random recipes of other seeds on the reactor.
+
+        Not on one that is off: a law that lets the jacket past its limits there is the faster one for it.
+        """
+        return tuple(self._random("development", seed) for seed in self.development_seeds)
+
+    def score(self, test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
+        """The usual figures, and those by level of the recipe [deg C].
+
+        ``masse`` and ``max_asse`` are the mean and the largest offset at the end of a level, where the
+        noise's effect is averaged over 500 s; ``max_overshoot`` is how far the core runs past a level at
+        most; ``tail_rms`` the root mean square of the last 1,500 s of all levels; ``min_jacket`` and
+        ``max_jacket`` the jacket's range; ``switches`` how often the mode changes.
+        """
+        found = super().score(test, pv, mv)
+        period, core = self.plant.period_s, pv[:, 0]
+        error = core - test.sp[:, 0]
+        starts = [0, *(np.flatnonzero(np.diff(test.sp[:, 0])) + 1)]
+        levels = [error[a:b] for a, b in zip(starts, [*starts[1:], len(error)], strict=True)]
+        offsets = [abs(float(np.mean(e[-round(END_S / period) :]))) for e in levels]
+        beyond = [float(np.max(-np.sign(e[0]) * e)) for e in levels]
+        tails = np.concatenate([e[-round(TAIL_S / period) :] for e in levels])
+        return found | {
+            "masse": float(np.mean(offsets)),
+            "max_asse": max(offsets),
+            "max_overshoot": max(0.0, *beyond),
+            "tail_rms": float(np.sqrt(np.mean(tails**2))),
+            "switches": float(np.count_nonzero(np.diff(mv[:, 1]))),
+            "min_jacket": float(pv[:, 1].min()),
+            "max_jacket": float(pv[:, 1].max()),
+        }
+
+    def _perturbed(self, name: str, share: float) -> tuple[Scenario, ...]:
+        title = f"The recipe on a printed model whose jacket's coefficients are off by up to {100 * share:g} %"
+        return tuple(self._recipe(name, title, plant=_printed(seed, share), seed=seed) for seed in range(PERTURBED))
+
+    def _recipe(
+        self,
+        name: str,
+        title: str,
+        changes: Mapping[str, Array] | None = None,
+        plant: Plant | None = None,
+        seed: int | None = None,
+    ) -> Scenario:
+        x0, mv0 = self.plant.start
+        sp = stepwise(SAMPLES, *RECIPE)[:, None]
+        return Scenario(name, title, sp, x0, mv0, changes or {}, seed=seed, plant=plant)
+
+    def _random(self, name: str, seed: int) -> Scenario:
+        x0, mv0 = self.plant.start
+        sp = np.repeat(random_levels(seed, LEVELS, LOWEST, HIGHEST), HOLD)[:, None]
+        return Scenario(name, f"Random recipe, seed {seed}", sp, x0, mv0, seed=seed)
+
+
+@cache
+def _printed(seed: int, share: float) -> FuzzyBatchReactor:
+    """The printed fuzzy model, the jacket's coefficients (a1: 1 - a1) times factors uniform in 1 -+ ``share``."""
+    plant, rng = FuzzyBatchReactor(), np.random.default_rng(seed)
+    changed = {}
+    for name, value in zip(plant.parameter_names(), plant.parameters().tolist(), strict=True):
+        factor = rng.uniform(1 - share, 1 + share)
+        if not name.startswith("core"):
+            changed[name] = 1 - factor * (1 - value) if name.startswith("a1") else factor * value
+    return plant.with_parameters(changed)

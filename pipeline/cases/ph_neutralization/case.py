@@ -1,0 +1,167 @@
+"""The pH neutralization's tests, sampled every minute: set points over the titration curve, disturbances on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from pipeline.cases.ph_neutralization.plant import PhNeutralization
+from pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
+from pipeline.plants.base import Plant
+from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
+
+HOLD_S = 1500.0
+SET_POINTS = [7.0, 9.0, 9.0, 8.0, 8.0, 8.0]
+HELD_OUT_LEVELS, HELD_OUT_RANGE = 10, (6.6, 9.2)
+Q1 = (990.0, 1010.0, 1020.0)  # [ml/min], 3000 s each
+Q2, Q2_HALVED = 33.0, 16.5  # [ml/min]
+WA3, WA3_WEAK = -3.05e-3, -2.75e-3  # [mol/l], NaOH .003 and .0027 mol/l with the carbonate in it unchanged
+
+FIXED = Curve("pid", {"tuning": "itae", "sampling": 1.0})
+LINEARIZED = Curve("linearized_pid", {"penalty": 20.0})
+ADAPTIVE = Curve("linearized_pid", {"adaptive": True})
+_COMPARED = (ADAPTIVE, Curve("recursive_pid", {"penalty": 5.0}), Curve("self_tuning_pid"))
+
+
+@dataclass(frozen=True)
+class PhNeutralizationCase(Case):
+    """Seed 002_4e35f3d541bda8ae.txt, section 5.1, made precise where the paper shows only a curve.
+
+    The printed disturbance of the buffer's flow, 990 to 1020 ml/min, is that of the acid's: the
+    buffer's is 33 ml/min. Beyond the printed tests: random set points, the buffer's flow halved
+    without the controller's knowledge, a weaker base (at a low pH: for 8 and 9 the base would not
+    suffice), and each test again with measurement noise.
+    """
+
+    held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
+
+    name: ClassVar[str] = "ph_neutralization"
+    title: ClassVar[str] = "pH neutralization"
+    metric: ClassVar[str] = "sse"
+    seen: ClassVar[str] = (
+        "penalties were chosen with the scored figures on the screen, that of gauss_newton_pid with an eye on "
+        "disturbance; the development got its tank with less buffer after a smaller penalty had failed buffer. "
+        "held_out served no choice."
+    )
+    unforeseen: ClassVar[bool] = True
+    plant_class: ClassVar[type[Plant]] = PhNeutralization
+    development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
+    noise: ClassVar[Mapping[str, float]] = {"pH": 0.02}
+    gate: ClassVar[Mapping[str, float]] = {
+        "set_point": 0.3,
+        "disturbance": 0.1,
+        "held_out": 0.4,
+        "buffer": 0.1,
+        "base": 0.1,
+    }
+    tables: ClassVar[tuple[PaperTable, ...]] = (
+        PaperTable(
+            1,
+            "One-step prediction of the identification example, SSE",
+            tuple(
+                PaperFigure(label, "identification_example", "", f"one_step.{key}", paper, {}, ours)
+                for label, key, paper, ours in (
+                    ("NNARX", "nnarx", 0.0424, 0.055),
+                    ("INST-NN (linearized)", "linearized", 0.5989, 0.599),
+                    ("REC-LIN, f = 0.8", "recursive_0.8", 2.1199, 2.57),
+                    ("REC-LIN, f = 0.5", "recursive_0.5", 9.862, 8.25),
+                )
+            ),
+        ),
+        PaperTable(
+            3,
+            "Adaptive PID controllers, example 1",
+            (
+                PaperFigure(
+                    "INST-NNPID, set points", ADAPTIVE.law, "set_point", "sse", 17.5477, ADAPTIVE.setting, 18.57
+                ),
+                PaperFigure(
+                    "REC-LINPID, set points", "recursive_pid", "set_point", "sse", 19.4597, {"penalty": 5.0}, 17.2
+                ),
+                PaperFigure("STPID, set points", "self_tuning_pid", "set_point", "sse", 30.4284, {}, 6.6),
+                PaperFigure(
+                    "INST-NNPID, disturbance", ADAPTIVE.law, "disturbance", "sse", 0.1659, ADAPTIVE.setting, 0.153
+                ),
+                PaperFigure("STPID, disturbance", "self_tuning_pid", "disturbance", "sse", 0.2782, {}, 0.166),
+            ),
+        ),
+    )
+    figures: ClassVar[tuple[Figure, ...]] = (
+        Figure(3, "One-step predictions of the identification example", (), model="identification_example"),
+        Figure(8, "PID with fixed settings (ITAE) after set-point changes", (FIXED,), "set_point"),
+        Figure(9, "Linearized PID with a fixed penalty of 20", (LINEARIZED,), "set_point"),
+        Figure(10, "Linearized PID with the adaptive penalty", (ADAPTIVE,), "set_point"),
+        Figure(11, "Settings in figure 10", (ADAPTIVE,), "set_point", info=("kc", "tau_i_s", "tau_d_s")),
+        Figure(
+            12,
+            "Penalty and linearization error in figure 10",
+            (ADAPTIVE,),
+            "set_point",
+            info=("penalty", "linearization_error"),
+        ),
+        Figure(13, "Adaptive PIDs after set-point changes", _COMPARED, "set_point"),
+        Figure(14, "Adaptive PIDs under changes of the acid's flow", _COMPARED, "disturbance"),
+    )
+    requirements: ClassVar[tuple[Requirement, ...]] = (
+        Requirement("gauss_newton_pid", "set_point", "sse", 6.2),
+        Requirement("linearized_pid", "set_point", "sse", 8.0, low=7.6, setting={"penalty": 1.0}),
+        Requirement("linearized_pid", "set_point", "sse", 44.9, low=41.9, setting={"penalty": 20.0}),
+        Requirement(None, "disturbance", "sse", 0.20),
+        Requirement(None, "held_out", "sse", 1.10, times="nmpc"),
+        Requirement(None, "set_point", "max_asse", 1e-3),
+        Requirement(None, "held_out", "max_asse", 1e-2),
+        Requirement(None, "buffer", "max_asse", 1e-2),
+        Requirement(None, "base", "max_asse", 1e-2),
+    )
+    claims: ClassVar[Mapping[str, str]] = {
+        "the PID with fixed settings overshoots and oscillates": "ITAE settings give 8.29, the adaptive form 18.57",
+        "a fixed penalty of 20 is slow": "reproduces: 43.4",
+        "the adaptive penalty is needed": "does not reproduce: a fixed penalty of 1 gives 7.8 against 18.6",
+        "the linearized PID is ahead of the recursive one": "does not reproduce: 7.8 against 7.4 with a penalty of 1",
+        "the linearized PID is ahead of the self-tuning one": "does not reproduce: the best of 160 tunings gives 6.6",
+        "the recursive PID is unstable under disturbances": "does not reproduce: 0.75 with a penalty of 5, 0.23 with 1",
+        "the disturbance is one of the buffer's flow": "cannot be: pH would move by 0.002; as the acid's flow it fits",
+        "the best settings without bounds are negative": "not unique: every one of them gives the same move",
+    }
+
+    @property
+    def hold(self) -> int:
+        """Samples of a hold, as long in time whatever the sampling period."""
+        return round(HOLD_S / self.plant_class.period_s)
+
+    def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        """set_point, disturbance, buffer, base (one scenario each) and held_out (one a seed)."""
+        plant, hold, n = self.plant, self.hold, 6 * self.hold
+        steps, low = held(SET_POINTS, hold), held([7.0, 6.8], 3 * hold)
+        acid = np.repeat(Q1, 2 * hold)
+        buffer = stepwise(n, (0, Q2), (2 * hold // 5, Q2_HALVED))
+        base = stepwise(n, (0, WA3), (hold, WA3_WEAK))
+        found = (
+            from_rest(plant, "set_point", "Set points 7, 9, 8", steps, hold=hold),
+            from_rest(plant, "disturbance", "Acid flow up by 20, then 10", held([8.0], n), changes={"q1": acid}),
+            from_rest(plant, "buffer", "Set points, buffer flow halved", steps, hold=hold, changes={"q2": buffer}),
+            from_rest(plant, "base", "Base 10 % weaker", low, hold=3 * hold, changes={"Wa3": base}),
+        )
+        fixed = {scenario.name: (scenario,) for scenario in found}
+        return {**fixed, "held_out": tuple(self._random("held_out", seed) for seed in self.held_out_seeds)}
+
+    def _random(self, name: str, seed: int) -> Scenario:
+        levels = held(random_levels(seed, HELD_OUT_LEVELS, *HELD_OUT_RANGE), self.hold)
+        return from_rest(self.plant, name, f"Random set points, seed {seed}", levels, hold=self.hold, seed=seed)
+
+    def development(self) -> tuple[Scenario, ...]:
+        """Random sequences of other seeds, and other disturbances than the scored ones."""
+        n = 6 * self.hold
+        acid, more = np.repeat([1000.0, 985.0, 995.0], n // 3), stepwise(n, (0, Q2), (n // 3, 45.0))
+        less = stepwise(n, (0, Q2), (n // 4, 21.0))
+        steps = held([7.3, 8.8, 7.9, 8.5, 7.1, 8.2], self.hold)
+        return (
+            *(self._random("development", seed) for seed in self.development_seeds),
+            from_rest(self.plant, "acid", "Acid flow down", held([7.6], n), changes={"q1": acid}),
+            from_rest(self.plant, "more_buffer", "Buffer flow up", held([8.4], n), changes={"q2": more}),
+            # A third less buffer, a plant gain up by half: a loop without any reserve shows here.
+            from_rest(self.plant, "less_buffer", "Buffer flow down", steps, hold=self.hold, changes={"q2": less}),
+        )

@@ -1,0 +1,1 @@
+"""CSTR with a reversible reaction, held by its feed."""

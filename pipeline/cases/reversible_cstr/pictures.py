@@ -1,0 +1,144 @@
+"""Pictures of loops that follow a reference model: levels, disturbances, and how the controllers were trained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+
+from pipeline.evaluation.case import Curve
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.law_evidence import Array, Loop
+from pipeline.pictures.drawing import SHADES, SIZE, axis_label, colour_of, symbol, time_axis
+from pipeline.pictures.words import law_name, number, scenario_name
+
+Draw = Callable[[Evidence], Canvas | None]
+
+
+def _loops(evidence: Evidence, curves: Mapping[str, Curve], scenario: str) -> list[tuple[str, str, Loop]]:
+    """(label, colour, loop) of each curve that was run."""
+    colours = dict(zip(curves, SHADES, strict=False))
+    found = [(label, colours[label], evidence.loop(curve, scenario)) for label, curve in curves.items()]
+    return [(label, colour, loop) for label, colour, loop in found if loop is not None]
+
+
+def _reference(evidence: Evidence, scenario: str) -> Array:
+    (test, *_) = evidence.tests[scenario]
+    return np.ravel(test.sp if test.reference is None else test.reference)
+
+
+def levels_picture(scenario: str, curves: Mapping[str, Curve]) -> Draw:
+    """Set point, reference model and CV of each curve; the distance from the reference; the MV."""
+
+    def draw(evidence: Evidence) -> Canvas | None:
+        found = _loops(evidence, curves, scenario)
+        if not found:
+            return None
+        cv, mv = evidence.case.plant_class.sp_signals[0], evidence.case.plant_class.mv_signals[0]
+        canvas = Canvas(figsize=(SIZE[0], 8.0), layout="constrained")
+        course, distance, move = canvas.subplots(3, 1, sharex=True, height_ratios=(2.2, 1.6, 1.4))
+        reference = _reference(evidence, scenario)
+        time, words = time_axis(found[0][2]["time_s"])
+        course.step(time, found[0][2]["sp"][:, 0], where="post", color="#999999", linewidth=0.8, label="set point")
+        course.plot(time, reference, color="black", linewidth=2.2, alpha=0.35, label="reference model")
+        for label, colour, loop in found:
+            course.plot(time, loop["pv"][:, 0], color=colour, linewidth=1.0, label=label)
+            distance.plot(time, np.abs(loop["pv"][:, 0] - reference), color=colour, linewidth=0.9)
+            move.step(time, loop["mv"][:, 0], where="post", color=colour, linewidth=0.9)
+        distance.set_yscale("log")
+        distance.set_ylim(1e-6, None)
+        course.set_ylabel(axis_label(symbol(cv.name), cv.unit))
+        distance.set_ylabel(axis_label("distance from\nreference", cv.unit))
+        move.set_ylabel(axis_label(symbol(mv.name), mv.unit))
+        move.set_xlabel(words)
+        move.margins(x=0.01)
+        canvas.align_ylabels()
+        canvas.legend(loc="outside lower center", ncols=3)
+        return canvas
+
+    return draw
+
+
+def disturbances_picture(scenarios: Sequence[str], curves: Mapping[str, Curve], until_s: float) -> Draw:
+    """CV less its set point after each disturbance, a panel a test, every curve in it with its IAE."""
+
+    def draw(evidence: Evidence) -> Canvas | None:
+        known = [name for name in scenarios if _loops(evidence, curves, name)]
+        if not known:
+            return None
+        rows = -(-len(known) // 2)
+        canvas = Canvas(figsize=(SIZE[0], 1.0 + 2.8 * rows), layout="constrained")
+        panels = canvas.subplots(rows, 2, squeeze=False).ravel()
+        cv = evidence.case.plant_class.sp_signals[0]
+        for axes, name in zip(panels, known, strict=False):
+            for label, colour, loop in _loops(evidence, curves, name):
+                _deviation(axes, loop, colour, until_s)
+                iae = evidence.figure(curves[label].law, name, "iae", curves[label].setting)
+                axes.lines[-1].set_label(f"{label}{'' if iae is None else f': IAE {number(iae, 2)}'}")
+            axes.set_title(evidence.scenarios[name])
+            axes.set_ylabel(axis_label(f"{symbol(cv.name)} less set point", cv.unit))
+            axes.set_xlabel("time [s]")
+            axes.legend(fontsize=7.5, frameon=True, framealpha=0.8, edgecolor="none")
+        for axes in panels[len(known) :]:
+            axes.axis("off")
+        return canvas
+
+    return draw
+
+
+def _deviation(axes: Axes, loop: Loop, colour: str, until_s: float) -> None:
+    shown = loop["time_s"] <= until_s
+    axes.plot(loop["time_s"][shown], (loop["pv"][:, 0] - loop["sp"][:, 0])[shown], color=colour, linewidth=1.1)
+
+
+def training_picture(laws: Sequence[str]) -> Draw:
+    """Distance from the reference model over the iterations: on the training loops, and on those of validation."""
+
+    def draw(evidence: Evidence) -> Canvas | None:
+        arrays = {name: evidence.laws[name].analysis_arrays({}) for name in laws if name in evidence.laws}
+        found = {name: a for name, a in arrays.items() if "history" in a}
+        if not found:
+            return None
+        unit = evidence.case.plant_class.sp_signals[0].unit
+        canvas = Canvas(figsize=(SIZE[0], 4.2), layout="constrained")
+        axes = canvas.subplots()
+        for name, values in found.items():
+            history, best = values["history"], int(values["best"][0])
+            colour = colour_of(name, evidence.laws)
+            axes.plot(history[:, 0], color=colour, linewidth=1.3, label=f"{law_name(name)}, training loops")
+            axes.plot(history[:, 1], ":", color=colour, linewidth=1.5, label="validation loops")
+            axes.plot([best], history[best, 1], "o", color=colour, markersize=5)
+        axes.set_yscale("log")
+        axes.set_xlabel("iteration of Levenberg-Marquardt")
+        axes.set_ylabel(axis_label("RMS from the reference model", unit))
+        axes.legend(ncols=2, title="the point is what was kept")
+        return canvas
+
+    return draw
+
+
+def offsets_picture(scenario: str, curves: Mapping[str, Curve], hold: int, last: int = 20) -> Draw:
+    """Mean error over the last samples of each level against the level: what a law without memory leaves."""
+
+    def draw(evidence: Evidence) -> Canvas | None:
+        found = _loops(evidence, curves, scenario)
+        if not found:
+            return None
+        cv = evidence.case.plant_class.sp_signals[0]
+        canvas = Canvas(figsize=(SIZE[0], 3.8), layout="constrained")
+        axes = canvas.subplots()
+        for label, colour, loop in found:
+            sp, error = loop["sp"][:, 0], loop["sp"][:, 0] - loop["pv"][:, 0]
+            level = sp.reshape(-1, hold)[:, 0]
+            offset = error.reshape(-1, hold)[:, -last:].mean(axis=1)
+            order = np.argsort(level)
+            axes.plot(level[order], offset[order], "o-", color=colour, linewidth=1.0, markersize=4, label=label)
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        axes.set_xlabel(axis_label("set point", cv.unit))
+        axes.set_ylabel(axis_label(f"offset on {scenario_name(scenario, False)}", cv.unit))
+        axes.legend()
+        return canvas
+
+    return draw

@@ -1,0 +1,1 @@
+"""Reactor with three steady states."""

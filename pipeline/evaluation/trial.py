@@ -1,0 +1,152 @@
+"""One exported file on trial: its closed loops over every test of the case, and what they say."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.closed_loop import locked_up
+from pipeline.plants.base import Array
+from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from pipeline.simulation.simulate import Trajectory, simulate_closed
+from serving.controller import Controller
+from serving.errors import LoopwrightError
+
+Metrics = dict[str, float]
+BASE = "base"  # the form of a controller that is shipped; the others are its variants
+ROUNDS = 8  # of timing a step
+DRAW = 1_000  # added to the noise's seed for every further draw of it
+DEVELOPMENT = 100_000  # added to the noise's seed over the development sequences
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One file's closed loops: figures by scenario (noisy ones under their own names), curves, faults."""
+
+    form: str
+    seed: int
+    info: tuple[str, ...]
+    metrics: dict[str, Metrics]
+    sequences: dict[str, dict[str, Metrics]]  # of the tests with several sequences, by their seeds
+    development: float  # the case's metric, mean over the development sequences
+    development_lock_ups: int
+    lock_ups: int  # in all closed loops, those of the development included
+    curves: dict[str, Trajectory]
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """One test, repeated with different noise where it is noisy: mean figures, the first loop, lock-ups of all."""
+
+    metrics: Metrics
+    first: Trajectory
+    lock_ups: int
+
+
+def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
+    """Run the file of one form and data seed over the case's tests, and over its development unless it is a variant.
+
+    Variants are there for the paper's tables, which have no random sequences; they run with noise
+    only where the plant is never measured without.
+    """
+    form, seed, path = item
+    controller = Controller(path)
+    metrics: dict[str, Metrics] = {}
+    sequences: dict[str, dict[str, Metrics]] = {}
+    curves: dict[str, Trajectory] = {}
+    lock_ups = 0
+    noisy = (False, True) if form == BASE or case.development_noise else (False,)
+    for name, tests in case.scenarios().items():
+        if form != BASE and len(tests) > 1:
+            continue
+        for noise in noisy:
+            found = [repeated(controller, case, test, noise, noise_seed + i) for i, test in enumerate(tests)]
+            key = name + (NOISE_SUFFIX if noise else "")
+            metrics[key] = together(one.metrics for one in found)
+            curves[key] = found[0].first
+            lock_ups += sum(one.lock_ups for one in found)
+            if len(tests) > 1 and not noise:
+                sequences[name] = {str(test.seed): one.metrics for test, one in zip(tests, found, strict=True)}
+    development = [
+        repeated(controller, case, test, case.development_noise, noise_seed + DEVELOPMENT + i)
+        for i, test in enumerate(case.development() if form == BASE else ())
+    ]
+    for figure in case.figures:
+        if figure.hold and figure.scenario:
+            (test,) = case.scenarios()[figure.scenario]
+            longer = repeated(controller, case, test.with_hold(figure.hold), False, 0)
+            curves[f"{figure.scenario}_hold{figure.hold}"] = longer.first
+    mean = statistics.fmean(one.metrics[case.metric] for one in development) if development else float("nan")
+    locked = sum(one.lock_ups for one in development)
+    told = {key: replace(c, info=c.info[:, :-1]) for key, c in curves.items()}
+    return Trial(form, seed, controller.manifest.info, metrics, sequences, mean, locked, lock_ups + locked, told)
+
+
+def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
+    """One test; with noise as many times as the case draws it."""
+    draws = range(case.noise_draws if noise else 1)
+    loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
+    rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
+    means = {key: statistics.fmean(row[key] for row in rows) for key in rows[0]}
+    return Repeated(means, loops[0], sum(stuck(case, test, loop) for loop in loops))
+
+
+def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
+    """One closed loop, with one more entry of info: whether the controller refused the step.
+
+    The MV is then kept, as the real loop's HOLD keeps it.
+    """
+    state = controller.cold_state()
+    n_info = len(controller.manifest.info)
+
+    def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, Array]:
+        nonlocal state
+        try:
+            mv, state, info = controller.step(sp=sp, pv=pv, mv_applied=mv_applied, state=state)
+        except LoopwrightError:
+            state = controller.cold_state()
+            return mv_applied, np.append(np.zeros(n_info), 1.0)
+        return mv, np.append(info, 0.0)
+
+    return simulate_closed(test.plant or case.plant, step, test, noise=noise, seed=seed)
+
+
+def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
+    """Locked up at an end of the MV, or with a step that the controller refused."""
+    mv, sp = case.plant.mv_signals[0], case.plant.sp_signals[0]
+    limits = {"low": mv.low, "high": mv.high, "span": sp.high - sp.low}
+    return locked_up(loop.sp[:, 0], loop.pv[:, 0], loop.mv[:, 0], test.hold, **limits) or bool(loop.info[:, -1].any())
+
+
+def together(rows: Iterable[Metrics]) -> Metrics:
+    """Mean over the sequences of a test; of a figure with max or min in its name (max_asse), the largest or least."""
+    table = list(rows)
+
+    def reduce(key: str, values: list[float]) -> float:
+        words = key.split("_")
+        return max(values) if "max" in words else min(values) if "min" in words else statistics.fmean(values)
+
+    return {key: float(reduce(key, [row[key] for row in table])) for key in table[0]}
+
+
+def step_us(controller: Controller, loop: Trajectory) -> dict[str, float]:
+    """Time of one step along a loop [us], all checks included: of several rounds the quietest.
+
+    Other processes run beside this one; a round that they disturb says nothing of the controller.
+    """
+    rounds = np.empty((ROUNDS, len(loop.sp) - 1))
+    for taken in rounds:
+        state = controller.cold_state()
+        for k in range(1, len(loop.sp)):
+            begun = time.perf_counter()
+            state = controller.step(sp=loop.sp[k], pv=loop.pv[k], mv_applied=loop.mv[k - 1], state=state).state
+            taken[k - 1] = 1e6 * (time.perf_counter() - begun)
+    p50, p99 = np.quantile(rounds, [0.5, 0.99], axis=1)
+    best = int(np.argmin(p50))
+    return {"p50": float(p50[best]), "p99": float(p99[best])}

@@ -1,0 +1,66 @@
+"""A controller's file: graph, manifest and digest written together; its evidence may be changed later.
+
+Apart from ``pipeline.export.gate``, because whoever only runs controllers needs no torch, and importing
+that takes longer than many a closed loop.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import onnx
+
+from serving.controller import Controller
+from serving.digest import TRAILER_BYTES, file_digest, seal
+from serving.manifest import MANIFEST_KEY, Manifest
+
+
+def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any]) -> Manifest:
+    """Copy a controller with other evidence in its manifest; the graph's bytes stay as they are.
+
+    Raises ArtifactError if ``src`` is no controller.
+    """
+    src, dst = Path(src), Path(dst)
+    manifest = replace(Controller(src).manifest, evidence=dict(evidence))
+    model = onnx.ModelProto.FromString(src.read_bytes()[:-TRAILER_BYTES])
+    del model.metadata_props[:]
+    with draft_of(dst) as draft:
+        draft.write_bytes(assembled(model.SerializeToString(), manifest))
+        Controller(draft)
+        os.replace(draft, dst)
+    write_sidecar(dst, manifest)
+    return manifest
+
+
+def assembled(model: bytes, manifest: Manifest) -> bytes:
+    """Model bytes + manifest + digest; appended, because a protobuf may be continued so."""
+    entry = onnx.StringStringEntryProto(key=MANIFEST_KEY, value=manifest.to_json())
+    return seal(model + onnx.ModelProto(metadata_props=[entry]).SerializeToString())
+
+
+def write_sidecar(path: Path, manifest: Manifest) -> None:
+    """``<law>.json``: the manifest again and the file's SHA-256, for hosts that cannot read ONNX metadata."""
+    text = json.dumps({**json.loads(manifest.to_json()), "sha256": file_digest(path.read_bytes())}, indent=2)
+    with draft_of(path.with_suffix(".json")) as draft:
+        draft.write_text(text + "\n", encoding="utf-8")
+        os.replace(draft, path.with_suffix(".json"))
+
+
+@contextmanager
+def draft_of(path: Path) -> Iterator[Path]:
+    """A file beside ``path`` to write and rename; whatever fails, none is left behind."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(handle)
+    os.chmod(name, 0o644)
+    try:
+        yield Path(name)
+    finally:
+        Path(name).unlink(missing_ok=True)

@@ -1,0 +1,119 @@
+"""Fuzzy feedforward with offset observers of core and jacket: what the model gets wrong is learnt on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from pipeline.laws.base import LawSignals
+from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, require_numbers, require_shares
+from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
+
+
+class FuzzyFeedforwardObserver(FuzzyLaw):
+    """The inverse of the model plus what it was wrong by, around an adjusted reference.
+
+    Core and jacket are each predicted by the model plus an offset and corrected by what is measured:
+
+        T^ = T^- + k_core e_c,        d_c(k) = d_c(k-1) + l_core e_c,    e_c = T - T^-
+        T_w^ = T_w^- + k_jacket e_w,  d_w(k) = d_w(k-1) + l_jacket e_w,  e_w = T_w - T_w^-
+
+    The adjusted reference R(k+1) of the core is where the law wants it at the next sample. It is to
+    come nearer to the set point by the share g, and the core nearer to it by the share c:
+
+        T_w,des = clip([R + g (T_ref - R) - c_t R + c (R - T^(k+1)) - d_c] / c_w),   R = R(k+1)
+
+    of which the modes, each d_w warmer than the model says, reach T_w,adj (``FuzzyLaw``). R takes
+    what of that was not spent on the core's distance to it,
+
+        R(k+2) = c_t R + c_w T_w,adj - c (R - T^(k+1)) + d_c,
+
+    which is what was aimed at where that is within reach, and otherwise what is: a core that lags
+    draws R along, so that nothing winds up. With g = 1 as in the feedforward alone, a jacket that
+    lies in the gap between the modes makes R overcorrect, and the modes alternate.
+
+    Source: the feedback part that seed 003_9cd6247d31a7c2db.txt, section 6, leaves open; ours.
+    """
+
+    name: ClassVar[str] = "fuzzy_feedforward_observer"
+    title: ClassVar[str] = "Fuzzy feedforward with offset observers"
+
+    @dataclass(frozen=True, slots=True)
+    class Params:
+        """Numbers of the law; the first five as in ``fuzzy_feedforward``.
+
+        ``k_jacket``, ``k_core`` are the shares of an innovation that correct an estimate, ``l_jacket``,
+        ``l_core`` those that go into its offset; ``core_gain`` (c) is the share of the core's distance to
+        its adjusted reference, ``approach`` (g) that of the reference's to the set point, to be made up in
+        a sample; all in 0..1 [-], g above 0.
+        """
+
+        part: str | None = None
+        jacket_low: float = 20.0
+        jacket_high: float = 70.0
+        switch_penalty: float = 0.6
+        mv_rate: float | None = None
+        k_jacket: float = 0.3
+        l_jacket: float = 0.05
+        k_core: float = 0.1
+        l_core: float = 0.003
+        core_gain: float = 0.04
+        approach: float = 0.2
+
+        def __post_init__(self) -> None:
+            require_numbers(self)
+            require_shares(self, "k_jacket", "l_jacket", "k_core", "l_core", "core_gain", "approach")
+
+    correct: Tensor  # (2,) shares of the innovations (core, jacket) for the estimates
+    learn: Tensor  # (2,) and for the offsets
+    core_gain: Tensor  # (1,)
+    approach: Tensor  # (1,)
+
+    def __init__(self, signals: LawSignals, model: HybridFuzzy, params: Params) -> None:
+        super().__init__(signals, model, params)
+        numbers = {
+            "correct": [params.k_core, params.k_jacket],
+            "learn": [params.l_core, params.l_jacket],
+            "core_gain": [params.core_gain],
+            "approach": [params.approach],
+        }
+        for name, value in numbers.items():
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+        # started, predicted T(k), R(k+1), both modes' T_w(k) at k_M = 0 and what k_M = 1 adds, offsets (core, jacket)
+        self.n_state = 9
+        self.info = (
+            "adjusted_reference",
+            "wanted_jacket",
+            "reached_jacket",
+            "mode",
+            "core_offset",
+            "jacket_offset",
+        )
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        started, t, reference, line, offsets = torch.split(state, [1, 1, 1, 4, 2], dim=-1)
+        side = self.side(started, mv_applied)
+        predicted = torch.cat([t, self.followed(line, side, mv_applied)], dim=-1)
+        predicted = torch.where(started > 0, predicted, pv)
+        innovation = pv - predicted
+        x = predicted + self.correct * innovation
+        offsets = offsets + self.learn * innovation
+        core_offset, jacket_offset = torch.split(offsets, 1, dim=-1)
+        t, t_w = torch.split(x, 1, dim=-1)
+        t_next = self.model.core_next(t, t_w) + core_offset
+        reference = torch.where(started > 0, reference, t_next)
+        spent = self.core_gain * (reference - t_next) - core_offset
+        target = reference + self.approach * (sp - reference)
+        wanted = self.allowed(self.wanted(target + spent, reference))
+        reach = self.model.jacket(t, t_w)
+        reach = JacketAffine(reach.base + jacket_offset, reach.gain)
+        mv, reached = self.move(reach, wanted, side, mv_applied)
+        adjusted = self.model.core_next(reference, reached) - spent
+        state = torch.cat([torch.ones_like(t), t_next, adjusted, *reach, offsets], dim=-1)
+        return mv, state, torch.cat([adjusted, wanted, reached, mv[..., 1:], offsets], dim=-1)

@@ -1,0 +1,101 @@
+"""Fuzzy feedforward with a PI controller around it: the plain way to close the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from pipeline.laws.base import LawSignals
+from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, require_numbers, require_shares
+from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+
+
+class FuzzyFeedforwardPi(FuzzyLaw):
+    """Feedforward along an adjusted reference R of the core, plus a PI controller on the core's distance to it.
+
+        e(k) = R(k) - T(k),   I(k) = I(k-1) + (kc h / ti) e(k),   u(k) = kc e(k) + I(k)
+        T_w,des = clip([R + g (T_ref - R) - c_t R] / c_w + u(k)),     R = R(k+1)
+        R(k+2)  = c_t R + c_w (T_w,adj - u(k))
+
+    with h the period and g the share of the reference's distance to the set point that is to be made
+    up in a sample. What the modes reach of T_w,des (``FuzzyLaw``) counts from the measured core and
+    the model's jacket, which follows the applied MVs and is corrected by the share k_jacket of its
+    distance to the measured one: a model whose throttle does too little or too much would ring with
+    the measured jacket alone. Where the jacket gives all that was asked for, R approaches the set
+    point; where it does not, R takes what is left beside the controller's share, so that a core
+    that lags draws R along and the integral does not wind up.
+
+    Source: seed 003_9cd6247d31a7c2db.txt, section 2, which splits the law so and leaves this part
+    open; ours.
+    """
+
+    name: ClassVar[str] = "fuzzy_feedforward_pi"
+    title: ClassVar[str] = "Fuzzy feedforward with PI"
+
+    @dataclass(frozen=True, slots=True)
+    class Params:
+        """Numbers of the law; the first five as in ``fuzzy_feedforward``.
+
+        ``kc`` [degC of the jacket per degC of the core] and ``ti_s`` [s] are the PI controller's,
+        ``approach`` (g) and ``k_jacket`` the shares above, in 0..1 [-], g above 0.
+        """
+
+        part: str | None = None
+        jacket_low: float = 20.0
+        jacket_high: float = 70.0
+        switch_penalty: float = 2.0
+        mv_rate: float | None = None
+        kc: float = 12.0
+        ti_s: float = 500.0
+        approach: float = 0.2
+        k_jacket: float = 0.8
+
+        def __post_init__(self) -> None:
+            require_numbers(self)
+            require_shares(self, "approach", "k_jacket")
+            if not (isfinite(self.kc) and self.kc >= 0 and isfinite(self.ti_s) and self.ti_s > 0):
+                raise ValueError(f"kc is {self.kc} and ti_s {self.ti_s}; give kc of 0 or above and ti_s above 0")
+
+    kc: Tensor  # (1,)
+    integral: Tensor  # (1,) kc h / ti
+    approach: Tensor  # (1,)
+    k_jacket: Tensor  # (1,)
+
+    def __init__(self, signals: LawSignals, model: HybridFuzzy, params: Params) -> None:
+        super().__init__(signals, model, params)
+        numbers = {
+            "kc": params.kc,
+            "integral": params.kc * signals.period_s / params.ti_s,
+            "approach": params.approach,
+            "k_jacket": params.k_jacket,
+        }
+        for name, value in numbers.items():
+            self.register_buffer(name, torch.tensor([value], dtype=torch.float64))
+        self.n_state = 8  # started, R(k), R(k+1), I(k-1), both modes' T_w(k) at k_M = 0 and what k_M = 1 adds
+        self.info = ("adjusted_reference", "wanted_jacket", "reached_jacket", "mode", "integral")
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        started, now, reference, integral, line = torch.split(state, [1, 1, 1, 1, 4], dim=-1)
+        t, measured = torch.split(pv, 1, dim=-1)
+        side = self.side(started, mv_applied)
+        t_w = torch.where(started > 0, self.followed(line, side, mv_applied), measured)
+        t_w = t_w + self.k_jacket * (measured - t_w)
+        now = torch.where(started > 0, now, t)
+        reference = torch.where(started > 0, reference, self.model.core_next(t, t_w))
+        error = now - t
+        integral = integral + self.integral * error
+        u = self.kc * error + integral
+        target = reference + self.approach * (sp - reference)
+        wanted = self.allowed(self.wanted(target, reference) + u)
+        reach = self.model.jacket(t, t_w)
+        mv, reached = self.move(reach, wanted, side, mv_applied)
+        adjusted = self.model.core_next(reference, reached - u)
+        state = torch.cat([torch.ones_like(t), reference, adjusted, integral, *reach], dim=-1)
+        return mv, state, torch.cat([adjusted, wanted, reached, mv[..., 1:], integral], dim=-1)

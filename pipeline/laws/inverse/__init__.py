@@ -1,0 +1,1 @@
+"""Inverse control: direct inverses, applicability domain, disturbance observers."""

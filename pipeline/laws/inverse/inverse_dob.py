@@ -1,0 +1,243 @@
+"""Offset-free inverse control: an inverse over several periods, a disturbance observer, a small integral."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from pipeline.errors import LawError
+from pipeline.laws.base import ControlLaw, LawSignals, require_part, require_single_loop
+from pipeline.models.base import Model
+from pipeline.models.static.pair import Layout, Pair, candidates
+from pipeline.plants.base import Plant
+
+# Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
+FOLLOWED = 1e-3
+
+
+def _column(value: float) -> Tensor:
+    return torch.tensor([value], dtype=torch.float64)
+
+
+def _rising(forward: Model, signals: LawSignals) -> bool:
+    """Whether more MV means more of the controlled variable, over states all over the PVs' ranges."""
+    rng = torch.Generator().manual_seed(0)
+    low, high = (torch.tensor([getattr(s, end) for s in signals.pv], dtype=torch.float64) for end in ("low", "high"))
+    states = low + (high - low) * torch.rand(1000, len(signals.pv), generator=rng, dtype=torch.float64)
+    mv = signals.mv[0]
+    ends = torch.tensor([mv.low, mv.high], dtype=torch.float64).expand(1000, 2)
+    with torch.no_grad():
+        at = candidates(forward, states, ends)
+    return float((at[:, 1] - at[:, 0]).sum()) >= 0
+
+
+class ObserverLaw(ControlLaw):
+    """What both forms share: everything but the inversion.
+
+        mv(k) = v(k) - d(k),   v = inverse(x(k), w + I),
+
+        T_hat(k) = f(x(k-1), mv_applied) + b d(k-1),   b = [f(x(k-1), mv_max) - f(x(k-1), mv_min)] / range
+        d(k)     = d(k-1) + L (T(k) - T_hat(k)) / b
+        I(k+1)   = I(k) + ki (w - y)   while |w - y| < band, the MV is not limited, and the last one was applied
+
+    An exact inverse over one period puts a closed-loop eigenvalue on the sampled plant's zero, which
+    may lie outside the unit circle; over several periods, applied anew at every sample, it does not.
+    d [mv] is what the MV would have had to be more, over the last period, for the one-step model f
+    to have predicted the observed variable T; it is fed the MV that the plant really received, so
+    it knows no saturation and cannot wind up. The integral only takes the rest.
+
+    Source: the remedy is not in the paper, seed 000_0a422d3e5d968dac.txt; eqs 12 and 21-23 are what it replaces.
+    """
+
+    @dataclass(frozen=True, slots=True)
+    class Params:
+        """Numbers of the law.
+
+        ``observer_gain`` L in (0, 1]; ``integral_gain`` ki >= 0 a sample; ``band`` [cv] the error below
+        which the integral acts; ``observed`` the name of the PV that part ``observer`` predicts, None for the
+        last; ``mv_rate`` [mv] the largest change a sample, None unlimited.
+        """
+
+        observer_gain: float = 0.7
+        integral_gain: float = 0.03
+        band: float = 0.03
+        observed: str | None = None
+        mv_rate: float | None = None
+
+        def __post_init__(self) -> None:
+            if not 0 < self.observer_gain <= 1:
+                raise ValueError(f"observer_gain is {self.observer_gain}; it must lie in (0, 1]")
+            if self.integral_gain < 0 or not self.band > 0:
+                raise ValueError(
+                    f"integral_gain is {self.integral_gain} and band {self.band}; they must be >= 0 and > 0"
+                )
+
+    span: Tensor
+    band: Tensor
+    least: Tensor  # (1,) share of the set point's range below which a reach is nothing but the models' errors
+
+    def __init__(self, signals: LawSignals, forward: Model, observer: Model, params: Params, sections: int = 1) -> None:
+        super().__init__(signals, params.mv_rate)
+        names = [s.name for s in signals.pv]
+        if params.observed is not None and params.observed not in names:
+            raise LawError(f"observed is {params.observed!r}; the process variables are {', '.join(names)}")
+        self.params = params
+        self.observed = len(names) - 1 if params.observed is None else names.index(params.observed)
+        self.n_pv = n = len(names)
+        self.n_state = n + 4  # started, x(k-1), d, I, mv(k-1)
+        self.info = ("sp_requested", "sp_min", "sp_max", "disturbance", "integral")
+        self.rising = _rising(forward, signals)
+        self.register_buffer("span", self.high - self.low)
+        self.register_buffer("band", _column(params.band))
+        self.register_buffer("least", 1e-3 * (signals.sp[0].high - signals.sp[0].low) / self.span)
+        grid = self.low + self.span * torch.linspace(0, 1, sections + 1, dtype=torch.float64)
+        layout = Layout(n_z=2 * n + 6, n=n, first=1, second=n + 4, mv=2 * n + 4)
+        self.models = Pair(observer, forward, grid, layout, self._combine)
+
+    def _combine(self, f: Tensor, g: Tensor, z: Tensor) -> Tensor:
+        """All that a step needs of the one-step model f at x(k-1) and the forward model g at x(k), linear in both.
+
+        f and g stand for [mv_applied, grid], z is [state, pv, mv_applied, sp].
+        """
+        sizes = [1, self.n_pv, 1, 1, 1, self.n_pv, 1, 1]
+        started, _, d, integral, last_mv, pv, mv_applied, sp = torch.split(z, sizes, dim=-1)
+        surprise = pv[..., self.observed : self.observed + 1] - f[..., :1]
+        w_min, w_max = (g[..., 1:2], g[..., -1:]) if self.rising else (g[..., -1:], g[..., 1:2])
+        error = sp - pv[..., :1]
+        rows = [
+            started,
+            (1 - self.params.observer_gain) * d,
+            self.params.observer_gain * surprise,
+            (f[..., -1:] - f[..., 1:2]) / self.span,
+            w_min,
+            w_max,
+            (w_max - w_min) / self.span,
+            sp + integral,
+            error / self.params.band,
+            (mv_applied - last_mv) / (FOLLOWED * self.span),
+            integral,
+            integral + self.params.integral_gain * error,
+            g[..., 1:],
+        ]
+        return torch.cat(rows, dim=-1)
+
+    @abstractmethod
+    def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
+        """The MV v (..., 1) for a request w (..., 1) within reach, given g (..., n_grid) over the grid."""
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        found = self.models(torch.cat([state, pv, mv_applied, sp], dim=-1))
+        parts = torch.split(found, [1, 1, 1, 1, 1, 1, 1, 1, 2, 1, 1, found.shape[-1] - 12], dim=-1)
+        started, kept, surprise, slope, w_min, w_max, width, request, acts, integral, moved, g = parts
+        # More than the whole actuator can never be acted on, and a bad sample must not be remembered for long.
+        disturbance = torch.minimum(torch.maximum(kept + surprise / slope, -self.span), self.span)
+        disturbance = started * disturbance
+        within = torch.minimum(torch.maximum(request, w_min), w_max)
+        # Where the plant hardly answers, the reach is the model's error and may have the wrong sign: the way to
+        # go on comes from the plant as a whole, or the loop would lock at the wrong end.
+        beyond = (request - within if self.rising else within - request) / torch.maximum(width, self.least)
+        wanted = self.invert(pv, within, g) + beyond - disturbance
+        mv = self.limited(wanted, mv_applied)
+        # Acting on an error that someone else's MV leaves would be winding up, in manual as at a limit.
+        free = (mv == wanted) & (acts.abs().amax(dim=-1, keepdim=True) < 1)
+        # The integral takes what the observer leaves: no more than the band in which it acts.
+        integral_next = torch.where(free, torch.minimum(torch.maximum(moved, -self.band), self.band), integral)
+        state_next = torch.cat([torch.ones_like(integral), pv, disturbance, integral_next, mv], dim=-1)
+        return mv, state_next, torch.cat([within, w_min, w_max, disturbance, integral], dim=-1)
+
+
+class InverseDob(ObserverLaw):
+    """The form with a learnt inverse: v = RBF(x, w) over h periods.
+
+        v = RBF(x, w_c) + (w - w_c) range / (g(x, mv_max) - g(x, mv_min)),   w_c = w limited to g(x, [mv_min, mv_max])
+
+    g is a forward model over the same h periods. The reach clip keeps the network off requests that
+    no MV can meet, where it extrapolates and can lock the loop at an end; beyond reach the slope
+    drives the MV to its limit, whatever the network would say.
+    """
+
+    name: ClassVar[str] = "inverse_dob"
+    title: ClassVar[str] = "RBF inverse over several periods, disturbance observer, integral"
+
+    def __init__(
+        self, signals: LawSignals, inverse: Model, forward: Model, observer: Model, params: ObserverLaw.Params
+    ) -> None:
+        super().__init__(signals, forward, observer, params)
+        self.inverse = inverse
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The law over parts ``inverse``, ``forward`` and ``observer``; raises LawError."""
+        require_single_loop(signals, cls.name)
+        n = len(signals.pv) + 1
+        inverse, forward, observer = (
+            require_part(models, p, cls.name, n, 1) for p in ("inverse", "forward", "observer")
+        )
+        return cls(signals, inverse, forward, observer, params)
+
+    def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
+        """As in ObserverLaw."""
+        v: Tensor = self.inverse(torch.cat([pv, w], dim=-1))
+        return v
+
+
+class ForwardDob(ObserverLaw):
+    """The form with a forward model g over h periods, inverted at every sample by sectioning.
+
+    The MV's range is cut into ``SECTIONS`` equal parts, the one in which g crosses w is cut again
+    (so many bisections at once), and the crossing taken on the chord of the last part. g must be
+    monotone in the MV. Beyond reach v goes on at the slope of the whole range.
+    """
+
+    name: ClassVar[str] = "forward_dob"
+    title: ClassVar[str] = "Forward network inverted online, disturbance observer, integral"
+    SECTIONS: ClassVar[int] = 16
+
+    cuts: Tensor  # (SECTIONS + 1,) [mv] cuts of one part, from its start
+    part: Tensor  # (1,) [mv] width of one part of the range
+    chord: Tensor  # (1,) [mv] width of one part of a part
+    flat: Tensor  # (1,) [cv] a rise below which a chord has no slope
+
+    def __init__(self, signals: LawSignals, model: Model, observer: Model, params: ObserverLaw.Params) -> None:
+        super().__init__(signals, model, observer, params, sections=self.SECTIONS)
+        self.model = model
+        self.register_buffer("part", self.span / self.SECTIONS)
+        self.register_buffer("chord", self.part / self.SECTIONS)
+        self.register_buffer("cuts", self.part * torch.linspace(0, 1, self.SECTIONS + 1, dtype=torch.float64))
+        self.register_buffer("flat", _column(1e-12))
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The law over parts ``forward`` and ``observer``; raises LawError."""
+        require_single_loop(signals, cls.name)
+        n = len(signals.pv) + 1
+        forward, observer = (require_part(models, p, cls.name, n, 1) for p in ("forward", "observer"))
+        return cls(signals, forward, observer, params)
+
+    def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
+        """As in ObserverLaw."""
+        start = self.low + self.part * self._before(w, g)
+        g = candidates(self.model, pv, start + self.cuts)
+        inside = self._before(w, g)
+        # The chord of the part in which the crossing lies: its ends are the two cuts around it.
+        at = start + self.chord * inside
+        ends = candidates(self.model, pv, torch.cat([at, at + self.chord], dim=-1))
+        rise = ends[..., 1:] - ends[..., :1]
+        flat = self.flat if self.rising else -self.flat
+        steep = torch.maximum(rise, flat) if self.rising else torch.minimum(rise, flat)
+        share = ((w - ends[..., :1]) / steep).clamp(0, 1)
+        return at + self.chord * share
+
+    def _before(self, w: Tensor, g: Tensor) -> Tensor:
+        """Number (..., 1) of inner cuts before the crossing of g (..., SECTIONS + 1) with w."""
+        inner = g[..., 1:-1]
+        before = inner < w if self.rising else inner > w
+        return before.to(w.dtype).sum(dim=-1, keepdim=True)

@@ -1,0 +1,1 @@
+"""Laws that linearize an NNARX at every sample."""

@@ -1,0 +1,100 @@
+"""The minimum-variance move of an NNARX without a PID around it: shows what the PID's structure costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self
+
+import torch
+from torch import Tensor
+
+from pipeline.laws.adaptive import signed_unit, target, target_slots
+from pipeline.laws.base import ControlLaw, LawSignals, require_kind, require_single_loop
+from pipeline.laws.linearized.nnarx_law import central_model, next_output, room
+from pipeline.models.base import Model
+from pipeline.models.lagged.next_output import GaussNewton
+from pipeline.models.lagged.nnarx import NNARX
+from pipeline.models.memory import Memory, Stage
+from pipeline.plants.base import Plant
+
+
+class MinimumVariance(ControlLaw):
+    """One-step-ahead control by an NNARX, free of offset.
+
+        min_du  (r - y(t+1))^2 + mu du^2,   y(t+1) = NN(phi(t+1)) + d(t),   mv(t) = mv(t-1) + du
+
+    by Gauss-Newton steps within the actuator's range; one of them is the minimum-variance law of
+    the linearized network.
+
+    Source: seed 002_4e35f3d541bda8ae.txt, eqs 16 and 17, without the PID form of du.
+    """
+
+    name: ClassVar[str] = "minimum_variance"
+    title: ClassVar[str] = "Minimum variance by the NNARX, no PID"
+    incremental: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True)
+    class Params:
+        """Numbers of the law; the MV counts in units of half its range.
+
+        ``penalty`` mu > 0 of the move [pv^2]; ``relinearize`` the linearizations a sample, 1 or more;
+        ``preview`` of r(t+1) and ``plant_gain`` as in AdaptiveParams; ``slope_min`` [pv] a slope
+        below which this one is taken; ``offset_filter`` alpha in (0, 1] as in NextOutput;
+        ``mv_rate`` [mv] the largest change a sample, None unlimited.
+        """
+
+        penalty: float = 0.1
+        relinearize: int = 5
+        preview: Literal["held", "ramp"] = "held"
+        plant_gain: Literal["auto", "positive", "negative"] = "auto"
+        slope_min: float = 1e-3
+        offset_filter: float = 1.0
+        mv_rate: float | None = None
+
+        def __post_init__(self) -> None:
+            if not self.penalty > 0:
+                raise ValueError(f"penalty is {self.penalty}; it must be above 0")
+            if self.relinearize < 1:
+                raise ValueError(f"relinearize is {self.relinearize}; give 1 or more linearizations a sample")
+            if not 0 < self.offset_filter <= 1:
+                raise ValueError(f"offset_filter is {self.offset_filter}; it must lie in (0, 1]")
+
+    unit: Tensor  # (1,) [mv]
+
+    def __init__(self, signals: LawSignals, model: NNARX, params: Params) -> None:
+        super().__init__(signals, params.mv_rate)
+        require_single_loop(signals, self.name)
+        unit = signed_unit(signals, params.plant_gain, float(central_model(model).b[0]))
+        self.model = next_output(self.name, model, unit, params.offset_filter)
+        self.search = GaussNewton(self.model, params.relinearize, params.penalty, params.slope_min)
+        self.register_buffer("unit", torch.tensor([unit], dtype=torch.float64))
+        self.register_buffer("by_unit", 1 / self.unit)
+        self.memory = Memory({**target_slots(params.preview), **self.model.slots})
+        self.stage = Stage(
+            self.memory.layout,
+            lambda p: {
+                "known": self.memory.then(p),
+                "mv": p["u"],
+                **room(p, self.low, self.high, unit),
+                **self.model.terms(p, target(p, params.preview)),
+            },
+        )
+        self.n_state = self.memory.n_state
+        self.info = ("b1", "offset", "mv_requested")
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The law over part ``nnarx``; raises LawError."""
+        return cls(signals, require_kind(models, NNARX, cls.name), params)
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
+        ahead = self.model(now)
+        move, _ = self.search(ahead, now["down"], now["up"])
+        requested = now["mv"] + move * self.unit
+        info = torch.cat([ahead.slope * self.by_unit, ahead.offset, requested], dim=-1)
+        return self.limited(requested, now["mv"]), self.memory.stored(now["known"], ahead.kept), info

@@ -1,0 +1,1 @@
+"""Local controllers blended over local models."""

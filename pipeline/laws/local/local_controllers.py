@@ -1,0 +1,170 @@
+"""What the local controller networks share: PIDs at operating points, blended by where the plant is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Self
+
+import torch
+from torch import Tensor
+
+from pipeline.errors import LawError
+from pipeline.laws.base import Analysis, ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.local.local_stability import StabilityTest, stability_analysis
+from pipeline.models.local.local_models import LocalModels
+from pipeline.plants.base import Plant
+
+Blending = Literal["gains", "outputs", "velocity"]
+
+
+@dataclass(frozen=True, slots=True)
+class LocalPid:
+    """Gains of one local controller, kp e + ki int(e) dt - kd dy/dt; kp may be 0 where ki is not."""
+
+    kp: float  # [mv/pv]
+    ki: float  # [mv/(pv s)]
+    kd: float = 0.0  # [mv s/pv]
+
+
+@dataclass(frozen=True, slots=True)
+class BlendedParams:
+    """What a user sets of any local controller network, however its local controllers are tuned.
+
+    ``blending``: what is blended (``gains``, ``outputs`` or ``velocity``, see LocalControllers).
+    ``derivative_limit`` is N of the derivative's filter, Tf = Td/N. ``stability`` says how the
+    closed loop is examined. ``mv_rate`` [mv] is the largest change a sample, None unlimited.
+    """
+
+    blending: Blending = "gains"
+    derivative_limit: float = 10.0
+    stability: StabilityTest = field(default_factory=StabilityTest)
+    mv_rate: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.derivative_limit > 0:
+            raise ValueError(f"derivative_limit is {self.derivative_limit}; give N above 0, as 10")
+
+
+class LocalControllers(ControlLaw):
+    """PIDs for m operating points of one loop, blended by the validity functions of their models.
+
+    With rho_i(y) the weights, e = r - y, h the period, and Kp, Ki, Kd, a their blended numbers
+    sum_i rho_i(y) (.)_i, the three forms are
+
+        gains      mv = Kp e + I - Kd v,                                     I += h Ki e
+        outputs    mv = sum_i rho_i(y) [ u_i + Kp_i e + Ki_i J - Kd_i v ],   J += h e
+        velocity   mv(k) = mv(k-1) + Kp (e(k) - e(k-1)) + h Ki e(k) - Kd (v(k) - v(k-1))
+
+    v is the filtered slope of the measurement, v(k) = a v(k-1) + (1 - a) (y(k) - y(k-1))/h with
+    a_i = Tf_i/(Tf_i + h) and Tf_i = Td_i/N. The forms differ in what happens while rho moves: with
+    blended gains the integral stands in units of the MV, so at e = 0 nothing bumps; blended outputs
+    weigh the one integral J, and the local biases u_i, anew with every move of rho; the velocity
+    form has no memory of where it should be.
+
+    Anti-windup: the integral keeps its value while the limited MV lies behind the request in the
+    direction of the error. A cold start, and an actuator that someone else moved, set the integral
+    to where the MV is, less the proportional part, so that taking over does not bump.
+
+    Source: seed 004_643aaacd7e46828e.txt, section III (blended outputs, in words); blending the
+    gains around one integrator is not in the paper.
+    """
+
+    incremental = True
+
+    table: Tensor  # (m, 5): Kp_i, h Ki_i, Kd_i/h, a_i, u_i
+    period: Tensor  # (1,) [s]
+    near: Tensor  # [mv] an actuator this close to the limited request has followed it
+
+    def __init__(
+        self,
+        signals: LawSignals,
+        models: LocalModels,
+        pids: Sequence[LocalPid],
+        *,
+        blending: Blending = "gains",
+        derivative_limit: float = 10.0,
+        stability: StabilityTest | None = None,
+        mv_rate: float | None = None,
+    ) -> None:
+        super().__init__(signals, mv_rate)
+        require_single_loop(signals, self.name)
+        if len(pids) != models.n_models:
+            raise LawError(
+                f"law {self.name!r} got {len(pids)} local controllers for {models.n_models} local models; one each"
+            )
+        if blending not in ("gains", "outputs", "velocity"):
+            raise LawError(f"law {self.name!r}: blending is {blending!r}; allowed are gains, outputs, velocity")
+        h = signals.period_s
+        rows = []
+        for pid, bias in zip(pids, models.mv[:, 0].tolist(), strict=True):
+            filter_s = pid.kd / pid.kp / derivative_limit if pid.kp else 0.0
+            rows.append([pid.kp, h * pid.ki, pid.kd / h, filter_s / (filter_s + h), bias])
+        self.register_buffer("table", torch.tensor(rows, dtype=torch.float64))
+        self.register_buffer("near", 1e-3 * (self.high - self.low))
+        self.register_buffer("period", torch.tensor([h], dtype=torch.float64))
+        self.validity = models.validity()
+        self.blending, self.pids = blending, tuple(pids)
+        self.stability = stability or StabilityTest()
+        self.points = tuple(float(v) for v in models.x[:, 0])  # [CV]
+        self.n_state = 6  # started, I or J/h, the proportional part before, y(k-1), v(k-1), the last MV given
+        self.info = ("kc", "tau_i_s", "tau_d_s", "mv_requested")
+
+    @classmethod
+    def blended(
+        cls, params: BlendedParams, signals: LawSignals, models: LocalModels, pids: Sequence[LocalPid], plant: Plant
+    ) -> Self:
+        """The law with these local controllers, the rest as ``params`` says; raises LawError."""
+        states, given = len(plant.state_signals), len(params.stability.low)
+        if params.stability.starts and given != states:
+            raise LawError(
+                f"law {cls.name!r}: stability.low and stability.high have {given} numbers; plant {plant.name!r} has "
+                f"{states} states, give one of each for every state"
+            )
+        return cls(
+            signals,
+            models,
+            pids,
+            blending=params.blending,
+            derivative_limit=params.derivative_limit,
+            stability=params.stability,
+            mv_rate=params.mv_rate,
+        )
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        y = pv[..., :1]
+        error = sp - y
+        blended = self.validity(y) @ self.table
+        kp, ki, kd, keep, bias = (blended[..., i : i + 1] for i in range(5))
+        proportional = kp * error + bias if self.blending == "outputs" else kp * error
+        nothing = torch.zeros_like(y)
+        # The velocity form remembers e(k-1) where the others remember their proportional part.
+        beside = error if self.blending == "velocity" else proportional
+        # What one unit of the integral is in the MV's.
+        unit = ki if self.blending == "outputs" else torch.ones_like(y)
+        fresh = torch.cat([(mv_applied - beside) / unit, beside, y, nothing, mv_applied], dim=-1)
+        past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
+        integral, beside1, y1, slope1, given = (past[..., i : i + 1] for i in range(5))
+        followed = (mv_applied - given).abs() <= self.near
+        # A derivative from the time when somebody else held the actuator would still fade in the MV.
+        slope1 = torch.where(followed, slope1, nothing)
+        slope = keep * slope1 + (1 - keep) * (y - y1)
+        if self.blending == "velocity":
+            requested = mv_applied + kp * (error - beside1) + ki * error - kd * (slope - slope1)
+            mv = self.limited(requested, mv_applied)
+            kept = nothing
+        else:
+            integral = torch.where(followed, integral, (mv_applied - beside1) / unit)
+            grown = integral + ki / unit * error
+            requested = proportional - kd * slope + unit * grown
+            mv = self.limited(requested, mv_applied)
+            kept = torch.where((requested - mv) * error > 0, integral, grown)
+        info = torch.cat([kp, kp / ki * self.period, kd / kp * self.period, requested], dim=-1)
+        return mv, torch.cat([torch.ones_like(y), kept, beside, y, slope, mv], dim=-1), info
+
+    def analysis(self, plant: Plant) -> Analysis:
+        """The stability of the loop along the operating points and from many starts, as ``stability`` asks for it."""
+        return stability_analysis(self, plant, self.points, self.stability)

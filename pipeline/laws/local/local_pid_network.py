@@ -1,0 +1,57 @@
+"""The local controller network with its gains given: one PID an operating point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+from pipeline.laws.base import LawSignals, require_kind
+from pipeline.laws.local.local_controllers import BlendedParams, LocalControllers, LocalPid
+from pipeline.models.base import Model
+from pipeline.models.local.local_models import LocalModels
+from pipeline.plants.base import Plant
+
+
+class LocalPidNetwork(LocalControllers):
+    """The paper's controllers, blended over the validity functions of the local models.
+
+    Source: seed 004_643aaacd7e46828e.txt, section IV.C. Its settings are from a Ziegler-Nichols
+    experiment and then corrected by hand; on these models, of relative degree two, proportional
+    feedback in continuous time has no ultimate gain, so only the correction can have made them.
+    """
+
+    name: ClassVar[str] = "local_pid_network"
+    title: ClassVar[str] = "Local controller network, printed gains"
+
+    @dataclass(frozen=True, slots=True)
+    class Params(BlendedParams):
+        """``kc`` [mv/pv], ``ti_s`` and ``td_s`` [s] of each local controller, in the order of the local models.
+
+        The defaults are the printed settings.
+        """
+
+        kc: tuple[float, ...] = (2550.0, 331.0, 404.2, 2080.0, 20100.0)
+        ti_s: tuple[float, ...] = (57.54, 30.72, 16.02, 26.04, 32.1)
+        td_s: tuple[float, ...] = (13.2, 0.0, 0.0, 0.0, 0.0)
+
+        def __post_init__(self) -> None:
+            BlendedParams.__post_init__(self)
+            if not len(self.kc) == len(self.ti_s) == len(self.td_s):
+                raise ValueError(
+                    f"there are {len(self.kc)} kc, {len(self.ti_s)} ti_s and {len(self.td_s)} td_s; give as many of "
+                    "each as there are local models"
+                )
+            if not all(abs(k) > 0 for k in self.kc):
+                raise ValueError(f"kc is {list(self.kc)}; none may be 0, or its controller would not act")
+            if not all(t > 0 for t in self.ti_s):
+                raise ValueError(f"ti_s is {list(self.ti_s)}; each must be above 0 s")
+            if not all(t >= 0 for t in self.td_s):
+                raise ValueError(f"td_s is {list(self.td_s)}; each must be 0 s or above, 0 for a PI")
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The law over the part ``local_models``; raises LawError."""
+        local = require_kind(models, LocalModels, cls.name)
+        settings = zip(params.kc, params.ti_s, params.td_s, strict=True)
+        return cls.blended(params, signals, local, [LocalPid(k, k / ti, k * td) for k, ti, td in settings], plant)

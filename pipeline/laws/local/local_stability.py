@@ -1,0 +1,147 @@
+"""What is said of the stability of a law that is blended over operating points: design time, not run time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.laws.base import Analysis, ControlLaw
+from pipeline.plants.base import Array, Plant
+from pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
+from pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
+
+SAME = 1e-3  # relative difference of two states that count as one
+
+
+@dataclass(frozen=True, slots=True)
+class StabilityTest:
+    """How the stability of a law is examined.
+
+    ``between``: linear loops from one operating point to the next, both included. ``starts``: loops
+    that begin anywhere between the states ``low`` and ``high`` (none where ``starts`` is 0), at any
+    MV, their set points anywhere between the outer operating points; ``seed`` draws them. One has
+    recovered when it stays within ``band`` [CV] for ``holding`` samples, before ``samples`` are over.
+    The courses of the first ``watched`` are kept.
+    """
+
+    between: int = 9
+    starts: int = 2_000
+    low: tuple[float, ...] = (0.005, 400.0)
+    high: tuple[float, ...] = (0.2, 500.0)
+    seed: int = 1
+    band: float = 1e-3
+    holding: int = 50
+    samples: int = 1_000
+    watched: int = 60
+
+    def __post_init__(self) -> None:
+        for name, least in (("between", 2), ("starts", 0), ("holding", 1), ("samples", 1), ("watched", 0)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        if not self.band > 0:
+            raise ValueError(f"band is {self.band}; give the width in the CV's unit, above 0")
+        if len(self.low) != len(self.high) or not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError(
+                f"low is {list(self.low)} and high is {list(self.high)}; give a number of each for every state of the "
+                "plant, each low below its high"
+            )
+
+
+def stability_analysis(law: ControlLaw, plant: Plant, points: Sequence[float], test: StabilityTest) -> Analysis:
+    """Frozen loops, Lyapunov functions of neighbouring points, and recoveries from many starts.
+
+    ``points`` are the operating points [CV] that the law is blended over.
+    """
+    edges = np.sort(np.array(points))
+    cvs = np.unique(np.concatenate([np.linspace(a, b, test.between) for a, b in pairwise(edges)]))
+    loops = FrozenLoops.of(plant, law, law.n_state, cvs)
+    matrices = loops.matrices()
+    contraction = pairwise_contraction(matrices, cvs, list(edges))
+    found = ~np.isnan(contraction)
+    sp = plant.sp_signals[0]
+    # Beyond the outer points too, where one controller is alone.
+    wide = np.linspace(sp.low, sp.high, 4 * len(cvs))[1:-1]
+    radius = spectral_radius(FrozenLoops.of(plant, law, law.n_state, wide).matrices())
+    figures = {
+        "frozen_radius": float(spectral_radius(matrices).max()),
+        "frozen_radius_over_range": float(radius.max()),
+        "gain_margin": loops.gain_margin(),
+        "lyapunov_pairs": float(found.sum()),
+        "neighbour_pairs": float(len(contraction)),
+    }
+    if found.all():
+        figures["lyapunov_contraction"] = float(contraction.max())
+    arrays = {"frozen_cv": wide, "frozen_radius": radius, "points": edges, "contraction": contraction}
+    notes = [_lyapunov_note(edges, found)]
+    if test.starts:
+        more, courses, told = _recoveries(law, plant, edges, test)
+        figures, arrays, notes = figures | more, arrays | courses, [*notes, *told]
+    return Analysis(figures, arrays, tuple(notes))
+
+
+def _lyapunov_note(edges: Array, found: Array) -> str:
+    words = (
+        "A quadratic Lyapunov function shared by the linear loops from one operating point to the next, checked after "
+        "the solver, proves that they stay stable however the operating point moves among them; it says nothing of "
+        "steps so large that no linear loop describes them."
+    )
+    missing = [f"{a:.4g} to {b:.4g}" for a, b, ok in zip(edges, edges[1:], found, strict=False) if not ok]
+    return words + (f" None was found from {', '.join(missing)}." if missing else "")
+
+
+def _recoveries(
+    law: ControlLaw, plant: Plant, edges: Array, test: StabilityTest
+) -> tuple[dict[str, float], dict[str, Array], list[str]]:
+    rng, sp, mv = np.random.default_rng(test.seed), plant.sp_signals[0], plant.mv_signals[0]
+    n = test.starts
+    starts = Starts(
+        rng.uniform(test.low, test.high, (n, len(test.low))),
+        rng.uniform(edges[0], edges[-1], (n, 1)),
+        rng.uniform(mv.low, mv.high, (n, 1)),
+    )
+
+    def run(begun: Starts, watched: int) -> Recovery:
+        options = {"samples": test.samples, "holding": test.holding, "watched": watched}
+        return recover(plant, law, law.n_state, begun, band=test.band, **options)
+
+    ended = run(starts, test.watched)
+    minutes = plant.period_s / 60.0
+    out = np.array(plant.measure(ended.end.T))[0] > sp.high + 0.5 * (sp.high - sp.low)
+    figures = {
+        "starts": float(n),
+        "recovered": float(ended.arrived.sum()),
+        "left_range": float((out & ~ended.arrived).sum()),
+    }
+    if ended.arrived.any():
+        figures["recovery_min"] = minutes * float(np.median(ended.samples[ended.arrived]))
+    arrays = {
+        "start": starts.x,
+        "start_sp": starts.sp,
+        "arrived": ended.arrived.astype(float),
+        "end": ended.end,
+        "courses": ended.courses,
+    }
+    rests = other_rests(plant)
+    if not len(rests):
+        return figures, arrays, []
+    middle = 0.5 * (edges[0] + edges[-1])
+    back = run(Starts(rests, np.full((len(rests), 1), middle), np.full((len(rests), 1), mv.low)), len(rests))
+    arrays |= {"other_rest": rests, "other_rest_arrived": back.arrived.astype(float)}
+    arrays["other_rest_courses"] = back.courses
+    # Several of them may lead to one: a reactor that has gone out rests elsewhere under another MV.
+    kept: list[Array] = []
+    cv = np.array(plant.measure(back.end.T))[0]
+    # What swings within the range does not arrive either, and yet came back.
+    for state in back.end[~back.arrived & ((cv < sp.low) | (cv > sp.high))]:
+        if all(np.abs(state / known - 1).max() > SAME for known in kept):
+            kept.append(state)
+    figures["states_of_no_return"] = float(len(kept))
+    names = ", ".join(s.name for s in plant.state_signals)
+    where = "; ".join(", ".join(f"{v:.4g}" for v in state) for state in kept)
+    told = (
+        f"Beyond the set point's range the plant has a state from which the law does not return: ({names}) = {where}."
+    )
+    return figures, arrays, [told] if kept else []

@@ -1,0 +1,206 @@
+"""The PID controller: the yardstick of every other law."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.errors import LawError
+from pipeline.laws.base import Analysis, ControlLaw, LawSignals, require_single_loop
+from pipeline.models.base import Model
+from pipeline.plants.base import Array, Linearization, Plant
+from pipeline.tuning import rules as tuning
+from pipeline.tuning.development import DevelopmentLoops
+from pipeline.tuning.reduction import LagWithDeadTime
+from pipeline.tuning.rules import AllPole, PidSettings
+from pipeline.tuning.stability import FrozenLoops, spectral_radius
+
+EXAMINED = 40  # linear closed loops over a range of the CV
+
+
+@runtime_checkable
+class HoldsLinearization(Protocol):
+    """A model that is a plant linearized at a steady state."""
+
+    def linearization(self) -> Linearization:
+        """The linearization, per second."""
+
+
+class PID(ControlLaw):
+    """Velocity-form PID for one loop, derivative on the measurement.
+
+        mv(k) = mv(k-1) + Kc [ p(k) - p(k-1) + (h/Ti) (r - y) - (d(k) - d(k-1)) ],   p = b r - y
+        d(k)  = (Tf d(k-1) + Td (y(k) - y(k-1))) / (Tf + h)
+        mv(k-1) = mv_applied + (1 - h/Tt) (what the actuator could not give of the last request)
+
+    d is the filtered derivative, h the period. Adding to the MV that the actuator really holds is
+    the anti-windup, and makes the transfer from manual to auto bumpless. Of a request beyond the
+    law's own limits a share is remembered, fading with the tracking time Tt: without it
+    (Tt = h, the plain velocity form) one saturated sample erases the proportional and derivative
+    kicks, whose end then pulls the MV the wrong way. An actuator that did not follow the limited
+    request (manual, stuck) is believed at once.
+
+    Source: the PID that seed 000_0a422d3e5d968dac.txt, section 4.3, compares with; the tracking
+    is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
+    """
+
+    name: ClassVar[str] = "pid"
+    title: ClassVar[str] = "PID"
+    incremental: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True)
+    class Params:
+        """How the PID is tuned.
+
+        ``tuning``: ``optimized`` (IMC, its filter and the set-point weight chosen in closed loop, by the
+        ``criterion`` mean absolute error or integral of the time-weighted one),
+        ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``itae`` (the rule for the
+        least ITAE after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``.
+        ``tracking_s`` [s] None is sqrt(Ti Td). ``set_point_weight`` None is 1, or optimized with the
+        filter.
+        ``operating_cv`` [pv] is the steady state to linearize where the model set has no part
+        ``linearized``; None is the middle of the set point's range. The development set points
+        are drawn for the optimization alone, ``development_set_points`` of them for each seed,
+        each held for ``development_hold`` samples. ``sampling`` is what ``itae`` counts of a period as
+        dead time: 0.5 is the textbook's, 1 more cautious. ``examined_cv`` [pv] is the range over which
+        the linear closed loops are examined; None: not at all. ``mv_rate`` [mv] is the largest change
+        a sample, None unlimited.
+        """
+
+        tuning: Literal["optimized", "imc", "simc", "itae", "manual"] = "optimized"
+        criterion: Literal["mae", "itae"] = "mae"
+        kc: float | None = None
+        ti_s: float | None = None
+        td_s: float = 0.0
+        filter_s: float = 0.0
+        tracking_s: float | None = None
+        set_point_weight: float | None = None
+        lambda_s: float | None = None
+        operating_cv: float | None = None
+        development_seeds: tuple[int, ...] = (7001, 7002, 7003)
+        development_set_points: int = 12
+        development_hold: int = 60
+        sampling: float = 0.5
+        examined_cv: tuple[float, float] | None = None
+        mv_rate: float | None = None
+
+    kc: Tensor  # (..., 1)
+    integral: Tensor  # h/Ti
+    keep: Tensor  # Tf/(Tf + h)
+    derivative: Tensor  # Td/(Tf + h)
+    weight: Tensor  # b
+    fade: Tensor  # 1 - h/Tt
+    near: Tensor  # [mv] an actuator this close to the limited request has followed it
+
+    examined_cv: tuple[float, float] | None = None
+
+    def __init__(
+        self, signals: LawSignals, settings: PidSettings | Sequence[PidSettings], mv_rate: float | None = None
+    ) -> None:
+        super().__init__(signals, mv_rate)
+        require_single_loop(signals, self.name)
+        # Several settings are candidates in one module: they broadcast over a leading dimension.
+        rows = [settings] if isinstance(settings, PidSettings) else list(settings)
+        h = signals.period_s
+        for s in rows:
+            if not (s.ti_s > 0 and s.td_s >= 0 and s.filter_s >= 0 and s.tracking_time_s > 0):
+                raise LawError(f"PID settings {s} need ti_s > 0, td_s >= 0, filter_s >= 0 and tracking_s > 0")
+        numbers = {
+            "kc": [s.kc for s in rows],
+            "integral": [h / s.ti_s for s in rows],
+            "keep": [s.filter_s / (s.filter_s + h) for s in rows],
+            "derivative": [s.td_s / (s.filter_s + h) for s in rows],
+            "weight": [s.set_point_weight for s in rows],
+            "fade": [max(0.0, 1 - h / s.tracking_time_s) for s in rows],
+        }
+        shape = (1,) if isinstance(settings, PidSettings) else (len(rows), 1, 1)
+        for name, values in numbers.items():
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float64).reshape(shape))
+        self.register_buffer("near", 1e-3 * (self.high - self.low))
+        self.settings = rows[0]
+        self.n_state = 6  # started, p(k-1), y(k-1), d(k-1), the last request, the same limited
+        self.info = ("mv_requested",)
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The PID tuned as ``params`` says, on part ``linearized`` or on the plant; raises LawError."""
+        law = cls._tuned(params, models, signals, plant)
+        law.examined_cv = params.examined_cv
+        return law
+
+    @classmethod
+    def _tuned(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        require_single_loop(signals, cls.name)
+        p = params
+        weight = 1.0 if p.set_point_weight is None else p.set_point_weight
+        rest = {"filter_s": p.filter_s, "tracking_s": p.tracking_s, "set_point_weight": weight}
+        if p.tuning == "manual":
+            if p.kc is None or p.ti_s is None:
+                raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
+            return cls(signals, PidSettings(p.kc, p.ti_s, p.td_s, **rest), p.mv_rate)
+        lin = _linearization(params, models, plant)
+        if p.tuning == "itae":
+            settings = tuning.itae_pid(LagWithDeadTime.of(lin), signals.period_s, p.sampling)
+        elif p.tuning == "simc":
+            settings = tuning.simc_pid(AllPole.of(lin), signals.period_s, p.lambda_s)
+        elif p.tuning == "imc" and p.lambda_s is not None:
+            settings = tuning.imc_pid(AllPole.of(lin), p.lambda_s)
+        elif p.tuning == "imc":
+            settings = tuning.robust_imc(lin, signals.period_s)
+        elif p.tuning == "optimized":
+            loops = DevelopmentLoops.draw(plant, p.development_seeds, p.development_set_points, p.development_hold)
+            free = p.set_point_weight is None
+
+            def cost(rows: Sequence[PidSettings]) -> Array:
+                law = cls(signals, rows, p.mv_rate)
+                return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
+
+            base = PidSettings(0.0, 1.0, **rest)
+            settings = tuning.optimized_imc(AllPole.near(lin), signals.period_s, cost, base, optimize_weight=free)
+            return cls(signals, settings, p.mv_rate)
+        else:
+            raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
+        return cls(signals, replace(settings, **rest), p.mv_rate)
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        y = pv[..., :1]
+        p = self.weight * sp - y
+        fresh = torch.cat([p, y, torch.zeros_like(p), mv_applied, mv_applied], dim=-1)
+        past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
+        p1, y1, d1, asked, given = (past[..., i : i + 1] for i in range(5))
+        # Where the actuator is not at the limited request, someone else moved it: nothing was unmet.
+        unmet = torch.where((mv_applied - given).abs() <= self.near, asked - given, torch.zeros_like(asked))
+        d = self.keep * d1 + self.derivative * (y - y1)
+        move = p - p1 + self.integral * (sp - y) - (d - d1)
+        requested = mv_applied + self.fade * unmet + self.kc * move
+        mv = self.limited(requested, mv_applied)
+        return mv, torch.cat([torch.ones_like(p), p, y, d, requested, mv], dim=-1), requested
+
+    def analysis(self, plant: Plant) -> Analysis:
+        """Stability and gain margin of the linear closed loops over ``examined_cv``; nothing where that is None."""
+        if self.examined_cv is None:
+            return Analysis()
+        loops = FrozenLoops.of(plant, self, self.n_state, np.linspace(*self.examined_cv, EXAMINED))
+        radius = spectral_radius(loops.matrices())
+        figures = {"frozen_radius": float(radius.max()), "gain_margin": loops.gain_margin()}
+        return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius})
+
+
+def _linearization(params: Any, models: Mapping[str, Model], plant: Plant) -> Linearization:
+    """Of the part ``linearized`` where the model set has one, else of the plant at ``operating_cv``."""
+    if "linearized" in models:
+        part = models["linearized"]
+        if not isinstance(part, HoldsLinearization):
+            raise LawError(f"law 'pid' needs a part 'linearized' that is a linearization; got one of kind {part.kind}")
+        return part.linearization()
+    sp = plant.sp_signals[0]
+    cv = 0.5 * (sp.low + sp.high) if params.operating_cv is None else params.operating_cv
+    return plant.linearize(*plant.steady_state_at(cv))

@@ -1,0 +1,1 @@
+"""Laws that go on learning a linear model in the loop."""

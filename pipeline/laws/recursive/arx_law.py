@@ -1,0 +1,42 @@
+"""What the laws share that go on learning an ARX model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pipeline.errors import LawError, ModelError
+from pipeline.laws.base import LawSignals, require_kind
+from pipeline.models.base import Model
+from pipeline.models.lagged.arx import ARX
+from pipeline.models.lagged.recursive import RecursiveLeastSquares
+from pipeline.models.lagged.recursive_arx import RecursiveArx
+
+
+def require_arx(models: Mapping[str, Model], law: str) -> ARX:
+    """Part ``arx`` of a model set; raises LawError that says what the law needs and what the set has."""
+    model = require_kind(models, ARX, law)
+    if model.n_mv != 1 or model.delay != 1:
+        raise LawError(
+            f"law {law!r} needs a part 'arx' (kind arx, one MV, delay 1); "
+            f"the model set's has {model.n_mv} MVs and delay {model.delay}"
+        )
+    return model
+
+
+def estimator(
+    law: str,
+    signals: LawSignals,
+    model: ARX,
+    unit: float,
+    *,
+    forgetting: float,
+    covariance: float,
+    prefilter: Sequence[float] = (),
+    n_y: int | None = None,
+) -> RecursiveArx:
+    """The model as a law learns it on, with ``unit`` [mv] from ``signed_unit``; raises LawError for wrong numbers."""
+    try:
+        rls = RecursiveLeastSquares(forgetting, covariance)
+    except ModelError as error:
+        raise LawError(f"law {law!r}: {error}") from error
+    return RecursiveArx(model, signals.sp[0], signals.mv[0], unit, rls, prefilter, n_y)

@@ -1,0 +1,162 @@
+"""Self-tuning PID after Cameron and Seborg: generalized minimum variance of an estimated predictor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self
+
+import torch
+from torch import Tensor
+
+from pipeline.laws.adaptive import signed_unit
+from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.gain_update import PidForm
+from pipeline.laws.recursive.arx_law import estimator, require_arx
+from pipeline.models.base import Model
+from pipeline.models.lagged.arx import ARX
+from pipeline.models.memory import Memory, Slot, Stage, constant
+from pipeline.plants.base import Plant
+
+TERMS = 3  # of F: more would be no PID
+
+
+class SelfTuningPid(ControlLaw):
+    """Implicit self-tuning control of generalized minimum variance, with the structure of a PID.
+
+        P(z) y(t+1) = F(z) y(t) + G(z) u(t) + c,   P = 1 + p_1/z + p_2/z^2 + ..,   F = f_0 + f_1/z + f_2/z^2
+
+    is the predictor of the prefiltered output, whose F and G recursive least squares estimates
+    straight from the data. Minimum variance of P y(t+1) + Q u(t) - F(1) r(t), with the weight
+    Q = (1 - 1/z)/nu - G, in which the predictor's G drops out, and with c left to the integral, is
+
+        u(t) - u(t-1) = nu (F(1) r - F y)
+                      = Ki (r - y) - kc (y - y1) - Kd (y - 2 y1 + y2)
+        Ki = nu (f_0 + f_1 + f_2),   kc = -nu (f_1 + 2 f_2),   Kd = nu f_2
+
+    a PID whose set point acts through the integral alone. F = z (P - A) for a plant A y = B u: the
+    estimate moves the gains with the plant's dynamics, but not with its gain, which the integral
+    action constant nu has to suit. Gains are held within bounds, and kept as they are where the
+    estimated slope over the MV does not tell the way. The move is added to the applied MV.
+
+    Source: Cameron and Seborg, A self-tuning controller with a PID structure, Int. J. Control 38
+    (1983), 401; named as STPID in seed 002_4e35f3d541bda8ae.txt, section 5.1, without its equations.
+    """
+
+    name: ClassVar[str] = "self_tuning_pid"
+    title: ClassVar[str] = "Self-tuning PID"
+    incremental: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True)
+    class Params:
+        """Numbers of the law; MVs count in units of half the MV's range, PVs in their own.
+
+        The defaults suit the pH tank sampled every minute, by search on its development sequences.
+
+        Parameters
+        ----------
+        prefilter
+            p_1, p_2, p_3 of P; fewer are followed by zeros.
+        integral
+            Integral action constant nu > 0 [1/pv].
+        forgetting
+            Forgetting factor of the estimator in (0, 1].
+        covariance
+            Its first and largest covariance, of parameters and signals scaled to the order of one.
+        gain_high
+            Upper bounds of kc, Ki = kc dt/tau_i and Kd = kc tau_d/dt [1/pv]; the lower are 0.
+        plant_gain
+            Sign of dPV/dMV; ``auto`` takes that of part ``arx``.
+        slope_min
+            The estimate is acted on where its slope, in that sign, is above this [pv].
+        mv_rate
+            Largest change of the MV a sample [mv]; None is unlimited.
+        """
+
+        prefilter: tuple[float, ...] = (0.5, -0.3, 0.12)
+        integral: float = 0.68
+        forgetting: float = 0.96
+        covariance: float = 0.44
+        gain_high: tuple[float, float, float] = (10.0, 10.0, 10.0)
+        plant_gain: Literal["auto", "positive", "negative"] = "auto"
+        slope_min: float = 1e-3
+        mv_rate: float | None = None
+
+        def __post_init__(self) -> None:
+            if len(self.prefilter) > TERMS:
+                raise ValueError(f"prefilter has {len(self.prefilter)} coefficients; a PID has room for {TERMS}")
+            if not self.integral > 0:
+                raise ValueError(f"integral is {self.integral}; it must be above 0")
+            if not self.slope_min >= 0:
+                raise ValueError(f"slope_min is {self.slope_min}; it must be 0 or above")
+            if not min(self.gain_high) > 0:
+                raise ValueError(f"gain_high is {list(self.gain_high)}; each must be above 0")
+
+    unit: Tensor  # (1,) [mv]
+    to_gains: Tensor  # (n, 3): theta -> kc, Ki, Kd
+    slope_min: Tensor  # (1,)
+    hi: Tensor  # (3,)
+    by_unit: Tensor  # (1,) 1/unit
+
+    def __init__(self, signals: LawSignals, model: ARX, params: Params) -> None:
+        super().__init__(signals, params.mv_rate)
+        require_single_loop(signals, self.name)
+        unit = signed_unit(signals, params.plant_gain, float(model.weight[model.n_y]))
+        self.model = estimator(
+            self.name,
+            signals,
+            model,
+            unit,
+            forgetting=params.forgetting,
+            covariance=params.covariance,
+            prefilter=params.prefilter,
+            n_y=max(TERMS, model.n_y),
+        )
+        n, nu = self.model.size, params.integral
+        self.form = PidForm(signals.period_s, unit, params.gain_high)
+        of_f = [[0.0, nu, 0.0], [-nu, nu, 0.0], [-2 * nu, nu, nu]]
+        numbers = {
+            "unit": [unit],
+            "to_gains": of_f + [[0.0] * 3] * (n - TERMS),
+            "slope_min": [params.slope_min],
+            "hi": params.gain_high,
+            "by_unit": [1 / unit],
+        }
+        for name, values in numbers.items():
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
+        start = self._limited_gains(self.model.first)
+        self.memory = Memory({**self.model.slots, "gains": Slot(3, constant(start))})
+        self.stage = Stage(
+            self.memory.layout,
+            lambda p: {
+                "known": self.memory.then(p),
+                **self.model.terms(p),
+                "rho": torch.cat([p["y1"] - p["y"], p["r"] - p["y"], 2 * p["y1"] - p["y"] - p["ys"][..., :1]], dim=-1),
+                "gains": p["gains"],
+                "mv": p["u"],
+            },
+        )
+        self.n_state = self.memory.n_state
+        self.info = ("kc", "tau_i_s", "tau_d_s", "b1", "updated")
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The law with part ``arx`` as its first estimate; raises LawError."""
+        return cls(signals, require_arx(models, cls.name), params)
+
+    def _limited_gains(self, theta: Tensor) -> Tensor:
+        return torch.minimum(torch.relu(theta @ self.to_gains), self.hi)
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
+        estimate = self.model(now)
+        slope = estimate.slope
+        told = slope > self.slope_min
+        z = torch.where(told, self._limited_gains(estimate.theta), now["gains"])
+        move = (now["rho"] * z).sum(dim=-1, keepdim=True)
+        mv = self.limited(now["mv"] + move * self.unit, now["mv"])
+        info = torch.cat([self.form(z), slope * self.by_unit, told.to(z.dtype)], dim=-1)
+        return mv, self.memory.stored(now["known"], {**estimate.kept, "gains": z}), info

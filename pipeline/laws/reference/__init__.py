@@ -1,0 +1,1 @@
+"""Laws that follow a reference model."""

@@ -1,0 +1,93 @@
+"""PI control towards a reference model's output: what a network that follows one is to be compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, Self
+
+from torch import Tensor
+
+from pipeline.errors import LawError
+from pipeline.laws.base import Analysis, LawSignals, require_kind, require_single_loop
+from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
+from pipeline.laws.reference.reference_loops import Training
+from pipeline.laws.reference.reference_networks import TrainablePi
+from pipeline.laws.reference.reference_training import Trained, gain_sign, story, train
+from pipeline.laws.reference_model import ReferenceModel
+from pipeline.models.base import Model
+from pipeline.models.memory import Named
+from pipeline.models.state_space.state_space import StateSpace
+from pipeline.plants.base import Plant
+
+
+class PiReference(ReferenceLaw):
+    """u = u_applied + Kc [e - e(k-1) + (h/Ti) e], e = y_m - y, limited: a PI controller whose set point is y_m.
+
+    The reference model alone shapes the response here; its two numbers are trained on the same loops, and
+    with the same noise and loads, as the networks that it stands beside.
+    """
+
+    name: ClassVar[str] = "pi_reference"
+    title: ClassVar[str] = "PI on the reference model"
+    incremental: ClassVar[bool] = True
+
+    @dataclass(frozen=True, slots=True)
+    class Params(ReferenceParams):
+        """The reference model; ``tuning`` trained as ``training`` says, or manual with ``kc`` [mv/pv] and ``ti_s``."""
+
+        tuning: Literal["trained", "manual"] = "trained"
+        kc: float | None = None
+        ti_s: float | None = None
+        training: Training = field(default_factory=Training)
+
+    def __init__(
+        self,
+        signals: LawSignals,
+        model: ReferenceModel,
+        kc: float,
+        ti_s: float,
+        trained: Trained | None = None,
+        mv_rate: float | None = None,
+    ) -> None:
+        super().__init__(signals, model, mv_rate)
+        if not ti_s > 0:
+            raise LawError(f"law {self.name!r} has ti_s = {ti_s} s; it must be above 0")
+        self.kc, self.ti_s, self.trained = kc, ti_s, trained
+        share = signals.period_s / ti_s
+
+        def formulas(p: Named) -> Named:
+            e = p["course"][..., :1] - p["y"]
+            return {"asked_for": p["u"] + kc * (e - p["before"] + share * e)}
+
+        self.stage = self.prepared(formulas)
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+        """The law with the numbers of ``params``, or trained through part ``state_space``; raises LawError."""
+        require_single_loop(signals, cls.name)
+        reference = params.model(cls.name)
+        if params.tuning == "manual":
+            if params.kc is None or params.ti_s is None:
+                raise LawError(f"law {cls.name!r} with tuning `manual` needs kc and ti_s; give both or take trained")
+            return cls(signals, reference, params.kc, params.ti_s, mv_rate=params.mv_rate)
+        network = require_kind(models, StateSpace, cls.name)
+        policy = TrainablePi(signals, params.order, gain_sign(network, signals))
+        trained = train(policy, network, reference, params.training)
+        return cls(signals, reference, *policy.settings(trained.theta), trained, params.mv_rate)
+
+    def forward(
+        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+        x = self.recalled(sp, pv, mv_applied, state)
+        done = self.stage(x)
+        return self.stepped(x, done, self.limited(done["asked_for"], mv_applied))
+
+    def analysis(self, plant: Plant) -> Analysis:
+        """The two numbers, and how their training went."""
+        own = {"kc": self.kc, "ti_s": self.ti_s}
+        if self.trained is None:
+            return Analysis(own)
+        told = story(self.trained, self.signals)
+        return Analysis({**told.figures, **own}, told.arrays, told.notes)

@@ -1,0 +1,193 @@
+"""Training of a controller through time: the loop over the plant's network shall follow the reference model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.errors import LawError
+from pipeline.laws.base import Analysis, LawSignals
+from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
+from pipeline.laws.reference.reference_networks import Trainable
+from pipeline.laws.reference_model import ReferenceModel
+from pipeline.models.state_space.state_space import StateSpace
+from pipeline.models.training.jacobian import input_jacobian
+
+Array = NDArray[np.float64]
+
+DAMPINGS = 8  # tries an iteration
+
+
+class Sums(NamedTuple):
+    """Mean squared residual of the loops, and J'J (P, P) and J'r (P,) for a step of Gauss and Newton."""
+
+    cost: float
+    tracking: float  # mean square of y_m - y alone [pv^2]
+    square: Array
+    slope: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trained:
+    """Weights that were best on the validation loops, and the RMS distance from the reference model on the way [pv].
+
+    ``history`` (iterations + 1, 2): training and validation, of the best restart; ``best`` is its row.
+    """
+
+    theta: Array
+    history: Array
+    best: int
+
+
+def follow(
+    policy: Trainable,
+    theta: Array,
+    plant: PlantNetwork,
+    model: ReferenceModel,
+    loops: Loops,
+    move_weight: float,
+    derivatives: bool = True,
+) -> Sums:
+    r"""Run the loops with forward sensitivities, dx/dtheta beside x.
+
+        X(k+1) = f_x X(k) + f_u U(k),   U(k) = du/dtheta + u_y C X(k) + u_u U(k-1) + u_e E(k-1),   E = -C X
+
+    with X = dx/dtheta, U = du/dtheta in all, E = de/dtheta, all zero at the start. Where the MV is at an end
+    of its range, U is zero. The residuals are y_m - y, of the true y, and the weighted moves. Without
+    ``derivatives`` the sums of the result stay zero.
+    """
+    signals = policy.signals
+    mv, cv = signals.mv[0], signals.sp[0]
+    weight = move_weight * (cv.high - cv.low) / (mv.high - mv.low)
+    phi, gamma, _ = model.sampled(signals.period_s)
+    n, lanes = loops.sp.shape
+    x, u, before = loops.x0.copy(), loops.u0.copy(), np.zeros(lanes)
+    course = np.zeros((lanes, model.order))
+    course[:, 0] = x[:, 0]
+    sx, su = np.zeros((lanes, plant.n_x, policy.size)), np.zeros((lanes, policy.size))
+    se = np.zeros_like(su)
+    square, slope = np.zeros((policy.size, policy.size)), np.zeros(policy.size)
+    tracking = moves = 0.0
+    for k in range(n):
+        distance = course[:, 0] - x[:, 0]
+        tracking += float(distance @ distance)
+        y = x[:, 0] + loops.noise[k]
+        seen = np.column_stack([loops.sp[k], y, u[:, 0], before, course])
+        action = policy.act(theta, seen)
+        before = course[:, 0] - y
+        given = np.clip(action.mv, mv.low, mv.high)[:, None]
+        change = weight * (given - u)[:, 0]
+        moves += float(change @ change)
+        u = given
+        x, jac = plant.step(x, u)
+        x += loops.load[k]
+        if derivatives:
+            cv_slope = sx[:, 0]
+            square += cv_slope.T @ cv_slope
+            slope += distance @ cv_slope
+            free = (action.mv > mv.low) & (action.mv < mv.high)
+            after = action.by_theta + action.by_cv[:, None] * cv_slope
+            after += action.by_mv[:, None] * su
+            after += action.by_before[:, None] * se
+            after *= free[:, None]
+            moved = weight * (after - su)
+            square += moved.T @ moved
+            slope -= change @ moved
+            su, se = after, -cv_slope
+            sx = np.matmul(jac[:, : plant.n_x].transpose(0, 2, 1), sx)
+            sx += jac[:, plant.n_x][:, :, None] * su[:, None, :]
+        course = course @ phi.T + loops.sp[k][:, None] * gamma[:, 0]
+    count = n * lanes
+    return Sums((tracking + moves) / count, tracking / count, square, slope)
+
+
+def train(policy: Trainable, model: StateSpace, reference: ReferenceModel, options: Training) -> Trained:
+    """Levenberg-Marquardt on the loops of ``options``, stopped early by its validation loops; the best restart.
+
+    Raises LawError where no restart gives a loop with finite states.
+    """
+    plant = PlantNetwork(model)
+    held = [Loops.drawn(plant, policy.signals, options, np.random.default_rng([options.seed, i])) for i in range(2)]
+    found = []
+    for restart in range(options.restarts):
+        start = policy.drawn(np.random.default_rng([options.seed, 2 + restart]))
+        with np.errstate(all="ignore"):
+            found.append(_descend(policy, start, plant, reference, held, options))
+    best = min(found, key=lambda t: t.history[t.best, 1])
+    if not np.isfinite(best.history[best.best, 1]):
+        raise LawError("the training found no loop with finite states; check the plant's network, or its range")
+    return best
+
+
+def _descend(
+    policy: Trainable,
+    theta: Array,
+    plant: PlantNetwork,
+    reference: ReferenceModel,
+    held: list[Loops],
+    options: Training,
+) -> Trained:
+    start, cv = theta, policy.signals.sp[0]
+    pull = (options.decay * (cv.high - cv.low)) ** 2
+
+    def sums(at: Array, which: int) -> Sums:
+        found = follow(policy, at, plant, reference, held[which], options.move_weight, derivatives=which == 0)
+        if which:
+            return found
+        # Weights stay near those of a slow controller where the loops do not ask for others.
+        count, moved = held[which].sp.size, at - start
+        return found._replace(
+            cost=found.cost + pull * float(moved @ moved),
+            square=found.square + count * pull * np.eye(policy.size),
+            slope=found.slope - count * pull * moved,
+        )
+
+    now, judged = sums(theta, 0), sums(theta, 1)
+    rows = [(now.tracking, judged.tracking)]
+    best, least, kept, damping = 0, _finite(judged.cost), theta, 1e-2
+    for i in range(1, options.iterations + 1):
+        for _ in range(DAMPINGS):
+            diagonal = np.diag(now.square)
+            step = np.linalg.solve(now.square + damping * np.diag(diagonal + 1e-9 * diagonal.mean()), now.slope)
+            tried = sums(theta + step, 0)
+            if tried.cost < now.cost:
+                break
+            damping *= 4
+        else:
+            break
+        theta, now, damping = theta + step, tried, max(damping / 3, 1e-9)
+        judged = sums(theta, 1)
+        rows.append((now.tracking, judged.tracking))
+        if _finite(judged.cost) < (1 - 1e-3) * least:
+            best, least, kept = i, judged.cost, theta
+        elif i - best >= options.patience:
+            break
+    return Trained(kept, np.sqrt(rows), best)
+
+
+def _finite(cost: float) -> float:
+    return cost if np.isfinite(cost) else np.inf
+
+
+def gain_sign(model: StateSpace, signals: LawSignals) -> float:
+    """Sign of dy(k+1)/du(k) in the middle of all ranges: +1 or -1."""
+    middle = torch.tensor([[(s.low + s.high) / 2 for s in (*signals.pv, *signals.mv)]], dtype=torch.float64)
+    slope = float(input_jacobian(model.net, middle)[0, 0, model.n_pv])
+    return 1.0 if slope > 0 else -1.0
+
+
+def story(trained: Trained, signals: LawSignals) -> Analysis:
+    """How a training went, for people and pictures."""
+    training, validation = trained.history[trained.best]
+    unit = signals.sp[0].unit
+    figures = {"training_rms": training, "validation_rms": validation, "iterations": float(len(trained.history) - 1)}
+    said = (
+        f"Trained through the plant's network in {len(trained.history) - 1} iterations, the best of them number "
+        f"{trained.best}: {training:.3g} {unit} RMS from the reference model on the training loops, {validation:.3g} "
+        "on the validation loops; both have noise and loads."
+    )
+    return Analysis(figures, {"history": trained.history, "best": np.array([float(trained.best)])}, (said,))

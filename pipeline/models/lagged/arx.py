@@ -1,0 +1,111 @@
+"""ARX: the linear predictor over past process variables and past manipulated variables, with a bias."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.config.params import choose
+from pipeline.errors import ModelError
+from pipeline.metrics import fit_percent, r2, rmse
+from pipeline.models.lagged.lagged import Array, LaggedModel
+from pipeline.models.part import Learnt, Part, Regions, predict
+from pipeline.models.training.regressors import nnarx_pairs
+from pipeline.plants.base import Plant
+from pipeline.records.record import Record
+
+
+class ARX(LaggedModel):
+    """y(t) = c - a_1 y(t-1) - .. - a_ny y(t-n_y) + b_1 u(t-d) + .. + b_nu u(t-d-n_u+1), for each MV u.
+
+    ``forward`` maps phi(t), as in LaggedModel, to y(t) = phi(t)' weight + bias in engineering units.
+
+    Source: seed 002_4e35f3d541bda8ae.txt, eqs. 10-13 (the form of its linearized and its recursive model).
+    """
+
+    kind: ClassVar[str] = "arx"
+    weight: Tensor  # (n_y + n_u n_mv,) [-a, b]
+    bias: Tensor  # (1,) c
+
+    def __init__(self, n_y: int, n_u: int, n_mv: int = 1, delay: int = 1) -> None:
+        super().__init__(n_y, n_u, n_mv, delay)
+        self.register_buffer("weight", torch.zeros(n_y + n_u * n_mv, dtype=torch.float64))
+        self.register_buffer("bias", torch.zeros(1, dtype=torch.float64))
+
+    def config(self) -> dict[str, Any]:
+        """JSON-ready arguments of the constructor."""
+        return {"n_y": self.n_y, "n_u": self.n_u, "n_mv": self.n_mv, "delay": self.delay}
+
+    @classmethod
+    def fit(cls, x: Array, y: Array, *, n_y: int, n_u: int, delay: int = 1) -> Self:
+        """Least squares over regressors x (N, n_y + n_u n_mv) and targets y (N, 1).
+
+        Raises ModelError where the lags do not explain the width, or the data leave a coefficient
+        undetermined: fewer rows than coefficients, or columns that depend on each other.
+        """
+        n_mv, rest = divmod(x.shape[1] - n_y, n_u)
+        if rest:
+            raise ModelError(f"{x.shape[1]} regressor columns are not n_y + n_u n_mv with n_y={n_y}, n_u={n_u}")
+        model = cls(n_y, n_u, n_mv, delay)
+        middle, scale = x.mean(axis=0), x.std(axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        # Standardized, so that the rank is judged alike for flows of hundreds and for pH.
+        design = np.column_stack([(x - middle) / scale, np.ones(len(x))])
+        solution, _, rank, _ = np.linalg.lstsq(design, y[:, 0], rcond=None)
+        if rank < design.shape[1]:
+            raise ModelError(
+                f"the data determine {rank} of {design.shape[1]} ARX coefficients (n_y={n_y}, n_u={n_u}); "
+                "ask for fewer lags or record richer moves"
+            )
+        weight = solution[:-1] / scale
+        model.weight.copy_(torch.from_numpy(weight))
+        model.bias.fill_(float(solution[-1] - middle @ weight))
+        return model.eval()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """y(t), shape (..., 1), for phi(t), shape (..., n_y + n_u n_mv)."""
+        # Product and sum: onnxruntime fuses a transposed constant before a vector wrongly.
+        return (x * self.weight).sum(-1, keepdim=True) + self.bias
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArxPart(Part):
+    """An ARX predictor of ``target`` (None: the controlled variable) by least squares.
+
+    ``n_y``, ``n_u``, ``delay`` the lags; ``steps`` the length of the free run whose error is reported.
+    """
+
+    model: ClassVar[type[LaggedModel]] = ARX
+    n_y: int = 2
+    n_u: int = 2
+    delay: int = 1
+    target: str | None = None
+    steps: int = 10
+    train_fraction: float = 0.7
+
+    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+        """Fit; the figures are of one step and of a free run, over the rows that did not train."""
+        if record is None:
+            raise ModelError("a part of kind 'arx' learns from a record; point `data:` of its set at one")
+        names = {s.name: i for i, s in enumerate(plant.pv_signals)}
+        target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
+        pairs = nnarx_pairs(record, self.n_y, self.n_u, target, self.delay)
+        train, validation = pairs.split(self.train_fraction, "time", seed)
+        model = ARX.fit(train.x, train.y, n_y=self.n_y, n_u=self.n_u, delay=self.delay)
+        predicted = predict(model, validation.x)
+        ahead, measured = model.k_step(record, self.steps, target)
+        late = slice(round(self.train_fraction * len(ahead)), None)
+        metrics = {
+            "rmse": rmse(validation.y, predicted),
+            "r2": r2(validation.y, predicted),
+            "fit_percent": fit_percent(validation.y, predicted),
+            "free_run_rmse": rmse(measured[late], ahead[late]),
+            "n_train": len(train),
+            "weight": model.weight.tolist(),
+            "bias": float(model.bias),
+        }
+        return Learnt(model, metrics)

@@ -1,0 +1,137 @@
+"""An NNARX seen from one operating point: its linear model there, and its course along the newest MV."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.errors import ModelError
+from pipeline.models.lagged.nnarx import NNARX
+from pipeline.models.static.mlp import scaled_layers
+from pipeline.models.training.jacobian import input_jacobian
+
+
+class Linearized(NamedTuple):
+    """NN(phi) and dNN/dphi at a point, shapes (..., 1) and (..., n_phi), in engineering units."""
+
+    value: Tensor
+    slopes: Tensor
+
+    def predict(self, step: Tensor) -> Tensor:
+        """The tangent plane (..., 1) at phi + step, step (..., n_phi)."""
+        return self.value + (self.slopes * step).sum(dim=-1, keepdim=True)
+
+
+class Arx(NamedTuple):
+    """y(t) = bias - sum_i a_i y(t-i) + sum_i b_i u(t-d-i+1): shapes (..., n_y), (..., n_u n_mv), (..., 1)."""
+
+    a: Tensor
+    b: Tensor
+    bias: Tensor
+
+
+@torch.no_grad()
+def linearize(model: NNARX, phi: Tensor) -> Linearized:
+    """Value and slopes of an NNARX at regressors phi (..., n_phi), for a batch at once.
+
+    Source: seed 002_4e35f3d541bda8ae.txt, eqs 10, 11, 13 and 14.
+    """
+    rows = phi.reshape(-1, phi.shape[-1])
+    return Linearized(model(phi), input_jacobian(model.net, rows)[:, 0].reshape(phi.shape))
+
+
+def arx(model: NNARX, phi: Tensor) -> Arx:
+    """The linear model at phi (..., n_phi) in the signs of an ARX, which goes through NN(phi).
+
+        a_i = -dNN/dy(t-i),   b_i = dNN/du(t-d-i+1),   bias = NN(phi) + sum_i a_i y(t-i) - sum_i b_i u(t-d-i+1)
+
+    Source: seed 002_4e35f3d541bda8ae.txt, eqs 9-12; eqs 13 and 14 there have both slopes positive.
+    """
+    value, slopes = linearize(model, phi)
+    bias = value - (slopes * phi).sum(dim=-1, keepdim=True)
+    return Arx(-slopes[..., : model.n_y], slopes[..., model.n_y :], bias)
+
+
+class AlongMv(nn.Module):
+    """An NNARX along its newest MV: the little of it that a law evaluates at every sample.
+
+        NN(phi) = base(phi) + g(m(phi)),   NN(phi + step e_u) = base(phi) + g(m(phi) + step d)
+
+    ``m`` is the first layer's preactivation, ``base`` the output's offset and residual column: both
+    are affine in phi, so that a law can fold them into its own arithmetic. g is the rest of the
+    network. The slope comes forward through the layers along d alone, a fraction of all slopes.
+
+    Parameters
+    ----------
+    model
+        An NNARX of one MV whose newest is u(t-1): delay 1.
+    unit
+        What one unit of ``step`` means [mv]; its sign too.
+
+    Raises
+    ------
+    ModelError
+        Several MVs, or a delay above 1: the newest MV would not act on y(t).
+    """
+
+    first: Tensor  # (n_phi, H)
+    first_bias: Tensor  # (H,)
+    direction: Tensor  # (H,) change of m per unit of step
+    out: Tensor  # (H_last, 1)
+    base_slope: Tensor  # (n_phi, 1)
+    base_offset: Tensor  # (1,)
+
+    @torch.no_grad()
+    def __init__(self, model: NNARX, unit: float = 1.0) -> None:
+        super().__init__()
+        if model.n_mv != 1 or model.delay != 1:
+            raise ModelError(
+                f"an NNARX of {model.n_mv} MVs and delay {model.delay} has no newest MV that acts on the next sample "
+                "alone; take one MV and delay 1 (more MV lags n_u stand for a dead time)"
+            )
+        layers = scaled_layers(model.net)
+        self.depth = len(layers) - 1
+        weight, bias = layers[0]
+        base = torch.zeros(len(weight), 1, dtype=torch.float64)
+        for column in model.net.residual:
+            base[column] = 1.0
+        self.register_buffer("first", weight)
+        self.register_buffer("first_bias", bias)
+        self.register_buffer("direction", unit * weight[model.n_y])
+        for i in range(1, self.depth):
+            self.register_buffer(f"weight{i}", layers[i][0])
+            self.register_buffer(f"bias{i}", layers[i][1])
+        self.register_buffer("out", layers[-1][0])
+        self.register_buffer("base_slope", base)
+        self.register_buffer("base_offset", layers[-1][1])
+
+    def preactivation(self, phi: Tensor) -> Tensor:
+        """The preactivation m, shape (..., H), at phi (..., n_phi)."""
+        return phi @ self.first + self.first_bias
+
+    def base(self, phi: Tensor) -> Tensor:
+        """Shape (..., 1), at phi (..., n_phi)."""
+        return phi @ self.base_slope + self.base_offset
+
+    def moved(self, m: Tensor, step: Tensor) -> Tensor:
+        """The preactivation after a step (..., 1) of the newest MV."""
+        return m + step * self.direction
+
+    def rest(self, m: Tensor) -> Tensor:
+        """The rest of the network g(m), shape (..., 1)."""
+        a = torch.tanh(m)
+        for i in range(1, self.depth):
+            a = torch.tanh(a @ getattr(self, f"weight{i}") + getattr(self, f"bias{i}"))
+        return a @ self.out
+
+    def rest_and_slope(self, m: Tensor) -> tuple[Tensor, Tensor]:
+        """The rest of the network g(m) and its derivative by the step, (..., 1) each."""
+        a = torch.tanh(m)
+        tangent = (1 - a * a) * self.direction
+        for i in range(1, self.depth):
+            weight = getattr(self, f"weight{i}")
+            a = torch.tanh(a @ weight + getattr(self, f"bias{i}"))
+            tangent = (1 - a * a) * (tangent @ weight)
+        return a @ self.out, tangent @ self.out

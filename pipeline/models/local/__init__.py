@@ -1,0 +1,1 @@
+"""Local linear models and the linearized plant."""

@@ -1,0 +1,1 @@
+"""What no controller can beat: collocation, horizon, NMPC and the stored bounds."""

@@ -1,0 +1,142 @@
+"""The stored bounds of a case: what ``pipeline.stages.bounds`` computed, as long as it still applies."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import json
+import textwrap
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import LawError
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.effort import Effort
+from pipeline.plants.base import Plant
+from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+
+SCHEMA = 1
+DEFAULTS: dict[str, Any] = {
+    "metric": "mae",
+    "recipe": False,
+    "unforeseen": False,
+    "limits": {},
+    "effort": json.loads(json.dumps(asdict(Effort()))),
+}
+"""What a file means that does not say."""
+
+
+def bounds_path(case: Case) -> Path:
+    """Where the figures of a case are stored: bounds.json beside its case.py, bounds_15s.json beside case_15s.py."""
+    module = Path(inspect.getfile(type(case)))
+    return module.with_name(module.stem.replace("case", "bounds", 1) + ".json")
+
+
+def kinds(case: Case) -> tuple[str, ...]:
+    """The figures to compute: nmpc, offline, and nmpc_noise where the measured states are worth stepping on.
+
+    Elsewhere the NMPC is given the state itself, which noise on the measurement does not reach: an
+    observer for it would be one more controller, and no bound. So it is where samples follow
+    one another quickly, and an NMPC without a filter is busy with the noise (``Effort.noisy``).
+    """
+    noisy = case.plant.measures_states and case.effort.noisy
+    return ("nmpc", "offline", "nmpc_noise") if noisy else ("nmpc", "offline")
+
+
+def problem(case: Case) -> dict[str, Any]:
+    """What the bounds of a whole case depend on, beside the scenarios: stored, and compared with what is stored."""
+    found = {key: getattr(case, key) for key in DEFAULTS} | {"limits": dict(case.limits), "effort": asdict(case.effort)}
+    as_read: dict[str, Any] = json.loads(json.dumps(found))
+    return {"plant": plant_digest(case.plant), **as_read}
+
+
+def bounded(case: Case, scenarios: Sequence[Scenario]) -> bool:
+    """Whether a test has bounds: not where it runs on a map from sample to sample, which no solver here plans over."""
+    plants = (type(s.plant or case.plant) for s in scenarios)
+    return all(plant.transition is Plant.transition for plant in plants)
+
+
+def plant_digest(plant: Plant) -> str:
+    """sha256 of the plant's equations, parameters and sampling; comments and layout do not count.
+
+    An output of its own mostly calls other functions, so it counts by its values over the states'
+    ranges, six digits of them; the rates too, whose constants may stand outside of ``derivative``.
+    A plant with a discrete MV counts with the values of its relaxation.
+    """
+    source = ast.parse(textwrap.dedent(inspect.getsource(type(plant).derivative)))
+    function = source.body[0]
+    if isinstance(function, ast.FunctionDef) and ast.get_docstring(function) is not None:
+        function.body = function.body[1:]
+    names = dict(zip(plant.parameter_names(), plant.parameters().tolist(), strict=True))
+    what = [ast.unparse(source), names, plant.period_s, plant.time_unit_s, plant.substeps]
+    if not plant.measures_states:
+        what.append(_probe(plant))
+    if any(s.values is not None for s in plant.mv_signals):
+        what.append(_probe(plant.relaxed()))
+    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+
+def _probe(plant: Plant) -> list[str]:
+    signals = (*plant.state_signals, *plant.mv_signals)
+    low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
+    found = []
+    for fractions in np.random.default_rng(0).uniform(0.1, 0.9, (7, len(signals))):
+        x, mv = np.split(low + fractions * (high - low), [len(plant.state_signals)])
+        values = (plant.measure(x), plant.rate(x, mv, plant.dv_nominal, plant.parameters()))
+        found += [f"{v:.6g}" for v in np.concatenate([np.array(v).ravel() for v in values])]
+    return found
+
+
+def read_stored(path: Path) -> dict[str, Any]:
+    """The file's content; empty where it is missing, damaged or of another schema."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return stored if isinstance(stored, dict) and stored.get("schema") == SCHEMA else {}
+
+
+def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dict[str, float]]]:
+    """The bounds by scenario: ``{"sp_a": {"nmpc": {"mae": ...}, "offline": {...}}, "sp_a_noise": {"nmpc": ...}}``.
+
+    Figures of several sequences are put ``together``. Where ``kinds`` has no ``nmpc_noise``,
+    the NMPC's figures with noise are those without. Tests without bounds
+    (``bounded``) are left out. Raises LawError where figures are missing or belong to another plant,
+    metric, effort or scenario than the case has now.
+    """
+    path = path or bounds_path(case)
+    stored = read_stored(path)
+    remedy = f"run `python -m pipeline.stages.bounds {case.name}` (some minutes on an idle core)"
+    if not stored:
+        raise LawError(f"{path} holds no bounds of case {case.name!r}; {remedy}")
+    current = problem(case)
+    if stored.get("plant") != current["plant"]:
+        raise LawError(f"the bounds in {path} belong to other equations or parameters of the plant; {remedy}")
+    for key, default in DEFAULTS.items():
+        if stored.get(key, default) != current[key]:
+            was = f"{key} {stored.get(key, default)!r}, and the case has {current[key]!r}"
+            raise LawError(f"the bounds in {path} were computed for the {was}; {remedy}")
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for name, scenarios in case.scenarios().items():
+        for kind in kinds(case) if bounded(case, scenarios) else ():
+            rows = [stored["figures"].get(name, {}).get(s.digest(), {}).get(kind) for s in scenarios]
+            missing = [s.seed for s, row in zip(scenarios, rows, strict=True) if row is None]
+            if missing:
+                which = f" (seeds {missing})" if missing[0] is not None else ""
+                raise LawError(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
+            key = name + NOISE_SUFFIX if kind == "nmpc_noise" else name
+            found.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows)
+        if name in found:
+            found.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(found[name]["nmpc"])})
+    return found
+
+
+def together(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Figures of several loops as one: means, the largest ``max_asse`` and ``step_ms_p99``, the sum of ``failures``."""
+    how: dict[str, Callable[[list[float]], float]] = {"max_asse": max, "step_ms_p99": max, "failures": sum}
+    return {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0]}

@@ -1,0 +1,132 @@
+"""Models drawn: predictions beside what was measured, and the candidates of a search."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+
+from pipeline.evaluation.case import Case, Figure
+from pipeline.evaluation.law_evidence import Array
+from pipeline.pictures.drawing import PALETTE, SIZE, axis_label, symbol, time_axis
+from pipeline.pictures.words import number
+
+PREDICTED = PALETTE[1]
+ONE_STEP = {
+    "nnarx": ("NNARX", "#0072b2"),
+    "linearized": ("linearized", "#e69f00"),
+    "recursive": ("recursive", "#cc79a7"),
+}
+RECURSIVE_SHADES = ("#cc79a7", "#009e73", "#d55e00")
+BEYOND = 0.5
+"""Of the measured range: how far beyond it a panel reaches; recursive models leave any."""
+
+
+def predictions_picture(case: Case, figure: Figure, models: Path) -> Canvas | None:
+    """The inverse model's MV beside the real one over some validation samples."""
+    arrays = next(
+        (a for p in sorted(models.glob("*/predictions.npz")) if {"actual", "predicted"} <= set(a := load(p))), None
+    )
+    if arrays is None:
+        return None
+    time_s, actual, predicted = (np.ravel(arrays[k]) for k in ("time_s", "actual", "predicted"))
+    canvas = Canvas(figsize=(SIZE[0], 4.2), layout="constrained")
+    axes = canvas.subplots(1, 2, gridspec_kw={"width_ratios": (2.4, 1)})
+    n = min(len(actual), 100)
+    # No line: a random split leaves samples that do not follow one another.
+    axes[0].plot(time_s[:n], actual[:n], "o", color="black", markersize=5, fillstyle="none", label="applied")
+    axes[0].plot(time_s[:n], predicted[:n], ".", color=PREDICTED, markersize=4, label="predicted")
+    axes[0].set_title(f"Figure {figure.number}. {figure.title}")
+    axes[0].set_xlabel("time [s]")
+    mv = case.plant_class.mv_signals[0]
+    axes[0].set_ylabel(axis_label(symbol(mv.name), mv.unit))
+    canvas.legend(loc="outside lower center", ncols=2)
+    axes[1].plot(actual, predicted, ".", color=PREDICTED, markersize=3)
+    ends = [float(min(actual.min(), predicted.min())), float(max(actual.max(), predicted.max()))]
+    axes[1].plot(ends, ends, color="black", linewidth=0.8)
+    axes[1].set_xlabel(axis_label("applied", mv.unit))
+    axes[1].set_ylabel(axis_label("predicted", mv.unit))
+    axes[1].set_aspect("equal", adjustable="box")
+    return canvas
+
+
+def load(path: Path) -> dict[str, Array]:
+    """The arrays of a predictions.npz."""
+    with np.load(path, allow_pickle=False) as file:
+        return {key: np.asarray(file[key], float) for key in file.files}
+
+
+def one_step_picture(figure: Figure, models: Path) -> Canvas | None:
+    """One-step predictions beside the measurement: network and linearization above, recursive models below."""
+    path = models / (figure.model or "") / "predictions.npz"
+    arrays = load(path) if path.exists() else {}
+    names = [key for key in arrays if key not in {"time_s", "measured"}]
+    if "measured" not in arrays or not names:
+        return None
+    recursive = [key for key in names if key.startswith("recursive")]
+    groups = [group for group in ([n for n in names if n not in recursive], recursive) if group]
+    canvas = Canvas(figsize=(SIZE[0], 1.2 + 2.2 * len(groups)), layout="constrained")
+    panels = list(np.atleast_1d(canvas.subplots(len(groups), 1, sharex=True)))
+    time, words = time_axis(np.ravel(arrays["time_s"]))
+    for axes, group in zip(panels, groups, strict=True):
+        _one_step_panel(axes, time, arrays, group)
+    panels[0].set_title(f"Figure {figure.number}. {figure.title}")
+    panels[-1].set_xlabel(words)
+    return canvas
+
+
+def _one_step_panel(axes: Axes, time: Array, arrays: Mapping[str, Array], group: list[str]) -> None:
+    measured = np.ravel(arrays["measured"])
+    axes.plot(time, measured, "o", color="black", markersize=3.5, fillstyle="none", label="measured", zorder=2)
+    for i, key in enumerate(group):
+        predicted = np.ravel(arrays[key])
+        kind, _, factor = key.partition("_")
+        label, colour = ONE_STEP.get(kind, (key.replace("_", " "), PALETTE[i]))
+        if kind == "recursive":
+            label, colour = f"{label}, f = {factor}", RECURSIVE_SHADES[i % len(RECURSIVE_SHADES)]
+        sse = number(float(np.sum((measured - predicted) ** 2)))
+        axes.plot(time, predicted, color=colour, linewidth=1.3, label=f"{label}, SSE {sse}", zorder=3)
+    room = BEYOND * float(np.ptp(measured))
+    axes.set_ylim(float(measured.min()) - room, float(measured.max()) + room)
+    axes.set_ylabel("$y$")
+    axes.margins(x=0.01)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.0), ncols=4)
+
+
+def candidates_picture(table: Mapping[str, Any]) -> Canvas:
+    """One-step and free-run error of each candidate of a search, and which was chosen."""
+    rows = sorted(table["rows"], key=lambda row: (row["parameters"], row["free_run_rmse"]))
+    at = np.arange(len(rows))
+    canvas = Canvas(figsize=(SIZE[0], 3.8), layout="constrained")
+    axes = canvas.subplots()
+    for key, words, mark, colour in (
+        ("free_run_rmse", "free run", "o", "#0072b2"),
+        ("rmse", "one step", "s", "#e69f00"),
+    ):
+        axes.plot(at, [row[key] for row in rows], mark, color=colour, markersize=5, label=words)
+    for i, row in enumerate(rows):
+        if row["chosen"]:
+            axes.plot(
+                i, row["free_run_rmse"], "o", color="#d55e00", fillstyle="none", markersize=12, markeredgewidth=1.6
+            )
+            axes.annotate(
+                f"chosen by {row['chosen']} of {table['seeds']}",
+                (i, row["free_run_rmse"]),
+                xytext=(0, 10),
+                textcoords="offset points",
+                ha="center",
+                fontsize="small",
+                color="#d55e00",
+            )
+    axes.set_yscale("log")
+    axes.set_ylabel("validation RMSE")
+    axes.set_xlabel("past outputs, past inputs | hidden units, by number of parameters")
+    axes.set_xticks(at, [f"{row['lags']} | {row['hidden']}" for row in rows], rotation=35, ha="right", fontsize="small")
+    axes.margins(x=0.06, y=0.18)
+    axes.set_title(f"Candidates of {table['model']}, {table['part']}")
+    axes.legend(loc="best")
+    return canvas

@@ -1,0 +1,45 @@
+"""The picture of a partition sweep."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from pipeline.models.static.sweep import SweepResult
+
+
+def draw(result: SweepResult, path: Path) -> None:
+    """RMSE overall and per region above, the number of centres below, the chosen partitions marked."""
+    c = [row.partitions for row in result.rows]
+    best = result.best
+    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    error, size = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    error.plot(c, [row.validation.rmse for row in result.rows], color="black", lw=2, label="validation")
+    error.plot(c, [row.train.rmse for row in result.rows], color="0.6", lw=2, label="training")
+    names = dict.fromkeys(name for row in result.rows for name in row.validation.regions)
+    for i, name in enumerate(names):
+        values = [row.validation.regions.get(name, float("nan")) for row in result.rows]
+        error.plot(c, values, color=f"C{i}", lw=1, label=f"validation, {name}")
+    error.plot([best.partitions], [best.validation.rmse], "o", color="C3", ms=7)
+    error.set_title(
+        f"best: c = {best.partitions}, {best.centres} centres, RMSE {best.validation.rmse:.3g} {result.unit}"
+    )
+    error.set_yscale("log")
+    error.set_ylabel("RMSE" + (f" [{result.unit}]" if result.unit else ""))
+    error.legend(frameon=False, ncols=2)
+    size.plot(c, [row.centres for row in result.rows], color="black")
+    size.set_ylabel("centres")
+    size.set_xlabel("partitions c of each input")
+    for axes in (error, size):
+        axes.axvline(best.partitions, color="C3", lw=0.8, ls=":")
+        axes.grid(alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".draft")
+    figure.savefig(draft, dpi=120, format=path.suffix.lstrip(".") or "png")
+    os.replace(draft, path)

@@ -1,0 +1,88 @@
+"""How metrics, laws and tests are called in front of a person."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.pictures.numbers import number, ratio
+from pipeline.simulation.scenario import NOISE_SUFFIX
+
+__all__ = [
+    "LONG",
+    "NO_UNIT",
+    "SHORT",
+    "law_label",
+    "law_name",
+    "metric_name",
+    "number",
+    "ratio",
+    "scenario_name",
+    "setting_text",
+]
+
+SHORT = {
+    "mae": "MAE",
+    "sse": "SSE",
+    "sse_late": "late SSE",
+    "ise": "ISE",
+    "masse": "MASSE",
+    "max_asse": "MaxASSE",
+    "overshoot": "overshoot",
+    "settling": "settling time",
+    "mv_travel": "MV travel",
+    "tracking": "tracking RMS",
+}
+"""A metric as it stands in a table."""
+LONG = {
+    "mae": "mean absolute error",
+    "sse": "sum of squared errors",
+    "tracking": "RMS distance from the reference model",
+}
+"""A case's metric in words."""
+WORDS = frozenset({"two"})
+"""Short words in the names of laws that are no abbreviations."""
+NO_UNIT = frozenset({"", "-", "1"})
+"""How a signal says that it is a plain number."""
+
+
+def metric_name(metric: str, own: Mapping[str, str] | None = None) -> str:
+    """A metric's short name; of a path into a model set's figures, ``one_step.nnarx``, the words before the dot.
+
+    ``own`` are the words of the case, ``Case.metric_words``.
+    """
+    first = metric.partition(".")[0]
+    words = {**SHORT, **(own or {})}
+    return words.get(metric) or words.get(first) or first.replace("_", " ")
+
+
+def law_name(law: str) -> str:
+    """``linearized_pid`` as linearized PID, ``inc`` as INC: a law's abbreviations are upper-case."""
+    parts = law.split("_")
+    return " ".join(p.upper() if (len(p) <= 3 or len(parts) == 1) and p not in WORDS else p for p in parts)
+
+
+def law_label(law: str, setting: Mapping[str, Any]) -> str:
+    """A law with its setting: INCAD (r=2.5)."""
+    return law_name(law) + (f" ({setting_text(setting)})" if setting else "")
+
+
+def setting_text(setting: Mapping[str, Any]) -> str:
+    """``r=2.5, correction=back_calculation``: how params.yaml names a variant."""
+    return ", ".join(
+        key if value is True else f"{key}={value:g}" if isinstance(value, int | float) else f"{key}={value}"
+        for key, value in setting.items()
+    )
+
+
+def scenario_name(scenario: str, recipe: bool) -> str:
+    """A test inside a sentence: held-out set points, SP-A, set point, trajectory with noise."""
+    bare = scenario.removesuffix(NOISE_SUFFIX)
+    if bare == "held_out":
+        words = "held-out recipes" if recipe else "held-out set points"
+    elif re.fullmatch(r"[a-z]{1,3}_[a-z0-9]", bare):
+        words = bare.upper().replace("_", "-")
+    else:
+        words = bare.replace("_", " ")
+    return words + (" with noise" if scenario != bare else "")

@@ -1,0 +1,137 @@
+"""The table that `make run` ends with: every case and every controller, and where to look."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.errors import PipelineError
+from pipeline.evaluation.standing import LawStanding, Standing, tally
+
+Validation = Mapping[str, Any]
+WIDTH = 120
+
+
+def show_results(artifacts: Path, console: Console | None = None, case: str | None = None) -> None:
+    """Print one table over all artifacts/<case>/validation.json, or that of one case with all of its tests.
+
+    Raises PipelineError where there is none.
+    """
+    console = console or Console()
+    if not console.is_terminal:
+        # A log has no width of its own; the table is not worth cutting for one.
+        console = Console(file=console.file, width=WIDTH)
+    folders = sorted(path.parent for path in artifacts.glob("*/validation.json"))
+    if not folders:
+        raise PipelineError(f"{artifacts} holds no validation.json yet; run the pipeline first: make run")
+    standings = {folder.name: Standing.read(folder) for folder in folders}
+    if case is not None and case not in standings:
+        raise PipelineError(f"{artifacts} holds no case {case!r}; it has {', '.join(standings)}")
+    console.print(overview(standings.values()) if case is None else _tests(standings[case]))
+    where = artifacts / (case or "<case>")
+    if case is None:
+        if any(standing.hidden for standing in standings.values()):
+            console.print("n          the bound is less than noise would hide: the ratio is to that, and at least 1")
+        console.print("*          the best of its case, chosen on sequences that are never scored")
+        console.print(f"overview   {artifacts / 'report.html'} (and .md)")
+        console.print(f"a case     {where / 'report.html'}; its tests here: python -m pipeline results CASE")
+    else:
+        console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
+    console.print(f"try one    python -m pipeline simulate {where / '<law>.onnx'}")
+    console.print(f"read one   python -m serving inspect {where / '<law>.onnx'}")
+    console.print("registry   make registry, then /#/models in the browser")
+
+
+def overview(standings: Iterable[Standing]) -> Table:
+    """One row a law: figure on the test that weighs most, bound, ratio, time of a step, size of the file."""
+    table = Table(box=box.SIMPLE, title_justify="left", pad_edge=False)
+    table.title = "Each case's main test, median over data seeds; the bound is the perfect-model NMPC"
+    for name, right in (
+        ("case", False), ("law (* the best)", False), ("figure", True), ("bound", True), ("ratio", True),
+        ("step", True), ("size", True),
+    ):  # fmt: skip
+        table.add_column(name, justify="right" if right else "left", no_wrap=True)
+    for standing in standings:
+        for about, law in zip_longest(_about(standing), standing.laws, fillvalue=None):
+            table.add_row(about or "", *(_row(standing, law) if law is not None else ()))
+        table.add_section()
+    return table
+
+
+def _about(standing: Standing) -> list[str]:
+    """What stands in a case's first column, a line a row."""
+    lines = [f"[bold]{standing.case}[/bold]", f"{standing.metric}, {standing.test}"]
+    for words, (good, known) in (
+        ("requirements", tally(standing.requirements)),
+        ("claims reproduce", tally(standing.claims)),
+        ("figures reproduce", standing.reproduced),
+    ):
+        if known:
+            lines.append(f"{good} of {known} {words}")
+    return lines
+
+
+def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
+    return (
+        f"[bold]{law.law} *[/bold]" if law.best else law.law,
+        _figure(law.figure),
+        _figure(standing.bound),
+        _multiple(standing, law),
+        "-" if law.step_us is None else f"{law.step_us:.0f} us",
+        _size(law),
+    )
+
+
+def _tests(standing: Standing) -> Table:
+    """A case's laws in all of its tests, a row a test: there are more tests than laws, and their names are short."""
+    validation: Validation = json.loads((standing.folder / "validation.json").read_text(encoding="utf-8"))
+    scenarios, bounds = validation["scenarios"], validation.get("bounds", {})
+    metric, main = validation.get("metric", "mae"), standing.test
+    weights = (validation.get("gate") or {}).get("weights") or {}
+    names = [name for name in scenarios if not name.endswith("_noise") or name in weights]
+    table = Table(title_justify="left", box=box.SIMPLE)
+    table.title = f"{standing.case}: {standing.metric_long}, median over data seeds"
+    table.add_column("test", no_wrap=True)
+    for name in ("perfect_NMPC", *(law.law for law in standing.laws)):
+        # A name breaks at its underscores: six of them side by side leave no line room.
+        table.add_column(name.replace("_", "_\n"), justify="right", no_wrap=True)
+
+    def ours(name: str, law: str) -> float | None:
+        return (scenarios.get(name, {}).get(law) or {}).get(metric)
+
+    for name in names:
+        nmpc = bounds.get(name, {}).get("nmpc", {}).get(metric)
+        table.add_row(name, _figure(nmpc), *(_figure(ours(name, law.law)) for law in standing.laws))
+    table.add_section()
+    table.add_row(f"{main} / NMPC", "", *(_multiple(standing, law) for law in standing.laws))
+    table.add_row("size", "", *map(_size, standing.laws))
+    return table
+
+
+def _size(law: LawStanding) -> str:
+    return "-" if law.bytes is None else f"{law.bytes / 1024:.0f} kB"
+
+
+def _multiple(standing: Standing, law: LawStanding) -> str:
+    """Two decimals, and more where a law comes within a hundredth of the bound; n: of noise, which hides the bound."""
+    if law.ratio is None:
+        return "-"
+    if standing.hidden:
+        return f"{law.ratio:.2f}n"
+    return f"{law.ratio:.3f}" if abs(law.ratio - 1) < 0.01 else f"{law.ratio:.2f}"
+
+
+def _figure(value: float | None) -> str:
+    """Four digits behind the point, three digits of a smaller figure, thousands grouped in a large one."""
+    if value is None:
+        return "-"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.4f}" if abs(value) >= 0.01 else f"{value:.3g}"

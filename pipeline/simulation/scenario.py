@@ -1,0 +1,134 @@
+"""One closed-loop test: set points, start, disturbances, and how such courses are made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PlantError
+from pipeline.plants.base import Plant
+
+Array = NDArray[np.float64]
+
+NOISE_SUFFIX = "_noise"
+"""A scenario's name with measurement noise is its name with this at the end: ``sp_a_noise``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenario:
+    """One closed-loop test.
+
+    At sample k the PV is measured, the error sp(k) - pv(k) counted, and the law's move acts over
+    [k, k+1). ``changes`` holds plant parameters over every period, which no controller sees.
+    """
+
+    name: str
+    title: str
+    sp: Array  # (n, n_sp) set point at every sample
+    x0: Array  # (n_x,) steady state at the start
+    mv0: Array  # (n_mv,) MV applied before sample 0
+    changes: Mapping[str, Array] = field(default_factory=dict)  # plant parameter -> (n,)
+    hold: int = 0  # samples per set point; 0: it never moves, or follows a course of its own
+    seed: int | None = None  # of a random sequence
+    late_from: int = 0  # where above 0: the sample from which `sse_late` counts, once the set point is within reach
+    plant: Plant | None = None  # what the test runs on, where that is not the case's plant
+    reference: Array | None = None  # (n, 1) what the CV should do, where that is not to be at its set point at once
+
+    def __post_init__(self) -> None:
+        if self.sp.ndim != 2 or not len(self.sp):
+            raise PlantError(f"scenario {self.name!r}: sp has shape {self.sp.shape}; give (n, n_sp) with n >= 1")
+        for key, values in self.changes.items():
+            if values.shape != (len(self.sp),):
+                raise PlantError(
+                    f"scenario {self.name!r}: {key} has shape {values.shape}; "
+                    f"give one value a period, ({len(self.sp)},)"
+                )
+        if self.reference is not None and self.reference.shape != self.sp.shape:
+            raise PlantError(
+                f"scenario {self.name!r}: reference has shape {self.reference.shape}; give that of sp, {self.sp.shape}"
+            )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.sp)
+
+    def parameters(self, plant: Plant) -> Array:
+        """The plant's parameter vector over every period, shape (n, n_p).
+
+        Raises PlantError where ``changes`` names a parameter that the plant does not have.
+        """
+        table = np.tile(plant.parameters(), (self.samples, 1))
+        plant.parameters({key: float(values[0]) for key, values in self.changes.items()})
+        for key, values in self.changes.items():
+            table[:, plant.parameter_names().index(key)] = values
+        return table
+
+    def with_hold(self, hold: int) -> Self:
+        """The same set points, each held for ``hold`` samples; only for a test without disturbances."""
+        if not self.hold or self.changes:
+            raise PlantError(f"scenario {self.name!r} has no holds that could be stretched")
+        return replace(self, sp=np.repeat(self.sp[:: self.hold], hold, axis=0), hold=hold)
+
+    def digest(self) -> str:
+        """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""
+        arrays = {"sp": self.sp, "x0": self.x0, "mv0": self.mv0, **self.changes}
+        text = {key: [f"{v:.7g}" for v in np.ravel(values)] for key, values in arrays.items()}
+        what: list[Any] = [text, self.hold, *([self.late_from] if self.late_from else [])]
+        if self.reference is not None:
+            what.append([f"{v:.7g}" for v in np.ravel(self.reference)])
+        if self.plant is not None:
+            what.append([self.plant.name, *(f"{v:.7g}" for v in self.plant.parameters())])
+        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+
+def held(levels: list[float], hold: int) -> Array:
+    """Set points, shape (len(levels) * hold, 1), each held for ``hold`` samples."""
+    return np.repeat(np.array(levels, dtype=np.float64), hold)[:, None]
+
+
+def random_levels(seed: int, count: int, low: float, high: float) -> list[float]:
+    """``count`` set points uniform in [low, high]."""
+    return [float(v) for v in np.random.default_rng(seed).uniform(low, high, count)]
+
+
+def from_rest(
+    plant: Plant,
+    name: str,
+    title: str,
+    sp: Array,
+    *,
+    hold: int = 0,
+    seed: int | None = None,
+    changes: Mapping[str, Array] | None = None,
+) -> Scenario:
+    """A test that starts at the steady state of its first set point, under its first parameters.
+
+    ``sp`` (n, 1); ``changes`` plant parameters over every period, each (n,). Raises PlantError
+    where there is no such steady state.
+    """
+    changes = changes or {}
+    first = _same(plant.with_parameters({key: float(values[0]) for key, values in changes.items()}))
+    x0, mv0 = first.steady_state_at(float(sp[0, 0]))
+    return Scenario(name, title, sp, x0, mv0, changes, hold, seed)
+
+
+@cache
+def _same(plant: Plant) -> Plant:
+    """The first plant with these parameters: it has its steady states already, which take longer than many a test."""
+    return plant
+
+
+def stepwise(n: int, *steps: tuple[int, float]) -> Array:
+    """Values of ``n`` samples from steps (first sample, value), shape (n,); the first step starts at sample 0."""
+    values = np.empty(n)
+    for at, value in steps:
+        values[at:] = value
+    return values

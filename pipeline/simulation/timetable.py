@@ -1,0 +1,224 @@
+"""What happens in a simulated run, sample by sample, from what a person asked for."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config.params import nearest
+from pipeline.errors import ParamsError
+from pipeline.plants.base import Plant
+from pipeline.simulation.scenario import Scenario
+
+Array = NDArray[np.float64]
+SETTLE_SAMPLES = 80  # after the last event, where no duration was asked for
+MAX_SAMPLES = 10_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A value at a time [s]; ``name`` is empty for a set point."""
+
+    value: float
+    time_s: float = 0.0
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ManualSpan:
+    """The operator's hands on the MVs from ``start_s`` to ``end_s`` [s]; None keeps them as they were."""
+
+    start_s: float
+    end_s: float
+    mv: tuple[float, ...] | None = None  # one value an MV
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timetable:
+    """A run: the plant, set points, start, plant parameters, noise and manual spans, all by sample."""
+
+    plant: Plant
+    sp: Array  # (n, n_sp)
+    x0: Array  # (n_x,)
+    mv0: Array  # (n_mv,)
+    changes: dict[str, Array]  # plant parameter -> (n,)
+    noise: Array  # (n, n_pv)
+    manual: tuple[ManualSpan, ...] = ()
+    marks: dict[float, str] = field(default_factory=dict)  # time [s] -> what happened there
+
+    def manual_at(self, time_s: float) -> ManualSpan | None:
+        """The manual span that holds at ``time_s``."""
+        return next((s for s in self.manual if s.start_s <= time_s < s.end_s), None)
+
+
+def parse_event(text: str, *, named: bool) -> Event:
+    """``VALUE[@TIME]``, or ``NAME=VALUE[@TIME]`` where ``named``; ParamsError shows the form."""
+    form = "NAME=VALUE@TIME_S" if named else "VALUE or VALUE@TIME_S"
+    name, equals, rest = text.partition("=") if named else ("", "=", text)
+    value, at, time_s = rest.partition("@")
+    if not equals or (named and not name):
+        raise ParamsError(f"{text!r} is not of the form {form}")
+    event = Event(_number(value, text, form), _number(time_s, text, form) if at else 0.0, name)
+    if event.time_s < 0:
+        raise ParamsError(f"{text!r}: the time must not be negative")
+    return event
+
+
+def parse_manual(text: str) -> ManualSpan:
+    """``START..END`` or ``START..END=MV``, several MVs as ``MV,MV``."""
+    form = "START..END or START..END=MV (of several MVs all: MV,MV)"
+    match = re.fullmatch(r"([^.=]+(?:\.\d+)?)\.\.([^=]+)(?:=(.+))?", text)
+    if match is None:
+        raise ParamsError(f"{text!r} is not of the form {form}")
+    start, end = (_number(match[i], text, form) for i in (1, 2))
+    if not 0 <= start < end:
+        raise ParamsError(f"{text!r}: it must start at 0 or later and end after that")
+    values = None if match[3] is None else tuple(_number(value, text, form) for value in match[3].split(","))
+    return ManualSpan(start, end, values)
+
+
+def timetable(
+    plant: Plant,
+    test: Scenario | None = None,
+    *,
+    set_points: Sequence[Event] = (),
+    disturbances: Sequence[Event] = (),
+    noise: Sequence[Event] = (),
+    manual: Sequence[ManualSpan] = (),
+    start_cv: float | None = None,
+    duration_s: float | None = None,
+    seed: int = 0,
+) -> Timetable:
+    """The run that was asked for; ParamsError or PlantError names what cannot be.
+
+    Without set points those of ``test`` are taken. A run with set points of its own starts at the
+    steady state of ``start_cv``, or at that in the middle of the set point's range; a test that has
+    a plant of its own is run on that.
+    """
+    sp_signal = plant.sp_signals[0]
+    if set_points and len(plant.sp_signals) > 1:
+        raise ParamsError(f"plant {plant.name!r} has {len(plant.sp_signals)} set points; run one of its scenarios")
+    for event in set_points:
+        if not sp_signal.low <= event.value <= sp_signal.high:
+            raise ParamsError(
+                f"set point {sp_signal.name} = {event.value:g} {sp_signal.unit} is outside "
+                f"[{sp_signal.low:g}, {sp_signal.high:g}] {sp_signal.unit}"
+            )
+    cv = plant.pv_signals[0]
+    if start_cv is not None and not cv.low <= start_cv <= cv.high:
+        raise ParamsError(
+            f"a start at {cv.name} = {start_cv:g} {cv.unit} is outside [{cv.low:g}, {cv.high:g}] {cv.unit}"
+        )
+    changes: dict[str, Array] = {}
+    marks: dict[float, str] = {}
+    if set_points:
+        start = (sp_signal.low + sp_signal.high) / 2 if start_cv is None else start_cv
+        x0, mv0 = plant.steady_state_at(start)
+        spans = [t for s in manual for t in (s.start_s, s.end_s) if math.isfinite(t)]
+        last = max([*spans, *(e.time_s for e in (*set_points, *disturbances))])
+        n = _samples(plant, duration_s, round(last / plant.period_s) + SETTLE_SAMPLES)
+        sp = np.full((n, 1), start)
+        for event in sorted(set_points, key=lambda e: e.time_s):
+            sp[_sample(plant, event, n) :] = event.value
+    else:
+        if test is None:
+            raise ParamsError("the plant belongs to no case, so it has no scenarios; give set points (--sp)")
+        chosen = test
+        plant = plant if chosen.plant is None else chosen.plant
+        n = _samples(plant, duration_s, chosen.samples)
+        x0, mv0 = (chosen.x0, chosen.mv0) if start_cv is None else plant.steady_state_at(start_cv)
+        sp = _stretched(chosen.sp, n)
+        changes = {name: _stretched(values, n) for name, values in chosen.changes.items()}
+        if changes:
+            marks[0.0] = ", ".join(changes)
+    for event in sorted(disturbances, key=lambda e: e.time_s):
+        if event.name not in plant.parameter_names():
+            raise ParamsError(
+                f"plant {plant.name!r} has no parameter {event.name!r}{nearest(event.name, plant.parameter_names())}"
+            )
+        k = _sample(plant, event, n)
+        row = changes.setdefault(event.name, np.full(n, float(getattr(plant, event.name))))
+        row[k:] = event.value
+        unit = plant.parameter_units()[event.name]
+        text = f"{event.name} = {event.value:g} {unit}".strip()
+        at = k * plant.period_s
+        marks[at] = f"{marks[at]}, {text}" if at in marks else text
+    for span in manual:
+        _check_manual(plant, span)
+        if span.start_s >= n * plant.period_s:
+            raise ParamsError(
+                f"manual from {span.start_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s"
+            )
+        marks.setdefault(span.start_s, "manual")
+    return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks)
+
+
+def _check_manual(plant: Plant, span: ManualSpan) -> None:
+    """ParamsError unless the span has one value an MV, each in its range or among its allowed values."""
+    if span.mv is None:
+        return
+    signals = plant.mv_signals
+    if len(span.mv) != len(signals):
+        raise ParamsError(
+            f"manual has {len(span.mv)} value{'s' * (len(span.mv) > 1)}; plant {plant.name!r} has the MVs "
+            f"{', '.join(s.name for s in signals)}: give {','.join(s.name for s in signals)}"
+        )
+    for s, value in zip(signals, span.mv, strict=True):
+        unit = "" if s.unit == "-" else f" {s.unit}"
+        if s.values is not None and value not in s.values:
+            raise ParamsError(f"manual {s.name} = {value:g} is none of {', '.join(f'{v:g}' for v in s.values)}")
+        if not s.low <= value <= s.high:
+            raise ParamsError(f"manual {s.name} = {value:g}{unit} is outside [{s.low:g}, {s.high:g}]{unit}")
+
+
+def _number(text: str, whole: str, form: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise ParamsError(f"{whole!r}: {text!r} is no number; the form is {form}") from None
+    if not math.isfinite(value):
+        raise ParamsError(f"{whole!r}: {text!r} is not finite")
+    return value
+
+
+def _samples(plant: Plant, duration_s: float | None, default: int) -> int:
+    n = default if duration_s is None else math.ceil(duration_s / plant.period_s - 1e-9)
+    if not 1 <= n <= MAX_SAMPLES:
+        raise ParamsError(
+            f"a duration of {n * plant.period_s:g} s is {n} samples; allowed are 1 to {MAX_SAMPLES} "
+            f"of {plant.period_s:g} s"
+        )
+    return n
+
+
+def _sample(plant: Plant, event: Event, n: int) -> int:
+    k = round(event.time_s / plant.period_s)
+    if k >= n:
+        raise ParamsError(f"time {event.time_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s")
+    return k
+
+
+def _stretched(values: Array, n: int) -> Array:
+    """The first n rows; the last row again where there are fewer."""
+    return np.concatenate([values[:n], np.repeat(values[-1:], max(0, n - len(values)), axis=0)])
+
+
+def _noise(plant: Plant, deviations: Sequence[Event], n: int, seed: int) -> Array:
+    """Gaussian, shape (n, n_pv); each PV has a stream of its own, so that one's noise does not change another's."""
+    names = [s.name for s in plant.pv_signals]
+    noise = np.zeros((n, len(names)))
+    for event in deviations:
+        if event.name not in names:
+            raise ParamsError(
+                f"plant {plant.name!r} has no process variable {event.name!r}{nearest(event.name, names)}"
+            )
+        if event.value < 0:
+            raise ParamsError(f"noise {event.name}={event.value:g}: a standard deviation must not be negative")
+        i = names.index(event.name)
+        noise[:, i] = np.random.default_rng([seed, i]).normal(0.0, event.value, n)
+    return noise

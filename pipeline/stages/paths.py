@@ -1,0 +1,44 @@
+"""Where the stages read and write: one function for each kind of folder or file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+WORK = Path("work")
+ARTIFACTS = Path("artifacts")
+
+
+def record_folder(case: str, record: str) -> Path:
+    """Folder of a record: seed<k>.parquet."""
+    return WORK / case / "records" / record
+
+
+def model_folder(case: str, model: str) -> Path:
+    """Folder of a model set: seed<k>/<part>.npz."""
+    return WORK / case / "models" / model
+
+
+def design_folder(case: str, law: str) -> Path:
+    """Folder of a controller's files before validation, one folder a form inside."""
+    return WORK / case / "controllers" / law
+
+
+def controller_file(case: str, law: str, form: str, seed: int) -> Path:
+    """The exported file of one form (``base`` or a variant's name) and data seed."""
+    return design_folder(case, law) / re.sub(r"[^\w.=]+", "_", form) / f"seed{seed}.onnx"
+
+
+def analysis_file(case: str, law: str, form: str, seed: int) -> Path:
+    """The arrays of a form's analysis, beside its exported file; there only where the law has some."""
+    return controller_file(case, law, form, seed).with_suffix(".analysis.npz")
+
+
+def validation_folder(case: str, law: str) -> Path:
+    """Folder of a controller's validation."""
+    return WORK / case / "validation" / law
+
+
+def receipt_file(case: str) -> Path:
+    """What a report leaves for the overview to wait for, in one folder because DVC cannot list a file a case."""
+    return WORK / "reports" / f"{case}.json"

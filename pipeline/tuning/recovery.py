@@ -1,0 +1,121 @@
+"""Does a loop come to its set point from anywhere? Thousands of starts at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.errors import PlantError
+from pipeline.plants.base import Plant
+from pipeline.tuning.development import LawStep
+
+Array = NDArray[np.float64]
+
+CHECK = 25  # samples between two looks at who has arrived
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Starts:
+    """Where loops begin: states, set points and MVs, a row each."""
+
+    x: Array  # (n, n_x)
+    sp: Array  # (n, n_sp)
+    mv: Array  # (n, n_mv) applied before the first sample
+
+    def __post_init__(self) -> None:
+        if not len(self.x) == len(self.sp) == len(self.mv) or not len(self.x):
+            raise PlantError(
+                f"starts have {len(self.x)} states, {len(self.sp)} set points and {len(self.mv)} MVs; one of each"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recovery:
+    """How loops ended."""
+
+    arrived: NDArray[np.bool_]  # (n,) within the band for the whole of the holding time
+    samples: Array  # (n,) from the start until the band was entered for good; all of them where not arrived
+    end: Array  # (n, n_x) last state seen
+    courses: Array  # (watched, samples / every, n_x) of the first loops; NaN after they arrived
+
+
+def recover(
+    plant: Plant,
+    law: LawStep,
+    n_state: int,
+    starts: Starts,
+    *,
+    samples: int,
+    band: float,
+    holding: int,
+    watched: int = 0,
+    every: int = 5,
+) -> Recovery:
+    """Run a law from many starts, all in one batch, without noise, until they hold their set points.
+
+    A loop has arrived when its controlled variable stays within ``band`` [CV] of the set point for
+    ``holding`` samples, and is then no longer simulated: a linear loop's stability says the rest.
+    What has not arrived after ``samples`` has not arrived. The first ``watched`` loops keep their
+    courses, one state in ``every``. A state that is not finite never arrives.
+    """
+    n, n_x = starts.x.shape
+    arrived, taken, end = np.zeros(n, dtype=bool), np.full(n, float(samples)), starts.x.copy()
+    courses = np.full((watched, -(-samples // every), n_x), np.nan)
+    at = np.arange(n)  # the loops that still run
+    x, sp, state = starts.x.T.copy(), torch.from_numpy(starts.sp), torch.zeros(n, n_state, dtype=torch.float64)
+    mv, inside = torch.from_numpy(starts.mv), np.zeros(n)
+    advance, dv, p = _batch(plant, n)
+    with torch.inference_mode():
+        for k in range(samples):
+            if k % every == 0:
+                courses[at[at < watched], k // every] = x.T[at < watched]
+            pv = np.array(plant.measure(x)).T
+            inside = np.where(np.abs(pv[:, 0] - sp[:, 0].numpy()) <= band, inside + 1, 0)
+            if k % CHECK == 0:
+                done = inside >= holding
+                arrived[at[done]], taken[at[done]] = True, k + 1 - inside[done]
+                end[at[done]] = x.T[done]
+                if done.any():
+                    stay = ~done & np.isfinite(x).all(axis=0)
+                    at, x, inside, pv = at[stay], x[:, stay], inside[stay], pv[stay]
+                    sp, state, mv = sp[stay], state[stay], mv[stay]
+                    if not len(at):
+                        break
+                    advance, dv, p = _batch(plant, len(at))
+            seen_dv = torch.from_numpy(dv.T.copy())
+            mv, state, _ = law(sp, torch.from_numpy(pv), seen_dv, mv, state)
+            x = np.array(advance(x, mv.T.numpy(), dv, p))
+    end[at] = x.T
+    return Recovery(arrived, taken, end, courses)
+
+
+def _batch(plant: Plant, n: int) -> tuple[Any, Array, Array]:
+    dv = np.tile(plant.dv_nominal[:, None], (1, n))
+    return plant.transition.map(n), dv, np.tile(plant.parameters()[:, None], (1, n))
+
+
+def other_rests(plant: Plant, samples: int = 1_500, moving: float = 1e-9) -> Array:
+    """States (n, n_x) at which the plant rests, the MV at one of its ends, outside the range of its set point.
+
+    Found from the corners of the states' ranges: a reactor that has gone out, or run away. Empty
+    where the plant has none.
+    """
+    low, high = (np.array([getattr(s, end) for s in plant.state_signals]) for end in ("low", "high"))
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(len(low), -1)
+    sp, mv = plant.sp_signals[0], plant.mv_signals[0]
+    found: list[Array] = []
+    advance, dv, p = _batch(plant, corners.shape[1])
+    for end in (mv.low, mv.high):
+        x, before = corners, corners
+        for _ in range(samples):
+            before, x = x, np.array(advance(x, np.full((1, x.shape[1]), end), dv, p))
+        cv = np.array(plant.measure(x))[0]
+        still = np.isfinite(x).all(axis=0) & (np.abs(x - before).max(axis=0) <= moving * np.abs(x).max(axis=0))
+        for state in x.T[still & ~((cv >= sp.low) & (cv <= sp.high))]:
+            if all(np.abs(state - known).max() > 1e-6 * np.abs(state).max() for known in found):
+                found.append(state)
+    return np.array(found).reshape(-1, len(low))

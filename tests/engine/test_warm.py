@@ -1,0 +1,161 @@
+"""Stages as forks of a warm process: the same as by themselves, whatever happens to either."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+
+import pytest
+
+SOURCES = Path(__file__).parents[2] / "pipeline"
+PROBE = """
+import json, os, sys
+from pathlib import Path
+told = {"arguments": sys.argv[1:], "parent": os.getppid(), "folder": os.getcwd(), "of": os.environ.get("OF")}
+print(json.dumps(told))
+"""
+WAIT = """
+import os
+from pathlib import Path
+from threading import Event
+Path("pid").write_text(str(os.getpid()))
+Event().wait(60)
+"""
+# The libraries are no part of these tests.
+SERVER = "import sys; from pipeline import warm; warm.LIBRARIES = (); sys.exit(warm.main(sys.argv[1:]))"
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere stages start by themselves")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A pipeline of nothing but the two modules under test and a stage ``probe``."""
+    stages = tmp_path / "pipeline" / "stages"
+    stages.mkdir(parents=True)
+    for name in ("__init__.py", "start.py", "warm.py"):
+        shutil.copy(SOURCES / name, tmp_path / "pipeline" / name)
+    (stages / "__init__.py").touch()
+    (stages / "probe.py").write_text(PROBE)
+    return tmp_path
+
+
+def begin(folder: Path, script: str) -> subprocess.Popen[str]:
+    """A shell script under a warm process, in a session of its own, as a terminal has it."""
+    command = [sys.executable, "-c", SERVER, "bash", "-c", script.replace("python", sys.executable)]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+
+
+def run(folder: Path, script: str) -> tuple[int, str, str]:
+    process = begin(folder, script)
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out, err
+
+
+def within(seconds: float, holds: Callable[[], bool]) -> bool:
+    for _ in range(int(seconds / 0.02)):
+        if holds():
+            return True
+        Event().wait(0.02)
+    return False
+
+
+def lives(pid: int) -> bool:
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+
+
+def test_a_stage_is_a_fork_of_the_warm_process(folder: Path) -> None:
+    code, out, err = run(folder, "echo $PPID; OF=mine python -m pipeline.engine.start probe one; exit 7")
+    server, told = out.splitlines()
+    assert (code, err) == (7, "")
+    assert f'"parent": {server},' in told
+    assert '"arguments": ["one"]' in told
+    assert f'"folder": "{folder}"' in told
+    assert '"of": "mine"' in told
+
+
+def test_stages_run_the_sources_as_they_are(folder: Path) -> None:
+    edit = "echo 'print(\"edited\")' > pipeline/stages/probe.py"
+    code, out, _ = run(folder, f"python -m pipeline.engine.start probe; {edit}; python -m pipeline.engine.start probe")
+    assert code == 0
+    assert out.splitlines()[1] == "edited"
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "says"),
+    [
+        ("raise SystemExit(2)", 2, ""),
+        ("raise SystemExit('no')", 1, "no"),
+        ("raise SystemExit()", 0, ""),
+        ("1 / 0", 1, "ZeroDivisionError"),
+        ("import os; os._exit(3)", 3, ""),
+        ("import os; os.kill(os.getpid(), 9)", 137, "stage probe was ended by signal 9"),
+    ],
+)
+def test_a_stage_ends_with_its_status(folder: Path, text: str, status: int, says: str) -> None:
+    (folder / "pipeline" / "stages" / "probe.py").write_text(text)
+    assert run(folder, "python -m pipeline.engine.start probe; echo $?")[1] == f"{status}\n"
+    assert says in run(folder, "python -m pipeline.engine.start probe")[2]
+
+
+@pytest.mark.parametrize(
+    "how", ["kill -9 $PPID", "cd pipeline; export PYTHONPATH=..", "export LOOPWRIGHT_WARM=nonsense"]
+)
+def test_without_a_warm_process_a_stage_starts_by_itself(folder: Path, how: str) -> None:
+    process = begin(folder, f"echo $LOOPWRIGHT_WARM; {how}; echo $$; python -m pipeline.engine.start probe 2>&1")
+    out, _ = process.communicate(timeout=60)
+    warm, shell, told = out.splitlines()
+    assert f'"parent": {shell},' in told
+    shutil.rmtree(Path(json.loads(warm)[0]).parent, ignore_errors=True)  # which a killed process left
+
+
+def test_a_stage_that_nobody_waits_for_ends(folder: Path) -> None:
+    (folder / "pipeline" / "stages" / "probe.py").write_text(WAIT)
+    process = begin(
+        folder,
+        "python -m pipeline.engine.start probe & while [ ! -s pid ]; do sleep 0.05; done; kill -9 $!; "
+        "exec tail -f /dev/null",
+    )
+    assert within(20, lambda: (folder / "pid").exists() and (folder / "pid").read_text() != "")
+    assert within(20, lambda: not lives(int((folder / "pid").read_text())))
+    process.terminate()
+    _, told = process.communicate(timeout=20)
+    # The command's own status, as a shell counts.
+    assert process.returncode == 128 + signal.SIGTERM, told
+
+
+def test_ctrl_c_ends_everything(folder: Path) -> None:
+    (folder / "pipeline" / "stages" / "probe.py").write_text(WAIT)
+    process = begin(folder, "python -m pipeline.engine.start probe")
+    assert within(20, lambda: (folder / "pid").exists() and (folder / "pid").read_text() != "")
+    os.killpg(process.pid, signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode != 0
+    assert not lives(int((folder / "pid").read_text()))
+
+
+def test_a_socket_that_cannot_be_made_is_no_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    long = folder / ("long" * 30)
+    long.mkdir()
+    monkeypatch.setenv("TMPDIR", str(long))
+    code, out, _ = run(folder, "python -m pipeline.engine.start probe; exit 7")
+    assert code == 7
+    assert "arguments" in out
+
+
+def test_a_command_that_is_missing_is_one_line(folder: Path) -> None:
+    process = subprocess.run(
+        [sys.executable, "-m", "pipeline.engine.warm"], cwd=folder, capture_output=True, text=True, timeout=60
+    )
+    assert process.returncode == 2
+    assert process.stderr.startswith("usage: python -m pipeline.engine.warm COMMAND")

@@ -1,0 +1,131 @@
+"""What a file's trial makes of its loops: noise repeated and averaged, lock-ups counted, infos kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.cases import CASES
+from pipeline.evaluation import trial
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck, together, try_file
+from serving.errors import OutputError
+
+
+@dataclass
+class Told:
+    info: tuple[str, ...] = ("error", "steps")
+
+
+class Proportional:
+    """u = 1/2 + gain (r - y), as a controller is stepped; refuses the steps of ``refused``."""
+
+    manifest = Told()
+
+    def __init__(self, gain: float = 0.02, refused: int = -1) -> None:
+        self.gain, self.refused, self.steps = gain, refused, 0
+
+    def cold_state(self) -> np.ndarray:
+        return np.zeros(1)
+
+    def step(self, *, sp: Any, pv: Any, mv_applied: Any, state: Any) -> Any:
+        self.steps += 1
+        if self.steps == self.refused:
+            raise OutputError("no")
+        error = sp - pv
+        return np.clip(0.5 + self.gain * error, 0.0, 1.0), state + 1, np.array([error[0], state[0]])
+
+
+@pytest.fixture
+def case() -> Case:
+    return CASES["batch_reactor"]
+
+
+def test_noisy_figures_are_means_over_different_noise(case: Case) -> None:
+    test = case.scenarios()["trajectory"][0]
+    controller: Any = Proportional()
+    found = repeated(controller, case, test, True, 7)
+    loops = [close_loop(controller, case, test, case.noise_std, 7 + DRAW * i) for i in range(case.noise_draws)]
+    rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
+    assert len({row["sse"] for row in rows}) == case.noise_draws
+    assert found.metrics["sse"] == pytest.approx(np.mean([row["sse"] for row in rows]), rel=1e-12)
+    assert np.array_equal(found.first.measured, loops[0].measured)
+    quiet = repeated(controller, case, test, False, 7)
+    assert quiet.metrics == case.score(test, quiet.first.pv, quiet.first.mv)
+
+
+def test_figures_of_a_test_with_a_late_part_count_it(case: Case) -> None:
+    test = case.scenarios()["trajectory"][0]
+    controller: Any = Proportional()
+    loop = close_loop(controller, case, test, None, 0)
+    error = (loop.sp - loop.pv)[:, 0]
+    found = case.score(test, loop.pv, loop.mv)
+    assert found["sse_late"] == pytest.approx(float(np.sum(error[test.late_from :] ** 2)))
+    assert found["sse"] > 5 * found["sse_late"] > 0
+
+
+def test_a_refused_step_keeps_the_mv_and_counts_as_a_lock_up(case: Case) -> None:
+    test = case.scenarios()["trajectory"][0]
+    held: Any = Proportional(refused=13)
+    loop = close_loop(held, case, test, None, 0)
+    assert loop.mv[12] == loop.mv[11]
+    assert loop.info[:, -1].tolist() == [float(k == 12) for k in range(test.samples)]
+    assert loop.info[13, 1] == 0  # it started afresh
+    assert stuck(case, test, loop)
+    sound: Any = Proportional()
+    assert not stuck(case, test, close_loop(sound, case, test, None, 0))
+
+
+def test_a_loop_at_its_limit_is_locked_up_and_a_start_up_is_not(case: Case) -> None:
+    test = case.scenarios()["trajectory"][0]
+    cold: Any = Proportional(gain=-1.0)  # the wrong way: full cooling for ever
+    assert stuck(case, test, close_loop(cold, case, test, None, 0))
+    hard: Any = Proportional(gain=1.0)  # full heating for 8 samples, then near the profile
+    loop = close_loop(hard, case, test, None, 0)
+    assert (loop.mv[:7] == 1).all()
+    assert not stuck(case, test, loop)
+
+
+def test_together_takes_the_largest_of_the_largest_steady_errors() -> None:
+    rows = [{"sse": 1.0, "max_asse": 0.3}, {"sse": 3.0, "max_asse": 0.1}]
+    assert together(rows) == {"sse": 2.0, "max_asse": 0.3}
+
+
+def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial, "Controller", lambda path: Proportional())
+    monkeypatch.setattr(type(case), "noise_draws", 2)
+    base = try_file(case, 0, ("base", 3, Path("p.onnx")))
+    fixed = ["trajectory", "trajectory_noise", "fouling", "fouling_noise"]
+    assert list(base.metrics) == [*fixed, "held_out", "held_out_noise"]
+    assert list(base.sequences["held_out"]) == [str(s) for s in case.held_out_seeds]
+    variant = try_file(case, 0, ("gain=1", 3, Path("p.onnx")))
+    assert list(variant.metrics) == fixed  # with noise, because the plant has no other measurements
+    assert np.isnan(variant.development)
+    assert base.lock_ups == base.development_lock_ups == 0
+    # The development is judged by the case's metric, under the noise that the plant always has.
+    controller: Any = Proportional()
+    tests = case.development()
+    rows = [repeated(controller, case, t, True, trial.DEVELOPMENT + i) for i, t in enumerate(tests)]
+    assert base.development == pytest.approx(np.mean([row.metrics["sse"] for row in rows]))
+    # Infos are those of the manifest, without the mark of a refused step.
+    assert base.info == ("error", "steps")
+    assert base.curves["trajectory"].info.shape == (50, 2)
+    assert base.curves["trajectory"].info[-1, 1] == 49
+
+
+def test_variants_run_without_noise_where_the_plant_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = CASES["ph_neutralization"]
+    monkeypatch.setattr(trial, "Controller", lambda path: Proportional(0.0))
+    monkeypatch.setattr(Proportional, "step", lambda self, **kw: (kw["mv_applied"], kw["state"], np.zeros(2)))
+    found = try_file(case, 0, ("penalty=20", 0, Path("p.onnx")))
+    assert list(found.metrics) == ["set_point", "disturbance", "buffer", "base"]
+
+
+def test_the_worst_of_several_sequences_stays_the_worst() -> None:
+    rows = [{"overshoot_max": 0.05, "max_asse": 3.0, "min_jacket": 20.0, "mae": 1.0}]
+    rows.append({"overshoot_max": 0.25, "max_asse": 1.0, "min_jacket": 19.0, "mae": 2.0})
+    assert together(rows) == {"overshoot_max": 0.25, "max_asse": 3.0, "min_jacket": 19.0, "mae": 1.5}

@@ -1,0 +1,71 @@
+"""The embedding examples run on a real controller, are as short as promised and agree to the bit."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.export.gate import export
+from pipeline.laws import ControlLaw
+from serving import Controller
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "embed"
+
+
+def run(example: str, file: Path) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parents[2])}
+    command = [sys.executable, "-W", "error", str(EXAMPLES / example), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", ["pid", "incadec"])
+def test_both_examples_give_the_controllers_bits(make_law: object, name: str, tmp_path: Path) -> None:
+    law: ControlLaw = make_law(name)  # type: ignore[operator]
+    file = tmp_path / "law.onnx"
+    export(law, file, case="thiosulfate_cstr", provenance={})
+    ours, plain = run("python_runtime.py", file), run("plain_onnxruntime.py", file)
+    assert ours == plain
+    assert len(ours.splitlines()) == 100
+    assert len(set(ours.splitlines())) > 10  # it does something
+    controller = Controller(file)
+    first = controller.step(sp=0.5, pv=[0.0, 200.0], mv_applied=0.0, state=controller.cold_state())
+    assert ast.literal_eval(ours.partition("] ")[0] + "]") == first.mv.tolist()
+    assert np.isfinite(first.mv).all()
+
+
+SHIPPED = sorted((EXAMPLES.parents[2] / "artifacts").glob("*/*.onnx"))
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
+def test_every_shipped_controller_gives_the_same_bits_without_our_package(file: Path) -> None:
+    assert run("python_runtime.py", file) == run("plain_onnxruntime.py", file)
+
+
+@pytest.mark.parametrize(("example", "lines"), [("python_runtime.py", 10), ("plain_onnxruntime.py", 20)])
+def test_the_examples_are_as_short_as_promised(example: str, lines: int) -> None:
+    text = (EXAMPLES / example).read_text()
+    body = text.split('"""', 2)[2].splitlines()
+    assert len([line for line in body if line.strip()]) <= lines
+
+
+def test_the_plain_example_needs_nothing_of_ours() -> None:
+    tree = ast.parse((EXAMPLES / "plain_onnxruntime.py").read_text())
+    imported = {a.name.partition(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
+    assert imported - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
+    assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
+
+
+@pytest.mark.parametrize("example", ["python_runtime.py", "plain_onnxruntime.py"])
+def test_an_example_without_a_file_says_what_it_wants(example: str) -> None:
+    done = subprocess.run([sys.executable, str(EXAMPLES / example)], capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0
+    assert done.stderr.startswith("usage: ")
+    assert "FILE.onnx" in done.stderr

@@ -1,0 +1,90 @@
+"""``python -m serving``: a card that a person can read, JSON for programs, one line for an error."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.export.controller_file import with_evidence
+from serving import Controller
+from serving.__main__ import main
+
+pytest_plugins = ["small_laws"]
+Capture = pytest.CaptureFixture[str]
+
+
+def test_card(pi_file: Path, capsys: Capture) -> None:
+    assert main(["inspect", str(pi_file)]) == 0
+    card = capsys.readouterr().out
+    for line in (
+        "formula for tank",
+        "  period    0.5 s",
+        "  level  0 .. 2 m",
+        "  valve  0 .. 100 %",
+        "inputs      sp, pv, mv_applied, state",
+        "outputs     mv, state_next, info",
+        "info        error, move",
+        "  git: 0123abc",
+        "               mae         ise",
+        "  step        0.25         0.5",
+    ):
+        assert line in card.splitlines()
+    assert Controller(pi_file).sha256 in card
+
+
+@pytest.mark.parametrize(
+    ("evidence", "text"),
+    [
+        ({}, "  none yet: this controller was not validated"),
+        ({"mae": 0.25, "seeds": [1, 2]}, "  mae: 0.25\n  seeds: 1, 2"),
+        (
+            {"scenarios": {"sp_a": {"mae": 1 / 3}, "ua": {"ise": 2}}, "seeds": 5},
+            "  ua             -           2\n  seeds: 5",
+        ),
+        ({"gate": {"passed": "yes"}}, "  gate\n    passed: yes"),
+    ],
+)
+def test_any_evidence_can_be_shown(
+    pi_file: Path, tmp_path: Path, capsys: Capture, evidence: dict[str, object], text: str
+) -> None:
+    with_evidence(pi_file, tmp_path / "x.onnx", evidence)
+    assert main(["inspect", str(tmp_path / "x.onnx")]) == 0
+    assert text in capsys.readouterr().out
+
+
+def test_json(pi_file: Path, capsys: Capture) -> None:
+    assert main(["inspect", "--json", str(pi_file)]) == 0
+    row = json.loads(capsys.readouterr().out)
+    assert row["law"] == "formula"
+    assert row["file"]["bytes"] == pi_file.stat().st_size
+    assert row["graph"]["opset"] <= 21
+
+
+def test_bench(pi_file: Path, capsys: Capture) -> None:
+    assert main(["bench", str(pi_file), "--steps", "50", "--loop-steps", "10"]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split() == ["step", "[us]", "p50", "p99", "p99.9"]
+    assert [row[:22].strip() for row in rows] == ["hot", "every 10 ms, warmed", "every 10 ms, cold"]
+    for row in rows:
+        p50, p99, p999 = map(float, row[22:].split())
+        assert 0 < p50 <= p99 <= p999
+
+
+def test_errors_are_one_line(pi_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    for arguments in (
+        ["inspect", "none.onnx"],
+        ["bench", str(tmp_path)],
+        ["inspect", str(pi_file.with_suffix(".json"))],
+        ["inspect", str(pi_file), "--sha256", "0" * 64],
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ")
+        assert error.count("\n") == 1
+
+
+def test_without_a_command_it_says_what_it_can(capsys: Capture) -> None:
+    assert main([]) == 0
+    assert "inspect" in capsys.readouterr().out

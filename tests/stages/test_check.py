@@ -1,0 +1,72 @@
+"""What the check of params.yaml finds, with one line for each mistake, before any stage runs."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from pipeline.stages import check
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def params(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The repository's own params.yaml in a folder of its own, which ``checked`` writes anew."""
+    shutil.copytree(ROOT / "pipeline" / "plants", tmp_path / "pipeline" / "plants")
+    shutil.copytree(ROOT / "pipeline" / "models", tmp_path / "pipeline" / "models")
+    monkeypatch.chdir(tmp_path)
+    tree: dict[str, Any] = yaml.safe_load((ROOT / "params.yaml").read_text())
+    return tree
+
+
+def checked(tree: dict[str, Any]) -> list[str]:
+    # Not as text of the original: anchors would carry a mistake to other sections.
+    Path("params.yaml").write_text(yaml.dump(tree))
+    return check.mistakes()
+
+
+def test_the_repositorys_own_has_none(params: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert checked(params) == []
+    assert check.main() == 0
+    assert f"{len(params['controllers'])} controllers" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "said"),
+    [
+        (("cases", "batch_reactor", "held_out_seeds"), [11, 12], "which serve the development"),
+        (("records", "ph_neutralization-aprbs", "kind"), "aprb", "did you mean 'aprbs'"),
+        (("records", "ph_neutralization-aprbs", "samples"), "many", "samples"),
+        (("models", "batch_reactor-nnarx", "data"), "work/batch_reactor/records/batch", "which no record makes"),
+        (("models", "batch_reactor-nnarx", "data"), "mine.csv", "which is not there"),
+        (("models", "batch_reactor-nnarx", "parts", "arx", "kind"), "arxx", "did you mean 'arx'"),
+        (("models", "thiosulfate_cstr-three_periods", "parts", "forward", "trainer", "kind"), "ml", "trainer"),
+        (("controllers", "batch_reactor-pid", "law"), "pit", "did you mean 'pid'"),
+        (("controllers", "batch_reactor-pid", "model"), "linear", "has the model sets"),
+        (("controllers", "batch_reactor-pid", "case"), "batch", "known: batch_reactor"),
+        (("controllers", "batch_reactor-pid", "tunings"), "imc", "unknown key 'tunings'"),
+        (("controllers", "thiosulfate_cstr-incad", "variants", "r=1"), {"q": 1.0}, "variants.r=1: unknown key 'q'"),
+    ],
+)
+def test_one_mistake_is_one_line(params: dict[str, Any], where: tuple[str, ...], value: Any, said: str) -> None:
+    section = params
+    for key in where[:-1]:
+        section = section[key]
+    section[where[-1]] = value
+    (line,) = checked(params)
+    assert said in line
+    assert f"{where[0]}.{where[1]}" in line
+
+
+def test_every_mistake_is_told_and_the_exit_says_so(params: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    params["records"]["ph_neutralization-aprbs"]["kind"] = "aprb"
+    params["controllers"]["batch_reactor-pid"]["law"] = "pit"
+    assert len(checked(params)) == 2
+    assert check.main() == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["check", "check"]

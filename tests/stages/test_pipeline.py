@@ -1,0 +1,146 @@
+"""The real pipeline under the real DVC, on a copy of the repository with small numbers."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+from reduced import reduced
+
+ROOT = Path(__file__).parents[2]
+CASE = "thiosulfate_cstr"
+ENVIRONMENT = {
+    **os.environ,
+    "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    "DVC_NO_ANALYTICS": "1",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "PYTHONPATH": "",
+}
+
+
+class Copy:
+    """A copy of the repository in which DVC runs."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def run(self, *command: str, check: bool = True) -> str:
+        found = subprocess.run(
+            command, cwd=self.path, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        assert not check or found.returncode == 0, found.stdout
+        return found.stdout
+
+    def repro(self) -> set[str]:
+        """Run the pipeline; the stages that ran, by name."""
+        said = self.run("python", "-m", "pipeline.engine.warm", "dvc", "repro")
+        return set(re.findall(r"Running stage '([^']+)'", said))
+
+    def edit(self, keys: Sequence[str], value: object) -> None:
+        path = self.path / "params.yaml"
+        tree = yaml.safe_load(path.read_text())
+        at = tree
+        for key in keys[:-1]:
+            at = at[key]
+        at[keys[-1]] = value
+        path.write_text(yaml.safe_dump(tree, sort_keys=False))
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
+    """The pipeline run once: one record, two model sets, two controllers, one data seed."""
+    path = tmp_path_factory.mktemp("repository")
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    for name in listed.stdout.splitlines():
+        if (ROOT / name).is_file() and not name.startswith("artifacts/") and name != "dvc.lock":
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, path / name)
+    tree = reduced(yaml.safe_load((path / "params.yaml").read_text()))
+    keep = {
+        "records": ["random_steps"],
+        "models": ["inverse", "linearized"],
+        "controllers": ["incad", "pid"],
+    }
+    tree["cases"] = {CASE: tree["cases"][CASE]}
+    for section, names in keep.items():
+        tree[section] = {f"{CASE}-{name}": tree[section][f"{CASE}-{name}"] for name in names}
+    tree["records"][f"{CASE}-random_steps"]["seeds"] = [0]
+    (path / "params.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
+    repository = Copy(path)
+    repository.run("git", "init", "--quiet")
+    stages = repository.repro()
+    kinds = {"code", "excite", "fit", "design", "validate", "report", "overview", "publish"}
+    assert {s.split("@")[0] for s in stages} == kinds
+    return repository
+
+
+def test_every_output_is_there(copy: Copy) -> None:
+    artifacts = copy.path / "artifacts" / CASE
+    for name in ("incad.onnx", "incad.json", "pid.onnx", "pid.json", "validation.json", "report.html", "report.md"):
+        assert (artifacts / name).is_file(), name
+    assert (copy.path / "published.json").is_file()
+    for name in ("report.html", "report.md"):
+        assert f"{CASE}-incad" in (copy.path / "artifacts" / name).read_text(), name
+    assert "incad" in copy.run("python", "-m", "pipeline", "results")
+    assert "held_out / NMPC" in copy.run("python", "-m", "pipeline", "results", CASE)
+
+
+def test_a_second_run_does_nothing(copy: Copy) -> None:
+    assert copy.repro() == set()
+    assert "up to date" in copy.run("dvc", "status")
+
+
+def test_another_r_reruns_its_own_design_and_validation_only(copy: Copy) -> None:
+    copy.edit(("controllers", f"{CASE}-incad", "r"), 2.0)
+    ran = copy.repro()
+    assert {f"design@{CASE}-incad", f"validate@{CASE}-incad"} <= ran
+    assert ran <= {f"design@{CASE}-incad", f"validate@{CASE}-incad", f"report@{CASE}", "overview", "publish"}
+    # Back again: DVC's cache has it, nothing is computed twice.
+    copy.edit(("controllers", f"{CASE}-incad", "r"), 1.5)
+    assert not {s for s in copy.repro() if s.startswith(("excite", "fit", "design"))}
+
+
+def test_a_run_killed_in_the_middle_loses_nothing(copy: Copy) -> None:
+    before = (copy.path / "artifacts" / CASE / "pid.onnx").read_bytes()
+    copy.edit(("models", f"{CASE}-inverse", "parts", "inverse", "partitions"), 9)
+    process = subprocess.Popen(
+        ["dvc", "repro"],
+        cwd=copy.path,
+        env={**ENVIRONMENT, "PYTHONUNBUFFERED": "1"},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "Running stage 'fit@" in line:
+            os.killpg(process.pid, signal.SIGKILL)
+            break
+    process.stdout.close()
+    process.wait()
+    ran = copy.repro()
+    assert f"fit@{CASE}-inverse" in ran
+    assert not {s for s in ran if s.startswith("excite") or s.endswith("-pid")}
+    assert "up to date" in copy.run("dvc", "status")
+    assert (copy.path / "artifacts" / CASE / "pid.onnx").read_bytes() == before
+
+
+def test_a_mistake_in_the_parameters_is_one_line(copy: Copy) -> None:
+    copy.edit(("controllers", f"{CASE}-incad", "narowing"), 2.0)
+    said = copy.run("python", "-m", "pipeline.stages.design", f"{CASE}-incad", check=False)
+    assert said.count("\n") == 1
+    assert f"controllers.{CASE}-incad: unknown key 'narowing'" in said
+    assert "Traceback" not in said
