@@ -23,9 +23,7 @@ $(STAMP): pyproject.toml constraints.txt tools/setup.sh
 	@touch $@
 
 run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, publish
-	@python -m pipeline.stages.check
-	@python -m pipeline.engine.warm dvc repro
-	@python -m pipeline results
+	@loopwright run
 
 test: check ## formatting, lint, types, import rules, tests
 	python -m pytest
@@ -37,8 +35,8 @@ check: $(STAMP) ## the static part of make test
 	lint-imports
 
 registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes first what the store lacks
-	python -m pipeline.tracking publish
-	python -m pipeline.tracking serve --port $(PORT)
+	loopwright registry publish
+	loopwright registry serve --port $(PORT)
 
 bench: $(STAMP) ## run the benchmarks
 	@for script in benchmarks/[a-z]*.py; do echo "== $$script"; python $$script || exit 1; done

@@ -1,4 +1,4 @@
-"""``python -m pipeline simulate``: what is asked for happens, and what cannot be is told in one line."""
+"""``loopwright simulate``: what is asked for happens, and what cannot be is told in one line."""
 
 from __future__ import annotations
 
@@ -180,9 +180,7 @@ def test_as_a_program(pid_file: Path) -> None:
     assert Path("loop.svg").exists()
     failed = run("simulate", "none.onnx")
     assert failed.returncode == 2
-    assert failed.stderr == (
-        "python -m pipeline simulate: none.onnx: the file cannot be read: No such file or directory\n"
-    )
+    assert failed.stderr == ("loopwright simulate: none.onnx: the file cannot be read: No such file or directory\n")
     assert "simulate" in run().stdout
 
 

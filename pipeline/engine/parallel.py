@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
+from pipeline.engine.lifeline import end_with_parent
 from pipeline.errors import PipelineError
 
 Item = TypeVar("Item")
@@ -144,6 +145,7 @@ class _Helper:
 
 def _help(connection: Connection, function: Callable[[Any], Any] | bytes, others: Connection | None) -> None:
     """What a helper runs: items as they come, until the other end is closed."""
+    end_with_parent()
     if others is not None:
         others.close()  # this fork's copy, which would keep it from seeing the end
     try:

@@ -24,6 +24,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from pipeline.engine.lifeline import end_with_parent
 from pipeline.engine.start import VARIABLE, run_here, served
 
 # What stages import for long; one that is missing or broken here costs time alone.
@@ -72,7 +73,8 @@ class _Server:
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.signal(signal.SIGINT, lambda *_: None)
         environment = {**os.environ, VARIABLE: json.dumps([address, *served()])}
-        self.command = subprocess.Popen(command, env=environment)
+        own = os.getpid()
+        self.command = subprocess.Popen(command, env=environment, preexec_fn=lambda: end_with_parent(own))
         signal.signal(signal.SIGTERM, lambda *_: self.command.terminate())
 
     def run(self) -> int:
@@ -109,8 +111,9 @@ class _Server:
             return
         sys.stdout.flush()
         sys.stderr.flush()
-        pid = os.fork()
+        own, pid = os.getpid(), os.fork()
         if not pid:
+            end_with_parent(own)
             self._become(request, files)
         for file in files:
             os.close(file)

@@ -111,7 +111,7 @@ def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dic
     """
     path = path or bounds_path(case)
     stored = read_stored(path)
-    remedy = f"run `python -m pipeline.stages.bounds {case.name}` (some minutes on an idle core)"
+    remedy = f"run `loopwright bounds {case.name}` (some minutes on an idle core)"
     if not stored:
         raise LawError(f"{path} holds no bounds of case {case.name!r}; {remedy}")
     current = problem(case)

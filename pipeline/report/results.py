@@ -41,11 +41,11 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
             console.print("n          the bound is less than noise would hide: the ratio is to that, and at least 1")
         console.print("*          the best of its case, chosen on sequences that are never scored")
         console.print(f"overview   {artifacts / 'report.html'} (and .md)")
-        console.print(f"a case     {where / 'report.html'}; its tests here: python -m pipeline results CASE")
+        console.print(f"a case     {where / 'report.html'}; its tests here: loopwright results CASE")
     else:
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
-    console.print(f"try one    python -m pipeline simulate {where / '<law>.onnx'}")
-    console.print(f"read one   python -m serving inspect {where / '<law>.onnx'}")
+    console.print(f"try one    loopwright simulate {where / '<law>.onnx'}")
+    console.print(f"read one   loopwright inspect {where / '<law>.onnx'}")
     console.print("registry   make registry, then /#/models in the browser")
 
 

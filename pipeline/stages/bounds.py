@@ -5,17 +5,15 @@
 A plant with a discrete MV is replaced by its ``relaxed()``, the figures' MVs being those that stand
 for its own. A test on a plant in discrete time has no bounds.
 
-``python -m pipeline.stages.bounds CASE`` computes both for every scenario of a case, NMPC also with
+``loopwright bounds CASE`` computes both for every scenario of a case, NMPC also with
 measurement noise, and stores them in ``pipeline/cases/<case>.bounds.json``, from where
 ``pipeline.optimal.bounds.load_bounds`` gives them as long as neither the plant nor the scenario has changed.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,12 +23,10 @@ from typing import Any
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
-from pipeline.cases import CASES
 from pipeline.evaluation.case import Case
 from pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored, together
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from pipeline.simulation.scenario import Scenario
-from serving.errors import LoopwrightError
 
 NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
 DRAW = 1_000
@@ -95,28 +91,3 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
         os.replace(draft, path)
         which = f"{job.scenario.name} {job.index} {job.kind}"
         yield f"[{done}/{len(work)}] {which}: {case.metric} {rounded[case.metric]:.6g} ({seconds:.0f} s)"
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Compute and store the bounds of a case."""
-    parser = argparse.ArgumentParser(prog="python -m pipeline.stages.bounds", description=main.__doc__)
-    parser.add_argument("case", choices=sorted(CASES))
-    parser.add_argument("--scenario", action="append", help="only this one (may be given again)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes side by side")
-    given = parser.parse_args(arguments)
-    case = CASES[given.case]
-    names = given.scenario or list(case.scenarios())
-    unknown = sorted(set(names) - set(case.scenarios()))
-    if unknown:
-        parser.error(f"case {case.name!r} has no scenario {unknown[0]!r}; it has {', '.join(case.scenarios())}")
-    try:
-        for line in compute(case, names, given.jobs):
-            print(line, flush=True)
-    except (LoopwrightError, OSError) as error:
-        print(f"python -m pipeline.stages.bounds: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,13 +1,11 @@
-"""``python -m pipeline.stages.check``: every section of params.yaml read before hours of work depend on it.
+"""Every section of params.yaml read before hours of work depend on it.
 
 A typo in a controller's section would otherwise show only when its own stage runs, after the fits.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 from pipeline.cases import CASES
@@ -97,20 +95,3 @@ CHECKS: dict[str, Callable[[str], None]] = {
     "models": _model,
     "controllers": _controller,
 }
-
-
-def main() -> int:
-    """Check params.yaml; 0 where every section can be read, else 2 after a line for each mistake."""
-    try:
-        found = mistakes()
-    except PipelineError as error:
-        found = [str(error)]
-    for line in found:
-        print(f"check: {line}", file=sys.stderr)
-    if not found:
-        print(f"check: {Path('params.yaml')} has no mistake: " + ", ".join(f"{len(sections(k))} {k}" for k in CHECKS))
-    return 2 if found else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

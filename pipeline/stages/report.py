@@ -24,7 +24,7 @@ def report(name: str) -> None:
     # A new case has no bounds until the oracle has run; stale ones are an error, never shown.
     bounds = load_bounds(case) if bounds_path(case).exists() else {}
     if not bounds:
-        print(f"report {name}: no bounds yet; `python -m pipeline.stages.bounds {name}` computes them", file=sys.stderr)
+        print(f"report {name}: no bounds yet; `loopwright bounds {name}` computes them", file=sys.stderr)
     laws, models = entries("controllers", name, "law"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
     evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data)

@@ -1,6 +1,6 @@
 """Tracking and registry: the only importer of mlflow and the only writer of its store.
 
-``python -m pipeline.tracking publish | list | promote | fetch | serve``; see ``__main__``.
+``loopwright registry`` is its command.
 
 The settings below stand in the package's own module because Python runs it before any of its
 submodules, hence before mlflow is imported anywhere: mlflow reads them once, at import.

@@ -27,7 +27,7 @@ def model_description(case: str, law: str, validation: Mapping[str, Any]) -> str
         "<p>Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup. "
         f"<b>candidate</b>: the newest version. <b>champion</b>: the best version {escape(beaten)}"
         "in closed loop without a lock-up. <b>case_champion</b>: on the best controller of the case only.</p>"
-        f"<p>Take its champion: <code>python -m pipeline.tracking fetch {escape(case)}-{escape(law)} FOLDER</code>, or "
+        f"<p>Take its champion: <code>loopwright registry fetch {escape(case)}-{escape(law)} FOLDER</code>, or "
         f"the newest version: <code>{escape(case)}-{escape(law)}@candidate</code> in its place.</p>"
     )
 

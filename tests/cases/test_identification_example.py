@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pipeline.cases.ph_neutralization.identification_example import IdentificationExamplePart, example_record
+from pipeline.cases.ph_neutralization.models import MODELS
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.config.params import parse
-from pipeline.models import MODELS, Learnt
+from pipeline.models import Learnt
 from pipeline.models.lagged.nnarx import NNARX
 
 N = 100

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.cases.jacketed_batch_reactor.excitations import EXCITATIONS
 from pipeline.cases.jacketed_batch_reactor.jacket_pulses import JacketPulses
 from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import ParamsError, PlantError
-from pipeline.excitation import EXCITATIONS
 from pipeline.records.record import Record
 from pipeline.simulation.simulate import simulate_open
 

@@ -13,9 +13,10 @@ import yaml
 from pipeline.cases import CASES
 from pipeline.config.params import ControllerParams, ModelParams, RecordParams, choose, digest, parse, read_section
 from pipeline.errors import ParamsError
-from pipeline.excitation import EXCITATIONS
 from pipeline.laws import LAWS
 from pipeline.models import MODELS
+from pipeline.stages.excite import excitations
+from pipeline.stages.fit import part_of
 
 
 @dataclass(frozen=True)
@@ -105,13 +106,12 @@ def test_the_shipped_file_is_read_whole(monkeypatch: pytest.MonkeyPatch) -> None
     models = set()
     for name in tree["records"]:
         record = RecordParams.read(name)
-        parse(EXCITATIONS[record.kind], record.excitation, name)
+        parse(excitations(CASES[record.case])[record.kind], record.excitation, name)
         assert name == f"{record.case}-{record.record}"
     for name in tree["models"]:
         model = ModelParams.read(name)
         for part in model.parts.values():
-            options = dict(part)
-            parse(MODELS[options.pop("kind")], options, name)
+            part_of(CASES[model.case], part, name)
         models.add((model.case, model.model))
         assert name == f"{model.case}-{model.model}"
     for name in tree["controllers"]:

@@ -29,19 +29,21 @@ Path("pid").write_text(str(os.getpid()))
 Event().wait(60)
 """
 # The libraries are no part of these tests.
-SERVER = "import sys; from pipeline import warm; warm.LIBRARIES = (); sys.exit(warm.main(sys.argv[1:]))"
+SERVER = "import sys; from pipeline.engine import warm; warm.LIBRARIES = (); sys.exit(warm.main(sys.argv[1:]))"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere stages start by themselves")
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A pipeline of nothing but the two modules under test and a stage ``probe``."""
+    """A pipeline of nothing but the modules under test and a stage ``probe``."""
     stages = tmp_path / "pipeline" / "stages"
-    stages.mkdir(parents=True)
-    for name in ("__init__.py", "start.py", "warm.py"):
-        shutil.copy(SOURCES / name, tmp_path / "pipeline" / name)
-    (stages / "__init__.py").touch()
+    for room in (stages, tmp_path / "pipeline" / "engine"):
+        room.mkdir(parents=True)
+        (room / "__init__.py").touch()
+    (tmp_path / "pipeline" / "__init__.py").touch()
+    for name in ("start.py", "warm.py", "lifeline.py"):
+        shutil.copy(SOURCES / "engine" / name, tmp_path / "pipeline" / "engine" / name)
     (stages / "probe.py").write_text(PROBE)
     return tmp_path
 
@@ -108,9 +110,7 @@ def test_a_stage_ends_with_its_status(folder: Path, text: str, status: int, says
     assert says in run(folder, "python -m pipeline.engine.start probe")[2]
 
 
-@pytest.mark.parametrize(
-    "how", ["kill -9 $PPID", "cd pipeline; export PYTHONPATH=..", "export LOOPWRIGHT_WARM=nonsense"]
-)
+@pytest.mark.parametrize("how", ["cd pipeline; export PYTHONPATH=..", "export LOOPWRIGHT_WARM=nonsense"])
 def test_without_a_warm_process_a_stage_starts_by_itself(folder: Path, how: str) -> None:
     process = begin(folder, f"echo $LOOPWRIGHT_WARM; {how}; echo $$; python -m pipeline.engine.start probe 2>&1")
     out, _ = process.communicate(timeout=60)
@@ -132,6 +132,16 @@ def test_a_stage_that_nobody_waits_for_ends(folder: Path) -> None:
     _, told = process.communicate(timeout=20)
     # The command's own status, as a shell counts.
     assert process.returncode == 128 + signal.SIGTERM, told
+
+
+def test_a_warm_process_that_is_killed_takes_everything_with_it(folder: Path) -> None:
+    (folder / "pipeline" / "stages" / "probe.py").write_text(WAIT)
+    process = begin(folder, "echo $$ > shell; python -m pipeline.engine.start probe; exec tail -f /dev/null")
+    assert within(20, lambda: (folder / "pid").exists() and (folder / "pid").read_text() != "")
+    os.kill(process.pid, signal.SIGKILL)
+    started = [int((folder / name).read_text()) for name in ("pid", "shell")]
+    assert within(20, lambda: not any(map(lives, started)))
+    process.communicate(timeout=20)
 
 
 def test_ctrl_c_ends_everything(folder: Path) -> None:

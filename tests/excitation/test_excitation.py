@@ -8,12 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_plant import Lag, Mixer
 
+from pipeline.cases import CASES, beside
 from pipeline.cases.batch_reactor.plant import BatchReactor
 from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.config.params import parse
 from pipeline.errors import ParamsError, PlantError
-from pipeline.excitation import EXCITATIONS, OpenLoop
+from pipeline.excitation import EXCITATIONS as GENERAL
+from pipeline.excitation import Excitation, OpenLoop
 from pipeline.excitation.batches import Batches
 from pipeline.excitation.operating_point import OperatingPoint
 from pipeline.excitation.sequences import TAPS, Aprbs, Multisine, Prbs, RandomSteps, maximal_length
@@ -22,6 +24,10 @@ from pipeline.records.record import Record
 from pipeline.simulation.simulate import simulate_open
 from serving.manifest import Signal
 
+# Every kind of excitation, those that only one case has among them.
+EXCITATIONS: dict[str, type[Excitation]] = dict(GENERAL)
+for case in CASES.values():
+    EXCITATIONS |= beside(case, "excitations", "EXCITATIONS", {})
 SMALL = {
     "random_steps": {"samples": 300},
     "prbs": {"samples": 300, "order": 5},

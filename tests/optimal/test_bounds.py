@@ -60,7 +60,7 @@ def test_bounds_are_means_over_the_sequences_with_all_metrics(stored: Path) -> N
 
 
 def test_figures_of_other_sequences_are_missed(stored: Path) -> None:
-    with pytest.raises(LawError, match=r"no nmpc figures of scenario 'held_out' \(seeds \[3\]\).*python -m pipeline"):
+    with pytest.raises(LawError, match=r"no nmpc figures of scenario 'held_out' \(seeds \[3\]\).*loopwright bounds"):
         load_bounds(TinyCase((1, 3)), stored)
 
 
@@ -68,9 +68,7 @@ def test_figures_of_another_plant_are_refused(stored: Path, tmp_path: Path) -> N
     tree = json.loads(stored.read_text())
     other = tmp_path / "other.json"
     other.write_text(json.dumps(tree | {"plant": "0" * 64}))
-    with pytest.raises(
-        LawError, match=r"other equations or parameters of the plant; run `python -m pipeline.stages.bounds"
-    ):
+    with pytest.raises(LawError, match=r"other equations or parameters of the plant; run `loopwright bounds"):
         load_bounds(TinyCase(), other)
 
 

@@ -13,9 +13,9 @@ import made_up_case as made_up
 import numpy as np
 import pytest
 from made_up_case import CASE
+from pipeline.tracking.__main__ import main
 
 from pipeline.errors import TrackingError
-from pipeline.tracking.__main__ import main
 from pipeline.tracking.gate import Gate
 from pipeline.tracking.lock import dataset_hash, is_current, read_lock
 from pipeline.tracking.publish import publish

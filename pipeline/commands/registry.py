@@ -1,4 +1,4 @@
-"""The registry from the command line: ``python -m pipeline.tracking publish | list | promote | fetch | serve``."""
+"""The registry of controllers: serve it, list it, promote, fetch and publish."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import argparse
 import os
 import socket
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.errors import PipelineError, TrackingError
+from pipeline.errors import TrackingError
 from pipeline.tracking.publish import publish
 from pipeline.tracking.registry import CHAMPION, fetch, promote, versions
 from pipeline.tracking.store import store, store_uri
@@ -30,7 +29,7 @@ def _list(args: argparse.Namespace) -> None:
                 score = version.tags.get("gate_score", "-")
                 print(f"{model.name:40} {version.version:>4}  gate {score:10} {aliases}")
         if not models:
-            print("the registry is empty; run `dvc repro`, or `python -m pipeline.tracking publish`")
+            print("the registry is empty; run `dvc repro`, or `loopwright registry publish`")
 
 
 def _promote(args: argparse.Namespace) -> None:
@@ -61,38 +60,27 @@ def _serve(args: argparse.Namespace) -> None:
     os.execve(sys.executable, [sys.executable, "-m", "mlflow", "server", *options], environment)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("python -m pipeline.tracking", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+def options(parser: argparse.ArgumentParser) -> None:
+    """What the command takes: a command of its own and what that one takes."""
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=type(parser))
     one = commands.add_parser("publish", help="write the cached results that the store lacks")
-    one.set_defaults(run=_publish)
+    one.set_defaults(action=_publish)
     one = commands.add_parser("list", help="controllers, versions, gate scores and aliases")
-    one.set_defaults(run=_list)
+    one.set_defaults(action=_list)
     one = commands.add_parser("promote", help="move an alias by hand")
     one.add_argument("name", help="registered controller: CASE-LAW")
     one.add_argument("version", help="its version, a number")
     one.add_argument("--alias", default=CHAMPION, help="default: %(default)s")
-    one.set_defaults(run=_promote)
+    one.set_defaults(action=_promote)
     one = commands.add_parser("fetch", help="write a controller and its manifest into a folder")
     one.add_argument("controller", help="CASE-LAW (its champion), CASE-LAW@ALIAS, CASE-LAW/VERSION, or CASE")
     one.add_argument("folder", type=Path)
-    one.set_defaults(run=_fetch)
+    one.set_defaults(action=_fetch)
     one = commands.add_parser("serve", help="open MLflow's UI on this machine only, its job execution off")
     one.add_argument("--port", type=int, default=5000, help="default: %(default)s")
-    one.set_defaults(run=_serve)
-    return parser
+    one.set_defaults(action=_serve)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns 2 after printing one line for an error on purpose."""
-    args = _parser().parse_args(argv)
-    try:
-        args.run(args)
-    except (PipelineError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def run(options: argparse.Namespace) -> None:
+    """Run the registry's command."""
+    options.action(options)

@@ -1,0 +1,30 @@
+"""The commands of ``loopwright``, a module each: ``options`` says what it takes, ``run`` does it.
+
+Importing this list loads none of them, so that ``loopwright --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import NoReturn
+
+COMMANDS = {
+    "run": "run the pipeline, or a part of it, and say beforehand what runs and why",
+    "check": "read every section of params.yaml and list its mistakes",
+    "results": "show the figures of every controller, and where to look",
+    "simulate": "close the loop of a controller file over its plant",
+    "inspect": "show what a controller file is and how its validation went",
+    "bench": "measure how long a step of a controller file takes here",
+    "laws": "list the control laws, or the parameters of one",
+    "models": "list the kinds of model, or the parameters of one",
+    "bounds": "compute what no controller of a case can beat",
+    "registry": "serve, list, promote, fetch or publish registered controllers",
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with status 2 and one line."""
+        self.exit(2, f"{self.prog}: {message}\n")

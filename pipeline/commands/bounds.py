@@ -1,0 +1,26 @@
+"""What no controller of a case can beat, computed and stored beside the case."""
+
+from __future__ import annotations
+
+import argparse
+
+from pipeline.cases import CASES
+from pipeline.config.params import choose
+from pipeline.stages.bounds import compute
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """What the command takes."""
+    parser.add_argument("case", metavar="CASE", help=", ".join(sorted(CASES)))
+    parser.add_argument("--scenario", metavar="NAME", action="append", help="only this test (may be given again)")
+    parser.add_argument("--jobs", metavar="N", type=int, default=1, help="processes side by side (1)")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Compute the bounds, a line for each figure."""
+    case = choose(CASES, options.case, "case", "bounds")
+    tests = case.scenarios()
+    for name in options.scenario or ():
+        choose(tests, name, "scenario", f"case {case.name!r}")
+    for line in compute(case, options.scenario or list(tests), options.jobs):
+        print(line, flush=True)

@@ -1,0 +1,8 @@
+"""What a controller file is, and how its validation went."""
+
+from __future__ import annotations
+
+from serving.__main__ import inspect_options as options
+from serving.__main__ import run_inspect as run
+
+__all__ = ["options", "run"]

@@ -1,0 +1,122 @@
+"""The pipeline or a part of it: says what will run and why, then runs it with the libraries loaded once."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from pipeline.config.params import nearest, sections
+from pipeline.engine.lifeline import end_with_parent
+from pipeline.errors import ParamsError, PipelineError
+from pipeline.report.results import show_results
+from pipeline.stages.check import mistakes
+
+ARTIFACTS = Path("artifacts")
+KINDS = {"records": "excite", "models": "fit", "controllers": "validate"}  # a section of params.yaml -> its stage
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """What the command takes."""
+    parser.add_argument(
+        "targets", metavar="TARGET", nargs="*", help="cases, controllers, models or records of params.yaml (all)"
+    )
+    parser.add_argument("--dry", action="store_true", help="say what would run and why, and run nothing")
+    parser.add_argument("--keep-going", action="store_true", help="after a failure, run what does not depend on it")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check params.yaml, say what runs, run it, and show the results."""
+    targets = [stage for name in options.targets for stage in stages_of(name)]
+    found = mistakes()
+    if found:
+        raise ParamsError(f"{found[0]}; params.yaml has {len(found)} mistakes, `loopwright check` lists them")
+    # The list of files that each stage runs comes first: what has changed shows only after it.
+    _dvc("repro", "--quiet", "code")
+    changed = status(targets)
+    print("\n".join(plan(changed)), flush=True)
+    if options.dry:
+        return 0
+    code = 0
+    if changed:
+        code = repro(*(["--keep-going"] if options.keep_going else []), *targets)
+    if code == 0:
+        show_results(ARTIFACTS)
+    return code
+
+
+def repro(*arguments: str) -> int:
+    """Run ``dvc repro`` with the stages' libraries loaded once; its exit status.
+
+    The process that loads them imports nothing of the pipeline, so that every stage runs the sources
+    as they are when it starts. It and all that it starts end with this process, whatever ends it.
+    """
+    own = os.getpid()
+    command = [sys.executable, "-m", "pipeline.engine.warm", sys.executable, "-m", "dvc", "repro", *arguments]
+    with subprocess.Popen(command, preexec_fn=lambda: end_with_parent(own)) as process:
+        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+        while True:
+            try:
+                return process.wait()
+            except KeyboardInterrupt:
+                continue  # the terminal has told all of them; wait until they have ended
+
+
+def stages_of(name: str) -> list[str]:
+    """The DVC stages that a name asks for: of a case its report, of a controller its validation.
+
+    Raises ParamsError for a name that params.yaml does not have.
+    """
+    if name in sections("cases"):
+        return [f"report@{name}"]
+    for kind, stage in KINDS.items():
+        if name in sections(kind):
+            return [f"{stage}@{name}"]
+    known = [name for kind in ("cases", *KINDS) for name in sections(kind)]
+    raise ParamsError(f"params.yaml has no case, controller, model or record {name!r}{nearest(name, known)}")
+
+
+def status(targets: Iterable[str]) -> Mapping[str, list[str]]:
+    """Stage -> why it runs, of the stages whose own files or parameters have changed (``dvc status``)."""
+    upstream = [] if not targets else ["--with-deps"]
+    tree = json.loads(_dvc("status", "--json", *upstream, *targets) or "{}")
+    return {stage: [reason for entry in found for reason in reasons(entry)] for stage, found in tree.items()}
+
+
+def reasons(entry: Mapping[str, object] | str) -> list[str]:
+    """What DVC says of a stage, in words: ``{"changed deps": {"params.yaml": {"x.y": "modified"}}}``."""
+    if isinstance(entry, str):  # "changed command", "always changed"
+        return [entry]
+    found = []
+    for items in entry.values():
+        for name, how in items.items() if isinstance(items, Mapping) else ():
+            if isinstance(how, Mapping):  # parameters of a file
+                found += [f"{key} is {verb}" for key, verb in how.items()]
+            else:
+                found.append(f"{name} is {how}")
+    return found
+
+
+def plan(changed: Mapping[str, list[str]]) -> list[str]:
+    """What runs and why, a line a stage."""
+    if not changed:
+        return ["nothing has changed; everything is up to date"]
+    width = max(map(len, changed))
+    rows = [f"  {stage:{width}}  {'; '.join(why)}" for stage, why in changed.items()]
+    return [f"{len(changed)} stages have changed; they run, and after them what depends on them:", *rows]
+
+
+def _dvc(*arguments: str) -> str:
+    """What DVC prints; PipelineError with its last line where it failed."""
+    command = [sys.executable, "-m", "dvc", *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    except subprocess.CalledProcessError as error:
+        lines = (error.stderr or error.stdout).strip().splitlines() or ["no output"]
+        raise PipelineError(f"dvc {arguments[0]} failed: {lines[-1]}") from error
+    return done.stdout

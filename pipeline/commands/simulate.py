@@ -1,0 +1,186 @@
+"""A controller file in the real loop over its plant, live."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from pipeline.cases import CASES, PLANTS
+from pipeline.config.params import choose, nearest
+from pipeline.errors import ParamsError
+from pipeline.evaluation.case import Case
+from pipeline.pictures.loop_picture import History, draw, summary, write_csv
+from pipeline.plants.base import Plant
+from pipeline.simulation.live import SimulatedPlant, view_of
+from pipeline.simulation.scenario import Scenario
+from pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
+from serving.clock import MonotonicClock, VirtualClock
+from serving.controller import Controller
+from serving.guard import Sample
+from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
+from serving.manifest import Manifest
+
+RECOVER_AFTER = 5  # good samples
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """What the command takes."""
+    event = partial(_argument, partial(parse_event, named=False))
+    named = partial(_argument, partial(parse_event, named=True))
+    add = parser.add_argument
+    add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
+    add("--sp", metavar="VALUE[@S]", type=event, action="append", default=[], help="set point from time S on")
+    add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
+    add(
+        "--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this controlled variable"
+    )
+    add("--disturbance", metavar="NAME=VALUE[@S]", type=named, action="append", default=[], help="plant parameter")
+    add("--noise", metavar="PV=STD", type=named, action="append", default=[], help="measurement noise")
+    add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
+        help="MANUAL between two times, with one value an MV")  # fmt: skip
+    add("--duration", metavar="S", type=_positive, help="length of the run")
+    add("--speed", metavar="X", type=_positive, help="times real time, 1 is real time (default: as fast as possible)")
+    add("--seed", metavar="N", type=_seed, default=0, help="of the noise (0)")
+    add("--picture", metavar="FILE", type=Path, help="where the picture goes (<law>-simulation.png)")
+    add("--csv", metavar="FILE", type=Path, help="write every sample there")
+
+
+def _test_of(case: Case | None, name: str | None) -> Scenario | None:
+    """The first sequence of the case's test ``name``, or of its first test; None where the plant has no case."""
+    tests = {} if case is None else case.scenarios()
+    if case is None or not tests:
+        return None
+    return choose(tests, next(iter(tests)) if name is None else name, "scenario", f"case {case.name!r}")[0]
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the loop, live, and leave a picture."""
+    if options.sp and options.scenario is not None:
+        raise ParamsError("give set points or a scenario, not both")
+    controller = Controller(options.file)
+    plant, case = _plant_of(controller.manifest)
+    course = timetable(
+        plant,
+        None if options.sp else _test_of(case, options.scenario),
+        set_points=options.sp,
+        disturbances=options.disturbance,
+        noise=options.noise,
+        manual=options.manual,
+        start_cv=options.start,
+        duration_s=options.duration,
+        seed=options.seed,
+    )
+    plant = course.plant  # a scenario may have one of its own
+    title = f"{controller.manifest.law} on {plant.title}"
+    history = close_loop(controller, plant, course, title=title, speed=options.speed)
+    print(summary(plant, history, "mae" if case is None else case.metric))
+    picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
+    draw(picture, plant, history, title, course.marks)
+    print(f"picture: {picture}")
+    if options.csv:
+        write_csv(options.csv, plant, history)
+        print(f"samples: {options.csv}")
+
+
+def close_loop(
+    controller: Controller, plant: Plant, course: Timetable, *, title: str, speed: float | None = None
+) -> History:
+    """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible."""
+    endpoint, history = SimulatedPlant(plant, course), History()
+    loop = ControlLoop(
+        controller,
+        endpoint,
+        sp=course.sp[0],
+        mv=course.mv0,
+        mode=Mode.AUTO,
+        recover_after=RECOVER_AFTER,
+        clock=VirtualClock() if speed is None else MonotonicClock(speed),
+        warm_lead_s=0.0 if speed is None else WARM_LEAD_S * speed,
+    )
+    period, n = plant.period_s, len(course.sp)
+    marks = {round(at / period): text for at, text in course.marks.items()}
+
+    def before(k: int) -> None:
+        # A period that a slow machine missed passed in the plant too, with the MV held.
+        while endpoint.k < k:
+            endpoint.write(endpoint.mv)
+        loop.set_sp(course.sp[k])
+        span = course.manual_at(k * period)
+        if span is not None and loop.mode is not Mode.MANUAL:
+            loop.set_mode(Mode.MANUAL)
+            if span.mv is not None:
+                loop.set_mv(span.mv)
+        elif span is None and loop.mode is Mode.MANUAL:
+            loop.set_mode(Mode.AUTO)
+        history.pv.append(endpoint.pv)
+
+    def observe(sample: Sample | None, command: Command) -> None:
+        k = endpoint.k - 1
+        assert sample is not None  # a simulated plant can always be read
+        history.time_s.append(k * period)
+        history.mode.append(command.mode.value)
+        history.sp.append(command.sp)
+        history.measured.append(sample.pv)
+        history.mv.append(command.mv)
+        history.reason.append(command.reason)
+        view.show(k * period, sample.pv, command, marks.get(k))
+
+    with view_of(plant, title, n * period, sys.stdout) as view:
+        loop.run(n, before=before, observe=observe)
+    return history
+
+
+def _plant_of(manifest: Manifest) -> tuple[Plant, Case | None]:
+    """The plant that the controller was made for, and its case if it has one."""
+    case = CASES.get(manifest.case)
+    if case is None and manifest.case not in PLANTS:
+        raise ParamsError(
+            f"the controller is for {manifest.case!r}, which is neither a case nor a plant here"
+            f"{nearest(manifest.case, {*CASES, *PLANTS})}"
+        )
+    plant = PLANTS[manifest.case]() if case is None else case.plant
+    for name in ("sp", "pv", "dv", "mv"):
+        ours = [(s.name, s.unit) for s in getattr(plant, f"{name}_signals")]
+        theirs = [(s.name, s.unit) for s in manifest.signals(name)]
+        if ours != theirs:
+            raise ParamsError(f"the controller's {name} are {theirs}, but plant {plant.name!r} has {ours}")
+    if manifest.period_s != plant.period_s:
+        raise ParamsError(
+            f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
+        )
+    return plant, case
+
+
+def _argument(parse: Callable[[str], object], text: str) -> object:
+    """A parser of this package as argparse wants it."""
+    try:
+        return parse(text)
+    except ParamsError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+    return value
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is no seed; give a whole number of at least 0")
+    return int(text)
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
+    return value
