@@ -599,7 +599,7 @@ CHAOS_FILES = [p for p in SHIPPED if p.stem in ("inverse_dob", "minimum_variance
 CHAOS_FILES += [p for p in SHIPPED if p.parent.name == "jacketed_batch_reactor"]
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=60)
 @given(
     st.data(), st.sampled_from(CHAOS_FILES), st.sampled_from(["default", "none", "one"]), st.sampled_from([None, 1, 2])
 )
