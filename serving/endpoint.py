@@ -14,7 +14,10 @@ Array: TypeAlias = NDArray[np.float64]
 
 
 class Endpoint(Protocol):
-    """The plant's side. Both calls raise EndpointError (or OSError) when the plant cannot be reached."""
+    """The plant's side. Both calls raise EndpointError when the plant cannot be reached.
+
+    Any other exception is taken the same way: the loop holds, names it and tries again.
+    """
 
     def read(self) -> Sample:
         """The present sample."""

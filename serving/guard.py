@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite
 from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from serving.errors import LoopError
 from serving.manifest import Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
+
+READ_BACK_MARGIN = 0.02  # share of an MV's range by which scaling may carry a sound read-back over its ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,23 +45,27 @@ class Guard(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Complete:
-    """Every value is there and finite."""
+    """Every value is there and finite. Only the applied MV may be None: it need not be read back."""
 
     manifest: Manifest
     memory: int = field(default=0, init=False)
 
     def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
-        """Why not: a vector has the wrong length, or a value is NaN or infinite."""
+        """Why not: a vector is no array of numbers or has the wrong length, or a value is NaN or infinite."""
         m = self.manifest
         for label, signals, values in (
             ("PV", m.pv, sample.pv),
             ("DV", m.dv, sample.dv),
             ("applied MV", m.mv, sample.mv_applied),
         ):
-            if values is None:
+            if values is None and (signals is m.mv or not signals):
                 continue
-            if np.shape(values) != (len(signals),):
-                return f"{label} has the shape {np.shape(values)} instead of ({len(signals)},)"
+            if not isinstance(values, np.ndarray):
+                return f"{label} is of the type {type(values).__name__}; it needs an array of {len(signals)} numbers"
+            if values.dtype.kind not in "fiu":
+                return f"{label} is an array of the type {values.dtype}; it needs numbers"
+            if values.shape != (len(signals),):
+                return f"{label} has the shape {values.shape} instead of ({len(signals)},)"
             for signal, value in zip(signals, values.tolist(), strict=True):
                 if not isfinite(value):
                     return f"{label} {signal.name} is {value}"
@@ -84,23 +91,19 @@ class InRange:
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Every discrete applied MV has a value that it may have.
+    """Every applied MV has a value that it may have.
 
-    A valve that is read back half way between open and shut has done neither over the last period:
-    no law knows what the plant received.
+    A continuous one lies in its signal's range, widened by ``READ_BACK_MARGIN`` times the range on
+    both sides. A discrete one has one of its values: a valve that is read back half way between
+    open and shut has done neither over the last period, so no law knows what the plant received.
     """
 
     signals: tuple[Signal, ...]
     memory: int = field(default=0, init=False)
 
     def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
-        """Why not: the actuator is on its way, or broken."""
-        if sample.mv_applied is None:
-            return None
-        for s, value in zip(self.signals, sample.mv_applied.tolist(), strict=True):
-            if s.values is not None and value not in s.values:
-                return f"applied MV {s.name} is {value:.6g}, none of {', '.join(f'{v:g}' for v in s.values)}"
-        return None
+        """Why not: the actuator is on its way, or it or its read-back is broken."""
+        return None if sample.mv_applied is None else implausible(self.signals, sample.mv_applied.tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,14 +134,23 @@ class Frozen:
 
 @dataclass(frozen=True, slots=True)
 class Fresh:
-    """The sample is at most ``max_age_s`` [s] old."""
+    """The sample is at most ``max_age_s`` [s] old, and not from the future.
+
+    Raises LoopError if ``max_age_s`` is no finite number of seconds, 0 or more.
+    """
 
     max_age_s: float
     memory: int = field(default=0, init=False)
 
+    def __post_init__(self) -> None:
+        if not _is_age(self.max_age_s):
+            raise LoopError(f"max_age_s is {self.max_age_s!r}; it must be a finite number of seconds, 0 or more")
+
     def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
-        """Why not: the measurement belongs to another period."""
-        if not sample.age_s <= self.max_age_s:
+        """Why not: the measurement belongs to another period, or its age is no age."""
+        if not _is_age(sample.age_s):
+            return f"the sample's age is {sample.age_s!r}; it must be a finite number of seconds, 0 or more"
+        if sample.age_s > self.max_age_s:
             return f"the sample is {sample.age_s:.3g} s old; allowed are {self.max_age_s:.3g} s"
         return None
 
@@ -164,5 +176,21 @@ class Rate:
 
 def default_guards(manifest: Manifest) -> tuple[Guard, ...]:
     """The guards that suit every plant: values there and allowed, PVs in range, no sample older than a period."""
-    discrete = (Allowed(manifest.mv),) if any(s.values for s in manifest.mv) else ()
-    return (Complete(manifest), *discrete, InRange(manifest.pv), Fresh(manifest.period_s))
+    return (Complete(manifest), Allowed(manifest.mv), InRange(manifest.pv), Fresh(manifest.period_s))
+
+
+def implausible(signals: Sequence[Signal], applied: Sequence[float]) -> str | None:
+    """Why no actuator can hold ``applied`` (n_mv,), by the rule of ``Allowed``; None if one can."""
+    for s, value in zip(signals, applied, strict=True):
+        if s.values is not None:
+            if value not in s.values:
+                return f"applied MV {s.name} is {value:.6g}, none of {', '.join(f'{v:g}' for v in s.values)}"
+            continue
+        slack = READ_BACK_MARGIN * (s.high - s.low)
+        if not s.low - slack <= value <= s.high + slack:
+            return f"applied MV {s.name} is {value:.6g} {s.unit}, outside its range [{s.low:g}, {s.high:g}] {s.unit}"
+    return None
+
+
+def _is_age(seconds: object) -> bool:
+    return isinstance(seconds, (int, float, np.integer, np.floating)) and bool(0 <= seconds < inf)

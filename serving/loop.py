@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TypeAlias
+from math import isfinite
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,11 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 from serving.clock import Clock, MonotonicClock
 from serving.controller import Controller
 from serving.endpoint import Endpoint
-from serving.errors import EndpointError, LoopError
-from serving.guard import Guard, Sample, default_guards
+from serving.errors import ContractError, LoopError, SampleError
+from serving.guard import Guard, Sample, default_guards, implausible
 from serving.manifest import Signal
 
 Array: TypeAlias = NDArray[np.float64]
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
 
 WARM_LEAD_S = 4e-4  # within the clock's spin, so that the processor does not sleep between warm-up and deadline
 
@@ -46,12 +52,18 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """How a run went: scans done, periods skipped because the machine was late, scans with a fault."""
+    """How a run went: scans done, periods skipped because the machine was late, scans with a fault.
+
+    An exception of ``observe``, ``until`` or the warm-up moves no MV and is no fault. ``errors``
+    counts these exceptions; ``first_errors`` names the first one of each.
+    """
 
     scans: int
     missed: int
     faults: int
     latest_s: float  # largest lateness of a scan against its place on the grid [s]
+    errors: int = 0
+    first_errors: tuple[str, ...] = ()
 
 
 class ControlLoop:
@@ -62,6 +74,10 @@ class ControlLoop:
     at its last applied value; a fault in AUTO leads there by itself, with the reason in the
     command, and ``recover_after`` good samples lead back. A law that had a gap starts cold
     (state = 0).
+
+    Every commanded MV lies in its range, in every mode and with any guards (a discrete MV has one
+    of its values). A read-back outside the range by more than ``guard.READ_BACK_MARGIN`` times the
+    range is a fault. One within this margin is clipped to the range, for the law and for HOLD.
 
     Parameters
     ----------
@@ -118,6 +134,7 @@ class ControlLoop:
         self.max_gap = max_gap
         self._sp = _within(sp, manifest.sp, "set point")
         self._mv = _within(mv, manifest.mv, "MV")
+        self._ranges = [(s.low, s.high, s.values) for s in manifest.mv]
         self._mode = mode
         self._fault = ""  # why the loop itself went to HOLD; empty while it did not
         self._good = 0
@@ -166,25 +183,28 @@ class ControlLoop:
         reason = self._refusal(sample)
         if reason:
             return self.miss(reason)
-        applied = self._mv if sample.mv_applied is None else np.array(sample.mv_applied, dtype=np.float64)
+        applied = self._mv
         try:
+            applied = self._read_back(sample)
             step = self.controller.step(sp=self._sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
+            if self._past.maxlen:
+                self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may use its array again
         except Exception as error:  # whatever it is, the plant needs an MV
             if self._mode is Mode.AUTO:
                 self._mv = applied
-            return self.miss(str(error))
-        self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may use its array again
+            return self.miss(_text(error))
         self._state = step.state
         if self._fault:
             self._good += 1
             if self.recover_after is not None and self._good >= self.recover_after:
                 self.set_mode(Mode.AUTO)
         if self._mode is Mode.AUTO:
-            self._mv = step.mv
+            self._mv = step.mv.copy()  # the host gets step.mv and may write into it
         return self._command(step.mv, step.info, self._fault)
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, the law starts cold afterwards."""
+        reason = reason or "a fault without a reason"
         self._state = self.controller.cold_state()
         self._past.clear()
         self._good = 0
@@ -193,14 +213,37 @@ class ControlLoop:
         return self._command(None, None, reason)
 
     def _refusal(self, sample: Sample) -> str | None:
+        if not isinstance(sample, Sample):
+            return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
         for guard in self.guards:
             try:
                 reason = guard.check(sample, self._past)
+                if reason:
+                    return str(reason)
             except Exception as error:  # a guard that fails has not cleared the sample
-                reason = f"{type(guard).__name__} failed: {error}"
-            if reason:
-                return reason
+                return f"{type(guard).__name__} failed: {_text(error)}"
         return None
+
+    def _read_back(self, sample: Sample) -> Array:
+        """The applied MV (n_mv,), each value one that may be commanded; the last command if there is no read-back.
+
+        Raises ContractError for a wrong shape and SampleError for an implausible value: HOLD makes
+        the read-back a command, so this check does not depend on the guards.
+        """
+        if sample.mv_applied is None:
+            return self._mv
+        applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
+        if applied.shape != self._mv.shape:
+            raise ContractError(f"applied MV has the shape {applied.shape} instead of {self._mv.shape}")
+        values = applied.tolist()
+        for value, (low, high, allowed) in zip(values, self._ranges, strict=True):
+            if not low <= value <= high or (allowed is not None and value not in allowed):
+                reason = implausible(self.controller.manifest.mv, values)
+                if reason:
+                    raise SampleError(reason)
+                lows, highs, _ = zip(*self._ranges, strict=True)
+                return np.clip(applied, lows, highs)
+        return applied
 
     def _command(self, law_mv: Array | None, info: Array | None, reason: str) -> Command:
         self._scan += 1
@@ -219,25 +262,42 @@ class ControlLoop:
 
         Deadlines are t0 + k period, so lateness never becomes drift; a period that has wholly
         passed is skipped and counted. ``before(k)`` is called ahead of the scan on grid place k (a
-        schedule of set points), ``observe`` after it. An unreachable endpoint is a fault like any
-        other: the loop holds and tries again.
+        schedule of set points), ``observe`` after it.
 
-        Raises LoopError without an endpoint.
+        No exception but KeyboardInterrupt, SystemExit and their like ends the run: the plant needs
+        an MV at every period. What raises decides what follows.
+
+        - ``endpoint``: a fault. The loop holds and tries again.
+        - ``before``: a fault, because the set points may be wrong. The held MV is written.
+        - ``clock``: a fault, because the law's period is not known. The held MV is written, and the
+          machine's clock measures the next period.
+        - ``observe``, ``until``, the warm-up: no fault, because the MV is already written or does
+          not depend on them. The run goes on; an ``until`` that raises has not said yes. The
+          exceptions are counted and named in the report, and the first of each is logged at once.
+
+        Raises
+        ------
+        LoopError
+            There is no endpoint.
+        Exception
+            What the clock raises when it is first read: nothing has been commanded yet.
         """
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")
         period = self.controller.manifest.period_s
         start = self.clock.now()
+        failures = _Failures()
         k = scans = missed = faults = 0
         latest = 0.0
         while n is None or k < n:
-            deadline = start + k * period
-            if self.warm_lead_s:
-                self.clock.sleep_until(deadline - self.warm_lead_s)
-                self.controller.warm()
-            self.clock.sleep_until(deadline)
-            late = max(0.0, self.clock.now() - deadline)
-            gap = int(late // period)
+            reason, late, gap = "", 0.0, 0
+            try:
+                late = self._wait(start + k * period, failures)
+                gap = int(late // period)
+            except Exception as error:
+                reason = f"the clock failed: {_named(error)}"
+                spare = MonotonicClock()
+                spare.sleep_until(spare.now() + period)
             if gap:
                 k, missed, late = k + gap, missed + gap, late - gap * period
                 if n is not None and k >= n:
@@ -246,41 +306,90 @@ class ControlLoop:
                     self._state = self.controller.cold_state()
             latest = max(latest, late)
             if before is not None:
-                before(k)
-            sample, command = self._exchange(self.endpoint)
+                try:
+                    before(k)
+                except Exception as error:
+                    reason = reason or f"before failed: {_named(error)}"
+            sample, command = self._exchange(self.endpoint, reason)
             scans += 1
             faults += bool(command.reason)
             if observe is not None:
-                observe(sample, command)
-            if until is not None and until(command):
+                failures.call("observe", observe, sample, command)
+            if until is not None and failures.call("until", lambda c: bool(until(c)), command):
                 break
             k += 1
-        return RunReport(scans, missed, faults, latest)
+        return RunReport(scans, missed, faults, latest, failures.count, tuple(failures.first.values()))
 
-    def _exchange(self, endpoint: Endpoint) -> tuple[Sample | None, Command]:
-        """Read, scan, write; an endpoint that fails gives a held command with the reason."""
-        sample, applied = None, self._mv
+    def _wait(self, deadline: float, failures: _Failures) -> float:
+        """Sleep until ``deadline`` [s], warm the controller just before it, and give the lateness [s]."""
+        if self.warm_lead_s:
+            self.clock.sleep_until(deadline - self.warm_lead_s)
+            failures.call("warm", self.controller.warm)
+        self.clock.sleep_until(deadline)
+        late = self.clock.now() - deadline
+        if not isfinite(late):
+            raise LoopError(f"the lateness is {late} s; the clock must give finite seconds")
+        return max(0.0, late)
+
+    def _exchange(self, endpoint: Endpoint, reason: str) -> tuple[Sample | None, Command]:
+        """Read, scan, write; ``reason`` (unless empty) or an endpoint that fails gives a held command."""
+        sample, last = None, self._mv
         try:
             sample = endpoint.read()
-        except (EndpointError, OSError) as error:
-            command = self.miss(f"the endpoint cannot be read: {error}")
+        except Exception as error:
+            command = self.miss(reason or f"the endpoint cannot be read: {_named(error)}")
         else:
-            command = self.scan(sample)
+            command = self.miss(reason) if reason else self.scan(sample)
         try:
             endpoint.write(command.mv)
-        except (EndpointError, OSError) as error:
+        except Exception as error:
             if self._mode is Mode.AUTO:
-                self._mv = applied  # what was decided never arrived
+                self._mv = last  # what was decided never arrived
             self._scan -= 1
-            command = self.miss(f"the endpoint cannot be written: {error}")
-        return sample, command
+            command = self.miss(f"the endpoint cannot be written: {_named(error)}")
+        return sample if isinstance(sample, Sample) else None, command
+
+
+class _Failures:
+    """Exceptions that move no MV: how many, and the text of the first one by the name of what raised."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first: dict[str, str] = {}
+
+    def call(self, name: str, act: Callable[..., T], *arguments: object) -> T | None:
+        """``act(*arguments)``; None, counted and named, if it raises."""
+        try:
+            return act(*arguments)
+        except Exception as error:
+            self.count += 1
+            if name not in self.first:
+                self.first[name] = f"{name} failed: {_named(error)}"
+                with suppress(Exception):  # a log handler of the host's may be what is broken
+                    _log.error(self.first[name])
+            return None
+
+
+def _text(error: Exception) -> str:
+    """The first line of the error's text; its type where it has none."""
+    name = type(error).__name__
+    try:
+        return (str(error).strip().splitlines() or [name])[0]
+    except Exception:
+        return name
+
+
+def _named(error: Exception) -> str:
+    """The error's type and text in one line."""
+    name, text = type(error).__name__, _text(error)
+    return name if text == name else f"{name}: {text}"
 
 
 def _within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
     """``values`` as (n,); LoopError outside the signals' ranges."""
     try:
         vector = np.array(values, dtype=np.float64, ndmin=1)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise LoopError(f"the {what} is no vector of numbers: {error}") from error
     if vector.shape != (len(signals),):
         names = ", ".join(f"{s.name} [{s.unit}]" for s in signals)

@@ -15,8 +15,15 @@ from rich.console import Console
 
 from pipeline.__main__ import main
 from pipeline.cases import CASES
+<<<<<<< HEAD
 from pipeline.export.gate import export
 from pipeline.laws import LAWS, LawSignals
+=======
+from pipeline.errors import PlantError
+from pipeline.export import export
+from pipeline.laws import LAWS, LawSignals
+from pipeline.live import SimulatedPlant, TerminalView, sparkline
+>>>>>>> loop
 from pipeline.metrics import mae
 from pipeline.plants.base import Plant
 from pipeline.simulation.live import TerminalView, sparkline
@@ -158,6 +165,24 @@ def test_bad_options_give_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_plant_that_leaves_its_equations_ends_the_simulation(
+    pid_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loop outlives an endpoint that raises; the command must say why and end."""
+    writes: list[int] = []
+
+    def write(self: SimulatedPlant, mv: np.ndarray) -> None:
+        writes.append(self.k)
+        raise PlantError("the plant has left what its equations can compute")
+
+    monkeypatch.setattr(SimulatedPlant, "write", write)
+    assert main(["simulate", str(pid_file), "--sp", "0.6", "--duration", "25"]) == 2
+    assert capsys.readouterr().err == (
+        "loopwright simulate: the plant has left what its equations can compute\n"
+    )
+    assert writes == [0]
 
 
 def test_a_controller_of_another_plant_is_refused(

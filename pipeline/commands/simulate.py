@@ -6,8 +6,10 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 from pipeline.cases import CASES, PLANTS
 from pipeline.config.params import choose, nearest
@@ -20,11 +22,14 @@ from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
 from serving.clock import MonotonicClock, VirtualClock
 from serving.controller import Controller
+from serving.endpoint import Array, Endpoint
 from serving.guard import Sample
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest
 
 RECOVER_AFTER = 5  # good samples
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -129,9 +134,41 @@ def close_loop(
         history.reason.append(command.reason)
         view.show(k * period, sample.pv, command, marks.get(k))
 
+    # The loop outlives whatever raises, as a plant needs it to; a simulation that raised is over.
+    failed: list[Exception] = []
+    loop.endpoint = _Ending(endpoint, failed)
     with view_of(plant, title, n * period, sys.stdout) as view:
-        loop.run(n, before=before, observe=observe)
+        loop.run(n, before=_ending(before, failed), observe=_ending(observe, failed), until=lambda _: len(failed) > 0)
+    if failed:
+        raise failed[0]
     return history
+
+
+@dataclass(frozen=True)
+class _Ending:
+    """An endpoint whose exceptions are kept in ``failed``."""
+
+    endpoint: Endpoint
+    failed: list[Exception]
+
+    def read(self) -> Sample:
+        return _ending(self.endpoint.read, self.failed)()
+
+    def write(self, mv: Array) -> None:
+        _ending(self.endpoint.write, self.failed)(mv)
+
+
+def _ending(act: Callable[P, T], failed: list[Exception]) -> Callable[P, T]:
+    """``act`` that also keeps its exceptions in ``failed``."""
+
+    def call(*arguments: P.args, **options: P.kwargs) -> T:
+        try:
+            return act(*arguments, **options)
+        except Exception as error:
+            failed.append(error)
+            raise
+
+    return call
 
 
 def _plant_of(manifest: Manifest) -> tuple[Plant, Case | None]:

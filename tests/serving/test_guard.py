@@ -9,7 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from serving import Complete, Fresh, Frozen, Guard, InRange, Manifest, Rate, Sample, Signal, default_guards
+from serving import (
+    Allowed,
+    Complete,
+    Fresh,
+    Frozen,
+    Guard,
+    InRange,
+    LoopError,
+    Manifest,
+    Rate,
+    Sample,
+    Signal,
+    default_guards,
+)
 
 PV = (Signal("level", "m", 0.0, 2.0), Signal("T", "K", 250.0, 400.0))
 MANIFEST = Manifest(
@@ -54,6 +67,9 @@ def test_a_good_run_passes_every_guard(guard: Guard) -> None:
         (sample(dv=np.array([math.inf])), "DV inflow is inf"),
         (sample(dv=np.zeros(0)), "DV has the shape (0,) instead of (1,)"),
         (Sample(pv=np.zeros(3), dv=np.zeros(1)), "PV has the shape (3,) instead of (2,)"),
+        (sample(dv=None), "DV is of the type NoneType; it needs an array of 1 numbers"),
+        (sample(mv_applied=[50.0]), "applied MV is of the type list; it needs an array of 1 numbers"),
+        (sample(mv_applied=np.array([None])), "applied MV is an array of the type object; it needs numbers"),
     ],
 )
 def test_complete(bad: Sample, reason: str) -> None:
@@ -81,6 +97,33 @@ def test_fresh() -> None:
     assert Fresh(0.5).check(sample(age_s=0.5), ()) is None
     assert Fresh(0.5).check(sample(age_s=0.6), ()) == "the sample is 0.6 s old; allowed are 0.5 s"
     assert Fresh(0.5).check(sample(age_s=math.nan), ()) is not None
+
+
+@pytest.mark.parametrize(
+    ("valve", "good"), [(-2.1, False), (-1.9, True), (101.9, True), (102.1, False), (1.7e308, False)]
+)
+def test_an_applied_mv_beyond_its_range_and_margin_is_implausible(valve: float, good: bool) -> None:
+    reason = Allowed(MANIFEST.mv).check(sample(mv_applied=np.array([valve])), ())
+    assert reason == (None if good else f"applied MV valve is {valve:.6g} %, outside its range [0, 100] %")
+
+
+def test_the_default_guards_look_at_the_applied_mv() -> None:
+    bad = sample(mv_applied=np.array([1e6]))
+    assert [type(g) for g in default_guards(MANIFEST) if g.check(bad, ())] == [Allowed]
+
+
+@pytest.mark.parametrize("age", [-1e-9, -math.inf, math.inf, math.nan, None, "0.1", np.float64(-1)])
+def test_an_age_that_is_none_is_refused(age: Any) -> None:
+    reason = f"the sample's age is {age!r}; it must be a finite number of seconds, 0 or more"
+    assert Fresh(0.5).check(sample(age_s=age), ()) == reason
+    for good in (0, 0.0, np.float32(0.1), np.int64(0)):
+        assert Fresh(0.5).check(sample(age_s=good), ()) is None
+
+
+@pytest.mark.parametrize("limit", [None, math.nan, math.inf, -1.0, "1"])
+def test_an_age_guard_needs_a_limit(limit: Any) -> None:
+    with pytest.raises(LoopError, match="it must be a finite number of seconds, 0 or more"):
+        Fresh(limit)
 
 
 def test_rate_looks_at_one_step_in_either_direction() -> None:

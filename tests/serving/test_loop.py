@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -12,18 +13,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import serving.loop
 from serving import (
     Command,
+    Complete,
     Controller,
     ControlLoop,
     EndpointError,
     LoopError,
     Mode,
     MonotonicClock,
+    OutputError,
     Rate,
     Sample,
+    Signal,
     SimulatedEndpoint,
     VirtualClock,
+    default_guards,
 )
 
 pytest_plugins = ["small_laws"]
@@ -262,6 +268,367 @@ def test_simulated_endpoint_steps_the_plant_at_each_write() -> None:
     assert (first.pv.tolist(), first.mv_applied.tolist()) == ([1.0], [10.0])  # type: ignore[union-attr]
     endpoint.write(np.array([30.0]))
     assert endpoint.read().pv.tolist() == [15.0]
+
+
+# ---------------------------------------------------------------------- the range, whatever comes
+SHIPPED = sorted((Path(__file__).parent.parent / "artifacts").glob("*/*.onnx"))
+
+
+@functools.cache
+def shipped(path: Path) -> Controller:
+    return Controller(path)
+
+
+def middle(signals: tuple[Signal, ...]) -> np.ndarray:
+    return np.array([s.middle for s in signals])
+
+
+def legal(mv: np.ndarray, signals: tuple[Signal, ...]) -> bool:
+    return mv.shape == (len(signals),) and all(
+        s.low <= value <= s.high and (s.values is None or value in s.values)
+        for s, value in zip(signals, mv.tolist(), strict=True)
+    )
+
+
+def refuse(**_: Any) -> None:
+    raise OutputError("the law gave nothing")
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: f"{p.parent.name}-{p.stem}")
+def test_no_shipped_law_commands_an_implausible_read_back(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    controller = shipped(path)
+    m = controller.manifest
+    good = {"pv": middle(m.pv), "dv": middle(m.dv)}
+    rest = np.array([s.low if s.values is None else s.values[0] for s in m.mv])
+    for guards in (None, ()):
+        for value in (1.7e308, -1.7e308, 1e6, -1e6, math.nan, math.inf):
+            for fails in (False, True):
+                loop = ControlLoop(controller, sp=middle(m.sp), mv=rest, mode=Mode.AUTO, guards=guards)
+                with monkeypatch.context() as patch:
+                    if fails:
+                        patch.setattr(controller, "step", refuse)
+                    command = loop.scan(Sample(mv_applied=np.full(len(m.mv), value), **good))
+                assert command.mode is Mode.HOLD
+                assert command.mv.tolist() == rest.tolist()
+                assert f"applied MV {m.mv[0].name} is " in command.reason
+                loop.set_mode(Mode.MANUAL)
+                command = loop.scan(Sample(mv_applied=np.full(len(m.mv), value), **good))
+                assert (command.mode, command.mv.tolist()) == (Mode.MANUAL, rest.tolist())
+                assert f"applied MV {m.mv[0].name} is " in command.reason
+
+
+@pytest.mark.parametrize("guards", [None, ()])
+@pytest.mark.parametrize(
+    ("read_back", "held"), [(100.9, 100.0), (-0.9, 0.0), (37.0, 37.0), (102.1, 40.0), (-2.1, 40.0)]
+)
+def test_hold_clips_a_read_back_that_its_scaling_carries_out_of_range(
+    make_loop: Callable[..., ControlLoop], monkeypatch: Any, guards: Any, read_back: float, held: float
+) -> None:
+    """Within 2 % of the range the read-back is the end of the range; beyond, the last command stays."""
+    loop = make_loop(guards=guards)
+    monkeypatch.setattr(loop.controller, "step", refuse)
+    command = loop.scan(sample(0.8, read_back))
+    assert (command.mode, command.mv.tolist()) == (Mode.HOLD, [held])
+    assert ("outside its range [0, 100] %" in command.reason) is (held == 40.0)
+
+
+def test_the_law_gets_the_end_of_the_range_for_a_read_back_beyond_it(
+    make_loop: Callable[..., ControlLoop], shared: Controller
+) -> None:
+    expected = shared.step(sp=1.0, pv=[0.8, 300.0], mv_applied=100.0, state=shared.cold_state())
+    command = make_loop().scan(sample(0.8, 101.5))
+    assert (command.reason, command.mv.tolist()) == ("", expected.mv.tolist())
+
+
+def test_a_host_that_writes_into_a_command_moves_nothing(make_loop: Callable[..., ControlLoop]) -> None:
+    loop = make_loop()
+    command = loop.scan(sample())
+    held = command.mv.copy()
+    assert command.law_mv is not None
+    for array in (command.law_mv, command.mv, command.sp):
+        array[:] = 1e9
+    assert loop.scan(sample(math.nan)).mv.tolist() == held.tolist()
+
+
+JUNK = [
+    None,
+    7,
+    "sample",
+    [0.8, 300.0],
+    Sample(pv=[0.8, 300.0], dv=np.zeros(1)),  # type: ignore[arg-type]
+    Sample(pv=None, dv=np.zeros(1)),  # type: ignore[arg-type]
+    Sample(pv=1, dv=np.zeros(1)),  # type: ignore[arg-type]
+    Sample(pv=np.array([0.8, None]), dv=np.zeros(1)),
+    Sample(pv=np.array(["0.8", "300"]), dv=np.zeros(1)),
+    Sample(pv=np.array([0.8, 300.0 + 1j]), dv=np.zeros(1)),
+    Sample(pv=np.array([0.8, 300.0]), dv=None),  # type: ignore[arg-type]
+    Sample(pv=np.array([0.8, 300.0]), dv=np.zeros(1), mv_applied=[40.0]),  # type: ignore[arg-type]
+    Sample(pv=np.array([0.8, 300.0]), dv=np.zeros(1), mv_applied=np.zeros((1, 1))),
+    Sample(pv=np.array([0.8, 300.0]), dv=np.zeros(1), age_s=None),  # type: ignore[arg-type]
+    Sample(pv=np.array([0.8, 300.0]), dv=np.zeros(1), age_s=-1e-9),
+]
+
+
+@pytest.mark.parametrize("junk", JUNK, ids=range(len(JUNK)))
+def test_what_is_no_sample_is_a_fault_with_its_reason(make_loop: Callable[..., ControlLoop], junk: Any) -> None:
+    tank, seen = Tank(), []
+    tank.read = lambda: junk  # type: ignore[method-assign]
+    report = make_loop(tank).run(1, observe=lambda s, c: seen.append((s, c)))
+    ((given, command),) = seen
+    assert given is (junk if isinstance(junk, Sample) else None)
+    assert (report.faults, report.errors, command.mode, tank.written) == (1, 0, Mode.HOLD, [40.0, 40.0])
+    assert "failed" not in command.reason  # a guard that says why, not one that broke
+    assert any(word in command.reason for word in ("must be", "needs", "instead of"))
+
+
+# ---------------------------------------------------------------------- whatever raises
+class UnspeakableError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no text either")
+
+
+RAISED = [
+    ValueError("bad\nnews"),
+    MemoryError(),
+    RecursionError("deep"),
+    StopIteration(),
+    UnspeakableError(),
+    OSError(5),
+]
+
+
+@pytest.mark.parametrize("error", RAISED, ids=lambda e: type(e).__name__)
+@pytest.mark.parametrize("where", ["read", "write", "before"])
+def test_whatever_raises_ahead_of_the_write_is_a_fault_that_names_its_type(
+    make_loop: Callable[..., ControlLoop], where: str, error: Exception
+) -> None:
+    tank, commands = Tank(), []
+
+    def raised(*_: Any) -> Any:
+        raise error
+
+    before = None
+    if where == "before":
+        before = raised
+    else:
+        setattr(tank, where, raised)
+    loop = make_loop(tank)
+    report = loop.run(3, before=before, observe=lambda _, c: commands.append(c))
+    assert (report.scans, report.faults, report.errors) == (3, 3, 0)
+    assert loop.mode is Mode.HOLD
+    for command in commands:
+        assert type(error).__name__ in command.reason
+        assert "\n" not in command.reason
+        assert command.mv.tolist() == [40.0]
+    assert tank.written == [40.0] * (1 if where == "write" else 4)
+
+
+@pytest.mark.parametrize("error", RAISED, ids=lambda e: type(e).__name__)
+def test_a_law_or_guard_that_raises_without_a_text_is_still_a_fault(
+    make_loop: Callable[..., ControlLoop], monkeypatch: Any, error: Exception
+) -> None:
+    def raised(*_: Any, **__: Any) -> Any:
+        raise error
+
+    class Broken(Complete):
+        check = raised
+
+    loop = make_loop(guards=(Broken(make_loop().controller.manifest),))
+    assert loop.scan(sample()).reason.startswith("Broken failed: ")
+    loop = make_loop()
+    monkeypatch.setattr(loop.controller, "step", raised)
+    assert loop.scan(sample()).reason
+    assert (loop.mode, bool(loop.fault)) == (Mode.HOLD, True)
+
+
+@pytest.mark.parametrize("error", RAISED, ids=lambda e: type(e).__name__)
+@pytest.mark.parametrize("where", ["observe", "until", "warm"])
+def test_whatever_raises_beside_the_plant_moves_nothing_and_is_reported(
+    make_loop: Callable[..., ControlLoop], monkeypatch: Any, caplog: Any, where: str, error: Exception
+) -> None:
+    def raised(*_: Any) -> Any:
+        raise error
+
+    undisturbed, tank = Tank(), Tank()
+    make_loop(undisturbed).run(5)
+    loop = make_loop(tank, warm_lead_s=1e-3)
+    if where == "warm":
+        monkeypatch.setattr(loop.controller, "warm", raised)
+        report = loop.run(5)
+    else:
+        report = loop.run(5, **{where: raised})
+    assert (report.scans, report.faults, report.errors) == (5, 0, 5)
+    (first,) = report.first_errors
+    assert first.startswith(f"{where} failed: {type(error).__name__}")
+    assert [record.getMessage() for record in caplog.records] == [first]
+    assert loop.mode is Mode.AUTO
+    assert tank.written == undisturbed.written
+
+
+@pytest.mark.parametrize("where", ["sleep_until", "now", "not a time"])
+def test_a_clock_that_fails_holds_and_the_machines_own_measures_the_period(
+    make_loop: Callable[..., ControlLoop], monkeypatch: Any, where: str
+) -> None:
+    spare = VirtualClock()
+    monkeypatch.setattr(serving.loop, "MonotonicClock", lambda: spare)
+    clock, tank, commands = VirtualClock(100.0), Tank(), []
+
+    def raised(*_: Any) -> Any:
+        if where == "not a time":
+            return math.nan
+        raise OSError("no time")
+
+    def before(k: int) -> None:
+        if k == 1:
+            setattr(clock, "now" if where == "not a time" else where, raised)
+        if k == 3:
+            vars(clock).clear()
+            clock.time_s = 100.0
+
+    report = make_loop(tank, clock=clock, recover_after=1).run(
+        6, before=before, observe=lambda _, c: commands.append(c)
+    )
+    assert (report.scans, report.faults) == (6, 2)
+    assert [c.reason.startswith("the clock failed: ") for c in commands] == [False, False, True, True, False, False]
+    assert spare.now() == 2 * PERIOD
+    assert commands[3].mv.tolist() == commands[1].mv.tolist()
+    assert commands[5].mode is Mode.AUTO
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("where", ["read", "write", "before", "observe", "until"])
+def test_a_person_can_still_end_the_run(make_loop: Callable[..., ControlLoop], where: str, stop: Any) -> None:
+    def raised(*_: Any) -> Any:
+        raise stop
+
+    tank = Tank()
+    options = {}
+    if where in ("read", "write"):
+        setattr(tank, where, raised)
+    else:
+        options[where] = raised
+    with pytest.raises(stop):
+        make_loop(tank).run(3, **options)
+
+
+NUMBERS = st.floats(width=64) | st.sampled_from([math.nan, math.inf, -math.inf, 1.7e308, -1.7e308, 1e6])
+PLACES = ("read", "write", "before", "observe", "until", "warm", "step", "guard", "clock")
+
+
+class Chaos:
+    """Endpoint, guard, clock and callbacks of a plant where anything goes wrong, as ``data`` draws it."""
+
+    memory = 2
+
+    def __init__(self, data: st.DataObject, controller: Controller) -> None:
+        self.data, self.m = data, controller.manifest
+        self.raises: dict[str, Exception] = {}
+        self.written: list[np.ndarray] = []
+        self.clock = VirtualClock()
+        self.loop: ControlLoop | None = None
+        self.inner_step, self.inner_warm = controller.step, controller.warm
+
+    def at(self, place: str) -> None:
+        if place in self.raises:
+            raise self.raises[place]
+
+    def vector(self, signals: tuple[Signal, ...]) -> Any:
+        size = st.sampled_from([len(signals)] * 4 + [0, 5]).flatmap(lambda n: st.lists(NUMBERS, min_size=n, max_size=n))
+        near = [
+            st.floats(s.low - 0.03 * (s.high - s.low), s.high) | st.sampled_from(s.values or (s.high,)) for s in signals
+        ]
+        odd = st.sampled_from([None, 3, [1.0], np.array([None]), np.array(["a"]), np.array([1j])])
+        return self.data.draw(
+            st.tuples(*near).map(np.array) | st.tuples(*near).map(np.array) | size.map(np.array) | odd
+        )
+
+    def before(self, k: int) -> None:
+        assert self.loop is not None
+        draw = self.data.draw
+        self.raises = draw(st.dictionaries(st.sampled_from(PLACES), st.sampled_from(RAISED), max_size=2))
+        mode = draw(st.sampled_from([None, None, *Mode]))
+        if mode is not None:
+            self.loop.set_mode(mode)
+        if mode is Mode.MANUAL:
+            self.loop.set_mv([draw(st.sampled_from(s.values or (s.low, s.middle, s.high))) for s in self.m.mv])
+        self.at("before")
+
+    def read(self) -> Any:
+        self.at("read")
+        s = Sample(self.vector(self.m.pv), self.vector(self.m.mv), self.vector(self.m.dv), self.data.draw(NUMBERS))
+        good = Sample(middle(self.m.pv), s.mv_applied, middle(self.m.dv))
+        return self.data.draw(st.sampled_from([s, good, good, None, 5]))
+
+    def write(self, mv: np.ndarray) -> None:
+        self.written.append(mv.copy())
+        mv[:] = 1e9
+        self.at("write")
+
+    def check(self, *_: Any) -> str | None:
+        self.at("guard")
+        return None
+
+    def now(self) -> float:
+        return self.clock.now()
+
+    def sleep_until(self, time_s: float) -> None:
+        self.at("clock")
+        self.clock.sleep_until(time_s)
+
+    def step(self, **inputs: Any) -> Any:
+        self.at("step")
+        return self.inner_step(**inputs)
+
+    def warm(self) -> None:
+        self.at("warm")
+        self.inner_warm()
+
+    def observe(self, _: Sample | None, command: Command) -> None:
+        assert command.law_mv is None or legal(command.law_mv, self.m.mv)
+        for array in (command.law_mv, command.info, command.sp):
+            if array is not None:
+                array[:] = -1e9
+        self.at("observe")
+
+    def until(self, _: Command) -> bool:
+        self.at("until")
+        return False
+
+
+CHAOS_FILES = [p for p in SHIPPED if p.stem in ("inverse_dob", "minimum_variance", "local_pid_network", "pi_reference")]
+CHAOS_FILES += [p for p in SHIPPED if p.parent.name == "jacketed_batch_reactor"]
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.data(), st.sampled_from(CHAOS_FILES), st.sampled_from(["default", "none", "one"]), st.sampled_from([None, 1, 2])
+)
+def test_every_written_mv_lies_in_range_and_the_run_never_raises(
+    data: st.DataObject, path: Path, guards: str, recover_after: int | None
+) -> None:
+    controller = shipped(path)
+    m, chaos = controller.manifest, Chaos(data, controller)
+    n = 8
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serving.loop, "MonotonicClock", VirtualClock)
+        patch.setattr(controller, "step", chaos.step)
+        patch.setattr(controller, "warm", chaos.warm)
+        chaos.loop = ControlLoop(
+            controller,
+            chaos,
+            sp=middle(m.sp),
+            mv=middle(m.mv),
+            mode=Mode.AUTO,
+            guards={"default": (*default_guards(m), chaos), "none": (), "one": (chaos,)}[guards],
+            recover_after=recover_after,
+            clock=chaos,
+        )
+        report = chaos.loop.run(n, before=chaos.before, observe=chaos.observe, until=chaos.until)
+    assert report.scans + report.missed == n
+    assert len(chaos.written) == report.scans
+    assert [mv.tolist() for mv in chaos.written if not legal(mv, m.mv)] == []
+    assert legal(chaos.loop.mv, m.mv)
+    assert not any("AssertionError" in text for text in report.first_errors)
 
 
 # ---------------------------------------------------------------------- time
