@@ -199,7 +199,7 @@ def _check(law: ControlLaw, proto: onnx.ModelProto) -> None:
     products = _transposed_products(proto.graph)
     if products:
         raise ExportError(
-            f"law {law.name!r}: {products[0]} multiplies a transposed matrix; onnxruntime below 1.26 does not load that; "
+            f"law {law.name!r}: {products[0]} multiplies a transposed matrix, which onnxruntime below 1.26 refuses; "
             "write the product as a sum, (a * b).sum(-1), or keep the matrix transposed in a buffer"
         )
     narrow = {onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16}

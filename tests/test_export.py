@@ -177,7 +177,7 @@ def transposed_before_a_difference(
         (branching, (), "cannot be traced"),
         (ambiguous, (), "0.1, 0.1000000001 become one number"),
         (single, (), "gives mv as torch.float32"),
-        (transposed, ("x",), "multiplies a transposed matrix; .* write the product as a sum"),
+        (transposed, ("x",), "multiplies a transposed matrix, .* write the product as a sum"),
         (transposed_before_a_difference, ("x",), "multiplies a transposed matrix"),
         (lambda law, sp, *_: (law.limited(sp, sp), sp, sp[..., :0]), (), "gives state_next as .* must be .*\\(0,\\)"),
         (lambda law, sp, *_: (law.limited(sp, sp), sp), (), "gives 2 outputs"),
