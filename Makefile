@@ -26,6 +26,7 @@ run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, 
 	@loopwright run
 
 test: check ## formatting, lint, types, import rules, tests
+	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
 	python -m pytest
 
 check: $(STAMP) ## the static part of make test

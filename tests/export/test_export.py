@@ -154,6 +154,19 @@ def single(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tens
     return sp.to(torch.float32), state, sp[..., :0]
 
 
+def transposed(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
+    outer = pv.unsqueeze(-1) * pv
+    return law.limited(sp, sp), state, (outer @ outer.transpose(-1, -2))[0, :1]
+
+
+def transposed_before_a_difference(
+    law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
+) -> Any:
+    """Fused all the same: onnxruntime moves the Transpose behind the difference."""
+    a, b = pv.unsqueeze(-1) * pv, sp.unsqueeze(-1) + pv * pv.unsqueeze(-1)
+    return law.limited(sp, sp), state, ((a.transpose(-1, -2) - b.transpose(-1, -2)) @ a)[0, :1]
+
+
 @pytest.mark.parametrize(
     ("formula", "info", "message"),
     [
@@ -164,6 +177,8 @@ def single(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tens
         (branching, (), "cannot be traced"),
         (ambiguous, (), "0.1, 0.1000000001 become one number"),
         (single, (), "gives mv as torch.float32"),
+        (transposed, ("x",), "multiplies a transposed matrix, .* write the product as a sum"),
+        (transposed_before_a_difference, ("x",), "multiplies a transposed matrix"),
         (lambda law, sp, *_: (law.limited(sp, sp), sp, sp[..., :0]), (), "gives state_next as .* must be .*\\(0,\\)"),
         (lambda law, sp, *_: (law.limited(sp, sp), sp), (), "gives 2 outputs"),
     ],

@@ -102,3 +102,15 @@ def test_another_structure_is_not_shared(make_formula: Make, drawn: Drawn) -> No
     wider.info = ("a", "b", "c", "d", "e")
     law_graph(wider)
     assert hits() == 0
+
+
+def test_a_transposed_matrix_may_be_used_outside_matrix_products(make_formula: Make) -> None:
+    """Beside a matrix that is not transposed, or summed to a vector first: onnxruntime fuses neither."""
+
+    def formula(law: Any, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
+        outer = pv.unsqueeze(-1) * torch.cat([pv[..., :1], sp], dim=-1)
+        turned = outer.transpose(-1, -2)
+        return law.limited(sp, sp), state, (outer @ torch.minimum(outer, turned)).sum(-1) + outer @ turned.sum(-1)
+
+    proto, _ = law_graph(make_formula(formula, 0, ("a", "b")))
+    assert {"Transpose", "MatMul"} <= {node.op_type for node in proto.graph.node}

@@ -7,6 +7,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import made_up_case as made_up
@@ -19,7 +20,7 @@ from pipeline.errors import TrackingError
 from pipeline.tracking.gate import Gate
 from pipeline.tracking.lock import dataset_hash, is_current, read_lock
 from pipeline.tracking.publish import publish
-from pipeline.tracking.registry import file_digest, versions
+from pipeline.tracking.registry import REQUIREMENTS, file_digest, versions
 from pipeline.tracking.store import store
 
 pytestmark = [
@@ -64,6 +65,11 @@ def root(tmp_path, monkeypatch, empty_store) -> Path:
     picture.parent.mkdir()
     picture.write_bytes(b"\x89PNG made up")
     return tmp_path
+
+
+def test_a_registered_model_asks_for_what_the_package_asks_for() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert sorted(REQUIREMENTS) == sorted(project["dependencies"])
 
 
 def holders(client, alias: str) -> dict[str, str]:

@@ -92,14 +92,16 @@ class RecursiveLeastSquares(nn.Module):
         error = y - (phi * theta).sum(-1, keepdim=True)
         w = phi.unsqueeze(-2) @ root  # (..., 1, n)
         beta = self.forgetting + (w * w).sum(-1, keepdim=True)  # (..., 1, 1)
-        gain = root @ w.transpose(-1, -2) / beta  # (..., n, 1)
+        # Sums of products, no transposed matrices: onnxruntime would fuse those, which its older versions cannot load.
+        gain = (root * w).sum(-1, keepdim=True) / beta  # (..., n, 1): S w / beta
         theta = theta + gain.squeeze(-1) * error
         # S w w' / (beta + sqrt(f beta)) = K w' / (1 + sqrt(f / beta))
         root = root - gain / (1 + (self.forgetting / beta).sqrt()) * w
         if self.bounded:
             # As many numbers as columns: onnxruntime takes a single one beside a MatMul into it, in float32.
             excess = self.excess.expand(1, root.shape[-1])
-            return theta, self.growth * root - excess * (root @ (root.transpose(-1, -2) @ root)), error
+            gram = (root.unsqueeze(-1) * root.unsqueeze(-2)).sum(-3)  # (..., n, n): S'S
+            return theta, self.growth * root - excess * (root @ gram), error
         return theta, self.growth * root, error
 
     @torch.no_grad()
