@@ -15,18 +15,12 @@ from rich.console import Console
 
 from pipeline.__main__ import main
 from pipeline.cases import CASES
-<<<<<<< HEAD
+from pipeline.errors import PlantError
 from pipeline.export.gate import export
 from pipeline.laws import LAWS, LawSignals
-=======
-from pipeline.errors import PlantError
-from pipeline.export import export
-from pipeline.laws import LAWS, LawSignals
-from pipeline.live import SimulatedPlant, TerminalView, sparkline
->>>>>>> loop
 from pipeline.metrics import mae
 from pipeline.plants.base import Plant
-from pipeline.simulation.live import TerminalView, sparkline
+from pipeline.simulation.live import SimulatedPlant, TerminalView, sparkline
 from pipeline.simulation.simulate import simulate_closed
 from serving import Command, Controller, Mode
 
@@ -179,9 +173,7 @@ def test_a_plant_that_leaves_its_equations_ends_the_simulation(
 
     monkeypatch.setattr(SimulatedPlant, "write", write)
     assert main(["simulate", str(pid_file), "--sp", "0.6", "--duration", "25"]) == 2
-    assert capsys.readouterr().err == (
-        "loopwright simulate: the plant has left what its equations can compute\n"
-    )
+    assert capsys.readouterr().err == ("loopwright simulate: the plant has left what its equations can compute\n")
     assert writes == [0]
 
 
