@@ -6,9 +6,10 @@ import statistics
 from collections.abc import Callable
 from itertools import pairwise
 
+import numpy as np
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.report.drawing import PALETTE, SIZE
+from pipeline.report.drawing import PALETTE, SIZE, clear_legend, scale
 from pipeline.report.evidence import Evidence
 from pipeline.report.verdicts import Check, Verdict
 from pipeline.report.words import number
@@ -51,11 +52,11 @@ def free_run_picture(model_set: str, pv: str, unit: str) -> Callable[[Evidence],
                 for key in range(len(first["one_step_rmse"])):
                     ends = [(run["one_step_rmse"][key], run["free_run_rmse"][key]) for run in (first, then)]
                     axes.plot(*zip(*ends, strict=True), color=colour, linewidth=0.8, alpha=0.6, zorder=2)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        for axis, key in ((axes.xaxis, "one_step_rmse"), (axes.yaxis, "free_run_rmse")):
+            scale(axis, np.array([v for stages in known.values() for found in stages.values() for v in found[key]]))
         axes.set_xlabel(f"RMSE one step ahead [{unit}]")
         axes.set_ylabel(f"RMSE running free [{unit}]")
-        axes.legend(loc="upper left", title="median fit of the free run")
+        clear_legend(axes, title="median fit of the free run")
         return canvas
 
     return draw

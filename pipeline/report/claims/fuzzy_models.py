@@ -103,7 +103,7 @@ def coefficients_picture(model_set: str) -> Callable[[Evidence], Canvas | None]:
                     if how in parts:
                         curve = _over_centres(parts[how]["parameters"], name, mode)
                         axes.plot(*curve, line, color=colour, marker="." if mode == "hot" else "x", linewidth=1.1)
-            axes.set_ylabel(f"{name[0]}$_{name[1]}${unit}" if len(name) > 1 else f"{name}{unit}")
+            axes.set_ylabel(f"${name[0]}_{name[1]}${unit}" if len(name) > 1 else f"${name}${unit}")
         for how, colour in zip(reversed(ORDER), PALETTE, strict=False):
             if how in parts:
                 axes.plot([], [], color=colour, label=how)
