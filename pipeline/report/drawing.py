@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ STYLE: Any = {
 SET_POINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.9}
 REFERENCE: Any = {"color": "black", "linestyle": ":", "linewidth": 1.3}
 """Lines of the set point and of the reference model, in every picture."""
-FRONT, STEP_BACK = 1.3, 0.6  # line widths in points: of the curve in front, and what each one behind it has more
+FRONT, STEP_BACK = 1.3, 0.5  # line widths in points: of the curve in front, and what each one behind it has more
 PLAIN_DECADES, TICKED_DECADES = 1.0, 3.0  # an axis that spans less is linear, or has ticks at 1, 2 and 5
 PLAIN_TICKS = 1e-3, 1e5  # numbers on a logarithmic axis that are written out
 LEGEND_GAP = 0.03  # of the axes' height, between a legend and the curves
@@ -118,6 +118,22 @@ def _tick(value: float, _: float) -> str:
     digits, _, power = f"{value:.0e}".partition("e")
     factor = "" if digits == "1" else rf"{digits} \cdot "
     return f"${factor}10^{{{int(power)}}}$"
+
+
+def legend_below(
+    canvas: Canvas, handles: Sequence[Any] = (), labels: Sequence[str] = (), most: int = 4, **options: Any
+) -> Legend:
+    """A legend below all panels, in as many columns as fit, at most ``most``; of ``labels`` or all there are."""
+    if not labels:
+        found = [axes.get_legend_handles_labels() for axes in canvas.axes]
+        handles, labels = [h for row, _ in found for h in row], [text for _, row in found for text in row]
+    for columns in range(min(most, len(labels)), 0, -1):
+        legend: Legend = canvas.legend(handles, labels, loc="outside lower center", ncols=columns, **options)
+        canvas.draw_without_rendering()
+        if columns == 1 or legend.get_window_extent().width <= canvas.bbox.width:
+            break
+        legend.remove()
+    return legend
 
 
 def covers(legend: Legend, axes: Axes) -> bool:

@@ -21,6 +21,7 @@ from pipeline.report.drawing import (
     axis_label,
     colour_of,
     layer,
+    legend_below,
     ratio_unit,
     scale,
     symbol,
@@ -49,11 +50,12 @@ STRIP = 0.7  # height of a discrete MV's panel, where a continuous one's is 2
 STRIP_ROOM = 0.3  # above and below its values, as a share of their range
 INCHES = 0.84  # that a height of 1 takes
 MV_HEIGHT, OWN_HEIGHT = 2.0, 1.2  # of the panel of a continuous MV, and of one that a ringing law has for itself
+MV_THINNER = 0.7  # its line beside the controlled variable's
 WINDOWS = 50  # parts of the time axis, each about 15 pixels wide, in which reversals are counted
 MOST_REVERSALS = 4  # of an MV in such a part; more of them run into one another
 SWING = 0.02  # of the MV's range: a smaller move is no reversal
 RINGING = 0.05  # share of the samples at which an MV reverses too fast to draw: from here on it has its own panel
-FAST = "shaded: range of swings too fast to draw, with their mean"
+FAST = "shaded: swings too fast to draw, with their mean"
 
 
 class LoopPanels:
@@ -117,12 +119,13 @@ class LoopPanels:
     def add(self, loop: Loop, label: str, colour: str) -> None:
         """One of the controllers that were announced."""
         look = layer(self.ranks[label])
-        thin = {**look, "linewidth": 0.7 * look["linewidth"]}
         time, _ = time_axis(loop["time_s"])
         pv = first(loop["pv"])
         self.cv.plot(time, pv, label=label, color=colour, **look)
         for place, mv in zip(self.places[label], _columns(loop), strict=True):
-            self._move(self.mvs[place], self.signals[place[0]], time, mv, {"color": colour, **thin})
+            wide = layer(0 if place[1] else self.ranks[label])["linewidth"]
+            style = {**look, "color": colour, "linewidth": MV_THINNER * wide}
+            self._move(self.mvs[place], self.signals[place[0]], time, mv, style)
         if self.error is not None:
             late = slice(self.late_from, None)
             error = first(loop["sp"])[late] - pv[late]
@@ -135,7 +138,7 @@ class LoopPanels:
             axes.step(time, mv, where="post", **style)
             return
         self.hidden = True
-        around = sliding_window_view(np.pad(mv, _window(mv) // 2, mode="edge"), _window(mv))[: len(mv)]
+        around = sliding_window_view(np.pad(mv, _window(mv) // 2, mode="reflect"), _window(mv))[: len(mv)]
         low, high = around.min(axis=1), around.max(axis=1)
         axes.fill_between(time, low, high, where=fast, step="post", color=style["color"], alpha=0.25, linewidth=0)
         axes.step(time, np.where(fast, around.mean(axis=1), mv), where="post", **style)
@@ -151,7 +154,7 @@ class LoopPanels:
         handles, labels = self.cv.get_legend_handles_labels()
         if self.hidden:
             handles, labels = [*handles, Patch(color="black", alpha=0.25, linewidth=0)], [*labels, FAST]
-        self.canvas.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+        legend_below(self.canvas, handles, labels)
         return self.canvas
 
 
@@ -171,9 +174,12 @@ def too_fast(mv: Array, signal: Signal) -> NDArray[np.bool_]:
         return np.zeros(len(mv), dtype=bool)
     width = _window(mv)
     moved = np.diff(mv)
-    moved = np.sign(np.where(np.abs(moved) > SWING * (signal.high - signal.low), moved, 0.0))
-    reversals = np.concatenate([[0.0, 0.0], moved[1:] * moved[:-1] < 0])
-    counted = np.convolve(reversals, np.ones(width), mode="same")
+    at = np.flatnonzero(np.abs(moved) > SWING * (signal.high - signal.low))
+    # A pulse may rest between its two moves.
+    turned = at[1:][moved[at[1:]] * moved[at[:-1]] < 0]
+    reversals = np.zeros(len(mv))
+    reversals[turned + 1] = 1.0
+    counted = np.convolve(np.pad(reversals, width // 2, mode="reflect"), np.ones(width), mode="valid")[: len(mv)]
     return np.asarray(counted > MOST_REVERSALS)
 
 
@@ -275,7 +281,7 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     title = panels[0].set_title(f"Figure {figure.number}. {figure.title}")
     if len(found) > 1:
         handles, labels = panels[0].get_legend_handles_labels()
-        canvas.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+        legend_below(canvas, handles, labels)
     else:
         words = _label(found[0][0]) + ("; gaps: no such action" if gaps else "")
         beside = panels[0].set_title(words, loc="right", fontweight="normal", fontsize="medium")

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.report.drawing import PALETTE, SIZE
+from pipeline.report.drawing import PALETTE, SIZE, legend_below
 from pipeline.report.evidence import Evidence
 from pipeline.report.law_evidence import Array
 from pipeline.report.verdicts import Check, Verdict
@@ -60,7 +60,7 @@ def reach_picture(model_set: str) -> Callable[[Evidence], Canvas | None]:
         for axes in grid[:, 0]:
             axes.set_ylabel("change in a period [°C]")
         handles, labels = panels[0].get_legend_handles_labels()
-        canvas.legend(handles, labels, loc="outside lower center", ncols=3)
+        legend_below(canvas, handles, labels, most=3)
         return canvas
 
     return draw
@@ -112,7 +112,7 @@ def coefficients_picture(model_set: str) -> Callable[[Evidence], Canvas | None]:
         axes.plot([], [], "--", color="black", linewidth=1.0, label="cold")
         for axes in grid[-1]:
             axes.set_xlabel("jacket temperature of the rule [°C]")
-        canvas.legend(loc="outside lower center", ncols=7)
+        legend_below(canvas, most=7)
         return canvas
 
     return draw

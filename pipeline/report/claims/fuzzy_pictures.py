@@ -9,7 +9,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.patheffects import withStroke
 
 from pipeline.cases.base import Curve
-from pipeline.report.drawing import PALETTE, SET_POINT, SIZE, colour_of, scale, time_axis
+from pipeline.report.drawing import PALETTE, SET_POINT, SIZE, colour_of, legend_below, scale, time_axis
 from pipeline.report.evidence import Evidence
 from pipeline.report.words import law_name, number
 
@@ -55,7 +55,7 @@ def recipe_picture(curve: Curve, scenario: str) -> Draw:
         for axes in (core, jacket, throttle, mode):
             axes.margins(x=0.01)
         canvas.align_ylabels()
-        canvas.legend(loc="outside lower center", ncols=4)
+        legend_below(canvas, most=4)
         return canvas
 
     return draw
@@ -76,8 +76,8 @@ def switches_picture(law: str, penalties: Sequence[float], scenarios: Mapping[st
             left.plot(penalties, counts, "o-", color=colour, label=label)
             right.plot(penalties, offsets, "o-", color=colour)
             for p, count in zip(penalties, counts, strict=True):
-                left.annotate(f"{count:g}", (p, float(count or 0)), xytext=(0, 7), textcoords="offset points",
-                              ha="center", color=colour, path_effects=HALO, zorder=5)  # fmt: skip
+                left.annotate(f"{count:g}", (p, float(count or 0)), xytext=(5, 5), textcoords="offset points",
+                              color=colour, path_effects=HALO, zorder=5)  # fmt: skip
         counted = np.concatenate([np.asarray(line.get_ydata(), float) for line in left.lines])
         scale(left.yaxis, counted)
         if left.get_yscale() == "log":
@@ -86,10 +86,10 @@ def switches_picture(law: str, penalties: Sequence[float], scenarios: Mapping[st
         right.set_ylabel("largest offset [°C]")
         right.set_ylim(0.0, 1.1 * max(float(np.max(line.get_ydata())) for line in right.lines))
         for axes in (left, right):
-            axes.margins(x=0.1)
+            axes.margins(x=0.15)
         for axes in (left, right):
             axes.set_xlabel("penalty of a switch [°C of the jacket]")
-        canvas.legend(loc="outside lower center", ncols=2)
+        legend_below(canvas, most=2)
         return canvas
 
     return draw
@@ -122,7 +122,7 @@ def offsets_picture(laws: Sequence[str], scenarios: Mapping[str, str]) -> Draw:
         axes.set_xticks(range(len(scenarios)), list(scenarios.values()))
         axes.set_ylabel("offset at the end of a level [°C]")
         axes.set_title("bar: mean over the levels; mark and number: largest", fontweight="normal", fontsize="medium")
-        canvas.legend(loc="outside lower center", ncols=len(laws))
+        legend_below(canvas, most=len(laws))
         return canvas
 
     return draw

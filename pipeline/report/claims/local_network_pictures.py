@@ -19,6 +19,7 @@ from pipeline.report.drawing import (
     clear_legend,
     colour_of,
     layer,
+    legend_below,
     symbol,
     time_axis,
 )
@@ -82,7 +83,7 @@ def phase_picture(evidence: Evidence) -> Canvas | None:
         axes.set_xlabel(_label(evidence, 0))
     panels[0].set_ylabel(_label(evidence, 1))
     handles, labels = panels[0].get_legend_handles_labels()
-    canvas.legend(handles, labels, loc="outside lower center", ncols=3, markerscale=1.5)
+    legend_below(canvas, handles, labels, most=3, markerscale=1.5)
     return canvas
 
 
@@ -121,7 +122,7 @@ def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
         axes.set_xlabel(_label(evidence, 0))
         axes.set_ylabel("factor per period")
         axes.set_title("lines: spectral radius; bars: contraction with one Lyapunov function", fontsize="medium")
-        canvas.legend(loc="outside lower center", ncols=3)
+        legend_below(canvas, most=3)
         return canvas
 
     return draw

@@ -19,6 +19,7 @@ from pipeline.report.drawing import (
     clear_legend,
     colour_of,
     layer,
+    legend_below,
     scale,
     symbol,
     time_axis,
@@ -70,7 +71,7 @@ def levels_picture(scenario: str, curves: Mapping[str, Curve]) -> Draw:
         move.set_xlabel(words)
         move.margins(x=0.01)
         canvas.align_ylabels()
-        canvas.legend(loc="outside lower center", ncols=3)
+        legend_below(canvas, most=3)
         return canvas
 
     return draw
@@ -99,7 +100,7 @@ def disturbances_picture(scenarios: Sequence[str], curves: Mapping[str, Curve], 
             axes.set_xlabel("time [s]")
         for axes in panels[len(known) :]:
             axes.axis("off")
-        canvas.legend(list(shown.values()), list(shown), loc="outside lower center", ncols=2)
+        legend_below(canvas, list(shown.values()), list(shown), most=2)
         for axes in panels[: len(known)]:
             clear_legend(axes, fontsize="small", title="IAE", title_fontsize="small", ncols=2, handlelength=1.2)
         return canvas
@@ -132,9 +133,10 @@ def training_picture(laws: Sequence[str]) -> Draw:
         for style, words in (("-", "training loops"), (":", "validation loops"), ("o", "the iteration that was kept")):
             axes.plot([], [], style, color="black", linewidth=1.3, markersize=5, label=words)
         scale(axes.yaxis, np.concatenate([np.ravel(values["history"][:, :2]) for values in found.values()]))
+        axes.xaxis.get_major_locator().set_params(integer=True)
         axes.set_xlabel("iteration of Levenberg-Marquardt")
         axes.set_ylabel(axis_label("RMS from the reference model", unit))
-        canvas.legend(loc="outside lower center", ncols=3)
+        legend_below(canvas, most=3)
         return canvas
 
     return draw
