@@ -88,7 +88,7 @@ def ratio_unit(top: str, bottom: str) -> str:
     return f"{'1' if top in NO_UNIT else top}/{below}"
 
 
-def layer(rank: int) -> dict[str, float]:
+def layer(rank: int) -> dict[str, Any]:
     """Line width and z-order of a curve; rank 0 lies in front.
 
     A curve behind another one is wider, so that both are seen where they coincide.
@@ -98,7 +98,7 @@ def layer(rank: int) -> dict[str, float]:
 
 def scale(axis: Axis, values: Array) -> None:
     """Give ``axis`` the scale and the ticks for ``values`` (n,): logarithmic where the positive span a decade."""
-    set_scale = getattr(axis.axes, f"set_{axis.axis_name}scale")
+    set_scale = axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale
     positive = values[np.isfinite(values) & (values > 0)]
     decades = float(np.ptp(np.log10(positive))) if len(positive) else 0.0
     if decades < PLAIN_DECADES:
@@ -112,7 +112,7 @@ def scale(axis: Axis, values: Array) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _tick(value: float, _: float) -> str:
+def _tick(value: float, _place: float) -> str:
     if PLAIN_TICKS[0] <= value < PLAIN_TICKS[1]:
         return f"{value:g}"
     digits, _, power = f"{value:.0e}".partition("e")

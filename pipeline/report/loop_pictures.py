@@ -133,11 +133,10 @@ class LoopPanels:
 
     def _move(self, axes: Axes, signal: Signal, time: Array, mv: Array, style: dict[str, Any]) -> None:
         # Each move acts over the period after its sample: a staircase that begins there.
-        fast = too_fast(mv, signal)
-        if not fast.any():
+        if not rings(mv, signal):
             axes.step(time, mv, where="post", **style)
             return
-        self.hidden = True
+        self.hidden, fast = True, too_fast(mv, signal)
         around = sliding_window_view(np.pad(mv, _window(mv) // 2, mode="reflect"), _window(mv))[: len(mv)]
         low, high = around.min(axis=1), around.max(axis=1)
         axes.fill_between(time, low, high, where=fast, step="post", color=style["color"], alpha=0.25, linewidth=0)

@@ -52,8 +52,8 @@ def free_run_picture(model_set: str, pv: str, unit: str) -> Callable[[Evidence],
                 for key in range(len(first["one_step_rmse"])):
                     ends = [(run["one_step_rmse"][key], run["free_run_rmse"][key]) for run in (first, then)]
                     axes.plot(*zip(*ends, strict=True), color=colour, linewidth=0.8, alpha=0.6, zorder=2)
-        for axis, key in ((axes.xaxis, "one_step_rmse"), (axes.yaxis, "free_run_rmse")):
-            scale(axis, np.array([v for stages in known.values() for found in stages.values() for v in found[key]]))
+        for axis, metric in ((axes.xaxis, "one_step_rmse"), (axes.yaxis, "free_run_rmse")):
+            scale(axis, np.array([v for stages in known.values() for found in stages.values() for v in found[metric]]))
         axes.set_xlabel(f"RMSE one step ahead [{unit}]")
         axes.set_ylabel(f"RMSE running free [{unit}]")
         clear_legend(axes, title="median fit of the free run")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
+from matplotlib.ticker import MaxNLocator
 
 from pipeline.cases.base import Curve
 from pipeline.report.drawing import (
@@ -133,7 +134,7 @@ def training_picture(laws: Sequence[str]) -> Draw:
         for style, words in (("-", "training loops"), (":", "validation loops"), ("o", "the iteration that was kept")):
             axes.plot([], [], style, color="black", linewidth=1.3, markersize=5, label=words)
         scale(axes.yaxis, np.concatenate([np.ravel(values["history"][:, :2]) for values in found.values()]))
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel("iteration of Levenberg-Marquardt")
         axes.set_ylabel(axis_label("RMS from the reference model", unit))
         legend_below(canvas, most=3)
