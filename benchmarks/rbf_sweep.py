@@ -3,6 +3,9 @@
 python benchmarks/rbf_sweep.py                 c = 4..100 on 42,000 samples
 python benchmarks/rbf_sweep.py --every 12      fewer partitions, for a quick look
 
+It prints a line a turn and a line a network, and takes about ``--seconds``: turns that the time does
+not suffice for are left out, and so are the last networks.
+
 Each sweep runs in a process of its own, so that the thread pools of numpy and torch do not meet,
 and the two take turns, so that both see the same load of the machine. Ends with status 1 where the
 sweep needs more than a third of the straightforward time or does not come to the same result.
@@ -25,6 +28,7 @@ import numpy as np
 LIMITS = (0.0, 500.0)
 SHARE, NEAR, AGREE = 1 / 3, 2, 0.01
 TURNS = 8
+SWEEPS = 0.7  # of the time, for the two sweeps
 
 
 def data(seed: int) -> tuple[Any, ...]:
@@ -50,8 +54,11 @@ def ours(x: Any, y: Any, x_val: Any, y_val: Any, counts: list[int]) -> Any:
     return [(r.partitions, r.centres, r.train.rmse, r.validation.rmse) for r in result.rows], seconds
 
 
-def one_network(x: Any, y: Any, x_val: Any, y_val: Any, c: int) -> Any:
-    """(name, centres, seconds of the fit, RMSE) of ours and of what one writes with scikit-learn alone."""
+def one_network(x: Any, y: Any, x_val: Any, y_val: Any, c: int, seconds: float) -> None:
+    """Print centres, seconds of the fit and RMSE of ours and of what one writes with scikit-learn alone.
+
+    No further network is begun after ``seconds``.
+    """
     from sklearn.cluster import KMeans
     from sklearn.linear_model import Ridge
     from sklearn.pipeline import make_pipeline
@@ -59,15 +66,14 @@ def one_network(x: Any, y: Any, x_val: Any, y_val: Any, c: int) -> Any:
 
     from pipeline.models.static.fuzzy_means import FuzzyMeansRBF
 
-    mine = FuzzyMeansRBF(c)
-    rows = []
+    mine, end = FuzzyMeansRBF(c), time.monotonic() + seconds
 
     def measure(name: str, model: Any) -> None:
         begun = time.perf_counter()
         model.fit(x, y)
-        seconds = time.perf_counter() - begun
+        spent = time.perf_counter() - begun
         error = float(np.sqrt(np.mean((model.predict(x_val).clip(*LIMITS) - y_val) ** 2)))
-        rows.append((name, len(mine.centres_), seconds, error))
+        print(f"{name:<34}{len(mine.centres_):>8}{spent:>9.2f}{error:>21.3f}", flush=True)
 
     measure("fuzzy means, thin plate, QR", mine)
     clusters = len(mine.centres_)
@@ -77,9 +83,11 @@ def one_network(x: Any, y: Any, x_val: Any, y_val: Any, c: int) -> Any:
         ("KMeans, Gaussian, Ridge(1e-6)", gaussian, 1e-6),
         ("KMeans, Gaussian, Ridge()", gaussian, 1.0),
     ):
+        if time.monotonic() > end:
+            print(f"{name:<34}left out: no time left", flush=True)
+            continue
         means = KMeans(clusters, n_init=1, random_state=0)
         measure(name, make_pipeline(MinMaxScaler((-1, 1)), means, FunctionTransformer(basis), Ridge(alpha)))
-    return rows
 
 
 def thin_plate(d: Any) -> Any:
@@ -93,11 +101,14 @@ def gaussian(d: Any) -> Any:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--every", type=int, default=1, help="take every n-th number of partitions")
+    parser.add_argument("--seconds", type=float, default=150.0, help="about what all of it may take (150)")
     parser.add_argument("--seed", type=int, default=0, help="of the excitation and the split")
     options = parser.parse_args()
     counts = list(range(4, 101, options.every))
+    started = time.monotonic()
+    print(f"two sweeps over {len(counts)} partitions and four networks; about {options.seconds:.0f} s", flush=True)
     samples = data(options.seed)
-    print(f"{len(counts)} partitions on {len(samples[0]):,} samples, {len(samples[2]):,} for validation", flush=True)
+    print(f"{len(samples[0]):,} samples, {len(samples[2]):,} for validation", flush=True)
     spawn = get_context("spawn")
     found: dict[str, list[Any]] = {"ours": [], "straightforward": []}
     seconds = dict.fromkeys(found, 0.0)
@@ -117,6 +128,9 @@ def main() -> int:
             seconds["straightforward"] += spent
             spent_so_far = ", ".join(f"{name} {total:.1f} s" for name, total in seconds.items())
             print(f"turn {turn + 1} of {turns}: {spent_so_far}", flush=True)
+            if time.monotonic() - started > SWEEPS * options.seconds and turn + 1 < turns:
+                print(f"the other turns are left out: {len(found['ours'])} partitions were swept", flush=True)
+                break
     best = {name: min(rows, key=lambda row: row[3]) for name, rows in found.items()}
     print(f"\n{'sweep':<18}{'seconds':>9}{'best c':>8}{'centres':>9}{'RMSE train [K]':>16}{'validation [K]':>16}")
     for name, (c, n, train, validation) in best.items():
@@ -134,11 +148,10 @@ def main() -> int:
     print()
     for text, passed in checks.items():
         print(f"{'ok  ' if passed else 'FAIL'} {text}")
+    print(f"\n{'one network':<34}{'centres':>8}{'fit [s]':>9}{'validation RMSE [K]':>21}", flush=True)
     with ProcessPoolExecutor(1, spawn) as peers:
-        rows = peers.submit(one_network, *samples, mine[0]).result()
-    print(f"\n{'one network':<34}{'centres':>8}{'fit [s]':>9}{'validation RMSE [K]':>21}")
-    for name, n, spent, error in rows:
-        print(f"{name:<34}{n:>8}{spent:>9.2f}{error:>21.3f}")
+        left = options.seconds - (time.monotonic() - started)
+        peers.submit(one_network, *samples, mine[0], left).result()
     return 0 if all(checks.values()) else 1
 
 

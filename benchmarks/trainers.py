@@ -88,7 +88,7 @@ def compare(
     seeds: int,
 ) -> None:
     """Print one line per trainer: median over the seeds."""
-    print(f"\n{title}; {len(train):,} rows, {seconds:g} s each, median of {seeds} seed(s)")
+    print(f"\n{title}; {len(train):,} rows, {seconds:g} s each, median of {seeds} seed(s)", flush=True)
     print(f"{'trainer':10}{'iterations':>12}{'RMSE':>12}{'worst':>12}")
     for name, plain in trainers().items():
         counts, scores = [], []
@@ -180,12 +180,19 @@ def _free_run(net: MLP, test: Windows) -> float:
         return float(torch.sqrt(test.loss(net)) * net.y_scale)
 
 
+TASKS = 1.0 + 4 * 1 / 5
+"""Of ``--seconds`` a trainer and seed: (a) takes them, (b) and (c) each two fifths."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--seeds", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    every = trainers()
+    seconds = TASKS * options.seconds * options.seeds * len(every)
+    print(f"trainers {', '.join(every)} on five tasks; about {seconds:.0f} s and the tasks' data", flush=True)
     cstr(options.seconds, options.seeds)
     example(options.seconds, options.seeds)
     ph(options.seconds, options.seeds)

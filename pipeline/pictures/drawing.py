@@ -1,14 +1,20 @@
-"""What all pictures share: size, style, colours, labels, the time axis, and the file that is written."""
+"""What all pictures share: size, style, colours, labels, axes, legends, and the file that is written."""
 
 from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Canvas
+from matplotlib.legend import Legend
+from matplotlib.path import Path as Outline
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 
 from pipeline.evaluation.law_evidence import Array
 from pipeline.pictures.words import NO_UNIT
@@ -34,6 +40,13 @@ STYLE: Any = {
     "legend.frameon": False,
     "legend.fontsize": 9.0,
 }
+SET_POINT: Any = {"color": "black", "linestyle": "--", "linewidth": 0.9}
+REFERENCE: Any = {"color": "black", "linestyle": ":", "linewidth": 1.3}
+"""Lines of the set point and of the reference model, in every picture."""
+FRONT, STEP_BACK = 1.3, 0.5  # line widths in points: of the curve in front, and what each one behind it has more
+PLAIN_DECADES, TICKED_DECADES = 1.0, 3.0  # an axis that spans less is linear, or has ticks at 1, 2 and 5
+PLAIN_TICKS = 1e-3, 1e5  # numbers on a logarithmic axis that are written out
+LEGEND_GAP = 0.03  # of the axes' height, between a legend and the curves
 LONGEST_IN_S, LONGEST_IN_MIN = 3000.0, 30_000.0  # [s] of a picture whose axis counts seconds, minutes
 
 
@@ -73,6 +86,90 @@ def ratio_unit(top: str, bottom: str) -> str:
         return top
     below = f"({bottom})" if "/" in bottom else bottom
     return f"{'1' if top in NO_UNIT else top}/{below}"
+
+
+def layer(rank: int) -> dict[str, Any]:
+    """Line width and z-order of a curve; rank 0 lies in front.
+
+    A curve behind another one is wider, so that both are seen where they coincide.
+    """
+    return {"linewidth": FRONT + STEP_BACK * rank, "zorder": 4.0 - 0.1 * rank}
+
+
+def scale(axis: Axis, values: Array) -> None:
+    """Give ``axis`` the scale and the ticks for ``values`` (n,): logarithmic where the positive span a decade."""
+    set_scale = axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale
+    positive = values[np.isfinite(values) & (values > 0)]
+    decades = float(np.ptp(np.log10(positive))) if len(positive) else 0.0
+    if decades < PLAIN_DECADES:
+        set_scale("linear")
+        axis.set_major_formatter(ScalarFormatter(useOffset=False))
+        return
+    set_scale("log", nonpositive="mask")
+    if decades < TICKED_DECADES:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(_tick))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _tick(value: float, _place: float) -> str:
+    if PLAIN_TICKS[0] <= value < PLAIN_TICKS[1]:
+        return f"{value:g}"
+    digits, _, power = f"{value:.0e}".partition("e")
+    factor = "" if digits == "1" else rf"{digits} \cdot "
+    return f"${factor}10^{{{int(power)}}}$"
+
+
+def legend_below(
+    canvas: Canvas, handles: Sequence[Any] = (), labels: Sequence[str] = (), most: int = 4, **options: Any
+) -> Legend:
+    """A legend below all panels, in as many columns as fit, at most ``most``; of ``labels`` or all there are."""
+    if not labels:
+        found = [axes.get_legend_handles_labels() for axes in canvas.axes]
+        handles, labels = [h for row, _ in found for h in row], [text for _, row in found for text in row]
+    for columns in range(min(most, len(labels)), 0, -1):
+        legend: Legend = canvas.legend(handles, labels, loc="outside lower center", ncols=columns, **options)
+        canvas.draw_without_rendering()
+        if columns == 1 or legend.get_window_extent().width <= canvas.bbox.width:
+            break
+        legend.remove()
+    return legend
+
+
+def covers(legend: Legend, axes: Axes) -> bool:
+    """Whether a legend's box lies over a line or a mark of ``axes``; the canvas has been drawn before."""
+    box = legend.get_window_extent()
+    for line in axes.lines:
+        points = line.get_transform().transform(np.column_stack([line.get_xdata(), line.get_ydata()]))
+        inside = axes.bbox.contains
+        near = [p for p in points if np.isfinite(p).all()]
+        if any(box.contains(*p) and inside(*p) for p in near):
+            return True
+        # Only between the marks of a line is there something drawn.
+        if line.get_linestyle() != "None" and len(near) > 1 and Outline(near).intersects_bbox(box, filled=False):
+            return True
+    return False
+
+
+def clear_legend(axes: Axes, **options: Any) -> Legend:
+    """A legend inside ``axes`` that covers no curve: where there is no free corner, the y axis grows upwards.
+
+    The axes belong to a canvas with a layout; ``options`` are those of ``Axes.legend``.
+    """
+    canvas: Any = axes.figure
+    legend = axes.legend(loc="best", **options)
+    canvas.draw_without_rendering()
+    if not covers(legend, axes):
+        return legend
+    legend = axes.legend(loc="upper center", **options)
+    canvas.draw_without_rendering()
+    taken = legend.get_window_extent().height / axes.bbox.height + LEGEND_GAP
+    to_scale = axes.yaxis.get_transform()
+    low, high = to_scale.transform(np.array(axes.get_ylim()))
+    # The present range keeps the part of the height that the legend leaves.
+    top = low + (high - low) / max(1.0 - taken, 0.2)
+    axes.set_ylim(axes.get_ylim()[0], float(to_scale.inverted().transform(np.array([top]))[0]))
+    return legend
 
 
 def save(canvas: Canvas, path: Path) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError
 from pipeline.metrics import mae, mv_travel, sse
 from pipeline.plants.base import Plant
+from serving.manifest import Signal
 
 Array = NDArray[np.float64]
 STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
@@ -87,13 +88,12 @@ def draw(path: Path, plant: Plant, history: History, title: str, marks: Mapping[
     figure.suptitle(title)
     for i, (ax, s) in enumerate(zip(axes, plant.sp_signals, strict=False)):
         ax.step(time_s, sp[:, i], where="post", color="0.35", linestyle="--", linewidth=1, label="set point")
-        ax.plot(time_s, pv[:, i], color="C0", linewidth=1.3, label=s.name)
-        ax.set_ylabel(f"{s.name} [{s.unit}]")
-        ax.legend(loc="upper right", fontsize="small")
+        ax.plot(time_s, pv[:, i], color="C0", linewidth=1.3, label="controlled variable")
+        ax.set_ylabel(_label(s))
     for i, s in enumerate(plant.mv_signals):
         ax = axes[len(plant.sp_signals) + i]
         ax.step(time_s, mv[:, i], where="post", color="C3", linewidth=1)
-        ax.set_ylabel(s.name if s.unit == "-" else f"{s.name} [{s.unit}]")
+        ax.set_ylabel(_label(s))
         if s.values is not None:
             room = 0.3 * (s.high - s.low)
             ax.set_yticks(s.values, [f"{v:g}" for v in s.values])
@@ -106,15 +106,23 @@ def draw(path: Path, plant: Plant, history: History, title: str, marks: Mapping[
             inside = np.array([m == mode for m in history.mode])
             if inside.any():
                 ax.fill_between(
-                    time_s, 0, 1, where=inside, step="post", color=color, alpha=0.15, transform=ax.get_xaxis_transform()
-                )
-    for at, text in marks.items():
+                    time_s, 0, 1, where=inside, step="post", color=color, alpha=0.15,
+                    transform=ax.get_xaxis_transform(), label=mode,
+                )  # fmt: skip
+    for k, (at, text) in enumerate(sorted(marks.items())):
+        # Above the panel, in two rows by turns: on the curves, or beside its neighbour, a text cannot be read.
         axes[0].annotate(
-            text, (at, 1), xycoords=("data", "axes fraction"), xytext=(3, -3), textcoords="offset points",
-            va="top", fontsize="x-small", color="C1",
+            text, (at, 1), xycoords=("data", "axes fraction"), xytext=(0, 3 + 9 * (k % 2)), textcoords="offset points",
+            va="bottom", fontsize="x-small", color="C1",
         )  # fmt: skip
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small", frameon=False)
     axes[-1].set_xlabel("time [s]")
     _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=120))
+
+
+def _label(signal: Signal) -> str:
+    return signal.name if signal.unit == "-" else f"{signal.name} [{signal.unit.replace('deg', '°')}]"
 
 
 def _replace(path: Path, write: Callable[[Path], None]) -> None:

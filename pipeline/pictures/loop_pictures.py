@@ -2,90 +2,190 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
+from matplotlib.patches import Patch
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from pipeline.evaluation.case import Case, Curve, Figure
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import Array, Loop
-from pipeline.pictures.drawing import SHADES, SIZE, axis_label, colour_of, ratio_unit, symbol, time_axis
+from pipeline.pictures.drawing import (
+    REFERENCE,
+    SET_POINT,
+    SHADES,
+    SIZE,
+    axis_label,
+    colour_of,
+    layer,
+    legend_below,
+    ratio_unit,
+    scale,
+    symbol,
+    time_axis,
+)
 from pipeline.pictures.words import SHORT, law_label, number, ratio
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from serving.manifest import Signal
 
 SCALES = {"kc", "tau_i_s", "tau_d_s", "penalty"}  # info whose ratios matter, not its differences
+LIKE_CV = (
+    "adjusted_reference",
+    "disturbance",
+    "reached_jacket",
+    "reference",
+    "sp_max",
+    "sp_min",
+    "sp_requested",
+    "wanted_jacket",
+)
+"""Info in the unit of the controlled variable."""
 SHORTEST, LONGEST = 1e-3, 9e3  # periods; times below and above say that there is no such action
 ORDERS_FOR_LOG = 2.0  # powers of ten that these must span to be drawn over them
 STRIP = 0.7  # height of a discrete MV's panel, where a continuous one's is 2
 STRIP_ROOM = 0.3  # above and below its values, as a share of their range
 INCHES = 0.84  # that a height of 1 takes
+MV_HEIGHT, OWN_HEIGHT = 2.0, 1.2  # of the panel of a continuous MV, and of one that a ringing law has for itself
+MV_THINNER = 0.7  # its line beside the controlled variable's
+WINDOWS = 50  # parts of the time axis, each about 15 pixels wide, in which reversals are counted
+MOST_REVERSALS = 4  # of an MV in such a part; more of them run into one another
+SWING = 0.02  # of the MV's range: a smaller move is no reversal
+RINGING = 0.05  # share of the samples at which an MV reverses too fast to draw: from here on it has its own panel
+FAST = "shaded: swings too fast to draw, with their mean"
 
 
 class LoopPanels:
     """The controlled variable with its set point, each MV, and the error of the late part where a test has one.
 
-    A discrete MV has a narrow strip with its allowed values as ticks. ``reference`` (n, 1) is the
-    course that the controlled variable should take where that is not the set point.
+    A discrete MV has a narrow strip with its allowed values as ticks. A law whose continuous MV rings
+    (``rings``) has a panel of its own for it, so that it hides no other law's. ``loops`` are the curves
+    to come by their label, the first in front; ``reference`` (n, 1) is the course that the controlled
+    variable should take where that is not the set point.
     """
 
-    def __init__(self, case: Case, title: str, late_from: int = 0, reference: Array | None = None) -> None:
+    def __init__(
+        self, case: Case, title: str, loops: Mapping[str, Loop], late_from: int = 0, reference: Array | None = None
+    ) -> None:
+        self.ranks = {label: rank for rank, label in enumerate(loops)}
         self.late_from, self.reference = late_from, reference
         # A set point that is held jumps; a recipe's course is sampled from a curve.
         self.sp_style = "default" if case.recipe else "steps-post"
-        cv, mvs = case.plant_class.sp_signals[0], case.plant_class.mv_signals
-        strips = [2.0 if mv.values is None else STRIP for mv in mvs]
-        heights = [3.0, *([1.6] if late_from else []), *strips]
-        more = 1.2 * bool(late_from) + INCHES * (sum(strips) - 2.0)
+        cv, self.signals = case.plant_class.sp_signals[0], case.plant_class.mv_signals
+        self.places = self._places(loops)
+        self.hidden = False
+        ordered = sorted({place for row in self.places.values() for place in row})
+        heights = [3.0, *([1.6] if late_from else []), *(self._height(*place) for place in ordered)]
+        more = 1.2 * bool(late_from) + INCHES * (sum(heights[-len(ordered) :]) - MV_HEIGHT)
         self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + more), layout="constrained")
         panels = list(self.canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}))
         self.cv: Axes = panels[0]
-        self.mvs: list[Axes] = panels[-len(mvs) :]
+        self.mvs: dict[tuple[int, str], Axes] = dict(zip(ordered, panels[-len(ordered) :], strict=True))
         self.error: Axes | None = panels[1] if late_from else None
         self.bottom = panels[-1]
         self.cv.set_title(title)
         self.cv.set_ylabel(axis_label(symbol(cv.name), cv.unit))
-        for axes, mv in zip(self.mvs, mvs, strict=True):
+        for (i, owner), axes in self.mvs.items():
+            mv = self.signals[i]
             axes.set_ylabel(axis_label(symbol(mv.name), mv.unit))
+            if owner:
+                axes.set_title(owner, loc="right", fontsize="small", fontweight="normal", pad=2.0)
             if mv.values is not None:
                 _allow_only(axes, mv)
-        if len(mvs) > 1:
+        if len(self.mvs) > 1:
             self.canvas.align_ylabels(panels)
         if self.error is not None:
             self.error.set_ylabel(axis_label("error", cv.unit))
             self.error.axhline(0.0, color="black", linewidth=0.9, linestyle="--", zorder=2)
 
-    def add(self, loop: Loop, label: str, colour: str, strong: bool = False) -> None:
-        """One controller; the strong one lies in front."""
-        # Each move acts over the period after its sample: a staircase that begins there.
-        order, wide = (4.0, 1.9) if strong else (3.0, 1.2)
+    def _places(self, loops: Mapping[str, Loop]) -> dict[str, list[tuple[int, str]]]:
+        """For each curve the panels of its MVs: (place of the MV, label of the curve that has it alone or "")."""
+        return {
+            label: [
+                (i, label if len(loops) > 1 and rings(mv, signal) else "")
+                for i, (mv, signal) in enumerate(zip(_columns(loop), self.signals, strict=False))
+            ]
+            for label, loop in loops.items()
+        }
+
+    def _height(self, i: int, owner: str) -> float:
+        if self.signals[i].values is not None:
+            return STRIP
+        return OWN_HEIGHT if owner else MV_HEIGHT
+
+    def add(self, loop: Loop, label: str, colour: str) -> None:
+        """One of the controllers that were announced."""
+        look = layer(self.ranks[label])
         time, _ = time_axis(loop["time_s"])
         pv = first(loop["pv"])
-        self.cv.plot(time, pv, label=label, color=colour, linewidth=wide, zorder=order)
-        # Laws that ring fill the panel: behind the strong curve they are only hinted at.
-        faint = 1.0 if strong else 0.5
-        for axes, mv in zip(self.mvs, loop["mv"].reshape(len(time), -1).T, strict=False):
-            axes.step(time, mv, where="post", color=colour, linewidth=0.6 * wide, zorder=order, alpha=faint)
+        self.cv.plot(time, pv, label=label, color=colour, **look)
+        for place, mv in zip(self.places[label], _columns(loop), strict=True):
+            wide = layer(0 if place[1] else self.ranks[label])["linewidth"]
+            style = {**look, "color": colour, "linewidth": MV_THINNER * wide}
+            self._move(self.mvs[place], self.signals[place[0]], time, mv, style)
         if self.error is not None:
             late = slice(self.late_from, None)
             error = first(loop["sp"])[late] - pv[late]
-            self.error.plot(time[late], error, color=colour, linewidth=wide, zorder=order)
+            self.error.plot(time[late], error, color=colour, **look)
+
+    def _move(self, axes: Axes, signal: Signal, time: Array, mv: Array, style: dict[str, Any]) -> None:
+        # Each move acts over the period after its sample: a staircase that begins there.
+        if not rings(mv, signal):
+            axes.step(time, mv, where="post", **style)
+            return
+        self.hidden, fast = True, too_fast(mv, signal)
+        around = sliding_window_view(np.pad(mv, _window(mv) // 2, mode="reflect"), _window(mv))[: len(mv)]
+        low, high = around.min(axis=1), around.max(axis=1)
+        axes.fill_between(time, low, high, where=fast, step="post", color=style["color"], alpha=0.25, linewidth=0)
+        axes.step(time, np.where(fast, around.mean(axis=1), mv), where="post", **style)
 
     def finish(self, loop: Loop) -> Canvas:
         """The set point, the time axis and the legend."""
         time, words = time_axis(loop["time_s"])
-        style: Any = {"drawstyle": self.sp_style, "linewidth": 0.9, "zorder": 2}
-        self.cv.plot(time, first(loop["sp"]), "--", color="black", label="set point", **style)
+        self.cv.plot(time, first(loop["sp"]), label="set point", drawstyle=self.sp_style, zorder=2, **SET_POINT)
         if self.reference is not None and len(self.reference) == len(time):
-            self.cv.plot(time, first(self.reference), ":", color="black", linewidth=1.3, label="reference", zorder=5)
+            self.cv.plot(time, first(self.reference), label="reference", zorder=5, **REFERENCE)
         self.cv.margins(x=0.01)
         self.bottom.set_xlabel(words)
-        labels = self.cv.get_legend_handles_labels()[1]
-        self.canvas.legend(loc="outside lower center", ncols=min(4, len(labels)))
+        handles, labels = self.cv.get_legend_handles_labels()
+        if self.hidden:
+            handles, labels = [*handles, Patch(color="black", alpha=0.25, linewidth=0)], [*labels, FAST]
+        legend_below(self.canvas, handles, labels)
         return self.canvas
+
+
+def _columns(loop: Loop) -> list[Array]:
+    """The MVs of a loop, (n,) each."""
+    return list(loop["mv"].reshape(len(loop["time_s"]), -1).T)
+
+
+def _window(mv: Array) -> int:
+    """Samples of one of the parts in which reversals are counted."""
+    return max(2, len(mv) // WINDOWS)
+
+
+def too_fast(mv: Array, signal: Signal) -> NDArray[np.bool_]:
+    """Samples (n,) around which a continuous MV (n,) reverses more often than a picture can show."""
+    if signal.values is not None or len(mv) < WINDOWS:
+        return np.zeros(len(mv), dtype=bool)
+    width = _window(mv)
+    moved = np.diff(mv)
+    at = np.flatnonzero(np.abs(moved) > SWING * (signal.high - signal.low))
+    # A pulse may rest between its two moves.
+    turned = at[1:][moved[at[1:]] * moved[at[:-1]] < 0]
+    reversals = np.zeros(len(mv))
+    reversals[turned + 1] = 1.0
+    counted = np.convolve(np.pad(reversals, width // 2, mode="reflect"), np.ones(width), mode="valid")[: len(mv)]
+    return np.asarray(counted > MOST_REVERSALS)
+
+
+def rings(mv: Array, signal: Signal) -> bool:
+    """Whether an MV (n,) reverses too fast to draw in so many samples that it would hide others in its panel."""
+    return float(np.mean(too_fast(mv, signal))) > RINGING
 
 
 def _allow_only(axes: Axes, signal: Signal) -> None:
@@ -132,12 +232,13 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
         return None
     late = 0 if figure.hold else evidence.late_from(figure.scenario or "")
     reference = None if figure.hold else reference_of(evidence, figure.scenario or "")
-    panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", late, reference)
     own = colours(evidence, figure)
-    for curve, loop in found:
-        ours, alone = curve is best, len(found) == 1
-        label = law_label(curve.law, curve.setting) + (" (ours, best)" if ours else "")
-        panels.add(loop, label, "black" if ours else own[curves.index(curve)], ours or alone)
+    labels = [_label(curve) + (" (ours, best)" if curve is best else "") for curve, _ in found]
+    # The paper's curves lie in front: the figure is about them.
+    loops = {label: loop for label, (_, loop) in zip(labels, found, strict=True)}
+    panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", loops, late, reference)
+    for label, (curve, loop) in zip(labels, found, strict=True):
+        panels.add(loop, label, "black" if curve is best else own[curves.index(curve)])
     return panels.finish(found[0][1])
 
 
@@ -169,9 +270,10 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     gaps = any(np.isnan(v).any() for _, _, values in found for v in values.values())
     for axes, name in zip(panels, figure.info, strict=True):
         axes.set_ylabel(info_label(evidence.case, name))
-        if name in SCALES and over_orders(np.concatenate([values[name] for _, _, values in found])):
-            axes.set_yscale("log", nonpositive="mask")
-            gaps = True
+        shown = np.concatenate([values[name] for _, _, values in found])
+        if name in SCALES and over_orders(shown):
+            scale(axes.yaxis, shown)
+            gaps = gaps or bool((shown <= 0).any())
         for at in moves(found[0][1]):
             axes.axvline(at, color="#b0b0b0", linewidth=0.8, linestyle=":", zorder=1)
         axes.margins(x=0.01)
@@ -179,7 +281,7 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     title = panels[0].set_title(f"Figure {figure.number}. {figure.title}")
     if len(found) > 1:
         handles, labels = panels[0].get_legend_handles_labels()
-        canvas.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+        legend_below(canvas, handles, labels)
     else:
         words = _label(found[0][0]) + ("; gaps: no such action" if gaps else "")
         beside = panels[0].set_title(words, loc="right", fontweight="normal", fontsize="medium")
@@ -216,7 +318,10 @@ def over_orders(values: Array) -> bool:
 
 
 def info_label(case: Case, name: str) -> str:
-    """An entry of info as an axis's label, with its unit where the name tells what it is."""
+    """An entry of info as an axis's label, with its unit where the name tells what it is.
+
+    What is asked of a signal, or estimated of it, has the signal's unit.
+    """
     cv, mv = case.plant_class.sp_signals[0], case.plant_class.mv_signals[0]
     known = {
         "kc": ("$k_c$", ratio_unit(mv.unit, cv.unit)),
@@ -225,6 +330,8 @@ def info_label(case: Case, name: str) -> str:
         "penalty": (r"penalty $\mu$", ""),
         "offset": ("offset $d$", cv.unit),
         "linearization_error": ("linearization error", cv.unit),
+        "mv_requested": ("requested MV", mv.unit),
+        **{name: (name.replace("_", " "), cv.unit) for name in LIKE_CV},
     }
     return axis_label(*known.get(name, (name.replace("_", " "), "")))
 
@@ -240,14 +347,17 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"
-    panels = LoopPanels(evidence.case, title, evidence.late_from(scenario), reference_of(evidence, scenario))
+    drawn = {law_label(law, {}): (own, law)}
     other = evidence.case.baseline
     baseline = evidence.loop(Curve(other), scenario) if law != other else None
     if baseline is not None:
         error = evidence.figure(other, scenario)
-        label = f"{law_label(other, {})}, {SHORT[metric]} {_error(error, metric)}"
-        panels.add(baseline, label, colour_of(other, evidence.laws))
-    panels.add(own, law, colour_of(law, evidence.laws), strong=True)
+        drawn[f"{law_label(other, {})}, {SHORT[metric]} {_error(error, metric)}"] = (baseline, other)
+    late_from, reference = evidence.late_from(scenario), reference_of(evidence, scenario)
+    loops = {label: loop for label, (loop, _) in drawn.items()}
+    panels = LoopPanels(evidence.case, title, loops, late_from, reference)
+    for label, (loop, name) in drawn.items():
+        panels.add(loop, label, colour_of(name, evidence.laws))
     return panels.finish(own)
 
 

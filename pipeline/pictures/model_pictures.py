@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Canvas
 
 from pipeline.evaluation.case import Case, Figure
 from pipeline.evaluation.law_evidence import Array
-from pipeline.pictures.drawing import PALETTE, SIZE, axis_label, symbol, time_axis
+from pipeline.pictures.drawing import PALETTE, SIZE, axis_label, scale, symbol, time_axis
 from pipeline.pictures.words import number
 
 PREDICTED = PALETTE[1]
@@ -97,8 +97,8 @@ def _one_step_panel(axes: Axes, time: Array, arrays: Mapping[str, Array], group:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.0), ncols=4)
 
 
-def candidates_picture(table: Mapping[str, Any]) -> Canvas:
-    """One-step and free-run error of each candidate of a search, and which was chosen."""
+def candidates_picture(table: Mapping[str, Any], unit: str) -> Canvas:
+    """One-step and free-run error [``unit``] of each candidate of a search, and which was chosen."""
     rows = sorted(table["rows"], key=lambda row: (row["parameters"], row["free_run_rmse"]))
     at = np.arange(len(rows))
     canvas = Canvas(figsize=(SIZE[0], 3.8), layout="constrained")
@@ -122,11 +122,11 @@ def candidates_picture(table: Mapping[str, Any]) -> Canvas:
                 fontsize="small",
                 color="#d55e00",
             )
-    axes.set_yscale("log")
-    axes.set_ylabel("validation RMSE")
+    scale(axes.yaxis, np.array([row[key] for row in rows for key in ("free_run_rmse", "rmse")]))
+    axes.set_ylabel(axis_label("validation RMSE", unit))
     axes.set_xlabel("past outputs, past inputs | hidden units, by number of parameters")
     axes.set_xticks(at, [f"{row['lags']} | {row['hidden']}" for row in rows], rotation=35, ha="right", fontsize="small")
-    axes.margins(x=0.06, y=0.18)
+    axes.margins(x=0.1, y=0.18)
     axes.set_title(f"Candidates of {table['model']}, {table['part']}")
-    axes.legend(loc="best")
+    canvas.legend(loc="outside lower center", ncols=2)
     return canvas

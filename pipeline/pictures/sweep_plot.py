@@ -32,7 +32,7 @@ def draw(result: SweepResult, path: Path) -> None:
     )
     error.set_yscale("log")
     error.set_ylabel("RMSE" + (f" [{result.unit}]" if result.unit else ""))
-    error.legend(frameon=False, ncols=2)
+    figure.legend(loc="outside lower center", frameon=False, ncols=3)
     size.plot(c, [row.centres for row in result.rows], color="black")
     size.set_ylabel("centres")
     size.set_xlabel("partitions c of each input")

@@ -50,7 +50,7 @@ def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CaseP
                 drawn["closed_loop.png"] = f"{evidence.laws[law].title} on {untuned}"
         for table in (t for name, model in evidence.models.items() for t in candidates(name, model)):
             name = f"candidates_{table['model']}_{table['part']}.png"
-            save(candidates_picture(table), folder / name)
+            save(candidates_picture(table, evidence.case.plant_class.sp_signals[0].unit), folder / name)
             drawn[name] = f"Lags and widths tried for {table['part']} of the model {table['model']}"
         for picture in own:
             canvas, name = picture.draw(evidence), f"{picture.name}.png"

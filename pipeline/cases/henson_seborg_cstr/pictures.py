@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +13,18 @@ from matplotlib.figure import Figure as Canvas
 from pipeline.evaluation.case import Curve
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import Loop
-from pipeline.pictures.drawing import PALETTE, SIZE, axis_label, colour_of, symbol, time_axis
+from pipeline.pictures.drawing import (
+    PALETTE,
+    SET_POINT,
+    SIZE,
+    axis_label,
+    clear_legend,
+    colour_of,
+    layer,
+    legend_below,
+    symbol,
+    time_axis,
+)
 
 PLANT, NETWORK = "black", PALETTE[0]
 RECOVERED, LOST, ROAD = PALETTE[1], PALETTE[0], "#bbbbbb"
@@ -34,15 +46,15 @@ def free_run_picture(model_set: str) -> Draw:
         panels = list(canvas.subplots(n + 1, 1, sharex=True))
         time, words = time_axis(np.ravel(arrays["time_s"]))
         for i, (axes, signal) in enumerate(zip(panels, states, strict=False)):
-            axes.plot(time, arrays["actual"][:, i], color=PLANT, linewidth=1.2, label="plant")
-            axes.plot(time, arrays["predicted"][:, i], "--", color=NETWORK, linewidth=1.2, label="network alone")
+            axes.plot(time, arrays["actual"][:, i], color=PLANT, label="plant", **layer(1))
+            axes.plot(time, arrays["predicted"][:, i], "--", color=NETWORK, label="network alone", **layer(0))
             axes.set_ylabel(axis_label(symbol(signal.name), signal.unit))
         mv = plant.mv_signals[0]
         panels[-1].step(time, np.ravel(arrays["mv"]), where="post", color=PLANT, linewidth=1.0)
         panels[-1].set_ylabel(axis_label(symbol(mv.name), mv.unit))
         panels[-1].set_xlabel(words)
-        panels[0].legend(loc="upper left")
         canvas.align_ylabels(panels)
+        clear_legend(panels[0])
         return canvas
 
     return draw
@@ -60,8 +72,8 @@ def phase_picture(evidence: Evidence) -> Canvas | None:
     for axes, (law, arrays) in zip(panels, found, strict=True):
         good = arrays["arrived"] > 0
         start = arrays["start"]
-        for course in arrays["courses"]:
-            axes.plot(course[:, 0], course[:, 1], color=ROAD, linewidth=0.5, zorder=1)
+        for i, course in enumerate(arrays["courses"]):
+            axes.plot(*course[:, :2].T, color=ROAD, linewidth=0.7, zorder=1, label=None if i else "courses of some")
         axes.plot(*start[good].T, ".", color=RECOVERED, markersize=1.6, zorder=2, label="recovered")
         axes.plot(*start[~good].T, "x", color=LOST, markersize=7, zorder=5, label="did not")
         axes.plot(cvs, xs[:, 1], color="black", linewidth=1.6, zorder=3, label="steady states of the range")
@@ -71,7 +83,7 @@ def phase_picture(evidence: Evidence) -> Canvas | None:
         axes.set_xlabel(_label(evidence, 0))
     panels[0].set_ylabel(_label(evidence, 1))
     handles, labels = panels[0].get_legend_handles_labels()
-    canvas.legend(handles, labels, loc="outside lower center", ncols=3, markerscale=1.5)
+    legend_below(canvas, handles, labels, most=3, markerscale=1.5)
     return canvas
 
 
@@ -102,18 +114,15 @@ def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
             proved = ~np.isnan(arrays["contraction"])
             for (a, b), rate in zip(pairwise(arrays["points"]), arrays["contraction"], strict=True):
                 axes.plot([a, b], [rate, rate], color=colour, linewidth=4, alpha=0.35, solid_capstyle="butt", zorder=2)
-            axes.plot(
-                [], [], color=colour, linewidth=4, alpha=0.35, label=f"{int(proved.sum())} of {len(proved)} pairs"
-            )
+            said = f"{int(proved.sum())} of {len(proved)} pairs proved"
+            axes.plot([], [], color=colour, linewidth=4, alpha=0.35, label=said)
         axes.axhline(1.0, color="black", linewidth=0.9, linestyle="--")
         for at in found[0][1]["points"]:
             axes.axvline(at, color="#999999", linewidth=0.8, linestyle=":")
         axes.set_xlabel(_label(evidence, 0))
-        axes.set_ylabel("per period")
-        axes.set_title(
-            "lines: spectral radius; bars: contraction with one Lyapunov function", loc="left", fontsize="medium"
-        )
-        axes.legend(loc="best", ncols=2)
+        axes.set_ylabel("factor per period")
+        axes.set_title("lines: spectral radius; bars: contraction with one Lyapunov function", fontsize="medium")
+        legend_below(canvas, most=3)
         return canvas
 
     return draw
@@ -136,9 +145,9 @@ def responses_picture(
             for i, (curve, label) in enumerate(curves):
                 loop = evidence.loop(curve, name)
                 if loop is not None:
-                    _response(column, loop, _colour(evidence, curves, i), _with_figure(evidence, curve, name, label))
+                    look = {"color": _colour(evidence, curves, i), **layer(i)}
+                    _response(column, loop, look, _with_figure(evidence, curve, name, label))
             column[0].set_title(words)
-            column[0].legend(loc="best", fontsize="small")
             if window is not None:
                 column[0].set_xlim(*window)
         mv = evidence.case.plant_class.mv_signals[0]
@@ -146,20 +155,22 @@ def responses_picture(
         panels[1, 0].set_ylabel(axis_label("error", evidence.case.plant_class.sp_signals[0].unit))
         panels[2, 0].set_ylabel(axis_label(symbol(mv.name), mv.unit))
         canvas.align_ylabels(list(panels[:, 0]))
+        for axes in panels[0]:
+            clear_legend(axes, fontsize="small")
         return canvas
 
     return draw
 
 
-def _response(column: Sequence[Axes], loop: Loop, colour: str, label: str) -> None:
+def _response(column: Sequence[Axes], loop: Loop, look: dict[str, Any], label: str) -> None:
     time = loop["time_s"] / 60.0
     above, middle, below = column
     sp, cv = np.ravel(loop["sp"]), loop["pv"][:, 0]
     if not above.lines:
-        above.plot(time, sp, "--", color="black", linewidth=0.9, drawstyle="steps-post")
-    above.plot(time, cv, color=colour, linewidth=1.1, label=label)
-    middle.plot(time, sp - cv, color=colour, linewidth=0.9)
-    below.step(time, np.ravel(loop["mv"]), where="post", color=colour, linewidth=0.8)
+        above.plot(time, sp, drawstyle="steps-post", label="set point", zorder=2, **SET_POINT)
+    above.plot(time, cv, label=label, **look)
+    middle.plot(time, sp - cv, **look)
+    below.step(time, np.ravel(loop["mv"]), where="post", **{**look, "linewidth": 0.7 * look["linewidth"]})
     below.set_xlabel("time [min]")
     above.margins(x=0.01)
 

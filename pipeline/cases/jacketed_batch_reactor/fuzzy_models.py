@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Canvas
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import Array
 from pipeline.evaluation.verdicts import Check, Verdict
-from pipeline.pictures.drawing import PALETTE, SIZE
+from pipeline.pictures.drawing import PALETTE, SIZE, legend_below
 from pipeline.pictures.words import number
 
 MODES = {"hot": "#d55e00", "cold": "#0072b2"}
@@ -60,7 +60,7 @@ def reach_picture(model_set: str) -> Callable[[Evidence], Canvas | None]:
         for axes in grid[:, 0]:
             axes.set_ylabel("change in a period [°C]")
         handles, labels = panels[0].get_legend_handles_labels()
-        canvas.legend(handles, labels, loc="outside lower center", ncols=3)
+        legend_below(canvas, handles, labels, most=3)
         return canvas
 
     return draw
@@ -103,7 +103,7 @@ def coefficients_picture(model_set: str) -> Callable[[Evidence], Canvas | None]:
                     if how in parts:
                         curve = _over_centres(parts[how]["parameters"], name, mode)
                         axes.plot(*curve, line, color=colour, marker="." if mode == "hot" else "x", linewidth=1.1)
-            axes.set_ylabel(f"{name[0]}$_{name[1]}${unit}" if len(name) > 1 else f"{name}{unit}")
+            axes.set_ylabel(f"${name[0]}_{name[1]}${unit}" if len(name) > 1 else f"${name}${unit}")
         for how, colour in zip(reversed(ORDER), PALETTE, strict=False):
             if how in parts:
                 axes.plot([], [], color=colour, label=how)
@@ -112,7 +112,7 @@ def coefficients_picture(model_set: str) -> Callable[[Evidence], Canvas | None]:
         axes.plot([], [], "--", color="black", linewidth=1.0, label="cold")
         for axes in grid[-1]:
             axes.set_xlabel("jacket temperature of the rule [°C]")
-        canvas.legend(loc="outside lower center", ncols=7)
+        legend_below(canvas, most=7)
         return canvas
 
     return draw

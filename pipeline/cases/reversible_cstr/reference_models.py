@@ -24,7 +24,7 @@ def reference_models_picture(evidence: Evidence) -> Canvas:
             time, y = _step(model)
             responses.plot(time, y, line, color=colour, linewidth=1.3, label=f"n = {order}" if line == "-" else None)
     responses.plot([], [], ":", color="black", linewidth=1.3, label="classic table")
-    responses.set_xlabel(r"$\omega_n t$")
+    responses.set_xlabel(r"time $\omega_n t$")
     responses.set_ylabel("response to a unit step")
     responses.legend(loc="lower right", ncols=2)
     _table(table)
