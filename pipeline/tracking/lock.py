@@ -111,8 +111,8 @@ def _md5(path: Path) -> str:
     return hashlib.md5(listing, usedforsecurity=False).hexdigest() + ".dir"
 
 
-def dataset_hash(result: StageResult, results: Iterable[StageResult]) -> str:
-    """sha256 over the records that ``result`` descends from; "none" for a law from equations alone.
+def datasets(result: StageResult, results: Iterable[StageResult]) -> dict[str, str]:
+    """Path -> content hash of the records that ``result`` descends from; none for a law from equations alone.
 
     A record is an output of an excite stage, or a table (CSV, Parquet) that no stage made.
     """
@@ -137,4 +137,10 @@ def dataset_hash(result: StageResult, results: Iterable[StageResult]) -> str:
                 todo.append(above)
             elif PurePosixPath(path).suffix in {".csv", ".parquet"}:
                 found[path] = md5
+    return found
+
+
+def dataset_hash(result: StageResult, results: Iterable[StageResult]) -> str:
+    """sha256 over ``datasets``; "none" where there are none."""
+    found = datasets(result, results)
     return hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest() if found else "none"
