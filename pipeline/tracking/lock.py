@@ -118,8 +118,9 @@ def datasets(result: StageResult, results: Iterable[StageResult]) -> dict[str, s
     """
     makers = {out: r for r in results for out in r.outs}
 
-    def maker(path: str) -> StageResult | None:
-        return next((r for out, r in makers.items() if PurePosixPath(path).is_relative_to(out)), None)
+    def made(path: str) -> list[StageResult]:
+        at = PurePosixPath(path)
+        return [r for out, r in makers.items() if at.is_relative_to(out) or PurePosixPath(out).is_relative_to(at)]
 
     found: dict[str, str] = {}
     todo, seen = [result], set()
@@ -132,10 +133,9 @@ def datasets(result: StageResult, results: Iterable[StageResult]) -> dict[str, s
             found |= stage.outs
             continue
         for path, md5 in stage.deps.items():
-            above = maker(path)
-            if above is not None:
-                todo.append(above)
-            elif PurePosixPath(path).suffix in {".csv", ".parquet"}:
+            above = made(path)
+            todo += above
+            if not above and PurePosixPath(path).suffix in {".csv", ".parquet"}:
                 found[path] = md5
     return found
 
