@@ -87,6 +87,7 @@ def test_a_store_is_filled_once_and_rebuilt_from_nothing(root, empty_store, monk
     assert "0 new runs of 4, 0 new versions" in capsys.readouterr().err
 
     with store() as client:
+        assert [e.name for e in client.search_experiments()] == [CASE]
         experiment = client.get_experiment_by_name(CASE)
         runs = {r.data.tags["dvc_stage"]: r for r in client.search_runs([experiment.experiment_id])}
         assert len(runs) == 4
@@ -423,12 +424,16 @@ def test_a_store_whose_folder_was_moved_or_copied_still_gives_its_files(root, mo
     first = next((copy / "mlruns").rglob("inverse_dob.onnx"))
     digest = file_digest(first)
     next((root / "mlruns").rglob("inverse_dob.onnx")).write_bytes(b"of the original alone")
-    monkeypatch.chdir(copy)
+
+    def work_in(folder: Path) -> None:
+        monkeypatch.chdir(folder)
+        monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)  # mlflow keeps the store of this process there
+
+    work_in(copy)
     assert main(["fetch", CASE, "out"]) == 0
     assert file_digest(copy / "out" / "inverse_dob.onnx") == digest
-    monkeypatch.chdir(root.parent)
     copy.rename(moved)
-    monkeypatch.chdir(moved)
+    work_in(moved)
     assert main(["fetch", CASE, "again"]) == 0
     assert publish(moved)["controllers"][f"{CASE}-inverse_dob"] == digest
 

@@ -14,7 +14,7 @@ from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_curre
 from pipeline.tracking.notes import experiment_note
 from pipeline.tracking.registry import describe, elect_champion, file_digest, register, rename_aliases
 from pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
-from pipeline.tracking.store import experiment_id, store
+from pipeline.tracking.store import experiment_id, hide_default, store
 
 
 def publish(root: Path) -> dict[str, Any]:
@@ -42,6 +42,7 @@ def publish(root: Path) -> dict[str, Any]:
         receipt: dict[str, Any] = {"stages": {}, "controllers": {}}
         for case, own in by_case.items():
             _publish_case(client, case, own, results, root, receipt)
+        hide_default(client)
     return receipt
 
 

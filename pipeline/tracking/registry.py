@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import mlflow
+import mlflow.artifacts
 import mlflow.onnx
 import numpy as np
 import onnx
@@ -272,10 +273,11 @@ def fetch(client: MlflowClient, what: str, folder: Path) -> list[Path]:
 
 def _download(client: MlflowClient, version: ModelVersion, file: str, draft: str) -> Path:
     """One file of a version's run; TrackingError says which one is missing and where it should be."""
+    place = str(client.get_run(str(version.run_id)).info.artifact_uri)
     try:
-        return Path(client.download_artifacts(str(version.run_id), file, draft))
+        # not by the run's id: mlflow remembers where a run lay, also of a store that was copied since
+        return Path(mlflow.artifacts.download_artifacts(artifact_uri=f"{place}/{file}", dst_path=draft))
     except (MlflowException, OSError) as error:
-        place = str(client.get_run(str(version.run_id)).info.artifact_uri)
         raise TrackingError(
             f"{version.name} version {version.version} is registered, but its file {file} is not in {place}; "
             "if mlflow.db was moved or copied, put its folder mlruns beside it, "

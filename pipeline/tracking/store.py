@@ -140,3 +140,11 @@ def experiment_id(client: MlflowClient, case: str) -> str:
     if experiment.lifecycle_stage == "deleted":
         client.restore_experiment(experiment.experiment_id)
     return str(experiment.experiment_id)
+
+
+def hide_default(client: MlflowClient) -> None:
+    """Take mlflow's own empty experiment off the list of cases."""
+    default = client.get_experiment_by_name("Default")
+    if default is not None and default.lifecycle_stage == "active" and default.experiment_id == "0":
+        if not client.search_runs(["0"], max_results=1):
+            client.delete_experiment("0")
