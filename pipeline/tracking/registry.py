@@ -68,7 +68,7 @@ def register(
     gate = Gate.of(validation, law)
     digest = file_digest(path)
     if not client.search_registered_models(f"name = '{name}'"):
-        client.create_registered_model(name, tags={"case": case, "law": law})
+        client.create_registered_model(name, tags={"standing": "not compared yet", "case": case, "law": law})
     known = next((v for v in versions(client, name) if v.tags.get("sha256") == digest), None)
     manifest = json.loads(path.with_suffix(".json").read_text()) if path.with_suffix(".json").exists() else {}
     own = {
@@ -80,7 +80,7 @@ def register(
     }
     description = card.version_description(validation, gate, run_id, picture)
     analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
-    tags = {**tags, **own, **gate.tags(), **analysis}
+    tags = {**gate.tags(), **analysis, **own, **tags}  # in this order they are shown
     if known is None:
         number, before = _log(client, name, path, run_id, description, tags), tags
         client.set_registered_model_alias(name, CANDIDATE, number)

@@ -145,6 +145,7 @@ def experiment_id(client: MlflowClient, case: str) -> str:
 def hide_default(client: MlflowClient) -> None:
     """Take mlflow's own empty experiment off the list of cases."""
     default = client.get_experiment_by_name("Default")
-    if default is not None and default.lifecycle_stage == "active" and default.experiment_id == "0":
-        if not client.search_runs(["0"], max_results=1):
-            client.delete_experiment("0")
+    if default is None or default.experiment_id != "0" or default.lifecycle_stage != "active":
+        return
+    if not client.search_runs(["0"], max_results=1):
+        client.delete_experiment("0")
