@@ -23,6 +23,7 @@ from pipeline.start import VARIABLE, receipt_path
 from pipeline.tracking.__main__ import CHAMPIONS, main
 from pipeline.tracking.gate import Gate
 from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_current, read_lock
+from pipeline.tracking.notes import item_of
 from pipeline.tracking.publish import publish
 from pipeline.tracking.registry import file_digest, versions
 from pipeline.tracking.store import store
@@ -356,6 +357,12 @@ def test_a_run_names_the_data_it_learnt_from(root):
         assert (used.dataset.name, used.dataset.digest) == ("steps", made.removesuffix(".dir"))
         assert [tag.value for tag in used.tags] == [context]
     assert not inputs[f"validate@{CASE}-pid"]  # from no data
+
+
+def test_a_run_is_named_by_its_stage_whatever_the_order_of_its_outputs():
+    outs = {"artifacts/plant/pid_2.json": "1", "artifacts/plant/pid_2.onnx": "2", "work/plant/validation/pid_2": "3"}
+    for order in (outs, dict(reversed(outs.items()))):
+        assert item_of(StageResult("validate@plant-pid_2", "", {}, {}, order)) == "pid_2"
 
 
 def test_a_stage_that_depends_on_a_folder_descends_from_what_was_made_inside():

@@ -21,8 +21,6 @@ from pipeline.tracking.store import store, store_uri
 HOST = "127.0.0.1"
 CHAMPIONS = "tags.standing LIKE 'champion%'"
 """MLflow's search for the registered models that are champion of their case."""
-MODE = "workflowType=machine_learning"
-"""MLflow's default mode hides the registered models from the sidebar."""
 
 
 def _publish(args: argparse.Namespace) -> None:
@@ -75,9 +73,9 @@ def _serve(args: argparse.Namespace) -> None:
         if probe.connect_ex((HOST, args.port)) == 0:
             raise TrackingError(f"port {args.port} of {HOST} is taken; give another one with --port")
     page = f"http://{HOST}:{args.port}"
-    print(f"champions:       {page}/#/models?{MODE}&searchInput={quote(CHAMPIONS)}")
-    print(f"all controllers: {page}/#/models?{MODE}")
-    print(f"runs by case:    {page}/#/experiments?{MODE}\nCtrl-C ends", flush=True)
+    print(f"champions:       {page}/#/models?searchInput={quote(CHAMPIONS)}")
+    print(f"all controllers: {page}/#/models (the sidebar hides it)")
+    print(f"runs by case:    {page}/#/experiments\nCtrl-C ends", flush=True)
     # mlflow's server would otherwise run jobs that its users submit
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     options = ["--host", HOST, "--port", str(args.port), "--backend-store-uri", uri, "--workers", "1"]

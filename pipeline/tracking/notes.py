@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import PurePosixPath
 from typing import Any
 
 from pipeline.tracking.gate import Gate
@@ -41,10 +40,10 @@ def run_note(result: StageResult, case: str, validation: Mapping[str, Any], time
     words = {"case": titles.get("case", case), "item": item, "metric": validation.get("metric", "mae")}
     if result.kind in {"design", "validate"}:
         words["item"] = (titles.get("laws") or {}).get(item, item)
-    parts = [WHAT.get(result.kind, "The stage {item} of the case *{case}*.").format(**words)]
-    if result.kind == "validate":
-        parts.append(_verdict(Gate.of(validation, item)))
-    elif result.kind == "report":
+    # the page shows the first lines, the rest on a click
+    parts = [_verdict(Gate.of(validation, item))] if result.kind == "validate" else []
+    parts.append(WHAT.get(result.kind, "The stage {item} of the case *{case}*.").format(**words))
+    if result.kind == "report":
         parts.append("Open `report.html` under Artifacts.")
     parts.append(METRICS.get(result.kind, "").format(**words))
     parts.append("All other figures: `figures.json` under Artifacts.")
@@ -57,9 +56,8 @@ def run_note(result: StageResult, case: str, validation: Mapping[str, Any], time
 
 
 def item_of(result: StageResult) -> str:
-    """What the stage was run for: the folder of its first output, such as the record, the model set or the law."""
-    first = PurePosixPath(next(iter(result.outs), result.name))
-    return first.stem if len(first.parts) > 3 else result.name.partition("@")[2] or result.name
+    """What the stage was run for, without its case: a record, a model set, a controller; the case for a report."""
+    return result.name.partition("@")[2].removeprefix(f"{result.case}-")
 
 
 def _verdict(gate: Gate) -> str:
@@ -74,12 +72,13 @@ def experiment_note(case: str, validation: Mapping[str, Any], champion: str | No
     """The description of a case's experiment: its champion, its laws in order, where to look."""
     titles, gate = validation.get("titles") or {}, validation.get("gate") or {}
     laws = titles.get("laws") or {}
-    lines = [f"**{titles.get('case', case)}.** One run for each stage of the pipeline."]
+    first = f"**{titles.get('case', case)}.**"  # the page shows this line, the rest on a click
     if champion:
         law = champion.removeprefix(f"{case}-")
         score = Gate.of(validation, law).score
         beside = "" if score is None else f", {score:.3f} times the bound"
-        lines.append(f"Champion: **[{laws.get(law, law)}](#/models/{champion})**{beside}.")
+        first += f" Champion: **[{laws.get(law, law)}](#/models/{champion})**{beside}."
+    lines = [first, "One run for each stage of the pipeline."]
     scores = {law: row["score"] for law, row in (gate.get("laws") or {}).items() if row.get("score") is not None}
     if scores:
         rows = [

@@ -15,7 +15,7 @@ from mlflow.utils.time import get_current_time_millis
 
 from pipeline.tracking.headline import curves, headline, of_gate, table
 from pipeline.tracking.lock import StageResult
-from pipeline.tracking.notes import run_note
+from pipeline.tracking.notes import item_of, run_note
 from pipeline.tracking.times import Times
 
 KEY_TAG = "stage_key"
@@ -79,7 +79,8 @@ def write_run(
     own |= {f"out.{_name(path)}": md5 for path, md5 in result.outs.items()}
     if rows:
         own[TABLES_TAG] = json.dumps([{"path": TABLE, "type": "table"}])
-    run = client.create_run(experiment, start_time=times.start_ms, run_name=result.name, tags={**own, **tags})
+    run_name = result.kind if result.kind == "report" else f"{result.kind} {item_of(result)}"
+    run = client.create_run(experiment, start_time=times.start_ms, run_name=run_name, tags={**own, **tags})
     run_id = str(run.info.run_id)
     params = [Param(_name(k), _text(v)) for k, v in result.params.items()]
     metrics = list(_metrics(result, trees, validation, times.end_ms))
