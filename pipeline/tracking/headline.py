@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 from pipeline.cases.base import NOISE_SUFFIX
 from pipeline.tracking.lock import flat
@@ -24,13 +24,13 @@ Figures = dict[str, float]
 
 def headline(kind: str, metrics: Mapping[str, Any], validation: Mapping[str, Any]) -> Figures:
     """The metrics of a run of stage ``kind``, from its own metrics.json and its case's validation.json."""
-    found = {
-        "excite": _of_record,
-        "fit": _of_models,
-        "design": _of_files,
-        "validate": lambda tree: _of_law(tree, validation),
-        "report": lambda _: _of_case(validation),
-    }.get(kind, lambda _: {})(metrics)
+    if kind == "validate":
+        found = _of_law(metrics, validation)
+    elif kind == "report":
+        found = _of_case(validation)
+    else:
+        own = {"excite": _of_record, "fit": _of_models, "design": _of_files}.get(kind)
+        found = own(metrics) if own else {}
     finite = {name: float(value) for name, value in found.items() if _is_figure(value)}
     return dict(list(finite.items())[:MOST])
 
@@ -48,7 +48,7 @@ def _of_record(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def _of_models(tree: Mapping[str, Any]) -> dict[str, Any]:
     parts = tree.get("parts") or {}
-    rows = {}
+    rows: dict[str, Any] = {}
     for part, row in parts.items():
         before = f"{part}/" if len(parts) > 1 else ""
         rows |= {f"{before}{name}": row["median"][name] for name in OF_A_MODEL if name in (row.get("median") or {})}
@@ -121,5 +121,5 @@ def table(trees: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, float]]:
     return rows
 
 
-def _is_figure(value: Any) -> bool:
+def _is_figure(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and math.isfinite(value)
