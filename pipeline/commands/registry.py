@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import socket
 import sys
 from pathlib import Path
+from urllib.parse import quote
+
+from mlflow.entities.model_registry import RegisteredModel
 
 from pipeline.errors import TrackingError
 from pipeline.tracking.publish import publish
@@ -14,6 +18,8 @@ from pipeline.tracking.registry import CHAMPION, fetch, promote, versions
 from pipeline.tracking.store import store, store_uri
 
 HOST = "127.0.0.1"
+CHAMPIONS = "tags.standing LIKE 'champion%'"
+"""MLflow's search for the registered models that are champion of their case."""
 
 
 def _publish(args: argparse.Namespace) -> None:
@@ -23,13 +29,25 @@ def _publish(args: argparse.Namespace) -> None:
 def _list(args: argparse.Namespace) -> None:
     with store() as client:
         models = client.search_registered_models(max_results=1000)
-        for model in sorted(models, key=lambda m: str(m.name)):
+        for model in sorted(models, key=_place):
             for version in versions(client, model.name):
                 aliases = " ".join(f"@{a}" for a in version.aliases)
                 score = version.tags.get("gate_score", "-")
                 print(f"{model.name:40} {version.version:>4}  gate {score:10} {aliases}")
         if not models:
             print("the registry is empty; run `dvc repro`, or `loopwright registry publish`")
+
+
+def _place(model: RegisteredModel) -> tuple[str, bool, int, str]:
+    """Cases by name; within a case the champion first, then by rank."""
+    standing = model.tags.get("standing", "")
+    rank = re.search(r"(\d+) of \d+", standing)
+    return (
+        model.tags.get("case", ""),
+        not standing.startswith(CHAMPION),
+        int(rank[1]) if rank else sys.maxsize,
+        str(model.name),
+    )
 
 
 def _promote(args: argparse.Namespace) -> None:
@@ -53,7 +71,10 @@ def _serve(args: argparse.Namespace) -> None:
     with store(), socket.socket() as probe:
         if probe.connect_ex((HOST, args.port)) == 0:
             raise TrackingError(f"port {args.port} of {HOST} is taken; give another one with --port")
-    print(f"registry: http://{HOST}:{args.port}/#/models (the sidebar hides it; Ctrl-C ends)", flush=True)
+    page = f"http://{HOST}:{args.port}"
+    print(f"champions:       {page}/#/models?searchInput={quote(CHAMPIONS)}")
+    print(f"all controllers: {page}/#/models (the sidebar hides it)")
+    print(f"runs by case:    {page}/#/experiments\nCtrl-C ends", flush=True)
     # mlflow's server would otherwise run jobs that its users submit
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     options = ["--host", HOST, "--port", str(args.port), "--backend-store-uri", uri, "--workers", "1"]
@@ -65,15 +86,19 @@ def options(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=type(parser))
     one = commands.add_parser("publish", help="write the cached results that the store lacks")
     one.set_defaults(action=_publish)
-    one = commands.add_parser("list", help="controllers, versions, gate scores and aliases")
+    one = commands.add_parser(
+        "list", help="controllers, versions, gate scores and aliases; the champion of each case first"
+    )
     one.set_defaults(action=_list)
-    one = commands.add_parser("promote", help="move an alias by hand")
+    one = commands.add_parser("promote", help="make a version the champion of its case, or move another alias")
     one.add_argument("name", help="registered controller: CASE-LAW")
     one.add_argument("version", help="its version, a number")
     one.add_argument("--alias", default=CHAMPION, help="default: %(default)s")
     one.set_defaults(action=_promote)
     one = commands.add_parser("fetch", help="write a controller and its manifest into a folder")
-    one.add_argument("controller", help="CASE-LAW (its champion), CASE-LAW@ALIAS, CASE-LAW/VERSION, or CASE")
+    one.add_argument(
+        "controller", help="CASE (its champion), CASE-LAW (its best version), CASE-LAW@ALIAS or CASE-LAW/VERSION"
+    )
     one.add_argument("folder", type=Path)
     one.set_defaults(action=_fetch)
     one = commands.add_parser("serve", help="open MLflow's UI on this machine only, its job execution off")

@@ -11,25 +11,56 @@ from html import escape
 from typing import Any
 
 from pipeline.simulation.scenario import NOISE_SUFFIX
-from pipeline.tracking.gate import Gate
+from pipeline.tracking.gate import Gate, Rank
 
 GAP = "&nbsp;" * 4
 """Cells have no padding there and may not be styled."""
 
 
-def model_description(case: str, law: str, validation: Mapping[str, Any]) -> str:
-    """The registered model's description: what the controller is and what the aliases mean."""
-    titles, gate = validation.get("titles") or {}, Gate.of(validation, law)
+def model_description(case: str, law: str, validation: Mapping[str, Any], champion: str | None) -> str:
+    """The registered model's description: where the controller stands in its case, and how to take it.
+
+    ``champion`` is the registered model that holds the case's alias ``champion``.
+    """
+    titles = validation.get("titles") or {}
     title = (titles.get("laws") or {}).get(law, law)
-    beaten = f"that beat the {gate.baseline_name} " if law != gate.baseline_law else ""
+    name = f"{case}-{law}"
+    take = case if name == champion else name
     return (
-        f"<p><b>{escape(str(title))}</b> for {escape(str(titles.get('case', case)))}.</p>"
-        "<p>Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup. "
-        f"<b>candidate</b>: the newest version. <b>champion</b>: the best version {escape(beaten)}"
-        "in closed loop without a lock-up. <b>case_champion</b>: on the best controller of the case only.</p>"
-        f"<p>Take its champion: <code>loopwright registry fetch {escape(case)}-{escape(law)} FOLDER</code>, or "
-        f"the newest version: <code>{escape(case)}-{escape(law)}@candidate</code> in its place.</p>"
+        f"<p>{escape(_standing(name, law, validation, champion))}</p>"
+        f"<p><b>{escape(str(title))}</b> for {escape(str(titles.get('case', case)))}. "
+        "Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup.</p>"
+        f"<p>Take it: <code>loopwright registry fetch {escape(take)} FOLDER</code></p>"
+        "<p><b>candidate</b>: the newest version. <b>best</b>: the best version that passed the gate. "
+        "<b>champion</b>: the best controller of the case; one in a case has it.</p>"
     )
+
+
+def _standing(name: str, law: str, validation: Mapping[str, Any], champion: str | None) -> str:
+    """Where a controller stands, in a sentence or two without markup."""
+    rank, gate = Rank.of_laws(validation).get(law), Gate.of(validation, law)
+    if rank is None or gate.score is None:
+        return "Not compared yet: the report stage of its case has not run."
+    score = f"{gate.score:.3f} times the bound"
+    if name == champion:
+        if rank.place == 1:
+            return f"CHAMPION: the best of the {rank.of} controllers of its case, {score}."
+        return f"CHAMPION of its case, {score}; rank {rank.place} of {rank.of} in the newest comparison."
+    best = f" The champion is {champion}." if champion else " The case has no champion."
+    if rank.refusal:
+        return f"Rank {rank.place} of {rank.of}, {score}. It does not pass the gate: {rank.refusal}.{best}"
+    return f"Rank {rank.place} of {rank.of}, {score}.{best}"
+
+
+def standing_tag(name: str, law: str, validation: Mapping[str, Any], champion: str | None) -> str:
+    """The same in a few words, for the list of models."""
+    rank = Rank.of_laws(validation).get(law)
+    if rank is None:
+        return "not compared yet"
+    place = f"{rank.place} of {rank.of}"
+    if name == champion:
+        return f"champion, {place}"
+    return f"{place}, did not pass the gate" if rank.refusal else place
 
 
 def version_description(validation: Mapping[str, Any], gate: Gate, run_id: str, picture: str | None) -> str:

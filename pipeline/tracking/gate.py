@@ -10,13 +10,14 @@ Aliases:
 
 ``candidate``
     the newest version of a controller.
+``best``
+    the best version of a controller that passed the gate. It moves only to a version that did not
+    lock up in any run, whose score is below that of the case's baseline (a PID where the case has no
+    better yardstick) in the same validation, and below that of the present best version. The
+    baseline has nobody else to beat than its own former version.
 ``champion``
-    of one registered model: the best version that beat the case's baseline, a PID where the case has
-    no better yardstick. It moves only to a version that did not lock up in any run, whose score is
-    below the baseline's of the same validation, and below the present champion's. The baseline has
-    nobody else to beat than its own former version.
-``case_champion``
-    one in a case: the champion with the lowest score among the case's registered models.
+    one in a case: the best version with the lowest score among the case's controllers, or the one
+    that a person promoted.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class Gate:
         return {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in rows.items() if v is not None}
 
     def refusal(self) -> str | None:
-        """Why no version with these figures may become champion, whoever holds the title; None if one may."""
+        """Why no version with these figures passes the gate, whichever is the best so far; None if one does."""
         if self.score is None or self.lock_ups is None:
             return "its validation has no gate score"
         if self.lock_ups:
@@ -85,11 +86,30 @@ class Gate:
             return f"its gate score {self.score:.4g} does not beat the {self.baseline_name}'s {self.baseline:.4g}"
         return None
 
-    def refusal_against(self, champion: Mapping[str, str]) -> str | None:
-        """Why the title stays with the champion that has these version tags; None if it moves."""
-        if champion.get("gate_id") != self.id:
-            return "the champion was measured on another gate; compare them and promote by hand"
-        held = float(champion.get("gate_score", "inf"))
+    def refusal_against(self, best: Mapping[str, str]) -> str | None:
+        """Why the version that has these tags stays the best one; None if this one takes its place."""
+        if best.get("gate_id") != self.id:
+            return "the best version was measured on another gate; compare them and promote by hand"
+        held = float(best.get("gate_score", "inf"))
         if self.score is None or self.score >= held:
-            return f"its gate score {self.score} does not beat the champion's {held:.4g}"
+            return f"its gate score {self.score} does not beat the best version's {held:.4g}"
         return None
+
+
+@dataclass(frozen=True, slots=True)
+class Rank:
+    """Where a law stands among the laws of its case: those that pass the gate first, the lowest score first."""
+
+    place: int
+    of: int
+    refusal: str | None
+
+    @classmethod
+    def of_laws(cls, validation: Mapping[str, Any]) -> dict[str, Self]:
+        """The rank of every law that has a score."""
+        gates = [Gate.of(validation, law) for law in (validation.get("gate") or {}).get("laws") or {}]
+        scored = [(gate.refusal() is not None, gate.score, gate.law) for gate in gates if gate.score is not None]
+        return {
+            law: cls(place, len(scored), Gate.of(validation, law).refusal())
+            for place, (_, _, law) in enumerate(sorted(scored), 1)
+        }

@@ -111,15 +111,16 @@ def _md5(path: Path) -> str:
     return hashlib.md5(listing, usedforsecurity=False).hexdigest() + ".dir"
 
 
-def dataset_hash(result: StageResult, results: Iterable[StageResult]) -> str:
-    """sha256 over the records that ``result`` descends from; "none" for a law from equations alone.
+def datasets(result: StageResult, results: Iterable[StageResult]) -> dict[str, str]:
+    """Path -> content hash of the records that ``result`` descends from; none for a law from equations alone.
 
     A record is an output of an excite stage, or a table (CSV, Parquet) that no stage made.
     """
     makers = {out: r for r in results for out in r.outs}
 
-    def maker(path: str) -> StageResult | None:
-        return next((r for out, r in makers.items() if PurePosixPath(path).is_relative_to(out)), None)
+    def made(path: str) -> list[StageResult]:
+        at = PurePosixPath(path)
+        return [r for out, r in makers.items() if at.is_relative_to(out) or PurePosixPath(out).is_relative_to(at)]
 
     found: dict[str, str] = {}
     todo, seen = [result], set()
@@ -132,9 +133,14 @@ def dataset_hash(result: StageResult, results: Iterable[StageResult]) -> str:
             found |= stage.outs
             continue
         for path, md5 in stage.deps.items():
-            above = maker(path)
-            if above is not None:
-                todo.append(above)
-            elif PurePosixPath(path).suffix in {".csv", ".parquet"}:
+            above = made(path)
+            todo += above
+            if not above and PurePosixPath(path).suffix in {".csv", ".parquet"}:
                 found[path] = md5
+    return found
+
+
+def dataset_hash(result: StageResult, results: Iterable[StageResult]) -> str:
+    """sha256 over ``datasets``; "none" where there are none."""
+    found = datasets(result, results)
     return hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest() if found else "none"

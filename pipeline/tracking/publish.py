@@ -10,10 +10,11 @@ from typing import Any
 
 from mlflow import MlflowClient
 
-from pipeline.tracking.lock import StageResult, dataset_hash, is_current, read_lock
-from pipeline.tracking.registry import elect_case_champion, file_digest, register
-from pipeline.tracking.runs import git_commit, published, write_run
-from pipeline.tracking.store import experiment_id, store
+from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_current, read_lock
+from pipeline.tracking.notes import experiment_note
+from pipeline.tracking.registry import describe, elect_champion, file_digest, register, rename_aliases
+from pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
+from pipeline.tracking.store import experiment_id, hide_default, store
 
 
 def publish(root: Path) -> dict[str, Any]:
@@ -41,6 +42,7 @@ def publish(root: Path) -> dict[str, Any]:
         receipt: dict[str, Any] = {"stages": {}, "controllers": {}}
         for case, own in by_case.items():
             _publish_case(client, case, own, results, root, receipt)
+        hide_default(client)
     return receipt
 
 
@@ -53,30 +55,37 @@ def _publish_case(
     receipt: dict[str, Any],
 ) -> None:
     experiment = experiment_id(client, case)
-    runs = {key: str(run.info.run_id) for key, run in published(client, experiment).items()}
+    rename_aliases(client, case)
+    known = published(client, experiment)
+    runs = {key: str(run.info.run_id) for key, run in known.items()}
     commit = git_commit(root)
+    evidence = root / "artifacts" / case / "validation.json"
+    validation = json.loads(evidence.read_text()) if evidence.exists() else {}
     new = 0
     for number, result in enumerate(own, 1):
         if result.key not in runs:
             tags = {"case": case, "git_commit": commit, "dataset_sha256": dataset_hash(result, results)}
-            runs[result.key] = write_run(client, experiment, result, root, tags)
+            records = datasets(result, results)
+            runs[result.key] = write_run(client, experiment, result, root, records, validation, tags)
             new += 1
             _say(f"[{number}/{len(own)}] {case}: run {result.name}")
         receipt["stages"][result.name] = result.key
-    evidence = root / "artifacts" / case / "validation.json"
-    validation = json.loads(evidence.read_text()) if evidence.exists() else {}
     made = 0
     for result in own:
         for path in sorted(root / out for out in result.outs if result.kind == "validate" and out.endswith(".onnx")):
             run_id = runs[result.key]
+            if result.key in known:
+                refresh(client, known[result.key], path.stem, validation)
             picture = _add_picture(client, run_id, evidence.parent / "figures" / f"closed_loop_{path.stem}.png")
             tags = {"git_commit": commit, "dataset_sha256": dataset_hash(result, results), "stage_key": result.key}
             line, is_new = register(client, case, path, run_id, validation, picture, tags)
             made += is_new
             _say(line)
             receipt["controllers"][f"{case}-{path.stem}"] = file_digest(path)
-    best = elect_case_champion(client, case)
-    _say(f"{case}: {new} new runs of {len(own)}, {made} new versions; case champion: {best or 'none'}")
+    champion = elect_champion(client, case)
+    describe(client, case, validation, champion)
+    describe_experiment(client, experiment, experiment_note(case, validation, champion))
+    _say(f"{case}: {new} new runs of {len(own)}, {made} new versions; champion: {champion or 'none'}")
 
 
 def _add_picture(client: MlflowClient, run_id: str, picture: Path) -> str | None:

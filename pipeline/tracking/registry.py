@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import mlflow
+import mlflow.artifacts
 import mlflow.onnx
 import numpy as np
 import onnx
@@ -26,7 +27,10 @@ from pipeline.errors import TrackingError
 from pipeline.tracking import card
 from pipeline.tracking.gate import Gate
 
-CANDIDATE, CHAMPION, CASE_CHAMPION = "candidate", "champion", "case_champion"
+CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
+FORMER = "case_champion"
+"""What ``champion`` was called when ``champion`` meant ``best``."""
+BY_HAND = "champion_by"
 REQUIREMENTS = ["onnxruntime>=1.20", "numpy>=2.0"]
 
 
@@ -64,11 +68,7 @@ def register(
     gate = Gate.of(validation, law)
     digest = file_digest(path)
     if not client.search_registered_models(f"name = '{name}'"):
-        client.create_registered_model(name, tags={"case": case, "law": law})
-    model = client.get_registered_model(name)
-    described = card.model_description(case, law, validation)
-    if model.description != described:
-        client.update_registered_model(name, described)
+        client.create_registered_model(name, tags={"standing": "not compared yet", "case": case, "law": law})
     known = next((v for v in versions(client, name) if v.tags.get("sha256") == digest), None)
     manifest = json.loads(path.with_suffix(".json").read_text()) if path.with_suffix(".json").exists() else {}
     own = {
@@ -80,7 +80,7 @@ def register(
     }
     description = card.version_description(validation, gate, run_id, picture)
     analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
-    tags = {**tags, **own, **gate.tags(), **analysis}
+    tags = {**gate.tags(), **analysis, **own, **tags}  # in this order they are shown
     if known is None:
         number, before = _log(client, name, path, run_id, description, tags), tags
         client.set_registered_model_alias(name, CANDIDATE, number)
@@ -130,50 +130,87 @@ def _schema(values: Iterable[onnx.ValueInfoProto]) -> Schema:
 
 
 def _elect(client: MlflowClient, name: str, number: str, gate: Gate) -> str:
-    """Move ``champion`` to the version if it earned it; returns the verdict in words."""
-    holder = next((v for v in versions(client, name) if CHAMPION in v.aliases), None)
+    """Move ``best`` to the version if it earned it; returns the verdict in words."""
+    holder = next((v for v in versions(client, name) if BEST in v.aliases), None)
     if holder is not None and str(holder.version) == number:
-        return "is the champion"
+        return "is the best version"
     refusal = gate.refusal() or (gate.refusal_against(holder.tags) if holder is not None else None)
     if refusal:
-        return f"not the champion: {refusal}"
-    client.set_registered_model_alias(name, CHAMPION, number)
-    return "is the champion"
+        return f"not the best version: {refusal}"
+    client.set_registered_model_alias(name, BEST, number)
+    return "is the best version"
 
 
-def elect_case_champion(client: MlflowClient, case: str) -> str | None:
-    """Put ``case_champion`` on the case's best champion, and only there; returns its name or None.
+def _of_case(client: MlflowClient, case: str) -> list[ModelVersion]:
+    """Every version of every controller of a case."""
+    models = client.search_registered_models(f"tags.`case` = '{case}'", max_results=1000)
+    return [version for model in models for version in versions(client, model.name)]
 
-    Champions are compared among those of the newest gate: the one that most of them share.
+
+def rename_aliases(client: MlflowClient, case: str) -> None:
+    """Bring the aliases of an earlier release to this one's names: champion was case_champion, best was champion."""
+    rows = _of_case(client, case)
+    if not any(FORMER in v.aliases for v in rows):
+        return
+    for version in rows:
+        if CHAMPION in version.aliases:
+            client.set_registered_model_alias(version.name, BEST, str(version.version))
+            client.delete_registered_model_alias(version.name, CHAMPION)
+        if FORMER in version.aliases:
+            client.delete_registered_model_alias(version.name, FORMER)
+
+
+def elect_champion(client: MlflowClient, case: str) -> str | None:
+    """Put ``champion`` on the best controller of the case, and only there; returns its name or None.
+
+    Best versions are compared among those of the newest gate: the one that most of them share. A
+    champion that a person promoted stays.
     """
-    champions = [
-        version
-        for model in client.search_registered_models(f"tags.`case` = '{case}'", max_results=1000)
-        for version in versions(client, model.name)
-        if CHAMPION in version.aliases or CASE_CHAMPION in version.aliases
-    ]
-    ids = [v.tags.get("gate_id") for v in champions if CHAMPION in v.aliases and "gate_score" in v.tags]
-    common = max(ids, key=ids.count, default=None)
-    able = [v for v in champions if CHAMPION in v.aliases and "gate_score" in v.tags and v.tags["gate_id"] == common]
-    best = min(able, key=lambda v: float(v.tags["gate_score"]), default=None)
-    for version in champions:
-        if CASE_CHAMPION in version.aliases and (best is None or version.name != best.name):
-            client.delete_registered_model_alias(version.name, CASE_CHAMPION)
+    rows = _of_case(client, case)
+    holders = [v for v in rows if CHAMPION in v.aliases]
+    best = next((v for v in holders if v.tags.get(BY_HAND) == "hand"), None)
     if best is None:
-        return None
-    client.set_registered_model_alias(best.name, CASE_CHAMPION, str(best.version))
-    return str(best.name)
+        scored = [v for v in rows if BEST in v.aliases and "gate_score" in v.tags]
+        ids = [v.tags.get("gate_id") for v in scored]
+        common = max(ids, key=ids.count, default=None)
+        able = [v for v in scored if v.tags.get("gate_id") == common]
+        best = min(able, key=lambda v: float(v.tags["gate_score"]), default=None)
+    _crown(client, holders, best)
+    return None if best is None else str(best.name)
+
+
+def _crown(client: MlflowClient, holders: Iterable[ModelVersion], best: ModelVersion | None) -> None:
+    """Move ``champion`` from its holders to the version."""
+    for version in holders:
+        if best is None or version.name != best.name:
+            client.delete_registered_model_alias(version.name, CHAMPION)
+    if best is not None and CHAMPION not in best.aliases:
+        client.set_registered_model_alias(best.name, CHAMPION, str(best.version))
+
+
+def describe(client: MlflowClient, case: str, validation: Mapping[str, Any], champion: str | None) -> None:
+    """Say on the page of every controller of a case where it stands."""
+    for model in client.search_registered_models(f"tags.`case` = '{case}'", max_results=1000):
+        law = model.tags["law"]
+        description = card.model_description(case, law, validation, champion)
+        standing = card.standing_tag(model.name, law, validation, champion)
+        if model.description != description:
+            client.update_registered_model(model.name, description)
+        if model.tags.get("standing") != standing:
+            client.set_registered_model_tag(model.name, "standing", standing)
 
 
 def _find(client: MlflowClient, what: str, default_alias: str) -> ModelVersion:
-    """The version meant by NAME, NAME@ALIAS, NAME/NUMBER, or a case's name (its case champion)."""
+    """The version meant by NAME, NAME@ALIAS, NAME/NUMBER, or a case's name (its champion)."""
     bare = what.partition("@")[0].partition("/")[0]
     names = [m.name for m in client.search_registered_models(max_results=1000)]
     if bare not in names and bare == what:
-        of_case = client.search_registered_models(f"tags.`case` = '{bare}'", max_results=1000)
-        crowned = [v for m in of_case for v in versions(client, m.name) if CASE_CHAMPION in v.aliases]
-        if crowned:
-            return crowned[0]
+        rows = _of_case(client, bare)
+        crowned = next((v for v in rows if CHAMPION in v.aliases), None)
+        if crowned is not None:
+            return crowned
+        if rows:
+            raise TrackingError(f"{bare} has no champion: no controller of the case passed the gate; `list` shows all")
     if bare not in names:
         near = get_close_matches(bare, names, n=1) or names[:1]
         hint = f"did you mean {near[0]!r}? `list` shows all" if near else "the registry is empty: run `dvc repro`"
@@ -189,31 +226,42 @@ def _find(client: MlflowClient, what: str, default_alias: str) -> ModelVersion:
 
 
 def promote(client: MlflowClient, name: str, number: str, alias: str) -> str:
-    """Move an alias by hand; a person may overrule the gate, and the tag ``promoted_by`` says so."""
+    """Move an alias by hand; a person may overrule the gate, and the tag ``promoted_by`` says so.
+
+    A champion that was promoted by hand stays champion until a person promotes another one.
+    """
     version = _find(client, f"{name}/{number}", alias)
     try:
         client.set_registered_model_alias(version.name, alias, str(version.version))
     except MlflowException as error:
         reason = " ".join(str(error).split())
-        raise TrackingError(f"alias {alias!r} was refused: {reason}; use champion or candidate") from error
+        raise TrackingError(f"alias {alias!r} was refused: {reason}; use champion, best or candidate") from error
     client.set_model_version_tag(version.name, str(version.version), "promoted_by", "hand")
-    if alias == CHAMPION and "case" in version.tags:
-        elect_case_champion(client, version.tags["case"])
+    case = version.tags.get("case")
+    if alias == BEST and case:
+        elect_champion(client, case)
     said = f"{version.name} version {version.version} is now @{alias}"
-    if alias == CHAMPION:
-        said += " by hand; the gate (no lock-up, better than the baseline and than the last champion) was not asked"
+    if alias == CHAMPION and case:
+        rows = _of_case(client, case)
+        for other in rows:
+            if other.tags.get(BY_HAND):
+                client.delete_model_version_tag(other.name, str(other.version), BY_HAND)
+        client.set_model_version_tag(version.name, str(version.version), BY_HAND, "hand")
+        best = next(v for v in rows if v.name == version.name and str(v.version) == str(version.version))
+        _crown(client, [v for v in rows if CHAMPION in v.aliases], best)
+        said += (
+            f" of {case}, by hand: the gate (no lock-up, better than the baseline and than the other controllers) was "
+            f"not asked. It stays champion until you promote another one or delete its tag {BY_HAND!r}"
+        )
     return said
 
 
 def fetch(client: MlflowClient, what: str, folder: Path) -> list[Path]:
     """Write a registered controller and its manifest into ``folder``, checked against its digest."""
-    version = _find(client, what, CHAMPION)
+    version = _find(client, what, BEST)
     law = version.tags.get("law", "")
     with tempfile.TemporaryDirectory() as draft:
-        files = [
-            Path(client.download_artifacts(str(version.run_id), f"{law}{suffix}", draft))
-            for suffix in (".onnx", ".json")
-        ]
+        files = [_download(client, version, f"{law}{suffix}", draft) for suffix in (".onnx", ".json")]
         if file_digest(files[0]) != version.tags.get("sha256"):
             raise TrackingError(
                 f"{version.name} version {version.version}: the stored {files[0].name} is not the file that was "
@@ -221,6 +269,20 @@ def fetch(client: MlflowClient, what: str, folder: Path) -> list[Path]:
             )
         folder.mkdir(parents=True, exist_ok=True)
         return [_place(file, folder / file.name) for file in files]
+
+
+def _download(client: MlflowClient, version: ModelVersion, file: str, draft: str) -> Path:
+    """One file of a version's run; TrackingError says which one is missing and where it should be."""
+    place = str(client.get_run(str(version.run_id)).info.artifact_uri)
+    try:
+        # not by the run's id: mlflow remembers where a run lay, also of a store that was copied since
+        return Path(mlflow.artifacts.download_artifacts(artifact_uri=f"{place}/{file}", dst_path=draft))
+    except (MlflowException, OSError) as error:
+        raise TrackingError(
+            f"{version.name} version {version.version} is registered, but its file {file} is not in {place}; "
+            "if mlflow.db was moved or copied, put its folder mlruns beside it, "
+            "otherwise delete mlflow.db and run `make registry`"
+        ) from error
 
 
 def _place(source: Path, target: Path) -> Path:

@@ -1,28 +1,31 @@
-"""One MLflow run for each stage result: parameters, figures, series, pictures."""
+"""One MLflow run for each stage result: description, data, parameters, the figures that matter, all files."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
 import subprocess
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from mlflow import MlflowClient
-from mlflow.entities import Metric, Param, Run, RunTag
+from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run
 from mlflow.utils.time import get_current_time_millis
 
-from pipeline.tracking.lock import StageResult, flat
+from pipeline.tracking.headline import curves, headline, of_gate, table
+from pipeline.tracking.lock import StageResult
+from pipeline.tracking.notes import item_of, run_note
+from pipeline.tracking.times import Times
 
 KEY_TAG = "stage_key"
 ARTIFACTS = {".png", ".json", ".html", ".md", ".onnx"}
 LARGEST_ARTIFACT = 5_000_000
 """Bytes; records and trajectories stay where DVC keeps them, named by the dataset hash."""
-DETAIL = re.compile(r"\bper_seed\b|\bsequences\b|^variants\..*\.(min|max)\b")
-"""Figures that stay in the metrics.json artifact: thousands of rows hide the hundred that matter."""
-METRICS_A_CALL, PARAMS_A_CALL, PARAM_CHARACTERS = 1000, 100, 6000  # mlflow's limits
+FIGURES = {"metrics.json", "validation.json", "sweep.json"}
+TABLE = "figures.json"
+NOTE_TAG, TABLES_TAG = "mlflow.note.content", "mlflow.loggedArtifacts"
+PARAMS_A_CALL, PARAM_CHARACTERS, DIGEST_CHARACTERS = 100, 6000, 36  # mlflow's limits
 
 
 def git_commit(root: Path) -> str:
@@ -55,23 +58,72 @@ def published(client: MlflowClient, experiment: str) -> dict[str, Run]:
             return found
 
 
-def write_run(client: MlflowClient, experiment: str, result: StageResult, root: Path, tags: dict[str, str]) -> str:
-    """Write the run of one stage result; its status turns to FINISHED last. Returns the run's id."""
+def write_run(
+    client: MlflowClient,
+    experiment: str,
+    result: StageResult,
+    root: Path,
+    records: Mapping[str, str],
+    validation: Mapping[str, Any],
+    tags: Mapping[str, str],
+) -> str:
+    """Write the run of one stage result; its status turns to FINISHED last. Returns the run's id.
+
+    Start and end are the stage's. ``records`` are the data that it descends from: path -> content hash.
+    """
+    times = Times.of(result, root)
+    trees = _trees(result, root)
+    rows = table(trees)
     own = {KEY_TAG: result.key, "stage": result.kind, "dvc_stage": result.name, "mlflow.source.name": result.cmd}
-    run = client.create_run(experiment, run_name=result.name, tags={**own, **tags})
+    own[NOTE_TAG] = run_note(result, str(result.case), validation, times)
+    own |= {f"out.{_name(path)}": md5 for path, md5 in result.outs.items()}
+    if rows:
+        own[TABLES_TAG] = json.dumps([{"path": TABLE, "type": "table"}])
+    run_name = result.kind if result.kind == "report" else f"{result.kind} {item_of(result)}"
+    run = client.create_run(experiment, start_time=times.start_ms, run_name=run_name, tags={**own, **tags})
     run_id = str(run.info.run_id)
     params = [Param(_name(k), _text(v)) for k, v in result.params.items()]
-    metrics = list(_metrics(result, root))
-    for start in range(0, len(params), PARAMS_A_CALL):
-        client.log_batch(run_id, params=params[start : start + PARAMS_A_CALL])
-    for start in range(0, len(metrics), METRICS_A_CALL):
-        client.log_batch(run_id, metrics=metrics[start : start + METRICS_A_CALL])
-    outs = [RunTag(f"out.{_name(path)}", md5) for path, md5 in result.outs.items()]
-    client.log_batch(run_id, tags=outs[:PARAMS_A_CALL])
+    metrics = list(_metrics(result, trees, validation, times.end_ms))
+    for start in range(0, max(len(params), 1), PARAMS_A_CALL):
+        client.log_batch(run_id, params=params[start : start + PARAMS_A_CALL], metrics=metrics if start == 0 else [])
+    if records:
+        client.log_inputs(run_id, [_dataset(*record, result, root) for record in records.items()])
     for path, folder in _artifacts(result, root):
         client.log_artifact(run_id, str(path), folder)
-    client.set_terminated(run_id, "FINISHED")
+    if rows:
+        client.log_text(run_id, json.dumps({"columns": ["figure", "value"], "data": rows}), TABLE)
+    client.set_terminated(run_id, "FINISHED", times.end_ms)
     return run_id
+
+
+def refresh(client: MlflowClient, run: Run, law: str, validation: Mapping[str, Any]) -> None:
+    """Write the score of a validation anew where the report has changed it since the run was written."""
+    figures = of_gate(law, validation)
+    now = get_current_time_millis()
+    changed = [Metric(k, v, now, 0) for k, v in figures.items() if run.data.metrics.get(k) != v]
+    if changed:
+        client.log_batch(run.info.run_id, metrics=changed)
+
+
+def describe_experiment(client: MlflowClient, experiment: str, note: str) -> None:
+    """Put the note on the experiment's page, unless it stands there."""
+    if client.get_experiment(experiment).tags.get(NOTE_TAG) != note:
+        client.set_experiment_tag(experiment, NOTE_TAG, note)
+
+
+def _dataset(path: str, digest: str, result: StageResult, root: Path) -> DatasetInput:
+    """A record as MLflow's data set; the run that made it says so."""
+    at = PurePosixPath(path)
+    rows = headline("excite", _read(root / at / "metrics.json"), {}).get("rows")
+    dataset = Dataset(
+        name=at.stem,
+        digest=digest.removesuffix(".dir")[:DIGEST_CHARACTERS],
+        source_type="local",
+        source=json.dumps({"uri": path}),
+        profile=None if rows is None else json.dumps({"num_rows": int(rows)}),
+    )
+    context = "made here" if path in result.outs else "training"
+    return DatasetInput(dataset, [InputTag(key="mlflow.data.context", value=context)])
 
 
 def _name(text: str) -> str:
@@ -102,24 +154,20 @@ def _artifacts(result: StageResult, root: Path) -> Iterator[tuple[Path, str | No
             yield path, folder
 
 
-def _metrics(result: StageResult, root: Path) -> Iterator[Metric]:
-    """metrics.json and validation.json flat, lists of numbers as series; sweep.json over its partitions."""
-    now = get_current_time_millis()
+def _trees(result: StageResult, root: Path) -> dict[str, Any]:
+    """The stage's files of figures, by name: metrics.json, validation.json and sweep.json."""
+    return {path.name: _read(path) for path, folder in _files(result, root) if not folder and path.name in FIGURES}
 
-    def metric(name: str, value: Any, step: int = 0) -> Iterator[Metric]:
-        if isinstance(value, bool | int | float) and math.isfinite(value):
-            yield Metric(_name(name), float(value), now, step)
 
-    for path, folder in _files(result, root):
-        if path.name == "sweep.json":
-            for row in json.loads(path.read_text())["rows"]:
-                for name, value in flat(row, "sweep").items():
-                    yield from metric(name, value, int(row["partitions"]))
-        if path.name not in {"metrics.json", "validation.json"}:
-            continue
-        for name, value in flat(json.loads(path.read_text()), folder or "").items():
-            if isinstance(value, list):
-                for step, entry in enumerate(value):
-                    yield from metric(name, entry, step)
-            elif not DETAIL.search(name):
-                yield from metric(name, value)
+def _read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def _metrics(
+    result: StageResult, trees: Mapping[str, Any], validation: Mapping[str, Any], at_ms: int
+) -> Iterator[Metric]:
+    own, sweep = trees.get("metrics.json", {}), trees.get("sweep.json", {})
+    for name, value in headline(result.kind, own, validation).items():
+        yield Metric(_name(name), value, at_ms, 0)
+    for name, step, value in curves(own, sweep):
+        yield Metric(_name(name), value, at_ms, step)

@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.request import url2pathname
 
 import mlflow
 import requests
@@ -18,6 +19,16 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.errors import TrackingError
 
 LOCAL = "mlflow.db"
+FILES = "mlruns"
+"""Folder of the artifacts, beside the database."""
+LOCATIONS = (
+    ("experiments", "artifact_location"),
+    ("runs", "artifact_uri"),
+    ("logged_models", "artifact_location"),
+    ("model_versions", "source"),
+    ("model_versions", "storage_location"),
+)
+"""Table and column of every absolute place that mlflow stores."""
 
 
 def store_uri() -> str:
@@ -41,6 +52,7 @@ def store() -> Iterator[MlflowClient]:
     try:
         if uri.startswith("sqlite:"):
             _migrate(uri)
+            _follow(_database(uri))
         mlflow.set_tracking_uri(uri)
         mlflow.set_registry_uri(uri)
         client = MlflowClient(uri)
@@ -65,7 +77,7 @@ def _migrate(uri: str) -> None:
 
     mlflow retries for a minute on a file that is no database, so that is found out here.
     """
-    path = Path(uri.removeprefix("sqlite:///"))
+    path = _database(uri)
     if not path.exists() or path.stat().st_size == 0:
         return
     with sqlite3.connect(path) as connection:
@@ -77,15 +89,63 @@ def _migrate(uri: str) -> None:
     engine.dispose()
 
 
+def _database(uri: str) -> Path:
+    """The file of a sqlite store."""
+    return Path(uri.removeprefix("sqlite:///"))
+
+
+def _follow(path: Path) -> None:
+    """Let the store's files be found where they lie now, after its folder was moved or copied.
+
+    mlflow stores absolute locations. Where the folder of an experiment lies beside the database and
+    its stored location is elsewhere, that place is put in the place of the old one.
+    """
+    if not path.exists() or path.stat().st_size == 0:
+        return
+    with sqlite3.connect(path) as connection:
+        tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if "experiments" in tables:
+            for old, new in _moves(connection, path.resolve().parent / FILES):
+                for table, column in LOCATIONS:
+                    if table in tables:
+                        connection.execute(
+                            f"UPDATE {table} SET {column} = ? || substr({column}, ?) "
+                            f"WHERE {column} = ? OR substr({column}, 1, ?) = ?",
+                            (new, len(old) + 1, old, len(old) + 1, old + "/"),
+                        )
+    connection.close()
+
+
+def _moves(connection: sqlite3.Connection, folder: Path) -> list[tuple[str, str]]:
+    """Stored location of an experiment -> where its files lie now, as far as these differ."""
+    moves = []
+    for (old,) in connection.execute("SELECT artifact_location FROM experiments").fetchall():
+        case = str(old).rpartition("/")[2]
+        new = (folder / url2pathname(case)).as_uri() if str(old).startswith("file:") else str(folder / case)
+        if str(old).rpartition("/")[0].endswith("/" + FILES) and old != new and (folder / url2pathname(case)).is_dir():
+            moves.append((str(old), new))
+    return moves
+
+
 def experiment_id(client: MlflowClient, case: str) -> str:
-    """The experiment named after the case; its artifacts lie in mlruns/<case> where the store is a file.
+    """The experiment named after the case; its artifacts lie in mlruns/<case> beside the store where that is a file.
 
     An experiment that somebody deleted in the UI is brought back: its name cannot be used again.
     """
     experiment = client.get_experiment_by_name(case)
     if experiment is None:
-        local = store_uri().startswith("sqlite:")
-        return str(client.create_experiment(case, (Path("mlruns") / case).resolve().as_uri() if local else None))
+        uri = store_uri()
+        local = (_database(uri).resolve().parent / FILES / case).as_uri() if uri.startswith("sqlite:") else None
+        return str(client.create_experiment(case, local, {"mlflow.experimentKind": "custom_model_development"}))
     if experiment.lifecycle_stage == "deleted":
         client.restore_experiment(experiment.experiment_id)
     return str(experiment.experiment_id)
+
+
+def hide_default(client: MlflowClient) -> None:
+    """Take mlflow's own empty experiment off the list of cases."""
+    default = client.get_experiment_by_name("Default")
+    if default is None or default.experiment_id != "0" or default.lifecycle_stage != "active":
+        return
+    if not client.search_runs(["0"], max_results=1):
+        client.delete_experiment("0")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -14,14 +16,19 @@ import made_up_case as made_up
 import numpy as np
 import pytest
 from made_up_case import CASE
-from pipeline.tracking.__main__ import main
+from mlflow.entities import Run
+from pipeline.tracking.__main__ import CHAMPIONS, main
 
+import pipeline
+from pipeline.engine.start import VARIABLE, receipt_path
 from pipeline.errors import TrackingError
 from pipeline.tracking.gate import Gate
-from pipeline.tracking.lock import dataset_hash, is_current, read_lock
+from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_current, read_lock
+from pipeline.tracking.notes import item_of
 from pipeline.tracking.publish import publish
 from pipeline.tracking.registry import REQUIREMENTS, file_digest, versions
 from pipeline.tracking.store import store
+from pipeline.tracking.times import Times
 
 pytestmark = [
     # SQLAlchemy's complaint about a loader that mlflow's own tables use
@@ -87,18 +94,19 @@ def test_a_store_is_filled_once_and_rebuilt_from_nothing(root, empty_store, monk
     assert "0 new runs of 4, 0 new versions" in capsys.readouterr().err
 
     with store() as client:
+        assert [e.name for e in client.search_experiments()] == [CASE]
         experiment = client.get_experiment_by_name(CASE)
         runs = {r.data.tags["dvc_stage"]: r for r in client.search_runs([experiment.experiment_id])}
         assert len(runs) == 4
         fit = runs[f"fit@{CASE}-one_step"]
         assert fit.data.params == {f"models.{CASE}-one_step.kind": "rbf", f"models.{CASE}-one_step.c": "88"}
-        assert fit.data.metrics["parts.inverse.median.centres"] == 725
-        sweep = client.get_metric_history(fit.info.run_id, "sweep.validation.rmse")
+        assert fit.data.metrics["centres"] == 725
+        sweep = client.get_metric_history(fit.info.run_id, "sweep/validation_rmse")
         assert [m.step for m in sweep] == list(range(4, 101, 8))
-        history = client.get_metric_history(fit.info.run_id, "parts.inverse.per_seed.0.history")
+        history = client.get_metric_history(fit.info.run_id, "training/inverse")
         assert [m.value for m in history] == [30.0, 22.0, 18.0]
         validate = runs[f"validate@{CASE}-inverse_dob"]
-        assert validate.data.metrics["scenarios.sp_a.median.mae"] == pytest.approx(0.064 * 1.12)
+        assert validate.data.metrics["mae/sp_a"] == pytest.approx(0.064 * 1.12)
         assert validate.data.tags["case"] == CASE
         assert validate.data.tags["stage"] == "validate"
         assert validate.data.tags["dataset_sha256"] == fit.data.tags["dataset_sha256"] != "none"
@@ -116,8 +124,8 @@ def test_a_store_is_filled_once_and_rebuilt_from_nothing(root, empty_store, monk
         pid = versions(client, f"{CASE}-pid")[0]
         assert f'src="get-artifact?path=closed_loop.png&run_uuid={pid.run_id}"' in pid.description
         assert "<img" not in version.description  # no picture was drawn of it
-        assert holders(client, "champion") == {f"{CASE}-pid": 1, f"{CASE}-inverse_dob": 1}
-        assert holders(client, "case_champion") == {f"{CASE}-inverse_dob": 1}
+        assert holders(client, "best") == {f"{CASE}-pid": 1, f"{CASE}-inverse_dob": 1}
+        assert holders(client, "champion") == {f"{CASE}-inverse_dob": 1}
 
         import mlflow.pyfunc
 
@@ -129,7 +137,7 @@ def test_a_store_is_filled_once_and_rebuilt_from_nothing(root, empty_store, monk
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{root / 'rebuilt.db'}")
     assert publish(root) == first
     with store() as client:
-        assert holders(client, "case_champion") == {f"{CASE}-inverse_dob": 1}
+        assert holders(client, "champion") == {f"{CASE}-inverse_dob": 1}
 
     # a run that was being written when its publisher was killed is written again
     with store() as client:
@@ -149,27 +157,27 @@ def next_version(root: Path, gain: float, **evidence) -> None:
     publish(root)
 
 
-def test_the_champion_falls_only_to_better_evidence(root, capsys):
+def test_the_best_version_falls_only_to_better_evidence(root, capsys):
     name = f"{CASE}-inverse_dob"
     publish(root)
     next_version(root, 101.0, scores={"pid": 1.4, "inverse_dob": 1.2})
     with store() as client:
         assert holders(client, "candidate")[name] == 2
-        assert holders(client, "champion")[name] == 1
-        assert "does not beat the champion's 1.1" in versions(client, name)[0].tags["verdict"]
+        assert holders(client, "best")[name] == 1
+        assert "does not beat the best version's 1.1" in versions(client, name)[0].tags["verdict"]
     next_version(root, 102.0, scores={"pid": 1.4, "inverse_dob": 0.9}, gate_id="another test")
     next_version(root, 103.0, scores={"pid": 1.4, "inverse_dob": 1.0}, lock_ups={"inverse_dob": 1})
     next_version(root, 104.0, scores={"pid": 1.0, "inverse_dob": 1.05})
     with store() as client:
-        assert holders(client, "champion")[name] == 1
+        assert holders(client, "best")[name] == 1
     next_version(root, 105.0, scores={"pid": 1.4, "inverse_dob": 1.05})
     with store() as client:
-        assert holders(client, "champion")[name] == 6
+        assert holders(client, "best")[name] == 6
 
     # by hand, and out again
-    assert main(["promote", name, "2"]) == 0
+    assert main(["promote", name, "2", "--alias", "best"]) == 0
     with store() as client:
-        assert holders(client, "champion")[name] == 2
+        assert holders(client, "best")[name] == 2
         assert client.get_model_version(name, "2").tags["promoted_by"] == "hand"
     capsys.readouterr()
     assert main(["fetch", f"{name}/6", "out"]) == 0
@@ -187,7 +195,7 @@ def test_the_champion_falls_only_to_better_evidence(root, capsys):
 
     assert f"did you mean '{name}'" in refused("fetch", f"{CASE}-inverse_dop", "out")
     assert "has no version 9" in refused("promote", name, "9")
-    assert "has no alias 'best'" in refused("fetch", f"{name}@best", "out")
+    assert "has no alias 'newest'" in refused("fetch", f"{name}@newest", "out")
     assert "refused" in refused("promote", name, "1", "--alias", "latest")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
@@ -211,7 +219,7 @@ def test_the_champion_falls_only_to_better_evidence(root, capsys):
         ("incad", {"pid": 1.4}, {}, "no gate score"),
     ],
 )
-def test_who_may_become_champion(law, scores, lock_ups, reason):
+def test_who_passes_the_gate(law, scores, lock_ups, reason):
     refusal = Gate.of(made_up.evidence(scores, lock_ups), law).refusal()
     assert (refusal is None) if reason is None else (reason in refusal)
 
@@ -267,3 +275,192 @@ def test_what_is_wrong_with_the_store_takes_one_line_and_seconds(root, monkeypat
     (root / "dvc.lock").write_text("- not a lock")
     with pytest.raises(TrackingError, match="not a lock file"):
         publish(root)
+
+
+def runs_of(client) -> dict[str, Run]:
+    """Stage -> its run."""
+    experiment = client.get_experiment_by_name(CASE)
+    return {r.data.tags["dvc_stage"]: r for r in client.search_runs([experiment.experiment_id])}
+
+
+def test_a_run_has_the_times_of_its_stage(root):
+    fit, excite = f"fit@{CASE}-one_step", f"excite@{CASE}-steps"
+    start = 1_700_000_000
+    for out in next(s for s in read_lock(root) if s.name == fit).outs:
+        for file in (root / out).rglob("*"):
+            os.utime(file, (start + 80, start + 80))
+    for stage in (fit, excite):  # the files of excite were written after that receipt: it is of another run
+        made_up.write_json(receipt_path(root, stage), {"stage": stage, "started": start + 0.5, "seconds": 90.0})
+    record = root / "work" / CASE / "records" / "steps" / "seed0.csv"
+    publish(root)
+    with store() as client:
+        runs = runs_of(client)
+    assert runs[fit].info.start_time == 1000 * start + 500
+    assert runs[fit].info.end_time - runs[fit].info.start_time == 90_000
+    assert runs[excite].info.start_time == runs[excite].info.end_time == round(1000 * record.stat().st_mtime)
+    assert "duration is not known" in runs[excite].data.tags["mlflow.note.content"]
+    assert "duration is not known" not in runs[fit].data.tags["mlflow.note.content"]
+
+
+def test_a_stage_under_dvc_leaves_a_receipt_that_fits_its_files(tmp_path):
+    package = tmp_path / "pipeline"
+    (package / "stages").mkdir(parents=True)
+    for name in ("__init__.py", "start.py"):
+        shutil.copy(Path(pipeline.__file__).parent / name, package)
+    (package / "stages" / "__init__.py").touch()
+    probe = (
+        "from pathlib import Path\nimport sys\nPath(sys.argv[1]).write_text('made')\nsys.exit(sys.argv[1] == 'bad')\n"
+    )
+    (package / "stages" / "probe.py").write_text(probe)
+    command = f'"{sys.executable}" -m pipeline.engine.start probe'
+    stages = {out: {"cmd": f"{command} {out}", "outs": [out]} for out in ("good", "bad")}
+    (tmp_path / "dvc.yaml").write_text(json.dumps({"stages": stages}))
+    environment = {k: v for k, v in os.environ.items() if k not in {VARIABLE, "PYTHONPATH"}}
+    before = time.time()
+    for argv, status in ((["init", "-q", "--no-scm"], 0), (["repro", "-q", "good"], 0), (["repro", "-q", "bad"], 255)):
+        done = subprocess.run([sys.executable, "-m", "dvc", *argv], cwd=tmp_path, env=environment, timeout=120)
+        assert done.returncode == status
+    assert [p.name for p in (tmp_path / "receipts").iterdir()] == ["good.json"]  # none of a stage that failed
+    (result,) = read_lock(tmp_path)
+    times = Times.of(result, tmp_path)
+    assert times.measured
+    assert before * 1000 <= times.start_ms < times.end_ms <= time.time() * 1000
+
+
+def test_a_run_shows_the_figures_that_matter_and_keeps_all(root):
+    publish(root)
+    evidence = json.loads((root / "artifacts" / CASE / "validation.json").read_text())
+    evidence["gate"]["laws"]["inverse_dob"]["score"] = 1.05
+    with store() as client:
+        run = runs_of(client)[f"validate@{CASE}-inverse_dob"]
+        shown = run.data.metrics
+        assert len(shown) <= 12
+        assert (shown["data_seeds"], shown["lock_ups"], shown["step_us"]) == (len(made_up.SEEDS), 0, 25.0)
+        assert shown["ratio_to_bound"] == SCORES["inverse_dob"]
+        rows = dict(json.loads(Path(client.download_artifacts(run.info.run_id, "figures.json")).read_text())["data"])
+        stored = made_up.spread(0.064 * made_up.QUALITY["inverse_dob"])
+        assert rows["scenarios.sp_a.per_seed.2.masse"] == stored["per_seed"]["2"]["masse"]
+        assert json.loads(run.data.tags["mlflow.loggedArtifacts"]) == [{"path": "figures.json", "type": "table"}]
+
+        note = run.data.tags["mlflow.note.content"]
+        assert "**1.100 times the bound.** It passes the gate." in note
+        assert "`mae/…`" in note
+
+    # the report's score of a run that stands in the store already
+    made_up.write_json(root / "artifacts" / CASE / "validation.json", evidence)
+    publish(root)
+    with store() as client:
+        assert runs_of(client)[f"validate@{CASE}-inverse_dob"].data.metrics["ratio_to_bound"] == 1.05
+
+
+def test_a_run_names_the_data_it_learnt_from(root):
+    publish(root)
+    made = next(md5 for s in read_lock(root) if s.kind == "excite" for md5 in s.outs.values())
+    with store() as client:
+        inputs = {name: run.inputs.dataset_inputs for name, run in runs_of(client).items()}
+    for name, context in ((f"excite@{CASE}-steps", "made here"), (f"validate@{CASE}-inverse_dob", "training")):
+        (used,) = inputs[name]
+        assert (used.dataset.name, used.dataset.digest) == ("steps", made.removesuffix(".dir"))
+        assert [tag.value for tag in used.tags] == [context]
+    assert not inputs[f"validate@{CASE}-pid"]  # from no data
+
+
+def test_a_run_is_named_by_its_stage_whatever_the_order_of_its_outputs():
+    outs = {"artifacts/plant/pid_2.json": "1", "artifacts/plant/pid_2.onnx": "2", "work/plant/validation/pid_2": "3"}
+    for order in (outs, dict(reversed(outs.items()))):
+        assert item_of(StageResult("validate@plant-pid_2", "", {}, {}, order)) == "pid_2"
+
+
+def test_a_stage_that_depends_on_a_folder_descends_from_what_was_made_inside():
+    record = StageResult("excite@c-steps", "", {}, {}, {"work/c/records/steps": "1.dir"})
+    fit = StageResult("fit@c-net", "", {"work/c/records/steps": "1.dir"}, {}, {"work/c/models/net": "2.dir"})
+    report = StageResult("report@c", "", {"work/c/models": "3.dir"}, {}, {"artifacts/c/report.md": "4"})
+    assert datasets(report, [record, fit, report]) == {"work/c/records/steps": "1.dir"}
+
+
+def test_a_case_has_one_champion_and_every_controller_says_where_it_stands(root, capsys):
+    pid, inverse = f"{CASE}-pid", f"{CASE}-inverse_dob"
+    publish(root)
+    with store() as client:
+        models = {m.name: m for m in client.search_registered_models()}
+        assert models[inverse].tags["standing"] == "champion, 1 of 2"
+        assert "CHAMPION: the best of the 2 controllers of its case, 1.100 times" in models[inverse].description
+        assert models[pid].tags["standing"] == "2 of 2"
+        assert f"The champion is {inverse}." in models[pid].description
+        found = client.search_registered_models(CHAMPIONS)  # what the link of `serve` asks
+        assert [m.name for m in found] == [inverse]
+        note = client.get_experiment_by_name(CASE).tags["mlflow.note.content"]
+        assert f"(#/models/{inverse})" in note
+    assert main(["list"]) == 0
+    assert capsys.readouterr().out.startswith(inverse)
+
+    # the champion falls to another controller, and no controller keeps an old title
+    write_evidence(root, {"pid": 1.0, "inverse_dob": 1.1})
+    publish(root)
+    with store() as client:
+        assert holders(client, "champion") == {pid: 1}
+        assert "does not pass the gate" in client.get_registered_model(inverse).description
+
+    # a person overrules the gate until a person promotes another one
+    assert main(["promote", inverse, "1"]) == 0
+    publish(root)
+    with store() as client:
+        assert holders(client, "champion") == {inverse: 1}
+        assert client.get_registered_model(inverse).tags["standing"] == "champion, 2 of 2"
+    assert main(["fetch", CASE, "out"]) == 0
+    assert (root / "out" / "inverse_dob.onnx").exists()
+    assert main(["promote", pid, "1"]) == 0
+    with store() as client:
+        assert holders(client, "champion") == {pid: 1}
+        assert "champion_by" not in client.get_model_version(inverse, "1").tags
+
+
+def test_the_aliases_of_an_earlier_release_are_renamed(root):
+    publish(root)
+    pid, inverse = f"{CASE}-pid", f"{CASE}-inverse_dob"
+    with store() as client:
+        for name in (pid, inverse):
+            client.delete_registered_model_alias(name, "best")
+            client.set_registered_model_alias(name, "champion", "1")
+        client.set_registered_model_alias(inverse, "case_champion", "1")
+    publish(root)
+    with store() as client:
+        assert holders(client, "best") == {pid: 1, inverse: 1}
+        assert holders(client, "champion") == {inverse: 1}
+        assert not holders(client, "case_champion")
+
+
+def test_a_store_whose_folder_was_moved_or_copied_still_gives_its_files(root, monkeypatch, capsys):
+    publish(root)
+    copy, moved = root.parent / "a copy", root.parent / "moved"
+    shutil.copytree(root, copy)
+    first = next((copy / "mlruns").rglob("inverse_dob.onnx"))
+    digest = file_digest(first)
+    next((root / "mlruns").rglob("inverse_dob.onnx")).write_bytes(b"of the original alone")
+
+    def work_in(folder: Path) -> None:
+        monkeypatch.chdir(folder)
+        monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)  # mlflow keeps the store of this process there
+
+    work_in(copy)
+    assert main(["fetch", CASE, "out"]) == 0
+    assert file_digest(copy / "out" / "inverse_dob.onnx") == digest
+    copy.rename(moved)
+    work_in(moved)
+    assert main(["fetch", CASE, "again"]) == 0
+    assert publish(moved)["controllers"][f"{CASE}-inverse_dob"] == digest
+
+    import mlflow.pyfunc
+
+    with store() as client:
+        mlflow.pyfunc.load_model(f"models:/{CASE}-inverse_dob@champion")
+        for run in runs_of(client).values():
+            assert run.info.artifact_uri.startswith(moved.as_uri())
+
+    # the database without its files: they are what is missing, and no file is damaged
+    shutil.rmtree(moved / "mlruns")
+    capsys.readouterr()
+    assert main(["fetch", CASE, "out"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"its file inverse_dob.onnx is not in {moved.as_uri()}" in line
+    assert "damaged" not in line

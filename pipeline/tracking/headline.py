@@ -1,0 +1,125 @@
+"""The figures of a stage that a run shows as metrics: about ten, the ones that decide something.
+
+All other figures stand in the run's artifacts: metrics.json or validation.json as the stage wrote
+it, and ``figures.json``, the same as one table of name and value.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeGuard
+
+from pipeline.simulation.scenario import NOISE_SUFFIX
+from pipeline.tracking.lock import flat
+
+MOST = 12
+OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
+POINTS = 200
+"""Of a curve; a training of thousands of iterations is thinned to these."""
+
+Figures = dict[str, float]
+
+
+def headline(kind: str, metrics: Mapping[str, Any], validation: Mapping[str, Any]) -> Figures:
+    """The metrics of a run of stage ``kind``, from its own metrics.json and its case's validation.json."""
+    if kind == "validate":
+        found = _of_law(metrics, validation)
+    elif kind == "report":
+        found = _of_case(validation)
+    else:
+        own = {"excite": _of_record, "fit": _of_models, "design": _of_files}.get(kind)
+        found = own(metrics) if own else {}
+    finite = {name: float(value) for name, value in found.items() if _is_figure(value)}
+    return dict(list(finite.items())[:MOST])
+
+
+def of_gate(law: str, validation: Mapping[str, Any]) -> Figures:
+    """The case's score of a law: its error over the bound's. It is the report's, so it may change after a run."""
+    score = (((validation.get("gate") or {}).get("laws") or {}).get(law) or {}).get("score")
+    return {"ratio_to_bound": float(score)} if _is_figure(score) else {}
+
+
+def _of_record(tree: Mapping[str, Any]) -> dict[str, Any]:
+    seeds = tree.get("per_seed") or {}
+    return {"data_seeds": len(seeds), "rows": sum(row.get("rows", 0) for row in seeds.values())} if seeds else {}
+
+
+def _of_models(tree: Mapping[str, Any]) -> dict[str, Any]:
+    parts = tree.get("parts") or {}
+    rows: dict[str, Any] = {}
+    for part, row in parts.items():
+        before = f"{part}/" if len(parts) > 1 else ""
+        rows |= {f"{before}{name}": row["median"][name] for name in OF_A_MODEL if name in (row.get("median") or {})}
+    seeds = max((len(row.get("per_seed") or {}) for row in parts.values()), default=0)
+    return {"data_seeds": seeds, **rows} if parts else {}
+
+
+def _of_files(tree: Mapping[str, Any]) -> dict[str, Any]:
+    rows = [row for row in tree.get("controllers") or () if row.get("form") == "base"]
+    if not rows:
+        return {}
+    figures = (rows[0].get("analysis") or {}).get("figures") or {}
+    shown = {"data_seeds": len(rows), "bytes": max(r["bytes"] for r in rows), "states": rows[0]["n_state"]}
+    return shown | {f"analysis/{name}": value for name, value in figures.items()}
+
+
+def _of_law(tree: Mapping[str, Any], validation: Mapping[str, Any]) -> dict[str, Any]:
+    """The case's score on each kind of test, the tests of the gate first: the median over the data seeds."""
+    metric = str(tree.get("metric") or validation.get("metric") or "mae")
+    scenarios, noisy = tree.get("scenarios") or {}, tree.get("noise") or {}
+    weights = (validation.get("gate") or {}).get("weights") or {}
+    errors = {}
+    for test in sorted(scenarios, key=lambda name: -max(weights.get(name, 0), weights.get(name + NOISE_SUFFIX, 0))):
+        rows = noisy if test + NOISE_SUFFIX in weights and test not in weights else scenarios
+        errors[f"{metric}/{test}"] = rows[test]["median"].get(metric)
+    step = tree.get("step_us")
+    shown = {
+        **of_gate(str(tree.get("law")), validation),
+        "lock_ups": tree.get("lock_ups"),
+        "step_us": step.get("p50") if isinstance(step, Mapping) else step,
+        "data_seeds": len(tree.get("seeds") or ()),
+    }
+    return shown | errors
+
+
+def _of_case(validation: Mapping[str, Any]) -> dict[str, Any]:
+    laws = (validation.get("gate") or {}).get("laws") or {}
+    scores = [row["score"] for row in laws.values() if row.get("score") is not None]
+    shown: dict[str, Any] = {"laws": len(laws), "laws_that_locked_up": sum(bool(r["lock_ups"]) for r in laws.values())}
+    if scores:
+        shown |= {"best_ratio_to_bound": min(scores), "median_ratio_to_bound": statistics.median(scores)}
+    for name, words in (("requirements", "met"), ("claims", "confirmed"), ("paper", "reproduced")):
+        known = [row["holds"] for row in validation.get(name) or () if row["holds"] is not None]
+        if known:
+            shown |= {f"{name}/checked": len(known), f"{name}/{words}": sum(known)}
+    return shown
+
+
+def curves(metrics: Mapping[str, Any], sweep: Mapping[str, Any]) -> Iterator[tuple[str, int, float]]:
+    """Name, step and value of the training curves (of the first data seed) and of the sweep over partitions."""
+    for part, row in (metrics.get("parts") or {}).items():
+        seed: Mapping[str, Any] = next(iter((row.get("per_seed") or {}).values()), {})
+        history = seed.get("history") or ()
+        for step in range(0, len(history), max(1, math.ceil(len(history) / POINTS))):
+            if _is_figure(history[step]):
+                yield f"training/{part}", step, float(history[step])
+    for row in sweep.get("rows") or ():
+        for name in ("train", "validation"):
+            value = (row.get(name) or {}).get("rmse")
+            if _is_figure(value):
+                yield f"sweep/{name}_rmse", int(row["partitions"]), float(value)
+
+
+def table(trees: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, float]]:
+    """Every figure of some JSON files as rows of name and value; lists stay in the files alone."""
+    several = len(trees) > 1
+    rows = []
+    for file, tree in trees.items():
+        rows += [(f"{file}: {k}" if several else k, float(v)) for k, v in flat(tree).items() if _is_figure(v)]
+    return rows
+
+
+def _is_figure(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and math.isfinite(value)

@@ -1,0 +1,89 @@
+"""What a person reads first on the page of a run or an experiment, in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.tracking.gate import Gate
+from pipeline.tracking.lock import StageResult
+from pipeline.tracking.times import Times
+
+WHAT = {
+    "excite": "Made the data set **{item}** of the case *{case}*: the simulated plant, excited, with measurement noise."
+    " The models learn from it.",
+    "fit": "Trained the model set **{item}** of the case *{case}*, once for each data seed."
+    " The control laws are designed from it.",
+    "design": "Designed the control law **{item}** of the case *{case}* and exported it as ONNX, one file for each"
+    " data seed. Each file agrees with its PyTorch original to 1e-9 over 1,000 steps in closed loop; otherwise this"
+    " stage fails.",
+    "validate": "Ran the exported files of the control law **{item}** in closed loop on every test of the case"
+    " *{case}*. The best file by the development tests is shipped and stands in the registry.",
+    "report": "Compared all control laws of the case *{case}* with each other, with the bound and with the paper.",
+}
+METRICS = {
+    "excite": "`rows` counts the samples of all data seeds.",
+    "fit": "The metrics are medians over the data seeds: `rmse` one step ahead, `free_run_rmse` when the model runs on"
+    " its own output. `training/` and `sweep/` are curves.",
+    "design": "`bytes` is the largest file, `states` the length of the state vector.",
+    "validate": "`ratio_to_bound` is the figure that decides: the error divided by that of an NMPC that knows the plant"
+    " exactly; 1 is the bound, lower is better. `{metric}/…` is the error on each test, the median over the data seeds."
+    " `lock_ups` must be 0. `step_us` is the time of one step in microseconds.",
+    "report": "`best_ratio_to_bound` is that of the best law; 1 is the bound.",
+}
+
+
+def run_note(result: StageResult, case: str, validation: Mapping[str, Any], times: Times) -> str:
+    """The description of a run: what the stage did, what came out, and what its metrics mean."""
+    titles = validation.get("titles") or {}
+    item = item_of(result)
+    words = {"case": titles.get("case", case), "item": item, "metric": validation.get("metric", "mae")}
+    if result.kind in {"design", "validate"}:
+        words["item"] = (titles.get("laws") or {}).get(item, item)
+    # the page shows the first lines, the rest on a click
+    parts = [_verdict(Gate.of(validation, item))] if result.kind == "validate" else []
+    parts.append(WHAT.get(result.kind, "The stage {item} of the case *{case}*.").format(**words))
+    if result.kind == "report":
+        parts.append("Open `report.html` under Artifacts.")
+    parts.append(METRICS.get(result.kind, "").format(**words))
+    parts.append("All other figures: `figures.json` under Artifacts.")
+    if not times.measured:
+        parts.append(
+            "The duration is not known: DVC took the files from its cache, or they came without their receipt."
+            " Created is when the files were written."
+        )
+    return "\n\n".join(filter(None, parts))
+
+
+def item_of(result: StageResult) -> str:
+    """What the stage was run for, without its case: a record, a model set, a controller; the case for a report."""
+    return result.name.partition("@")[2].removeprefix(f"{result.case}-")
+
+
+def _verdict(gate: Gate) -> str:
+    if gate.score is None:
+        return ""
+    refusal = gate.refusal()
+    passed = "It passes the gate." if refusal is None else f"It does not pass the gate: {refusal}."
+    return f"**{gate.score:.3f} times the bound.** {passed}"
+
+
+def experiment_note(case: str, validation: Mapping[str, Any], champion: str | None) -> str:
+    """The description of a case's experiment: its champion, its laws in order, where to look."""
+    titles, gate = validation.get("titles") or {}, validation.get("gate") or {}
+    laws = titles.get("laws") or {}
+    first = f"**{titles.get('case', case)}.**"  # the page shows this line, the rest on a click
+    if champion:
+        law = champion.removeprefix(f"{case}-")
+        score = Gate.of(validation, law).score
+        beside = "" if score is None else f", {score:.3f} times the bound"
+        first += f" Champion: **[{laws.get(law, law)}](#/models/{champion})**{beside}."
+    lines = [first, "One run for each stage of the pipeline."]
+    scores = {law: row["score"] for law, row in (gate.get("laws") or {}).items() if row.get("score") is not None}
+    if scores:
+        rows = [
+            f"| {laws.get(law, law)} | {scores[law]:.3f} | {Gate.of(validation, law).lock_ups} |"
+            for law in sorted(scores, key=lambda law: scores[law])
+        ]
+        lines.append("| Control law | Error over the bound's | Lock-ups |\n|---|---|---|\n" + "\n".join(rows))
+    return "\n\n".join(lines)
