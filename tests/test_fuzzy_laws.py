@@ -194,6 +194,21 @@ def test_a_dearer_switch_switches_less() -> None:
     assert found[0] > 5 * found[1]
 
 
+@pytest.mark.parametrize("name", ["fuzzy_feedforward_pi", "fuzzy_feedforward_observer"])
+def test_a_stuck_throttle_that_comes_free_on_set_point_does_not_kick(name: str) -> None:
+    """Stuck until the core rests, the set point 35 degC above it, then there: the law has wound nothing up."""
+    step, stuck, after = plants(PRINTED.consequents.numpy()[None]), 1500, 200
+    throttle = (0.4, HOT)
+
+    def run(level: float) -> Loops:
+        sp = np.concatenate([np.full(stuck, level + 35.0), np.full(after, level)])
+        return loops(made(name), step, sp=sp, by_hand=lambda k: throttle if k < stuck else None)
+
+    level = float(run(30.0).pv[0, stuck, 0])
+    span = SIGNALS.sp[0].high - SIGNALS.sp[0].low
+    assert np.abs(run(level).pv[0, stuck:, 0] - level).sum() / span < 0.2
+
+
 def test_a_core_that_lags_draws_its_reference_along() -> None:
     """A level beyond the jacket's limit for good: nothing winds up, and the way back begins at once."""
     for name in ("fuzzy_feedforward_pi", "fuzzy_feedforward_observer"):
