@@ -196,12 +196,12 @@ def test_a_dearer_switch_switches_less() -> None:
 
 @pytest.mark.parametrize("name", ["fuzzy_feedforward_pi", "fuzzy_feedforward_observer"])
 def test_a_stuck_throttle_that_comes_free_on_set_point_does_not_kick(name: str) -> None:
-    """Stuck until the core rests, the set point 35 degC above it, then there: the law has wound nothing up."""
-    step, stuck, after = plants(PRINTED.consequents.numpy()[None]), 1500, 200
+    """Stuck with the core at rest, the set point 15 degC below it for ten minutes, then there: nothing is wound up."""
+    step, stuck, away, after = plants(PRINTED.consequents.numpy()[None]), 1200, 60, 200
     throttle = (0.4, HOT)
 
     def run(level: float) -> Loops:
-        sp = np.concatenate([np.full(stuck, level + 35.0), np.full(after, level)])
+        sp = np.repeat([level, level - 15.0, level], [stuck - away, away, after])
         return loops(made(name), step, sp=sp, by_hand=lambda k: throttle if k < stuck else None)
 
     level = float(run(30.0).pv[0, stuck, 0])
