@@ -43,10 +43,10 @@ def file_digest(path: Path) -> str:
 
 def registered(client: MlflowClient) -> list[RegisteredModel]:
     """Every registered controller: cases by name, within a case the champion first, then by rank."""
-    return sorted(client.search_registered_models(max_results=1000), key=_place)
+    return sorted(client.search_registered_models(max_results=1000), key=_order)
 
 
-def _place(model: RegisteredModel) -> tuple[str, bool, int, str]:
+def _order(model: RegisteredModel) -> tuple[str, bool, int, str]:
     standing = model.tags.get("standing", "")
     rank = re.search(r"(\d+) of \d+", standing)
     return (
