@@ -308,6 +308,10 @@ def undefined(model: onnx.ModelProto) -> None:
     model.graph.node[0].input[0] = "nowhere"
 
 
+def mistyped(model: onnx.ModelProto) -> None:
+    model.graph.node[0].attribute.append(helper.make_attribute("surprise", 1))
+
+
 def headless(model: onnx.ModelProto) -> None:
     model.ClearField("graph")
 
@@ -323,7 +327,8 @@ def headless(model: onnx.ModelProto) -> None:
         (foreign_operator, "operator com.example"),
         (future_ir, "IR 11"),
         (future_opset, "opset 22"),
-        (undefined, "onnxruntime does not load the graph"),
+        (undefined, "reads 'nowhere', which nothing before it gives"),
+        (mistyped, "onnxruntime does not load the graph"),
         (headless, "it has no graph"),
     ],
 )
