@@ -52,7 +52,7 @@ def audit(data: bytes) -> GraphSummary:
     Refused: a file over 64 MiB; bytes that are not a protobuf in canonical form, or hold a field
     that no controller has; IR outside 8 to 10 or opset outside 18 to 21; an operator off the list;
     a subgraph, a function, training data, sparse or external tensors; values without a static
-    shape; a step of more than 20 million multiply-adds.
+    shape; a step of more than 5 million multiply-adds.
     """
     if len(data) > MAX_BYTES:
         raise ArtifactError(f"the file has {len(data)} bytes; a controller has at most {MAX_BYTES}")
@@ -70,7 +70,7 @@ def audit(data: bytes) -> GraphSummary:
     nodes = model["graph"].get("node", [])
     if len(nodes) > MAX_NODES:
         raise ArtifactError(f"the graph has {len(nodes)} operators; a controller has at most {MAX_NODES}")
-    work = _work(model["graph"])
+    _, work = graph_values(model["graph"])
     ops = Counter(node["op_type"] for node in nodes)
     return GraphSummary(ir, opset, dict(ops.most_common()), _metadata(model), work)
 
@@ -91,8 +91,12 @@ def _metadata(model: Message) -> dict[str, str]:
     return metadata
 
 
-def _work(graph: Message) -> int:
-    """The work of a step in multiply-adds; ArtifactError where it exceeds MAX_WORK or cannot be known."""
+def graph_values(graph: Message) -> tuple[dict[str, Value], int]:
+    """Every value of the graph, by its name, and the work of a step in multiply-adds.
+
+    Raises ArtifactError where an operator is off the list, a value's shape cannot be known, or the
+    work exceeds MAX_WORK.
+    """
     values: dict[str, Value] = {}
     for tensor in graph.get("initializer", []):
         _define(values, tensor.get("name", ""), _constant(tensor))
@@ -124,7 +128,7 @@ def _work(graph: Message) -> int:
             raise ArtifactError(f"the graph's output {name!r} is computed nowhere")
         if values[name].shape != _end(wanted).shape:
             raise ArtifactError(f"the graph's output {name!r} has not the shape {values[name].shape} that it says")
-    return work
+    return values, work
 
 
 def _define(values: dict[str, Value], name: str, value: Value) -> None:

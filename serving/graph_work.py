@@ -19,7 +19,8 @@ Shape: TypeAlias = tuple[int, ...]
 FLOAT, INT32, INT64, BOOL, DOUBLE = 1, 6, 7, 9, 11  # TensorProto.DataType
 ITEM_BYTES = {FLOAT: 4, INT32: 4, INT64: 8, BOOL: 1, DOUBLE: 8}
 MAX_RANK = 8
-MAX_WORK = 20_000_000
+# At most 50 ms of ordinary numbers and half a second of subnormal ones; the largest shipped controller has .5 million.
+MAX_WORK = 5_000_000
 # An element read or written counts as so many multiply-adds: a power or a cosine takes 10 to 50 ns,
 # a multiply-add in a product of matrices .3 to 1 ns.
 ELEMENT_WORK = 32
@@ -284,6 +285,8 @@ def _split(node: Node) -> list[Shape]:
         each = -(-shape[axis] // parts)
         lengths = [each] * (parts - 1)
         lengths.append(shape[axis] - sum(lengths))
+        if lengths[-1] <= 0:  # onnxruntime gives the last part no length of zero
+            raise ValueError(f"an axis of {shape[axis]} cannot be split in {parts} parts of {each}")
     if any(n < 0 for n in lengths) or sum(lengths) != shape[axis]:
         raise ValueError(f"the lengths {lengths} are not those of an axis of {shape[axis]}")
     return [(*shape[:axis], n, *shape[axis + 1 :]) for n in lengths]

@@ -110,8 +110,7 @@ class Manifest:
             raise ArtifactError("the manifest has no manipulated variable")
         if not SHORTEST_S <= self.period_s <= LONGEST_S:
             raise ArtifactError(
-                f"the manifest has the period {self.period_s} s; "
-                f"it must be positive, {SHORTEST_S:g} to {LONGEST_S:g} s"
+                f"the manifest has the period {self.period_s} s; it must be positive, {SHORTEST_S:g} to {LONGEST_S:g} s"
             )
         if not 0 <= self.n_state <= MAX_STATE:
             raise ArtifactError(f"the manifest has n_state = {self.n_state}; it must be 0 to {MAX_STATE}")
