@@ -47,8 +47,7 @@ def assert_same_for_all(data: bytes) -> None:
 def accepted(data: bytes) -> bool:
     try:
         audit(data)
-    except ArtifactError as error:
-        assert "\n" not in str(error)
+    except ArtifactError:
         return False
     assert_same_for_all(data)
     return True
