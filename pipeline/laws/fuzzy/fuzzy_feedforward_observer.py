@@ -45,7 +45,12 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
 
     @dataclass(frozen=True, slots=True)
     class Params:
-        """Numbers of the law; the first five as in ``fuzzy_feedforward``.
+        """Numbers of the law.
+
+        ``part`` names the model of the set (None: its only one). ``jacket_low`` and ``jacket_high``
+        [degC] are what the jacket may have. ``switch_penalty`` [degC] is how much nearer another mode
+        must come to the wanted jacket temperature to be taken. ``mv_rate`` is the throttle's largest
+        change a sample, None unlimited.
 
         ``k_jacket``, ``k_core`` are the shares of an innovation that correct an estimate, ``l_jacket``,
         ``l_core`` those that go into its offset; ``core_gain`` (c) is the share of the core's distance to

@@ -39,7 +39,12 @@ class FuzzyFeedforwardPi(FuzzyLaw):
 
     @dataclass(frozen=True, slots=True)
     class Params:
-        """Numbers of the law; the first five as in ``fuzzy_feedforward``.
+        """Numbers of the law.
+
+        ``part`` names the model of the set (None: its only one). ``jacket_low`` and ``jacket_high``
+        [degC] are what the jacket may have. ``switch_penalty`` [degC] is how much nearer another mode
+        must come to the wanted jacket temperature to be taken. ``mv_rate`` is the throttle's largest
+        change a sample, None unlimited.
 
         ``kc`` [degC of the jacket per degC of the core] and ``ti_s`` [s] are the PI controller's,
         ``approach`` (g) and ``k_jacket`` the shares above, in 0..1 [-], g above 0.

@@ -63,12 +63,13 @@ class PID(ControlLaw):
         ``tuning``: ``optimized`` (IMC, its filter and the set-point weight chosen in closed loop, by the
         ``criterion`` mean absolute error or integral of the time-weighted one),
         ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``itae`` (the rule for the
-        least ITAE after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``.
+        least ITAE after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``
+        and the derivative's filter ``filter_s`` [s].
         ``tracking_s`` [s] None is sqrt(Ti Td). ``set_point_weight`` None is 1, or optimized with the
         filter.
         ``operating_cv`` [pv] is the steady state to linearize where the model set has no part
         ``linearized``; None is the middle of the set point's range. The development set points
-        are drawn for the optimization alone, ``development_set_points`` of them for each seed,
+        are drawn for the optimization alone, ``development_set_points`` of them for each of the ``development_seeds``,
         each held for ``development_hold`` samples. ``sampling`` is what ``itae`` counts of a period as
         dead time: 0.5 is the textbook's, 1 more cautious. ``examined_cv`` [pv] is the range over which
         the linear closed loops are examined; None: not at all. ``mv_rate`` [mv] is the largest change

@@ -39,6 +39,9 @@ class NnarxPart(Part):
     ``long_run`` periods of free runs, end to end over the validation data, whose fit is told for the network
     trained on one step and for the one that is kept; 0 for none. ``free_run_iterations`` limit the second
     training; None: as the first.
+    ``residual`` has the network learn the change from one sample to the next instead of the level. ``train_fraction``
+    of the record train, the rest validates. ``trainer`` names a trainer by ``kind`` (lm, lbfgs, adam) and its numbers.
+    ``forgetting`` are the factors of the recursive linear models that the one-step predictions are compared with.
     ``compared`` validation samples show the one-step predictions beside those of linear models; 0 none, which
     leaves the picture to the free runs.
     """

@@ -21,7 +21,7 @@ from serving.graph_audit import audit, graph_values
 from serving.graph_work import MAX_WORK, RULES
 from serving.onnx_bytes import SCHEMA, read_model
 
-SHIPPED = sorted((Path(__file__).resolve().parents[1] / "artifacts").glob("*/*.onnx"))
+SHIPPED = sorted((Path(__file__).resolve().parents[2] / "artifacts").glob("*/*.onnx"))
 by_name = pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
 
 
