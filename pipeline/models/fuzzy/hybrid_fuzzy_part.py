@@ -29,8 +29,8 @@ class HybridFuzzyPart(Part):
 
     ``identification`` printed takes the paper's matrices and needs no data; tied, global and local are least
     squares over a record (hybrid_fuzzy_identification). ``centres`` are the rules' jacket temperatures [degC],
-    of the identified models. ``free_run`` is the length of the free runs whose error is reported [samples]. ``train_fraction`` of the record
-    trains, the rest validates.
+    of the identified models. ``free_run`` is the length of the free runs whose error is reported [samples].
+    ``train_fraction`` of the record trains, the rest validates.
     """
 
     model: ClassVar[type[Model]] = HybridFuzzy
