@@ -27,7 +27,7 @@ LAWS = ("inc", "incad", "incadec", "pid", "inverse_dob", "forward_dob")
 
 
 def load(root: Path) -> Evidence:
-    return Evidence.load(CASES[CASE], made_up.bounds(), root / "work" / CASE)
+    return Evidence.load(CASES[CASE], made_up.bounds(), root / "work" / CASE, timing=root / "timing" / CASE)
 
 
 @pytest.fixture(scope="module")

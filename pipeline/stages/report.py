@@ -12,7 +12,7 @@ from pipeline.command import run_stage
 from pipeline.params import CaseParams, choose, entries, parse, read_section
 from pipeline.report.evidence import Evidence
 from pipeline.report.page import write_report
-from pipeline.stages import ARTIFACTS, WORK, receipt_file, write_json
+from pipeline.stages import ARTIFACTS, TIMING, WORK, receipt_file, write_json
 
 
 def report(name: str) -> None:
@@ -25,7 +25,7 @@ def report(name: str) -> None:
         print(f"report {name}: no bounds yet; `python -m pipeline.oracle {name}` computes them", file=sys.stderr)
     laws, models = entries("controllers", name, "law"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
-    evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data)
+    evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data, TIMING / name)
     for path in write_report(evidence, WORK / name / "models", ARTIFACTS / name):
         print(path)
     verdicts = (ARTIFACTS / name / "validation.json").read_bytes()

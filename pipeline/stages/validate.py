@@ -25,6 +25,7 @@ from pipeline.stages import (
     controller_file,
     design_folder,
     read_json,
+    step_time_file,
     validation_folder,
     write_json,
 )
@@ -60,9 +61,11 @@ def validate(name: str) -> None:
         **_summary(params, base, trials, shipped),
         "analysis": analysis,
         "metric": case.metric,
-        "step_us": step_us(Controller(source), next(iter(shipped.curves.values()))),
     }
     write_json(folder / "metrics.json", metrics)
+    took = step_us(Controller(source), next(iter(shipped.curves.values())))
+    write_json(step_time_file(params.case, params.law), took)
+    print(f"validate {name}: one step takes {took['p50']:.0f} us (median)", file=sys.stderr)
     curves = {f"{s}/{t.form}/{t.seed}": c for t in trials if t.seed == shipped.seed for s, c in t.curves.items()}
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)
