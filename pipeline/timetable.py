@@ -213,7 +213,7 @@ def _scenario(case: Case | None, name: str | None) -> Scenario:
     """The first sequence of the scenario ``name``; of the case's first scenario where None."""
     if case is None:
         raise ParamsError("the plant belongs to no case, so it has no scenarios; give set points (--sp)")
-    scenarios = case.scenarios()
+    scenarios = case.tests()
     if name is None:
         return next(iter(scenarios.values()))[0]
     return choose(scenarios, name, "scenario", f"case {case.name!r}")[0]

@@ -6,7 +6,7 @@ import hashlib
 import sys
 from pathlib import Path
 
-from pipeline.bounds import bounds_path, load_bounds
+from pipeline.bounds import bounds_path, stored_bounds
 from pipeline.cases import CASES
 from pipeline.command import run_stage
 from pipeline.params import CaseParams, choose, entries, parse, read_section
@@ -19,10 +19,11 @@ def report(name: str) -> None:
     """Write artifacts/<case>/{validation.json,report.html,report.md,figures/} from work/<case>."""
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
     case = choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+    case.tests()  # raises where there are none
     # A new case has no bounds until the oracle has run; stale ones are an error, never shown.
-    bounds = load_bounds(case) if bounds_path(case).exists() else {}
-    if not bounds:
-        print(f"report {name}: no bounds yet; `python -m pipeline.oracle {name}` computes them", file=sys.stderr)
+    bounds, missing = stored_bounds(case) if bounds_path(case).exists() else ({}, [])
+    for line in missing or ([] if bounds else [f"no bounds yet; `python -m pipeline.oracle {name}` computes them"]):
+        print(f"report {name}: {line}", file=sys.stderr)
     laws, models = entries("controllers", name, "law"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
     evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data, TIMING / name)

@@ -40,6 +40,7 @@ def validate(name: str) -> None:
     params = ControllerParams.read(name)
     choices = parse(CaseParams, read_section("cases", params.case), f"cases.{params.case}")
     case = choose(CASES, params.case, "case", f"controllers.{name}").with_held_out(choices.held_out_seeds)
+    case.tests()  # before hours of closed loops: raises where there are none
     seeds = sorted(
         int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.law) / BASE).glob("*.onnx")
     )
