@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -264,13 +265,15 @@ def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
     case = {"held_out_seeds": list(CASES[CASE].held_out_seeds)}
     models = {f"{CASE}-one_step": {"case": CASE, "model": "one_step", "data": "work", "parts": {}}}
     params = {"cases": {CASE: case}, "records": {}, "models": models, "controllers": laws}
-    (root / "params.yaml").write_text(yaml.safe_dump(params))
-    monkeypatch.chdir(root)
+    own = tmp_path / "own"
+    shutil.copytree(root, own)
+    (own / "params.yaml").write_text(yaml.safe_dump(params))
+    monkeypatch.chdir(own)
     report(CASE)
     assert (
         "has no nmpc figures of scenario 'ua' as it is now; run `python -m pipeline.oracle" in capsys.readouterr().err
     )
-    folder = root / "artifacts" / CASE
+    folder = own / "artifacts" / CASE
     tree = json.loads((folder / "validation.json").read_text())
     assert "ua" not in tree["bounds"]
     assert tree["bounds"]["held_out"]["nmpc"]["mae"] > 0
