@@ -138,6 +138,15 @@ class PID(ControlLaw):
         return law
 
     @classmethod
+    def check(cls, params: Any, models: Mapping[str, Model], plant: Plant) -> None:
+        """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
+        require_single_loop(LawSignals.of(plant), cls.name)
+        if params.tuning == "optimized":
+            AllPole.near(_linearization(params, models, plant))
+        else:
+            cls._tuned(params, models, LawSignals.of(plant), plant)
+
+    @classmethod
     def _tuned(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
         require_single_loop(signals, cls.name)
         p = params

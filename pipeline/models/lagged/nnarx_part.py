@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -111,7 +110,6 @@ class NnarxPart(Part):
     def _trial(
         self, train: Record, validation: Record, target: int, back: int, seed: int
     ) -> tuple[NNARX, FitHistory, dict[str, LongRun], Candidate]:
-        begun = time.perf_counter()
         lags = (self.n_y, self.n_u, target, self.delay)
         fitted, held = nnarx_pairs(train, *lags), nnarx_pairs(validation, *lags)
         model = NNARX.scaled_to(
@@ -138,8 +136,7 @@ class NnarxPart(Part):
             error = float(free.loss(model.net).sqrt() * model.net.y_scale)
         size = sum(p.numel() for p in model.parameters())
         one_step = rmse(held.y, predict(model, held.x))
-        seconds = time.perf_counter() - begun
-        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step, error, seconds)
+        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step, error)
 
     def _run_free(
         self, model: NNARX, trainer: Trainer, train: Record, validation: Record, target: int, seed: int
