@@ -14,6 +14,7 @@ from pipeline.cases import CASES, PLANTS
 from pipeline.config.params import choose, nearest
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.metric import METRICS
 from pipeline.pictures.loop_picture import History, draw, summary, write_csv
 from pipeline.plants.base import Plant
 from pipeline.report.results import show_results
@@ -110,7 +111,7 @@ def _simulate(options: argparse.Namespace) -> None:
     plant = run.plant  # a scenario may have one of its own
     title = f"{controller.manifest.law} on {plant.title}"
     history = close_loop(controller, plant, run, title=title, speed=options.speed)
-    print(summary(plant, history, "mae" if case is None else case.metric))
+    print(summary(plant, history, METRICS["mae"] if case is None else case.criterion))
     picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
     draw(picture, plant, history, title, run.marks)
     print(f"picture: {picture}")

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure as Canvas
 from pipeline.evaluation.case import Case, Curve, Figure
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import Array, Loop
+from pipeline.evaluation.metric import Metric
 from pipeline.pictures.drawing import SHADES, SIZE, axis_label, colour_of, ratio_unit, symbol, time_axis
-from pipeline.pictures.words import SHORT, law_label, number, ratio
+from pipeline.pictures.words import law_label, number, ratio
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from serving.manifest import Signal
 
@@ -109,7 +110,7 @@ def first(values: Array) -> Array:
 
 def curves_and_loops(evidence: Evidence, figure: Figure, curves: Sequence[Curve]) -> list[tuple[Curve, Loop]]:
     """The curves that have a trajectory."""
-    found = [(c, evidence.loop(c, figure.scenario or "", figure.hold)) for c in curves]
+    found = [(c, evidence.loop(c, figure.scenario or "")) for c in curves]
     return [(c, loop) for c, loop in found if loop is not None]
 
 
@@ -130,8 +131,7 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     found = curves_and_loops(evidence, figure, curves)
     if not found:
         return None
-    late = 0 if figure.hold else evidence.late_from(figure.scenario or "")
-    reference = None if figure.hold else reference_of(evidence, figure.scenario or "")
+    late, reference = evidence.late_from(figure.scenario or ""), reference_of(evidence, figure.scenario or "")
     panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", late, reference)
     own = colours(evidence, figure)
     for curve, loop in found:
@@ -231,7 +231,7 @@ def info_label(case: Case, name: str) -> str:
 
 def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     """A law beside the baseline on the first sequence of the test that weighs most, with the figures over all."""
-    scenario, metric = evidence.main_test, evidence.case.metric
+    scenario, metric = evidence.main_test, evidence.case.criterion
     own = evidence.loop(Curve(law), scenario)
     if own is None:
         return None
@@ -239,19 +239,19 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
     late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
-    title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"
+    title = f"{evidence.laws[law].title}\n{metric.short} {_error(error, metric)}{beside}{rest}"
     panels = LoopPanels(evidence.case, title, evidence.late_from(scenario), reference_of(evidence, scenario))
     other = evidence.case.baseline
     baseline = evidence.loop(Curve(other), scenario) if law != other else None
     if baseline is not None:
         error = evidence.figure(other, scenario)
-        label = f"{law_label(other, {})}, {SHORT[metric]} {_error(error, metric)}"
+        label = f"{law_label(other, {})}, {metric.short} {_error(error, metric)}"
         panels.add(baseline, label, colour_of(other, evidence.laws))
     panels.add(own, law, colour_of(law, evidence.laws), strong=True)
     return panels.finish(own)
 
 
-def _error(value: float | None, metric: str) -> str:
+def _error(value: float | None, metric: Metric) -> str:
     if value is None:
         return "–"
-    return f"{value:.4f}" if metric == "mae" and 0.01 <= value < 1.0 else number(value, 4)
+    return f"{value:.4f}" if not metric.squared and 0.01 <= value < 1.0 else number(value, 4)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,6 +9,7 @@ from typing import Any
 
 from mlflow import MlflowClient
 
+from pipeline.evaluation.validation import FILE, Validation
 from pipeline.tracking.lock import StageResult, dataset_hash, is_current, read_lock
 from pipeline.tracking.registry import elect_case_champion, file_digest, register
 from pipeline.tracking.runs import git_commit, published, write_run
@@ -63,8 +63,8 @@ def _publish_case(
             new += 1
             _say(f"[{number}/{len(own)}] {case}: run {result.name}")
         receipt["stages"][result.name] = result.key
-    evidence = root / "artifacts" / case / "validation.json"
-    validation = json.loads(evidence.read_text()) if evidence.exists() else {}
+    evidence = root / "artifacts" / case / FILE
+    validation = Validation.read(evidence) if evidence.exists() else None
     made = 0
     for result in own:
         for path in sorted(root / out for out in result.outs if result.kind == "validate" and out.endswith(".onnx")):

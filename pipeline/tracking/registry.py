@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
 import mlflow
 import mlflow.onnx
@@ -23,6 +22,7 @@ from mlflow.models import ModelSignature
 from mlflow.types import Schema, TensorSpec
 
 from pipeline.errors import TrackingError
+from pipeline.evaluation.validation import Validation
 from pipeline.tracking import card
 from pipeline.tracking.gate import Gate
 
@@ -51,7 +51,7 @@ def register(
     case: str,
     path: Path,
     run_id: str,
-    validation: Mapping[str, Any],
+    validation: Validation | None,
     picture: str | None,
     tags: Mapping[str, str],
 ) -> tuple[str, bool]:

@@ -15,6 +15,7 @@ import pytest
 from made_up_case import CASE
 
 from pipeline.errors import TrackingError
+from pipeline.evaluation.validation import Validation
 from pipeline.tracking.__main__ import main
 from pipeline.tracking.gate import Gate
 from pipeline.tracking.lock import dataset_hash, is_current, read_lock
@@ -58,8 +59,10 @@ def root(tmp_path, monkeypatch, empty_store) -> Path:
     made_up.write_lock(tmp_path, LAWS)
     write_evidence(tmp_path, SCORES)
     evidence = tmp_path / "artifacts" / CASE / "validation.json"
-    told = {"inverse_dob": {"analysis": {"base": {"figures": {"spectral_radius": 0.93}, "notes": ["Not <proved>."]}}}}
-    made_up.write_json(evidence, {**json.loads(evidence.read_text()), "laws": told})
+    tree = json.loads(evidence.read_text())
+    analysis = {"base": {"figures": {"spectral_radius": 0.93}, "notes": ["Not <proved>."]}}
+    tree["laws"]["inverse_dob"]["analysis"] = analysis
+    made_up.write_json(evidence, tree)
     picture = tmp_path / "artifacts" / CASE / "figures" / "closed_loop_pid.png"
     picture.parent.mkdir()
     picture.write_bytes(b"\x89PNG made up")
@@ -205,8 +208,10 @@ def test_the_champion_falls_only_to_better_evidence(root, capsys):
         ("incad", {"pid": 1.4}, {}, "no gate score"),
     ],
 )
-def test_who_may_become_champion(law, scores, lock_ups, reason):
-    refusal = Gate.of(made_up.evidence(scores, lock_ups), law).refusal()
+def test_who_may_become_champion(law, scores, lock_ups, reason, tmp_path):
+    path = tmp_path / "validation.json"
+    made_up.write_json(path, made_up.evidence(scores, lock_ups))
+    refusal = Gate.of(Validation.read(path), law).refusal()
     assert (refusal is None) if reason is None else (reason in refusal)
 
 
