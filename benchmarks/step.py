@@ -61,8 +61,8 @@ def nmpc_median_us(case_name: str, samples: int, seconds: float) -> tuple[float,
     """
     case = CASES[case_name]
     scenario = next(iter(case.scenarios().values()))[0]
-    plant, ahead = (scenario.plant or case.plant).relaxed(), case.recipe or case.metric == "tracking"
-    nmpc = PerfectNmpc(plant, case.metric, replace(case.effort, every=1), case.limits)
+    plant, ahead = (scenario.plant or case.plant).relaxed(), case.foreseen
+    nmpc = PerfectNmpc(plant, case.criterion, replace(case.effort, every=1), case.limits)
     course = scenario.sp if scenario.reference is None or not ahead else scenario.reference
     simulate, p, x, times = plant.stepper(), plant.parameters(), scenario.x0, []
     started = time.monotonic()

@@ -8,6 +8,8 @@ from typing import Any
 from serving.controller import Controller
 from serving.manifest import Signal
 
+SHOWN = {"scenarios", "locked_up", "as_printed"}  # entries of the evidence that have a place of their own
+
 
 def card(controller: Controller) -> str:
     """What the controller is, what goes in and out, where it comes from and how its validation went."""
@@ -19,6 +21,7 @@ def card(controller: Controller) -> str:
         f"  period    {m.period_s:g} s",
         f"  graph     {graph.nodes} operators, opset {graph.opset}, IR {graph.ir_version}",
     ]
+    lines[1:1] = _locked_up(m.evidence)
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         lines += _signals(title, m.signals(name))
     lines += _signals("manipulated variables", m.mv)
@@ -49,6 +52,23 @@ def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
     return ["", title, *rows]
 
 
+def _locked_up(evidence: dict[str, Any]) -> list[str]:
+    """The first thing to know of a controller that locked up while it was validated; nothing of any other."""
+    count, tests = evidence.get("lock_ups"), evidence.get("locked_up")
+    if not isinstance(count, int) or count <= 0:
+        return []
+    lines = [
+        f"  LOCKED UP in {count} closed loop{'s' if count > 1 else ''} of its validation: do not run it on a plant"
+    ]
+    if isinstance(tests, dict):
+        for test, seeds in tests.items():
+            named = ", ".join(f"seed {seed}: {n}" for seed, n in seeds.items()) if isinstance(seeds, dict) else seeds
+            lines.append(f"    {test} ({named})")
+    if evidence.get("as_printed") is True:
+        lines.append("    shipped as printed, to reproduce a paper")
+    return lines
+
+
 def _evidence(evidence: dict[str, Any]) -> list[str]:
     """A table where the evidence is figures by scenario, else an indented list."""
     rows = evidence.get("scenarios", evidence)
@@ -63,7 +83,7 @@ def _evidence(evidence: dict[str, Any]) -> list[str]:
     for name, row in rows.items():
         cells = (f"{row[c]:.4g}" if isinstance(row.get(c), int | float) else "-" for c in columns)
         lines.append(f"  {name:<{first}}" + "".join(f"  {c:>{w}}" for c, w in zip(cells, widths, strict=True)))
-    return lines + _tree({k: v for k, v in evidence.items() if rows is not evidence and k != "scenarios"})
+    return lines + _tree({k: v for k, v in evidence.items() if rows is not evidence and k not in SHOWN})
 
 
 def _tree(values: dict[str, Any], indent: int = 2) -> list[str]:

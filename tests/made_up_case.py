@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 import yaml
 from onnx import TensorProto, helper
+from pipeline.evaluation.for_programs import validation
 
 from pipeline.cases import CASES, beside
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.for_programs import validation
+from pipeline.evaluation.validation import SCHEMA, Validation
 from pipeline.evaluation.verdicts import PLAIN, Claims, judge
 from pipeline.report.page import write_report
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
@@ -232,6 +233,8 @@ def write_validation(
         "seeds": list(SEEDS),
         "shipped_seed": 0,
         "lock_ups": lock_ups,
+        "locked_up": {"sp_a": {"0": lock_ups}} if lock_ups else {},
+        "as_printed": bool(lock_ups),
         "setting": mini.setting.get(law, {}),
         "info": list(GAINS) if adaptive else [],
         "scenarios": {name: spread(error, metric) for name, error in errors.items()},
@@ -244,9 +247,7 @@ def write_validation(
     write_json(folder / "metrics.json", metrics)
     write_json(root / "timing" / mini.case / f"{law}-step.json", {"p50": 25.0, "p99": 60.0})
     loops = {**tests, **{name + NOISE_SUFFIX: test for name, test in tests.items()}}
-    loops |= {
-        f"{f.scenario}_hold{f.hold}": tests[f.scenario].with_hold(f.hold) for f in case.figures if f.hold and f.scenario
-    }
+    loops |= case.unscored()
     arrays = {}
     for i, variant in enumerate(("base", *variants)):
         for name, scenario in loops.items():
@@ -271,12 +272,22 @@ def evidence(scores: dict[str, float], lock_ups: dict[str, int] | None = None, g
         for law, score in scores.items()
     }
     table = {law: {**figures(0.064 * s), "mae_min": 0.06, "mae_max": 0.2, "seeds": 3} for law, s in scores.items()}
+    what = {"id": gate_id, "weights": {"sp_a": 1.0}, "floor": 0.0, "floors": {"sp_a": 5e-4}}
+    titles = {"case": "Thiosulfate CSTR", "laws": {"pid": "PID"}, "scenarios": {"sp_a": "Set points"}}
     return {
+        "schema": SCHEMA,
         "case": CASE,
+        "metric": "mae",
+        "best": None,
+        "main": "sp_a",
         "scenarios": {"sp_a": table, "sp_a" + NOISE_SUFFIX: table},
         "bounds": {"sp_a": {"nmpc": figures(0.064)}},
-        "gate": {"id": gate_id, "weights": {"sp_a": 1.0}, "laws": laws},
-        "titles": {"case": "Thiosulfate CSTR", "laws": {"pid": "PID"}, "scenarios": {"sp_a": "Set points"}},
+        "gate": {**what, "baseline": "pid", "baseline_name": "PID", "laws": laws},
+        "laws": {law: {"seeds": 3, "lock_ups": row["lock_ups"], "step_us": 20.0} for law, row in laws.items()},
+        "requirements": [],
+        "claims": [],
+        "paper": [],
+        "titles": {**titles, "metric": "mean absolute error", "metric_short": "MAE", "figures": {}},
     }
 
 
@@ -322,7 +333,7 @@ def write_case(root: Path, quality: Mapping[str, float] | None = None, mini: Min
 
 def claims_of(case: str) -> Claims:
     """What is known of the case with this name."""
-    claims: Claims = beside(CASES[case], "paper", "CLAIMS", PLAIN)
+    claims: Claims = beside(CASES[case], "paper", "CLAIMS", PLAIN) if case in CASES else PLAIN
     return claims
 
 
@@ -331,6 +342,6 @@ def report(evidence: Evidence, models: Path, out: Path) -> None:
     write_report(evidence, claims_of(evidence.case.name), models, out)
 
 
-def for_programs(evidence: Evidence) -> dict[str, Any]:
+def for_programs(evidence: Evidence) -> Validation:
     """validation.json with what is known of the case."""
     return validation(evidence, judge(evidence, claims_of(evidence.case.name)))

@@ -15,6 +15,7 @@ from pipeline.cases import CASES, PLANTS
 from pipeline.config.params import choose, nearest
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.metric import METRICS
 from pipeline.pictures.loop_picture import History, draw, summary, write_csv
 from pipeline.plants.base import Plant
 from pipeline.simulation.live import SimulatedPlant, view_of
@@ -82,7 +83,7 @@ def run(options: argparse.Namespace) -> None:
     plant = course.plant  # a scenario may have one of its own
     title = f"{controller.manifest.law} on {plant.title}"
     history = close_loop(controller, plant, course, title=title, speed=options.speed)
-    print(summary(plant, history, "mae" if case is None else case.metric))
+    print(summary(plant, history, METRICS["mae"] if case is None else case.criterion))
     picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
     draw(picture, plant, history, title, course.marks)
     print(f"picture: {picture}")

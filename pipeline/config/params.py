@@ -205,13 +205,17 @@ class ModelParams:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ControllerParams:
-    """``controllers.<name>``: a law, its models, its numbers; ``variants`` are evaluated beside it."""
+    """``controllers.<name>``: a law, its models, its numbers; ``variants`` are evaluated beside it.
+
+    ``as_printed`` marks the reproduction of a paper's law: it alone is shipped although it locked up in a test.
+    """
 
     case: str
     law: str
     model: str
     settings: Mapping[str, Any]
     variants: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    as_printed: bool = False
 
     @classmethod
     def read(cls, name: str) -> ControllerParams:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import rmse
 from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import Scenario
@@ -73,8 +74,7 @@ class Figure:
     number: int
     title: str
     curves: tuple[Curve, ...]
-    scenario: str | None = None
-    hold: int | None = None  # other than the scenario's own
+    scenario: str | None = None  # of ``Case.scenarios`` or ``Case.unscored``
     info: tuple[str, ...] = ()  # entries of the controllers' info to show in place of the loop, a panel each
     model: str | None = None  # the model set whose predictions it shows
 
@@ -109,12 +109,10 @@ class Case(ABC):
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = ()
     claims: ClassVar[Mapping[str, str]] = {}  # what the paper states -> what an independent implementation found
-    # The figure that laws are compared by: "mae", "sse" (sum of squared errors over a test's samples), or "tracking"
-    # (root mean square of reference - CV, where the tests have a reference).
-    metric: ClassVar[str] = "mae"
-    # A figure that `score` adds, or that a law's analysis has -> its words in a table, unit and all ("IAE [K s]").
-    # What a case names here, its report shows of every test.
-    metric_words: ClassVar[Mapping[str, str]] = {}
+    metric: ClassVar[str] = "mae"  # the figure that laws are compared by, one with a floor: mae, sse, tracking
+    # Figures that `score` adds, or that a law's analysis has, and other words for a common one. The report shows
+    # them of every test.
+    own_metrics: ClassVar[tuple[Metric, ...]] = ()
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
     seen: ClassVar[str] = ""  # in words for the report: which scored figures were looked at while numbers were chosen
@@ -166,6 +164,32 @@ class Case(ABC):
                 )
         return found
 
+    @cached_property
+    def metrics(self) -> Mapping[str, Metric]:
+        """Every metric of the case by its name: the common ones, and its own."""
+        return METRICS | {metric.name: metric for metric in self.own_metrics}
+
+    @property
+    def criterion(self) -> Metric:
+        """The metric that laws are compared by."""
+        return self.metrics[self.metric]
+
+    @property
+    def foreseen(self) -> bool:
+        """Whether the bounds may use the whole course that the CV should take: of a recipe, or of a reference."""
+        return self.recipe or self.criterion.reference
+
+    @property
+    def cv_unit(self) -> str:
+        """The unit of the controlled variable."""
+        return self.plant_class.sp_signals[0].unit
+
+    def label(self, metric: str) -> str:
+        """Words for a figure at the head of a table, with its unit; of a path into a model set's, before the dot."""
+        first = metric.partition(".")[0]
+        known = self.metrics.get(metric) or self.metrics.get(first)
+        return first.replace("_", " ") if known is None else known.label(self.cv_unit)
+
     def with_held_out(self, seeds: tuple[int, ...]) -> Self:
         """The case scored on other held-out sequences."""
         return replace(self, held_out_seeds=seeds)
@@ -186,8 +210,16 @@ class Case(ABC):
         """The tests by name, each as its scenarios.
 
         A test of several random sequences has one scenario for each sequence, and its figures are
-        the means over them; the other tests have one scenario.
+        put ``together``; the other tests have one scenario.
         """
+
+    def unscored(self) -> Mapping[str, Scenario]:
+        """Further tests by name, whose curves are kept and whose figures are not: what a picture shows."""
+        return {}
+
+    def variants_run(self, tests: tuple[Scenario, ...]) -> bool:
+        """Whether a law's variants run these tests of one name; by default those of one sequence, as papers have."""
+        return len(tests) == 1
 
     @abstractmethod
     def development(self) -> tuple[Scenario, ...]:

@@ -11,8 +11,8 @@ from typing import Any, Self
 
 from pipeline.evaluation.case import Case, Curve
 from pipeline.evaluation.law_evidence import LawEvidence, Loop, ReportError, read_metrics
+from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.model_evidence import model_figure
-from pipeline.pictures.words import scenario_name
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]
@@ -121,16 +121,6 @@ class Evidence:
         """Title of the test that weighs most."""
         return self.scenarios[self.main_test.removesuffix(NOISE_SUFFIX)]
 
-    @property
-    def main_words(self) -> tuple[str, str]:
-        """What a picture of the main test shows, and what the test is to somebody who doubts a tuning."""
-        name, recipe = self.main_test, self.case.recipe
-        if len(self.tests[name.removesuffix(NOISE_SUFFIX)]) == 1:
-            return (scenario_name(name, recipe),) * 2
-        if recipe:
-            return "a held-out recipe", "recipes that nothing was tuned on"
-        return "a held-out sequence", "set points that nothing was tuned on"
-
     def figure(
         self,
         law: str,
@@ -168,19 +158,12 @@ class Evidence:
 
     @cached_property
     def floors(self) -> dict[str, float]:
-        """Of each scenario the error that noise would hide: its deviation, or its variance times the samples.
-
-        An NMPC that is told of a disturbance before it acts leaves an error of 1e-11: no yardstick.
-        Nor is one that can stay on its reference throughout, and there good loops stay well within
-        the noise. What n noisy samples still tell apart is then the yardstick, s (2/n)^(1/4): an
-        error whose square is the deviation of their mean square.
-        """
-        if self.case.metric == "mae":
-            return dict.fromkeys(self.scenarios, self.noise)
+        """Of each scenario the error that noise would hide, in the case's metric."""
+        floor = self.case.criterion.floor
+        if floor is None:
+            raise ReportError(f"case {self.case.name!r} is compared by {self.case.metric!r}, a metric without a floor")
         samples = {name: statistics.fmean(test.samples for test in tests) for name, tests in self.tests.items()}
-        if self.case.metric == "tracking":
-            return {name: self.noise * (2 / n) ** 0.25 for name, n in samples.items()}
-        return {name: self.noise**2 * n for name, n in samples.items()}
+        return {name: floor.error(self.noise, n) for name, n in samples.items()}
 
     def floor(self, scenario: str) -> float:
         """Error below which a loop of this test, with noise or without, is as good as perfect."""
@@ -189,12 +172,12 @@ class Evidence:
     def ratio(self, law: str, scenario: str, kind: str = "nmpc") -> float | None:
         """Error of the law over that of the bound; None also where the bound lies below ``floor``."""
         own, bound = self.figure(law, scenario), self.bound(scenario, None, kind)
-        return None if own is None or bound is None or bound < self.floor(scenario) else own / bound
+        return None if own is None or bound is None else ratio_to_bound(own, bound, self.floor(scenario))
 
     def gate_ratio(self, law: str, scenario: str) -> float | None:
         """Error over the NMPC's, both at least ``floor``: 1 is the bound, or an error that noise would hide."""
-        own, bound, floor = self.figure(law, scenario), self.bound(scenario), self.floor(scenario)
-        return None if own is None or bound is None else max(own, floor) / max(bound, floor)
+        own, bound = self.figure(law, scenario), self.bound(scenario)
+        return None if own is None or bound is None else gate_ratio(own, bound, self.floor(scenario))
 
     def score(self, law: str) -> float | None:
         """Gate score: weighted mean of ``gate_ratio`` over the gate's scenarios; lower is better, 1 the bound."""
@@ -216,10 +199,10 @@ class Evidence:
         known = {n: e for n, e in errors.items() if e is not None}
         return min(known, key=lambda n: known[n], default=None)
 
-    def loop(self, curve: Curve, scenario: str, hold: int | None = None) -> Loop | None:
+    def loop(self, curve: Curve, scenario: str) -> Loop | None:
         """The trajectory behind a curve of a figure; None where none was stored."""
         law = self.laws.get(curve.law)
-        return None if law is None else law.loop(scenario + (f"_hold{hold}" if hold else ""), curve.setting)
+        return None if law is None else law.loop(scenario, curve.setting)
 
 
 def _step_time(path: Path) -> dict[str, float]:

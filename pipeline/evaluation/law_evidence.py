@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from pipeline.simulation import NOISE_SUFFIX
 
 Array = NDArray[np.float64]
 Loop = dict[str, Array]
@@ -46,6 +46,13 @@ def parse_setting(name: str) -> dict[str, Any]:
     return found
 
 
+def lock_up_text(locked_up: Mapping[str, Mapping[str, int]]) -> str:
+    """Tests with the data seeds that locked up in them: ``sp_a (seeds 0, 3), held_out (seed 1)``."""
+    return ", ".join(
+        f"{test} (seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)})" for test, seeds in locked_up.items()
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class LawEvidence:
     """What validate measured of one law: metrics.json, the time of a step and, when asked for, trajectories.npz."""
@@ -70,6 +77,16 @@ class LawEvidence:
         """Closed loops that got stuck, over all seeds and scenarios."""
         found = self.metrics.get("lock_ups")
         return None if found is None else int(found)
+
+    @property
+    def locked_up(self) -> Mapping[str, Mapping[str, int]]:
+        """Test -> data seed -> closed loops that got stuck; tests and seeds without one are left out."""
+        return self.metrics.get("locked_up") or {}
+
+    @property
+    def as_printed(self) -> bool:
+        """Whether the law is a reproduction of a paper's, shipped although it locked up."""
+        return bool(self.metrics.get("as_printed"))
 
     def info(self, setting: Mapping[str, Any]) -> tuple[str, ...]:
         """Names of the controller's info with this setting, in the order of the trajectories' columns."""

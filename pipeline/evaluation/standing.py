@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-from pipeline.errors import PipelineError
-
-NOISE = "_noise"  # the end of a test's name where it is run with measurement noise
+from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
+from pipeline.evaluation.validation import FILE, Statement, Validation
+from pipeline.simulation import NOISE_SUFFIX
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,17 +27,6 @@ class LawStanding:
     ratio: float | None  # to the bound, or to what noise would hide where the bound is less: ``Standing.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
-
-
-@dataclass(frozen=True, slots=True)
-class Statement:
-    """A requirement or a claim of the paper, what was measured, and whether it holds; None: not measured."""
-
-    what: str
-    limit: str  # of a requirement what was asked, of a claim what an independent implementation found
-    measured: str
-    because: str
-    holds: bool | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,40 +53,30 @@ class Standing:
 
         Raises PipelineError where it cannot be read.
         """
-        path = folder / "validation.json"
-        try:
-            return cls._of(json.loads(path.read_text(encoding="utf-8")), folder)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise PipelineError(f"{path} cannot be read ({error!r}); run `dvc repro`") from error
+        return cls.of(Validation.read(folder / FILE), folder)
 
     @classmethod
-    def _of(cls, tree: Mapping[str, Any], folder: Path) -> Self:
-        scenarios, titles = tree["scenarios"], tree.get("titles") or {}
-        metric, gate = tree.get("metric", "mae"), tree.get("gate") or {}
-        weights = gate.get("weights") or {}
-        test = tree.get("main") or max(weights, key=lambda name: weights[name], default="")
-        bare = test.removesuffix(NOISE)
-        bound = ((tree.get("bounds") or {}).get(test) or {}).get("nmpc", {}).get(metric)
-        floor = (gate.get("floors") or {}).get(bare, gate.get("floor", 0.0))
-        names = dict.fromkeys(law for rows in scenarios.values() for law in rows)
-        rows = {law: (scenarios.get(test) or {}).get(law) or {} for law in names}
-        laws = [_law(tree, law, row, metric, bound, floor, folder) for law, row in rows.items()]
+    def of(cls, validation: Validation, folder: Path) -> Self:
+        """The standing in a validation, whose controller files lie in ``folder``."""
+        test = validation.main
+        bare = test.removesuffix(NOISE_SUFFIX)
+        bound, floor = validation.bound(test), validation.floor(bare)
+        laws = [_law(validation, law, folder) for law in validation.laws]
         # A row of a figure that the paper does not print stands beside another implementation's alone.
-        printed = [row for row in tree.get("paper") or () if row["paper"] is not None]
-        judged = [row["holds"] for row in printed if row["holds"] is not None]
+        judged = [row.holds for row in validation.paper if row.paper is not None and row.holds is not None]
         return cls(
-            case=tree["case"],
+            case=validation.case,
             folder=folder,
-            title=titles.get("case", tree["case"]),
-            metric=titles.get("metric_short", metric.upper()),
-            metric_long=titles.get("metric", metric),
+            title=validation.titles.case,
+            metric=validation.titles.metric_short,
+            metric_long=validation.titles.metric,
             test=test,
-            test_title=(titles.get("scenarios") or {}).get(bare, bare) + (" with noise" if test != bare else ""),
+            test_title=validation.titles.scenarios.get(bare, bare) + (" with noise" if test != bare else ""),
             bound=bound,
             hidden=bound is not None and bound < floor,
             laws=tuple(sorted(laws, key=lambda law: math.inf if law.figure is None else law.figure)),
-            requirements=_statements(tree.get("requirements")),
-            claims=_statements(tree.get("claims")),
+            requirements=validation.requirements,
+            claims=validation.claims,
             reproduced=(sum(judged), len(judged)),
         )
 
@@ -115,39 +92,26 @@ def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:
     return sum(known), len(known)
 
 
-def _law(
-    tree: Mapping[str, Any],
-    law: str,
-    row: Mapping[str, Any],
-    metric: str,
-    bound: float | None,
-    floor: float,
-    folder: Path,
-) -> LawStanding:
-    told = (tree.get("laws") or {}).get(law) or {}
+def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
+    test, metric, found = validation.main, validation.metric, validation.laws[law]
+    row = validation.scenarios.get(test, {}).get(law, {})
+    own, bound, floor = row.get(metric), validation.bound(test), validation.floor(test.removesuffix(NOISE_SUFFIX))
     file = folder / f"{law}.onnx"
-    own = row.get(metric)
     return LawStanding(
         law=law,
-        title=((tree.get("titles") or {}).get("laws") or {}).get(law, law),
-        best=law == tree.get("best"),
+        title=validation.titles.laws.get(law, law),
+        best=law == validation.best,
         figure=own,
         low=row.get(f"{metric}_min"),
         high=row.get(f"{metric}_max"),
-        seeds=told.get("seeds", row.get("seeds")),
-        lock_ups=told.get("lock_ups"),
+        seeds=found.seeds,
+        lock_ups=found.lock_ups,
         ratio=None if own is None or bound is None else _ratio(own, bound, floor),
-        step_us=told.get("step_us"),
+        step_us=found.step_us,
         bytes=file.stat().st_size if file.exists() else None,
     )
 
 
 def _ratio(own: float, bound: float, floor: float) -> float | None:
     """Error over the bound's; where noise would hide the bound, over what it would hide, and no less than 1."""
-    if bound >= floor:
-        return own / bound if bound else None
-    return max(own, floor) / floor
-
-
-def _statements(rows: Any) -> tuple[Statement, ...]:
-    return tuple(Statement(r["what"], r["limit"], r["measured"], r["because"], r["holds"]) for r in rows or ())
+    return gate_ratio(own, bound, floor) if bound < floor else ratio_to_bound(own, bound, floor)

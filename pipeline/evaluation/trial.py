@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import locked_up
+from pipeline.evaluation.metric import mean_of_draws, together
 from pipeline.plants.base import Array
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from pipeline.simulation.simulate import Trajectory, simulate_closed
@@ -22,6 +22,7 @@ Metrics = dict[str, float]
 BASE = "base"  # the form of a controller that is shipped; the others are its variants
 ROUNDS = 8  # of timing a step
 DRAW = 1_000  # added to the noise's seed for every further draw of it
+DEVELOPED = "development"  # stands for all development sequences among the names of tests
 DEVELOPMENT = 100_000  # added to the noise's seed over the development sequences
 
 
@@ -35,9 +36,18 @@ class Trial:
     metrics: dict[str, Metrics]
     sequences: dict[str, dict[str, Metrics]]  # of the tests with several sequences, by their seeds
     development: float  # the case's metric, mean over the development sequences
-    development_lock_ups: int
-    lock_ups: int  # in all closed loops, those of the development included
+    locked_up: dict[str, int]  # test -> closed loops that locked up, of those where any did; DEVELOPED: development
     curves: dict[str, Trajectory]
+
+    @property
+    def lock_ups(self) -> int:
+        """Closed loops that locked up, those of the development included."""
+        return sum(self.locked_up.values())
+
+    @property
+    def development_lock_ups(self) -> int:
+        """Of them those over the development sequences."""
+        return self.locked_up.get(DEVELOPED, 0)
 
 
 @dataclass(frozen=True)
@@ -52,40 +62,38 @@ class Repeated:
 def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
     """Run the file of one form and data seed over the case's tests, and over its development unless it is a variant.
 
-    Variants are there for the paper's tables, which have no random sequences; they run with noise
-    only where the plant is never measured without.
+    Variants run the tests that the case says, with noise only where the plant is never measured without.
     """
     form, seed, path = item
     controller = Controller(path)
     metrics: dict[str, Metrics] = {}
     sequences: dict[str, dict[str, Metrics]] = {}
     curves: dict[str, Trajectory] = {}
-    lock_ups = 0
+    locked_up: dict[str, int] = {}
     noisy = (False, True) if form == BASE or case.development_noise else (False,)
     for name, tests in case.scenarios().items():
-        if form != BASE and len(tests) > 1:
+        if form != BASE and not case.variants_run(tests):
             continue
         for noise in noisy:
             found = [repeated(controller, case, test, noise, noise_seed + i) for i, test in enumerate(tests)]
             key = name + (NOISE_SUFFIX if noise else "")
-            metrics[key] = together(one.metrics for one in found)
+            metrics[key] = together((one.metrics for one in found), case.metrics)
             curves[key] = found[0].first
-            lock_ups += sum(one.lock_ups for one in found)
+            locked_up[key] = sum(one.lock_ups for one in found)
             if len(tests) > 1 and not noise:
                 sequences[name] = {str(test.seed): one.metrics for test, one in zip(tests, found, strict=True)}
     development = [
         repeated(controller, case, test, case.development_noise, noise_seed + DEVELOPMENT + i)
         for i, test in enumerate(case.development() if form == BASE else ())
     ]
-    for figure in case.figures:
-        if figure.hold and figure.scenario:
-            (test,) = case.scenarios()[figure.scenario]
-            longer = repeated(controller, case, test.with_hold(figure.hold), False, 0)
-            curves[f"{figure.scenario}_hold{figure.hold}"] = longer.first
+    for name, test in case.unscored().items():
+        one = repeated(controller, case, test, False, noise_seed)
+        curves[name], locked_up[name] = one.first, one.lock_ups
     mean = statistics.fmean(one.metrics[case.metric] for one in development) if development else float("nan")
-    locked = sum(one.lock_ups for one in development)
+    locked_up[DEVELOPED] = sum(one.lock_ups for one in development)
+    locked_up = {name: count for name, count in locked_up.items() if count}
     told = {key: replace(c, info=c.info[:, :-1]) for key, c in curves.items()}
-    return Trial(form, seed, controller.manifest.info, metrics, sequences, mean, locked, lock_ups + locked, told)
+    return Trial(form, seed, controller.manifest.info, metrics, sequences, mean, locked_up, told)
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
@@ -93,8 +101,7 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     draws = range(case.noise_draws if noise else 1)
     loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
-    means = {key: statistics.fmean(row[key] for row in rows) for key in rows[0]}
-    return Repeated(means, loops[0], sum(stuck(case, test, loop) for loop in loops))
+    return Repeated(mean_of_draws(rows), loops[0], sum(stuck(case, test, loop) for loop in loops))
 
 
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
@@ -122,17 +129,6 @@ def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
     mv, sp = case.plant.mv_signals[0], case.plant.sp_signals[0]
     limits = {"low": mv.low, "high": mv.high, "span": sp.high - sp.low}
     return locked_up(loop.sp[:, 0], loop.pv[:, 0], loop.mv[:, 0], test.hold, **limits) or bool(loop.info[:, -1].any())
-
-
-def together(rows: Iterable[Metrics]) -> Metrics:
-    """Mean over the sequences of a test; of a figure with max or min in its name (max_asse), the largest or least."""
-    table = list(rows)
-
-    def reduce(key: str, values: list[float]) -> float:
-        words = key.split("_")
-        return max(values) if "max" in words else min(values) if "min" in words else statistics.fmean(values)
-
-    return {key: float(reduce(key, [row[key] for row in table])) for key in table[0]}
 
 
 def step_us(controller: Controller, loop: Trajectory) -> dict[str, float]:

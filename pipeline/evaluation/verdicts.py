@@ -14,21 +14,15 @@ from matplotlib.figure import Figure as Canvas
 
 from pipeline.evaluation.case import PaperFigure, PaperTable, Requirement
 from pipeline.evaluation.evidence import Evidence
-from pipeline.pictures.words import law_label, metric_name, number
+from pipeline.evaluation.metric import Metric
 
 RELATIVE = 0.25
 ABSOLUTE = 1e-4
-FINE = 5  # digits shown of a figure that has to be near
-RULE = (
-    f"A figure reproduces when it lies within {100 * RELATIVE:g} % of the paper's or within {ABSOLUTE:g} of it "
-    "(in its own unit), or within what its row names. Ours are medians over the data seeds, whose models were each "
-    "learnt from another record."
-)
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A statement, what was measured, and whether that holds; None: nothing was measured."""
+    """A statement in the words of its check, what was measured, and whether that holds; None: nothing was measured."""
 
     what: str
     limit: str
@@ -65,19 +59,36 @@ class Claims:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """A row of one of the paper's tables beside ours."""
+class Met:
+    """A requirement against what was measured; ``holds`` None: nothing was measured, or the bound is missing.
 
-    label: str
-    metric: str
-    paper: float | None
+    ``law`` is the one that was asked for, or the case's best. ``high`` is the limit in the metric's own unit, a
+    bound's figure counted in; None where that bound is missing.
+    """
+
+    need: Requirement
+    law: str | None
+    metric: Metric
+    high: float | None
+    measured: float | None
+    holds: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """A figure of the paper's tables against ours, the median, least and largest over the data seeds.
+
+    ``reason`` says in words why it does not reproduce; ``as_independent``: ours is then what the independent
+    implementation found.
+    """
+
+    figure: PaperFigure
     ours: float | None
     low: float | None
     high: float | None
-    independent: float | None
-    verdict: str
     holds: bool | None
-    digits: int = 3  # to be shown of its numbers
+    reason: str = ""
+    as_independent: bool = False
 
 
 def close(ours: float, paper: float, within: float | None = None) -> bool:
@@ -100,65 +111,32 @@ def _times(ours: float, paper: float) -> str:
     return f"{ours / paper:.2g} times" if paper else "above"
 
 
-def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Row:
+def paper_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> Reproduction:
     """One row of a paper's table, judged."""
-
-    def ours(how: str) -> float | None:
-        return evidence.figure(row.law, row.scenario, row.metric, row.setting, how)
-
-    median, digits = ours("median"), 3 if row.within is None else FINE
-    if median is None:
-        verdict, holds = f"not measured: {_unmeasured(row)}", None
-    elif close(median, row.paper, row.within):
-        verdict, holds = "reproduces" + ("" if row.within is None else f" within {row.within:.2g}"), True
-    else:
-        verdict, holds = f"does not, because {reason(row, median, evidence)}", False
-        if row.independent is not None and close(median, row.independent, row.within):
-            verdict += f"; an independent implementation found {number(row.independent, max(digits, 4))} too"
-    metric = metric_name(row.metric, evidence.case.metric_words)
-    paper = row.paper if row.printed else None
-    low, high = ours("min"), ours("max")
-    return Row(row.label, metric, paper, median, low, high, row.independent, verdict, holds, digits)
+    ours, low, high = (
+        evidence.figure(row.law, row.scenario, row.metric, row.setting, how) for how in ("median", "min", "max")
+    )
+    if ours is None:
+        return Reproduction(row, None, low, high, None)
+    if close(ours, row.paper, row.within):
+        return Reproduction(row, ours, low, high, True)
+    as_independent = row.independent is not None and close(ours, row.independent, row.within)
+    return Reproduction(row, ours, low, high, False, reason(row, ours, evidence), as_independent)
 
 
-def _unmeasured(row: PaperFigure) -> str:
-    return "this setting was not validated" if row.scenario else f"no such figure of {row.law}"
-
-
-def requirement(need: Requirement, evidence: Evidence) -> Verdict:
+def requirement(need: Requirement, evidence: Evidence) -> Met:
     """One row of the acceptance list; the limit of a ratio is its factor times the bound's figure."""
-    law = need.law or evidence.best
-    who = _who(need, law)
-    value = None if law is None else evidence.figure(law, need.scenario, need.metric, need.setting)
-    high, metric = need.high, metric_name(need.metric, evidence.case.metric_words)
-    limit = f"{metric} ≤ {number(need.high, 6)}"
-    if need.low:
-        limit = f"{number(need.low, 6)} ≤ {limit}"
+    law, metric, high = need.law or evidence.best, evidence.case.metrics[need.metric], need.high
     if need.times is not None:
         bound = evidence.bound(need.scenario, need.metric, need.times)
-        limit = f"{metric} ≤ {need.high:g} × {_bound_name(need.times)}"
         if bound is None:
-            return Verdict(f"{who}, {need.scenario}", limit, "the bound is missing", None)
+            return Met(need, law, metric, None, None, None)
         high *= bound
-        limit += f" = {number(high, 4)}"
-    if value is None:
-        return Verdict(f"{who}, {need.scenario}", limit, "not measured", None)
-    measured = number(value, 4)
-    if need.times is not None and high:
-        measured += f" ({value / high * need.high:.3f} ×)"
-    return Verdict(f"{who}, {need.scenario}", limit, measured, need.low <= value <= high)
+    value = None if law is None else evidence.figure(law, need.scenario, need.metric, need.setting)
+    return Met(need, law, metric, high, value, None if value is None else bool(need.low <= value <= high))
 
 
-def _bound_name(kind: str) -> str:
-    return {"nmpc": "perfect NMPC", "offline": "offline optimum"}.get(kind, kind)
-
-
-def _who(need: Requirement, law: str | None) -> str:
-    """Who is meant: a law with its setting, or the best controller by name."""
-    return law_label(need.law, need.setting) if need.law else f"best controller ({law or 'none'})"
-
-
-def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict]:
+def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict | Met]:
     """The whole acceptance list: the case's requirements, what every case must show, and its own checks."""
     best = evidence.laws[evidence.best] if evidence.best else None
     seeds = 1 if evidence.own_data else evidence.case.data_seeds  # a plant's own record is one
@@ -186,8 +164,8 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[Verdict]:
 class Judged:
     """A case held against its paper: the paper's tables, what it had to show, and what the paper states."""
 
-    tables: tuple[tuple[PaperTable, tuple[Row, ...]], ...]
-    acceptance: tuple[Verdict, ...]
+    tables: tuple[tuple[PaperTable, tuple[Reproduction, ...]], ...]
+    acceptance: tuple[Verdict | Met, ...]
     statements: tuple[Verdict, ...]
 
 

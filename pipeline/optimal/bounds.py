@@ -7,7 +7,7 @@ import hashlib
 import inspect
 import json
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import together
 from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
@@ -142,18 +143,7 @@ def stored_bounds(case: Case, path: Path | None = None) -> tuple[Bounds, list[st
                 absent.append(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
                 continue
             key = name + NOISE_SUFFIX if kind == "nmpc_noise" else name
-            found.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows)
+            found.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows, case.metrics)
         if "nmpc" in found.get(name, {}):
             found.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(found[name]["nmpc"])})
     return found, absent
-
-
-def together(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Figures of several loops as one: means, the largest ``max_asse`` and ``step_ms_p99``, sums of what is counted.
-
-    Counted are ``failures``, and ``from_nmpc``, which only some of the loops may have.
-    """
-    how: dict[str, Callable[[list[float]], float]] = {"max_asse": max, "step_ms_p99": max, "failures": sum}
-    found = {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0] if key != "from_nmpc"}
-    taken = sum(row.get("from_nmpc", 0.0) for row in rows)
-    return found | ({"from_nmpc": taken} if taken else {})

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
+from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.optimal.collocation import collocation, scaling, trace
 from pipeline.plants.base import Plant
 
@@ -19,9 +20,8 @@ Array = NDArray[np.float64]
 # The plan is never allowed to leave the states' ranges by more than this fraction of them.
 MARGIN = 0.1
 
-# By metric: w below. Squared errors are small where absolute ones still count, and so must the weight be.
-MOVE_WEIGHT = {"mae": 1e-3, "sse": 1e-6, "tracking": 1e-6}
-SQUARED = frozenset({"sse", "tracking"})
+# w below, for absolute and for squared errors. Squared ones are small where absolute ones still count.
+MOVE_WEIGHT = {False: 1e-3, True: 1e-6}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,8 @@ class Horizon:
 
         min  sum_k sum_i J((r_i(k) - y_i(k)) / span_i)  +  w sum_k ((u(k) - u(k-1)) / span_u)^2,   k = 1..n
 
-    with J(e) = |e| for the metric "mae" and e^2 for "sse" and "tracking", over u(0)..u(n-1) within the MVs'
-    ranges, each held for one period. The plant's ``derivative``
+    with J(e) = e^2 where the ``metric`` is squared, else |e|, over u(0)..u(n-1) within the MVs' ranges,
+    each held for one period. The plant's ``derivative``
     enters by Radau collocation (``elements`` of ``degree`` a period): implicit, so that neither
     the hot branch's stiffness nor an ignition within one period costs accuracy or stability, and
     cheap to differentiate twice. The absolute value enters through slacks, s >= +-(r - y). Squared
@@ -62,7 +62,7 @@ class Horizon:
         plant: Plant,
         n: int,
         *,
-        metric: str = "mae",
+        metric: Metric = METRICS["mae"],
         limits: Mapping[str, tuple[float, float]] | None = None,
         elements: int = 3,
         degree: int = 3,
@@ -70,14 +70,15 @@ class Horizon:
         tolerance: float = 1e-7,
         max_iterations: int = 150,
     ) -> None:
-        if metric not in MOVE_WEIGHT:
-            raise PlantError(f"no horizon for the metric {metric!r}; it may be {', '.join(MOVE_WEIGHT)}")
+        if metric.floor is None:
+            able = ", ".join(name for name, known in METRICS.items() if known.floor is not None)
+            raise PlantError(f"no horizon for the metric {metric.name!r}, which has no floor; it may be {able}")
         discrete = [s.name for s in plant.mv_signals if s.values is not None]
         if discrete:
             raise PlantError(
                 f"no horizon for the discrete MV {discrete[0]!r} of plant {plant.name!r}; give its relaxed()"
             )
-        self.plant, self.n, self._squared = plant, n, metric in SQUARED
+        self.plant, self.n, self._squared = plant, n, metric.squared
         self._n_x, self._n_mv, self._n_cv = len(plant.state_signals), len(plant.mv_signals), len(plant.sp_signals)
         self._points = elements * degree
         self._x_low, self._x_span = scaling(plant.state_signals)
@@ -98,7 +99,7 @@ class Horizon:
         defects = collocation(plant, elements, degree).map(n)(starts, z, u, p)
         error = sp - self._controlled().map(n)(ends)
         moves = u[:, 1:] - u[:, :-1]
-        weight = MOVE_WEIGHT[metric] if move_weight is None else move_weight
+        weight = MOVE_WEIGHT[metric.squared] if move_weight is None else move_weight
         cost = ca.sumsqr(s) if self._squared else ca.sum1(ca.vec(s))
         binds = [ca.vec(s - error)] if self._squared else [ca.vec(s - error), ca.vec(s + error)]
         problem: Any = {

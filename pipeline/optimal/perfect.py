@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PlantError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.optimal.horizon import Horizon, Plan
 from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import Scenario
@@ -41,6 +42,7 @@ Limits = Mapping[str, tuple[float, float]]
 """State -> range to keep it in."""
 
 DEFAULT = Effort()
+MAE = METRICS["mae"]
 CAME_TRUE = 1e-5  # of the states' ranges: how far a prediction may be off
 
 
@@ -55,7 +57,7 @@ class PerfectNmpc:
     """
 
     def __init__(
-        self, plant: Plant, metric: str = "mae", effort: Effort = DEFAULT, limits: Limits | None = None
+        self, plant: Plant, metric: Metric = MAE, effort: Effort = DEFAULT, limits: Limits | None = None
     ) -> None:
         self.plant, self._every = plant, effort.every
         self._reaches = effort.reaches
@@ -172,7 +174,7 @@ def run_nmpc(
 def run_offline(
     plant: Plant,
     scenario: Scenario,
-    metric: str = "mae",
+    metric: Metric = MAE,
     recipe: bool = False,
     effort: Effort = DEFAULT,
     score: Score | None = None,

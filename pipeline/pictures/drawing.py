@@ -17,7 +17,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 
 from pipeline.evaluation.law_evidence import Array
-from pipeline.pictures.words import NO_UNIT
+from pipeline.evaluation.metric import NO_UNIT
 
 BASELINE, BASELINE_COLOUR = "pid", "#7f7f7f"
 PALETTE = ("#d55e00", "#0072b2", "#cc79a7", "#009e73", "#56b4e9", "#e69f00", "#8c564b", "#332288")

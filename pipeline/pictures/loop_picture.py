@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
-from pipeline.metrics import mae, mv_travel, sse
+from pipeline.evaluation.metric import METRICS, Metric
+from pipeline.metrics import mv_travel
 from pipeline.plants.base import Plant
 from serving.manifest import Signal
 
@@ -34,16 +35,18 @@ class History:
     reason: list[str] = field(default_factory=list)
 
 
-def summary(plant: Plant, history: History, metric: str = "mae") -> str:
+def summary(plant: Plant, history: History, metric: Metric = METRICS["mae"]) -> str:
     """The error of each controlled variable in the case's metric and at the end, MV travel, faults; one line each."""
     sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
     lines = []
     for i, s in enumerate(plant.sp_signals):
         unit = "" if s.unit == "-" else f" {s.unit}"
-        error = f"MAE {s.name} {mae(sp[:, i], pv[:, i]):.4g}{unit}"
-        if metric == "sse":
-            error = f"SSE {s.name} {sse(sp[:, i], pv[:, i]):.6g}, {error}"
-        lines.append(f"{error}, final error {sp[-1, i] - pv[-1, i]:.3g}{unit}")
+        errors = [
+            f"{m.short} {s.name} {m.of(sp[:, i], pv[:, i]):.{6 if m.squared else 4}g} {m.unit_of(s.unit)}".rstrip()
+            for m in dict.fromkeys((metric, METRICS["mae"]))
+            if m.of is not None
+        ]
+        lines.append(f"{', '.join(errors)}, final error {sp[-1, i] - pv[-1, i]:.3g}{unit}")
     for i, s in enumerate(plant.mv_signals):
         if s.values is None:
             lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g}" + ("" if s.unit == "-" else f" {s.unit}"))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.evaluation.case import Case, Curve, Figure
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import Array, Loop
+from pipeline.evaluation.metric import Metric
 from pipeline.pictures.drawing import (
     REFERENCE,
     SET_POINT,
@@ -29,7 +30,7 @@ from pipeline.pictures.drawing import (
     symbol,
     time_axis,
 )
-from pipeline.pictures.words import SHORT, law_label, number, ratio
+from pipeline.pictures.words import law_label, number, ratio
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from serving.manifest import Signal
 
@@ -209,7 +210,7 @@ def first(values: Array) -> Array:
 
 def curves_and_loops(evidence: Evidence, figure: Figure, curves: Sequence[Curve]) -> list[tuple[Curve, Loop]]:
     """The curves that have a trajectory."""
-    found = [(c, evidence.loop(c, figure.scenario or "", figure.hold)) for c in curves]
+    found = [(c, evidence.loop(c, figure.scenario or "")) for c in curves]
     return [(c, loop) for c, loop in found if loop is not None]
 
 
@@ -230,8 +231,7 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
     found = curves_and_loops(evidence, figure, curves)
     if not found:
         return None
-    late = 0 if figure.hold else evidence.late_from(figure.scenario or "")
-    reference = None if figure.hold else reference_of(evidence, figure.scenario or "")
+    late, reference = evidence.late_from(figure.scenario or ""), reference_of(evidence, figure.scenario or "")
     own = colours(evidence, figure)
     labels = [_label(curve) + (" (ours, best)" if curve is best else "") for curve, _ in found]
     # The paper's curves lie in front: the figure is about them.
@@ -338,7 +338,7 @@ def info_label(case: Case, name: str) -> str:
 
 def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     """A law beside the baseline on the first sequence of the test that weighs most, with the figures over all."""
-    scenario, metric = evidence.main_test, evidence.case.metric
+    scenario, metric = evidence.main_test, evidence.case.criterion
     own = evidence.loop(Curve(law), scenario)
     if own is None:
         return None
@@ -346,13 +346,13 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
     late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
-    title = f"{evidence.laws[law].title}\n{SHORT[metric]} {_error(error, metric)}{beside}{rest}"
+    title = f"{evidence.laws[law].title}\n{metric.short} {_error(error, metric)}{beside}{rest}"
     drawn = {law_label(law, {}): (own, law)}
     other = evidence.case.baseline
     baseline = evidence.loop(Curve(other), scenario) if law != other else None
     if baseline is not None:
         error = evidence.figure(other, scenario)
-        drawn[f"{law_label(other, {})}, {SHORT[metric]} {_error(error, metric)}"] = (baseline, other)
+        drawn[f"{law_label(other, {})}, {metric.short} {_error(error, metric)}"] = (baseline, other)
     late_from, reference = evidence.late_from(scenario), reference_of(evidence, scenario)
     loops = {label: loop for label, (loop, _) in drawn.items()}
     panels = LoopPanels(evidence.case, title, loops, late_from, reference)
@@ -361,7 +361,7 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     return panels.finish(own)
 
 
-def _error(value: float | None, metric: str) -> str:
+def _error(value: float | None, metric: Metric) -> str:
     if value is None:
         return "–"
-    return f"{value:.4f}" if metric == "mae" and 0.01 <= value < 1.0 else number(value, 4)
+    return f"{value:.4f}" if not metric.squared and 0.01 <= value < 1.0 else number(value, 4)

@@ -1,4 +1,4 @@
-"""How metrics, laws and tests are called in front of a person."""
+"""How laws and tests are called in front of a person."""
 
 from __future__ import annotations
 
@@ -10,51 +10,16 @@ from pipeline.pictures.numbers import number, ratio
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 __all__ = [
-    "LONG",
-    "NO_UNIT",
-    "SHORT",
     "law_label",
     "law_name",
-    "metric_name",
     "number",
     "ratio",
     "scenario_name",
     "setting_text",
 ]
 
-SHORT = {
-    "mae": "MAE",
-    "sse": "SSE",
-    "sse_late": "late SSE",
-    "ise": "ISE",
-    "masse": "MASSE",
-    "max_asse": "MaxASSE",
-    "overshoot": "overshoot",
-    "settling": "settling time",
-    "mv_travel": "MV travel",
-    "tracking": "tracking RMS",
-}
-"""A metric as it stands in a table."""
-LONG = {
-    "mae": "mean absolute error",
-    "sse": "sum of squared errors",
-    "tracking": "RMS distance from the reference model",
-}
-"""A case's metric in words."""
 WORDS = frozenset({"two"})
 """Short words in the names of laws that are no abbreviations."""
-NO_UNIT = frozenset({"", "-", "1"})
-"""How a signal says that it is a plain number."""
-
-
-def metric_name(metric: str, own: Mapping[str, str] | None = None) -> str:
-    """A metric's short name; of a path into a model set's figures, ``one_step.nnarx``, the words before the dot.
-
-    ``own`` are the words of the case, ``Case.metric_words``.
-    """
-    first = metric.partition(".")[0]
-    words = {**SHORT, **(own or {})}
-    return words.get(metric) or words.get(first) or first.replace("_", " ")
 
 
 def law_name(law: str) -> str:

@@ -17,6 +17,8 @@ from pipeline.evaluation.verdicts import CasePicture
 from pipeline.pictures.drawing import STYLE, save
 from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
+from pipeline.pictures.words import scenario_name
+from pipeline.simulation.scenario import NOISE_SUFFIX
 
 
 def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CasePicture] = ()) -> dict[str, str]:
@@ -30,7 +32,7 @@ def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CaseP
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, str] = {}
-    where, untuned = evidence.main_words
+    where, untuned = main_words(evidence)
     with mpl.rc_context(STYLE):
         for figure in evidence.case.figures:
             canvas = _own(evidence, figure, models)
@@ -64,6 +66,16 @@ def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CaseP
         shutil.copyfile(path, folder / name)
         drawn[name] = f"Partition sweep of the model {path.parent.name}"
     return drawn
+
+
+def main_words(evidence: Evidence) -> tuple[str, str]:
+    """What a picture of the main test shows, and what the test is to somebody who doubts a tuning."""
+    name, recipe = evidence.main_test, evidence.case.recipe
+    if len(evidence.tests[name.removesuffix(NOISE_SUFFIX)]) == 1:
+        return (scenario_name(name, recipe),) * 2
+    if recipe:
+        return "a held-out recipe", "recipes that nothing was tuned on"
+    return "a held-out sequence", "set points that nothing was tuned on"
 
 
 def _own(evidence: Evidence, figure: Figure, models: Path) -> Canvas | None:

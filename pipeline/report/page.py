@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.for_programs import validation
+from pipeline.evaluation.law_evidence import lock_up_text
+from pipeline.evaluation.metric import NO_UNIT
 from pipeline.evaluation.model_evidence import candidates, model_rows
-from pipeline.evaluation.verdicts import RULE, Claims, Judged, judge
+from pipeline.evaluation.validation import FILE
+from pipeline.evaluation.verdicts import Claims, Judged, judge
 from pipeline.optimal.bounds import bounded
-from pipeline.pictures.words import LONG, NO_UNIT, SHORT, law_name, metric_name, number, ratio, scenario_name
-from pipeline.report.figures import draw_all
+from pipeline.pictures.words import law_name, number, ratio, scenario_name
+from pipeline.report.figures import draw_all, main_words
+from pipeline.report.for_programs import validation
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
+from pipeline.report.verdict_words import RULE, statement, table_row
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 MOST_HEADLINES = 5
@@ -26,9 +29,8 @@ def write_report(evidence: Evidence, claims: Claims, models: Path, out: Path) ->
     judged = judge(evidence, claims)
     pictures = draw_all(evidence, out / "figures", models, claims.pictures)
     content = context(evidence, claims, judged, pictures)
-    programs = json.dumps(validation(evidence, judged), indent=1, allow_nan=False) + "\n"
     pages = {name: render(f"{name}.j2", content) for name in ("report.html", "report.md")}
-    written = write_pages(out, {"validation.json": programs, **pages})
+    written = write_pages(out, {FILE: validation(evidence, judged).to_json(), **pages})
     return [*written, *(out / "figures" / name for name in pictures)]
 
 
@@ -43,7 +45,7 @@ def context(evidence: Evidence, claims: Claims, judged: Judged, pictures: Mappin
     return {
         "case": case,
         "evidence": evidence,
-        "metric": {"short": SHORT[case.metric], "long": LONG[case.metric]},
+        "metric": case.criterion,
         "noise": "true output, noisy measurement"
         + (f", mean of {draws} draws" if (draws := case.noise_draws) > 1 else ""),
         "floor": _floor(evidence),
@@ -55,12 +57,13 @@ def context(evidence: Evidence, claims: Claims, judged: Judged, pictures: Mappin
         "loops": of_kind("closed_loop_"),
         "sweeps": of_kind("sweep_") | of_kind("candidates_"),
         "overview": pictures.get("closed_loop.png"),
-        "main_test": evidence.main_words[0],
-        "tables": judged.tables,
+        "main_test": main_words(evidence)[0],
+        "tables": [(table, [table_row(row, evidence) for row in rows]) for table, rows in judged.tables],
         "rule": RULE,
-        "acceptance": judged.acceptance,
+        "acceptance": [statement(v, evidence) for v in judged.acceptance],
         "met": sum(v.holds is True for v in judged.acceptance),
-        "statements": judged.statements,
+        "statements": [statement(v, evidence) for v in judged.statements],
+        "locked": [_locked(evidence, law) for law, own in evidence.laws.items() if own.lock_ups],
         "laws": [_law(evidence, law) for law in evidence.laws],
         "scenarios": _rows(evidence),
         "further": _further(evidence),
@@ -100,11 +103,8 @@ def _seeds(count: int) -> str:
 
 def _floor(evidence: Evidence) -> str:
     """What the gate takes for perfect, in words."""
-    if evidence.case.metric == "mae":
-        return f"{evidence.noise} (the measurement noise)"
-    if evidence.case.metric == "tracking":
-        return f"what the test's samples tell apart from their noise ({evidence.noise:g} times (2/samples)^(1/4))"
-    return f"what the measurement noise alone adds up to ({evidence.noise:g} squared times the samples)"
+    floor = evidence.case.criterion.floor
+    return "" if floor is None else floor.text.format(noise=evidence.noise)
 
 
 def headline(evidence: Evidence) -> list[tuple[str, str]]:
@@ -116,7 +116,6 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     best, case = evidence.best, evidence.case
     if best is None:
         return []
-    short = "" if case.metric == "mae" else f"{SHORT[case.metric]} of the "
     bounds = {"nmpc": "perfect-model NMPC", "offline": "offline optimum"}
     needs = [n for n in case.requirements if n.law in (None, best) and not n.low and not n.setting]
     asked = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
@@ -124,21 +123,43 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     for name, kind in dict.fromkeys(asked):
         value = evidence.ratio(best, name, kind)
         if value is not None:
-            rows.append((ratio(value), f"× {short}{bounds.get(kind, kind)} on {scenario_name(name, case.recipe)}"))
+            rows.append(
+                (
+                    ratio(value),
+                    f"× {case.criterion.short} of the {bounds.get(kind, kind)} on {scenario_name(name, case.recipe)}",
+                )
+            )
     for need in needs:
         late = evidence.figure(best, need.scenario, need.metric) if need.metric == "sse_late" else None
         if late is not None:
             where = scenario_name(need.scenario, case.recipe)
-            rows.append((number(late), f"{SHORT[need.metric]} on {where}; at most {number(need.high)} is asked"))
+            rows.append(
+                (number(late), f"{case.metrics[need.metric].short} on {where}; at most {number(need.high)} is asked")
+            )
     rows = rows[:MOST_HEADLINES]
     late_s = evidence.late_s(evidence.main_test)
     metric = "sse_late" if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
     if own and other and own < other:
-        what = "less squared error" if case.metric == "sse" else "less error"
         where = scenario_name(evidence.main_test, case.recipe) + (f", from {late_s:g} s on" if late_s else "")
-        rows.append((f"{100 * (1 - own / other):.0f} %", f"{what} than the {law_name(case.baseline)} on {where}"))
+        rows.append(
+            (
+                f"{100 * (1 - own / other):.0f} %",
+                f"lower {case.criterion.long} than the {law_name(case.baseline)} on {where}",
+            )
+        )
     return rows
+
+
+def _locked(evidence: Evidence, law: str) -> dict[str, str]:
+    """A law that locked up, on which tests, and why it is shipped all the same."""
+    own = evidence.laws[law]
+    return {
+        "law": law,
+        "loops": "one closed loop" if own.lock_ups == 1 else f"{own.lock_ups} closed loops",
+        "tests": lock_up_text(own.locked_up),
+        "why": "; shipped as printed, to reproduce the paper" if own.as_printed else "",
+    }
 
 
 def _law(evidence: Evidence, law: str) -> dict[str, Any]:
@@ -170,12 +191,12 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
 
 def _further(evidence: Evidence) -> list[dict[str, Any]]:
     """Of each test the figures that the case has named beside its own: each law's median, and with noise."""
-    words, found = evidence.case.metric_words, []
+    case, found = evidence.case, []
     for name, title in evidence.scenarios.items():
         rows = [
-            (metric_name(metric, words), _row(evidence, name, title, metric)["cells"])
-            for metric in words
-            if metric != evidence.case.metric
+            (metric.label(case.cv_unit), _row(evidence, name, title, metric.name)["cells"])
+            for metric in case.own_metrics
+            if metric.name != case.metric
         ]
         rows = [(metric, cells) for metric, cells in rows if any(c["value"] is not None for c in cells.values())]
         if rows:
@@ -185,7 +206,6 @@ def _further(evidence: Evidence) -> list[dict[str, Any]]:
 
 def _analyses(evidence: Evidence) -> list[dict[str, Any]]:
     """Of each law that tells of an analysis: its figures, a column for every form, and its notes."""
-    words = evidence.case.metric_words
     found = []
     for law, own in evidence.laws.items():
         forms = own.analyses
@@ -202,7 +222,7 @@ def _analyses(evidence: Evidence) -> list[dict[str, Any]]:
                 "title": own.title,
                 "forms": [form or "as shipped" for form in forms],
                 "rows": [
-                    (metric_name(n, words), [(said.get("figures") or {}).get(n) for said in forms.values()])
+                    (evidence.case.label(n), [(said.get("figures") or {}).get(n) for said in forms.values()])
                     for n in names
                 ],
                 # A note that every form has needs no form beside it.

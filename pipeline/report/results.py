@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -14,8 +12,9 @@ from rich.table import Table
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.standing import LawStanding, Standing, tally
+from pipeline.evaluation.validation import FILE, Validation
+from pipeline.simulation import NOISE_SUFFIX
 
-Validation = Mapping[str, Any]
 WIDTH = 120
 
 
@@ -36,6 +35,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         raise PipelineError(f"{artifacts} holds no case {case!r}; it has {', '.join(standings)}")
     console.print(overview(standings.values()) if case is None else _tests(standings[case]))
     where = artifacts / (case or "<case>")
+    if any(law.lock_ups for standing in standings.values() for law in standing.laws if case in (None, standing.case)):
+        console.print(
+            "!          the closed loops that it locked up in; it reproduces a paper: do not run it on a plant"
+        )
     if case is None:
         if any(standing.hidden for standing in standings.values()):
             console.print("n          the bound is less than noise would hide: the ratio is to that, and at least 1")
@@ -80,7 +83,8 @@ def _about(standing: Standing) -> list[str]:
 
 def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
     return (
-        f"[bold]{law.law} *[/bold]" if law.best else law.law,
+        (f"[bold]{law.law} *[/bold]" if law.best else law.law)
+        + (f" [red]!{law.lock_ups}[/red]" if law.lock_ups else ""),
         _figure(law.figure),
         _figure(standing.bound),
         _multiple(standing, law),
@@ -91,11 +95,9 @@ def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
 
 def _tests(standing: Standing) -> Table:
     """A case's laws in all of its tests, a row a test: there are more tests than laws, and their names are short."""
-    validation: Validation = json.loads((standing.folder / "validation.json").read_text(encoding="utf-8"))
-    scenarios, bounds = validation["scenarios"], validation.get("bounds", {})
-    metric, main = validation.get("metric", "mae"), standing.test
-    weights = (validation.get("gate") or {}).get("weights") or {}
-    names = [name for name in scenarios if not name.endswith("_noise") or name in weights]
+    validation = Validation.read(standing.folder / FILE)
+    scenarios, metric, weights = validation.scenarios, validation.metric, validation.gate.weights
+    names = [name for name in scenarios if not name.endswith(NOISE_SUFFIX) or name in weights]
     table = Table(title_justify="left", box=box.SIMPLE)
     table.title = f"{standing.case}: {standing.metric_long}, median over data seeds"
     table.add_column("test", no_wrap=True)
@@ -104,13 +106,13 @@ def _tests(standing: Standing) -> Table:
         table.add_column(name.replace("_", "_\n"), justify="right", no_wrap=True)
 
     def ours(name: str, law: str) -> float | None:
-        return (scenarios.get(name, {}).get(law) or {}).get(metric)
+        return scenarios[name].get(law, {}).get(metric)
 
     for name in names:
-        nmpc = bounds.get(name, {}).get("nmpc", {}).get(metric)
-        table.add_row(name, _figure(nmpc), *(_figure(ours(name, law.law)) for law in standing.laws))
+        table.add_row(name, _figure(validation.bound(name)), *(_figure(ours(name, law.law)) for law in standing.laws))
     table.add_section()
-    table.add_row(f"{main} / NMPC", "", *(_multiple(standing, law) for law in standing.laws))
+    table.add_row(f"{standing.test} / NMPC", "", *(_multiple(standing, law) for law in standing.laws))
+    table.add_row("lock-ups", "", *(("-" if law.lock_ups is None else str(law.lock_ups)) for law in standing.laws))
     table.add_row("size", "", *map(_size, standing.laws))
     return table
 

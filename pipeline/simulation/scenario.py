@@ -5,20 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
 from pipeline.plants.base import Plant
+from pipeline.simulation import NOISE_SUFFIX as NOISE_SUFFIX
 
 Array = NDArray[np.float64]
-
-NOISE_SUFFIX = "_noise"
-"""A scenario's name with measurement noise is its name with this at the end: ``sp_a_noise``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,12 +68,6 @@ class Scenario:
         for key, values in self.changes.items():
             table[:, plant.parameter_names().index(key)] = values
         return table
-
-    def with_hold(self, hold: int) -> Self:
-        """The same set points, each held for ``hold`` samples; only for a test without disturbances."""
-        if not self.hold or self.changes:
-            raise PlantError(f"scenario {self.name!r} has no holds that could be stretched")
-        return replace(self, sp=np.repeat(self.sp[:: self.hold], hold, axis=0), hold=hold)
 
     def digest(self) -> str:
         """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""

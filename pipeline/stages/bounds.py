@@ -28,7 +28,8 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from pipeline.evaluation.case import Case
-from pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored, together
+from pipeline.evaluation.metric import mean_of_draws
+from pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from pipeline.simulation.scenario import Scenario
 
@@ -48,16 +49,16 @@ class Job:
 def _compute(case: Case, job: Job) -> tuple[Job, dict[str, dict[str, float]], float]:
     begun = time.perf_counter()
     plant = (job.scenario.plant or case.plant).relaxed()
-    ahead = case.recipe or case.metric == "tracking"
+    ahead, criterion = case.foreseen, case.criterion
     first = job.kinds[0]
     with threadpool_limits(1):
-        nmpc = PerfectNmpc(plant, case.metric, case.effort, case.limits)
+        nmpc = PerfectNmpc(plant, criterion, case.effort, case.limits)
         noise, draws = (case.noise_std.tolist(), case.noise_draws) if first == "nmpc_noise" else (None, 1)
         seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
         know = (ahead, case.unforeseen, case.score)
-        figures = {first: together([run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds])}
+        figures = {first: mean_of_draws(run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds)}
         if "offline" in job.kinds:
-            aim = (case.metric, ahead, case.effort, case.score, case.limits)
+            aim = (criterion, ahead, case.effort, case.score, case.limits)
             best = run_offline(plant, job.scenario, *aim, np.array(nmpc.moves))
             figures["offline"] = better(best, figures[first], case.metric)
     return job, figures, time.perf_counter() - begun

@@ -18,6 +18,7 @@ from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.trial import BASE, Metrics, Trial, step_us, try_file
 from pipeline.export.controller_file import with_evidence
 from pipeline.files import read_json, write_json
@@ -53,6 +54,12 @@ def validate(name: str) -> None:
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))
     source = controller_file(params.case, params.law, BASE, shipped.seed)
+    locked_up = _locked_up(base)
+    if locked_up and not params.as_printed:
+        raise LawError(
+            f"controllers.{name} locked up on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
+            "numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
+        )
     folder = validation_folder(params.case, params.law)
     shutil.rmtree(folder, ignore_errors=True)
     designed = read_json(design_folder(params.case, params.law) / "metrics.json")
@@ -61,6 +68,8 @@ def validate(name: str) -> None:
         "law": params.law,
         "title": designed["title"],
         **_summary(params, base, trials, shipped),
+        "as_printed": params.as_printed,
+        "locked_up": locked_up,
         "analysis": analysis,
         "metric": case.metric,
     }
@@ -75,7 +84,15 @@ def validate(name: str) -> None:
     evidence = _evidence(case, base, shipped)
     if BASE in analysis:
         evidence["analysis"] = analysis[BASE]["figures"]
+    if locked_up:
+        evidence |= {"locked_up": locked_up, "as_printed": True}
     with_evidence(source, ARTIFACTS / params.case / f"{params.law}.onnx", evidence)
+
+
+def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:
+    """Test -> data seed -> closed loops that locked up, of those where any did."""
+    tests = dict.fromkeys(test for t in base for test in t.locked_up)
+    return {test: {str(t.seed): t.locked_up[test] for t in base if test in t.locked_up} for test in tests}
 
 
 def _is_told(row: Mapping[str, Any], seed: int) -> bool:

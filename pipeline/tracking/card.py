@@ -6,10 +6,10 @@ strips ``data:`` images and every size or style, so pictures are drawn in the si
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from html import escape
-from typing import Any
 
+from pipeline.evaluation.metric import ratio_to_bound
+from pipeline.evaluation.validation import Analysis, Validation
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.tracking.gate import Gate, Rank
 
@@ -17,18 +17,17 @@ GAP = "&nbsp;" * 4
 """Cells have no padding there and may not be styled."""
 
 
-def model_description(case: str, law: str, validation: Mapping[str, Any], champion: str | None) -> str:
+def model_description(case: str, law: str, validation: Validation | None, champion: str | None) -> str:
     """The registered model's description: where the controller stands in its case, and how to take it.
 
     ``champion`` is the registered model that holds the case's alias ``champion``.
     """
-    titles = validation.get("titles") or {}
-    title = (titles.get("laws") or {}).get(law, law)
+    title, place = (law, case) if validation is None else (validation.titles.laws.get(law, law), validation.titles.case)
     name = f"{case}-{law}"
     take = case if name == champion else name
     return (
         f"<p>{escape(_standing(name, law, validation, champion))}</p>"
-        f"<p><b>{escape(str(title))}</b> for {escape(str(titles.get('case', case)))}. "
+        f"<p><b>{escape(title)}</b> for {escape(place)}. "
         "Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup.</p>"
         f"<p>Take it: <code>loopwright registry fetch {escape(take)} FOLDER</code></p>"
         "<p><b>candidate</b>: the newest version. <b>best</b>: the best version that passed the gate. "
@@ -36,7 +35,7 @@ def model_description(case: str, law: str, validation: Mapping[str, Any], champi
     )
 
 
-def _standing(name: str, law: str, validation: Mapping[str, Any], champion: str | None) -> str:
+def _standing(name: str, law: str, validation: Validation | None, champion: str | None) -> str:
     """Where a controller stands, in a sentence or two without markup."""
     rank, gate = Rank.of_laws(validation).get(law), Gate.of(validation, law)
     if rank is None or gate.score is None:
@@ -52,7 +51,7 @@ def _standing(name: str, law: str, validation: Mapping[str, Any], champion: str 
     return f"Rank {rank.place} of {rank.of}, {score}.{best}"
 
 
-def standing_tag(name: str, law: str, validation: Mapping[str, Any], champion: str | None) -> str:
+def standing_tag(name: str, law: str, validation: Validation | None, champion: str | None) -> str:
     """The same in a few words, for the list of models."""
     rank = Rank.of_laws(validation).get(law)
     if rank is None:
@@ -63,9 +62,11 @@ def standing_tag(name: str, law: str, validation: Mapping[str, Any], champion: s
     return f"{place}, did not pass the gate" if rank.refusal else place
 
 
-def version_description(validation: Mapping[str, Any], gate: Gate, run_id: str, picture: str | None) -> str:
+def version_description(validation: Validation | None, gate: Gate, run_id: str, picture: str | None) -> str:
     """A version's description: verdict, closed-loop evidence per scenario, analysis, picture of the loop."""
-    parts = [_verdict(gate), _table(validation, gate), _analysis(validation, gate.law)]
+    parts = [_verdict(gate)]
+    if validation is not None:
+        parts += [_table(validation, gate), _analysis(validation, gate.law)]
     if picture:
         alt = f"Closed loop on the test that weighs most, beside the {escape(gate.baseline_name)}"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
@@ -78,37 +79,42 @@ def _verdict(gate: Gate) -> str:
         return "No closed-loop evidence yet: the report stage of its case has not run.\n"
     other = gate.baseline is not None and gate.law != gate.baseline_law
     beside = f", {gate.baseline_name} {gate.baseline:.3f}" if other else ""
-    locks = "no lock-up" if not gate.lock_ups else f"{gate.lock_ups} lock-ups"
-    return f"Gate score {gate.score:.3f} (1 = perfect-model NMPC{beside}), {locks}.\n"
+    score = f"Gate score {gate.score:.3f} (1 = perfect-model NMPC{beside})"
+    if not gate.lock_ups:
+        return f"{score}, no lock-up.\n"
+    where = f": {gate.locked_up}" if gate.locked_up else ""
+    return f"LOCKED UP in {gate.lock_ups} closed loops{where}; do not run it on a plant. {score}.\n"
 
 
-def _table(validation: Mapping[str, Any], shown: Gate) -> str:
+def _table(validation: Validation, shown: Gate) -> str:
     law = shown.law
-    scenarios = validation.get("scenarios") or {}
-    bounds = validation.get("bounds") or {}
-    titles = (validation.get("titles") or {}).get("scenarios") or {}
-    metric = validation.get("metric", "mae")
-    gate = validation.get("gate") or {}
-    floors = gate.get("floors") or {}
-    words = (validation.get("titles") or {}).get("metric", "mean absolute error")
-    heads = [f"Scenario ({words})", "this law", "range over seeds", "with noise", shown.baseline_name, "NMPC", "ratio"]
+    scenarios, metric, titles = validation.scenarios, validation.metric, validation.titles
+    heads = [
+        f"Scenario ({titles.metric})",
+        "this law",
+        "range over seeds",
+        "with noise",
+        shown.baseline_name,
+        "NMPC",
+        "ratio",
+    ]
     rows = []
     for name, laws in scenarios.items():
         own = laws.get(law)
         if name.endswith(NOISE_SUFFIX) or not own:
             continue
-        bound = ((bounds.get(name) or {}).get("nmpc") or {}).get(metric)
-        floor = floors.get(name, gate.get("floor", 0.0))
+        error, bound = own.get(metric), validation.bound(name)
+        ratio = None if error is None or bound is None else ratio_to_bound(error, bound, validation.floor(name))
         spread = [own.get(f"{metric}_min"), own.get(f"{metric}_max")]
         rows.append(
             [
-                escape(str(titles.get(name, name))),
-                _figure(own.get(metric)),
+                escape(titles.scenarios.get(name, name)),
+                _figure(error),
                 "" if None in spread else " … ".join(map(_figure, spread)),
-                _figure((scenarios.get(name + NOISE_SUFFIX) or {}).get(law, {}).get(metric)),
-                _figure((laws.get(shown.baseline_law) or {}).get(metric)),
+                _figure(scenarios.get(name + NOISE_SUFFIX, {}).get(law, {}).get(metric)),
+                _figure(laws.get(shown.baseline_law, {}).get(metric)),
                 _figure(bound),
-                f"{own[metric] / bound:.2f}" if bound and bound >= floor and own.get(metric) is not None else "",
+                "" if ratio is None else f"{ratio:.2f}",
             ]
         )
     if not rows:
@@ -118,27 +124,27 @@ def _table(validation: Mapping[str, Any], shown: Gate) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def analysis_figures(validation: Mapping[str, Any], law: str) -> dict[str, float]:
+def analysis_figures(validation: Validation | None, law: str) -> dict[str, float]:
     """What the shipped form of a law found apart from its tests, by name; empty where it has no analysis."""
-    return dict(_analysed(validation, law).get("figures") or {})
+    return {} if validation is None else dict(_analysed(validation, law).figures)
 
 
-def _analysed(validation: Mapping[str, Any], law: str) -> Mapping[str, Any]:
-    found: Mapping[str, Any] = ((validation.get("laws") or {}).get(law) or {}).get("analysis") or {}
-    return found.get("base") or {}
+def _analysed(validation: Validation, law: str) -> Analysis:
+    found = validation.laws.get(law)
+    return (found.analysis.get("base") if found else None) or Analysis()
 
 
-def _analysis(validation: Mapping[str, Any], law: str) -> str:
-    words = (validation.get("titles") or {}).get("figures") or {}
-    figures, notes = analysis_figures(validation, law), _analysed(validation, law).get("notes") or ()
+def _analysis(validation: Validation, law: str) -> str:
+    words, said = validation.titles.figures, _analysed(validation, law)
+    figures, notes = said.figures, said.notes
     if not figures and not notes:
         return ""
     rows = "".join(
-        f"<tr><td>{escape(str(words.get(name, name.replace('_', ' '))))}{GAP}</td><td>{_figure(value)}</td></tr>"
+        f"<tr><td>{escape(words.get(name, name.replace('_', ' ')))}{GAP}</td><td>{_figure(value)}</td></tr>"
         for name, value in figures.items()
     )
     table = f"<table><thead><tr><th>Analysis{GAP}</th><th></th></tr></thead><tbody>{rows}</tbody></table>"
-    listed = "".join(f"<li>{escape(str(note))}</li>" for note in notes)
+    listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
     return (table if rows else "<p>Analysis</p>") + (f"<ul>{listed}</ul>" if listed else "")
 
 

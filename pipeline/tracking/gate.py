@@ -26,6 +26,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
+from pipeline.evaluation.law_evidence import lock_up_text
+from pipeline.evaluation.validation import Validation
+
 BASELINE = "pid"  # of a validation that names none
 
 
@@ -41,23 +44,25 @@ class Gate:
     ratios: dict[str, float]
     baseline_law: str = BASELINE
     baseline_name: str = "PID"
+    locked_up: str = ""  # on which tests, of which data seeds
 
     @classmethod
-    def of(cls, validation: Mapping[str, Any], law: str) -> Self:
-        """The figures of ``law``; scores are None where the validation has none."""
-        gate = validation.get("gate") or {}
-        laws = gate.get("laws") or {}
-        own = laws.get(law) or {}
-        baseline = str(gate.get("baseline", BASELINE))
+    def of(cls, validation: Validation | None, law: str) -> Self:
+        """The figures of ``law``; scores are None where the validation, or the whole of it, is missing."""
+        if validation is None:
+            return cls(law, "", None, None, None, {})
+        gate = validation.gate
+        own, baseline, found = gate.laws.get(law), gate.laws.get(gate.baseline), validation.laws.get(law)
         return cls(
             law=law,
-            id=str(gate.get("id", "")),
-            score=own.get("score"),
-            baseline=(laws.get(baseline) or {}).get("score"),
-            lock_ups=own.get("lock_ups"),
-            ratios=dict(own.get("ratios") or {}),
-            baseline_law=baseline,
-            baseline_name=str(gate.get("baseline_name", baseline.upper())),
+            id=gate.id,
+            score=None if own is None else own.score,
+            baseline=None if baseline is None else baseline.score,
+            lock_ups=None if own is None else own.lock_ups,
+            ratios={} if own is None else dict(own.ratios),
+            baseline_law=gate.baseline,
+            baseline_name=gate.baseline_name,
+            locked_up="" if found is None else lock_up_text(found.locked_up),
         )
 
     def tags(self) -> dict[str, str]:
@@ -68,6 +73,7 @@ class Gate:
             "gate_baseline": self.baseline_law,
             "gate_baseline_score": self.baseline,
             "lock_ups": self.lock_ups,
+            "locked_up": self.locked_up or None,
             **{f"gate_{scenario}": ratio for scenario, ratio in self.ratios.items()},
         }
         return {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in rows.items() if v is not None}
@@ -105,9 +111,9 @@ class Rank:
     refusal: str | None
 
     @classmethod
-    def of_laws(cls, validation: Mapping[str, Any]) -> dict[str, Self]:
+    def of_laws(cls, validation: Validation | None) -> dict[str, Self]:
         """The rank of every law that has a score."""
-        gates = [Gate.of(validation, law) for law in (validation.get("gate") or {}).get("laws") or {}]
+        gates = [Gate.of(validation, law) for law in (validation.gate.laws if validation else ())]
         scored = [(gate.refusal() is not None, gate.score, gate.law) for gate in gates if gate.score is not None]
         return {
             law: cls(place, len(scored), Gate.of(validation, law).refusal())

@@ -11,7 +11,9 @@ import statistics
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
+from pipeline.evaluation.validation import Validation
 from pipeline.simulation.scenario import NOISE_SUFFIX
+from pipeline.tracking.gate import Gate
 from pipeline.tracking.lock import flat
 
 MOST = 12
@@ -22,7 +24,7 @@ POINTS = 200
 Figures = dict[str, float]
 
 
-def headline(kind: str, metrics: Mapping[str, Any], validation: Mapping[str, Any]) -> Figures:
+def headline(kind: str, metrics: Mapping[str, Any], validation: Validation | None) -> Figures:
     """The metrics of a run of stage ``kind``, from its own metrics.json and its case's validation.json."""
     if kind == "validate":
         found = _of_law(metrics, validation)
@@ -35,9 +37,9 @@ def headline(kind: str, metrics: Mapping[str, Any], validation: Mapping[str, Any
     return dict(list(finite.items())[:MOST])
 
 
-def of_gate(law: str, validation: Mapping[str, Any]) -> Figures:
+def of_gate(law: str, validation: Validation | None) -> Figures:
     """The case's score of a law: its error over the bound's. It is the report's, so it may change after a run."""
-    score = (((validation.get("gate") or {}).get("laws") or {}).get(law) or {}).get("score")
+    score = Gate.of(validation, law).score
     return {"ratio_to_bound": float(score)} if _is_figure(score) else {}
 
 
@@ -65,11 +67,11 @@ def _of_files(tree: Mapping[str, Any]) -> dict[str, Any]:
     return shown | {f"analysis/{name}": value for name, value in figures.items()}
 
 
-def _of_law(tree: Mapping[str, Any], validation: Mapping[str, Any]) -> dict[str, Any]:
+def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str, Any]:
     """The case's score on each kind of test, the tests of the gate first: the median over the data seeds."""
-    metric = str(tree.get("metric") or validation.get("metric") or "mae")
+    metric = str(tree.get("metric") or (validation.metric if validation else "mae"))
     scenarios, noisy = tree.get("scenarios") or {}, tree.get("noise") or {}
-    weights = (validation.get("gate") or {}).get("weights") or {}
+    weights = validation.gate.weights if validation else {}
     errors = {}
     for test in sorted(scenarios, key=lambda name: -max(weights.get(name, 0), weights.get(name + NOISE_SUFFIX, 0))):
         rows = noisy if test + NOISE_SUFFIX in weights and test not in weights else scenarios
@@ -84,14 +86,21 @@ def _of_law(tree: Mapping[str, Any], validation: Mapping[str, Any]) -> dict[str,
     return shown | errors
 
 
-def _of_case(validation: Mapping[str, Any]) -> dict[str, Any]:
-    laws = (validation.get("gate") or {}).get("laws") or {}
-    scores = [row["score"] for row in laws.values() if row.get("score") is not None]
-    shown: dict[str, Any] = {"laws": len(laws), "laws_that_locked_up": sum(bool(r["lock_ups"]) for r in laws.values())}
+def _of_case(validation: Validation | None) -> dict[str, Any]:
+    if validation is None:
+        return {}
+    laws = validation.gate.laws
+    scores = [row.score for row in laws.values() if row.score is not None]
+    shown: dict[str, Any] = {"laws": len(laws), "laws_that_locked_up": sum(bool(r.lock_ups) for r in laws.values())}
     if scores:
         shown |= {"best_ratio_to_bound": min(scores), "median_ratio_to_bound": statistics.median(scores)}
-    for name, words in (("requirements", "met"), ("claims", "confirmed"), ("paper", "reproduced")):
-        known = [row["holds"] for row in validation.get(name) or () if row["holds"] is not None]
+    judged = (
+        ("requirements", "met", validation.requirements),
+        ("claims", "confirmed", validation.claims),
+        ("paper", "reproduced", validation.paper),
+    )
+    for name, words, rows in judged:
+        known = [row.holds for row in rows if row.holds is not None]
         if known:
             shown |= {f"{name}/checked": len(known), f"{name}/{words}": sum(known)}
     return shown

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
+from pipeline.evaluation.validation import Validation
 from pipeline.tracking.gate import Gate
 from pipeline.tracking.lock import StageResult
 from pipeline.tracking.times import Times
@@ -33,13 +31,14 @@ METRICS = {
 }
 
 
-def run_note(result: StageResult, case: str, validation: Mapping[str, Any], times: Times) -> str:
+def run_note(result: StageResult, case: str, validation: Validation | None, times: Times) -> str:
     """The description of a run: what the stage did, what came out, and what its metrics mean."""
-    titles = validation.get("titles") or {}
     item = item_of(result)
-    words = {"case": titles.get("case", case), "item": item, "metric": validation.get("metric", "mae")}
-    if result.kind in {"design", "validate"}:
-        words["item"] = (titles.get("laws") or {}).get(item, item)
+    words = {"case": case, "item": item, "metric": "mae"}
+    if validation is not None:
+        words |= {"case": validation.titles.case, "metric": validation.metric}
+        if result.kind in {"design", "validate"}:
+            words["item"] = validation.titles.laws.get(item, item)
     # the page shows the first lines, the rest on a click
     parts = [_verdict(Gate.of(validation, item))] if result.kind == "validate" else []
     parts.append(WHAT.get(result.kind, "The stage {item} of the case *{case}*.").format(**words))
@@ -68,18 +67,19 @@ def _verdict(gate: Gate) -> str:
     return f"**{gate.score:.3f} times the bound.** {passed}"
 
 
-def experiment_note(case: str, validation: Mapping[str, Any], champion: str | None) -> str:
+def experiment_note(case: str, validation: Validation | None, champion: str | None) -> str:
     """The description of a case's experiment: its champion, its laws in order, where to look."""
-    titles, gate = validation.get("titles") or {}, validation.get("gate") or {}
-    laws = titles.get("laws") or {}
-    first = f"**{titles.get('case', case)}.**"  # the page shows this line, the rest on a click
+    laws = validation.titles.laws if validation else {}
+    title = validation.titles.case if validation else case
+    first = f"**{title}.**"  # the page shows this line, the rest on a click
     if champion:
         law = champion.removeprefix(f"{case}-")
         score = Gate.of(validation, law).score
         beside = "" if score is None else f", {score:.3f} times the bound"
         first += f" Champion: **[{laws.get(law, law)}](#/models/{champion})**{beside}."
     lines = [first, "One run for each stage of the pipeline."]
-    scores = {law: row["score"] for law, row in (gate.get("laws") or {}).items() if row.get("score") is not None}
+    results = validation.gate.laws if validation else {}
+    scores = {law: row.score for law, row in results.items() if row.score is not None}
     if scores:
         rows = [
             f"| {laws.get(law, law)} | {scores[law]:.3f} | {Gate.of(validation, law).lock_ups} |"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,9 +9,16 @@ from typing import Any
 
 from mlflow import MlflowClient
 
+from pipeline.evaluation.validation import FILE, Validation
 from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_current, read_lock
 from pipeline.tracking.notes import experiment_note
-from pipeline.tracking.registry import describe, elect_champion, file_digest, register, rename_aliases
+from pipeline.tracking.registry import (
+    describe,
+    elect_champion,
+    file_digest,
+    register,
+    rename_aliases,
+)
 from pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
 from pipeline.tracking.store import experiment_id, hide_default, store
 
@@ -59,8 +65,8 @@ def _publish_case(
     known = published(client, experiment)
     runs = {key: str(run.info.run_id) for key, run in known.items()}
     commit = git_commit(root)
-    evidence = root / "artifacts" / case / "validation.json"
-    validation = json.loads(evidence.read_text()) if evidence.exists() else {}
+    evidence = root / "artifacts" / case / FILE
+    validation = Validation.read(evidence) if evidence.exists() else None
     new = 0
     for number, result in enumerate(own, 1):
         if result.key not in runs:

@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
 import mlflow
 import mlflow.artifacts
@@ -26,6 +25,7 @@ from mlflow.models import ModelSignature
 from mlflow.types import Schema, TensorSpec
 
 from pipeline.errors import TrackingError
+from pipeline.evaluation.validation import Validation
 from pipeline.tracking import card
 from pipeline.tracking.gate import Gate
 
@@ -73,7 +73,7 @@ def register(
     case: str,
     path: Path,
     run_id: str,
-    validation: Mapping[str, Any],
+    validation: Validation | None,
     picture: str | None,
     tags: Mapping[str, str],
 ) -> tuple[str, bool]:
@@ -206,7 +206,7 @@ def _crown(client: MlflowClient, holders: Iterable[ModelVersion], best: ModelVer
         client.set_registered_model_alias(best.name, CHAMPION, str(best.version))
 
 
-def describe(client: MlflowClient, case: str, validation: Mapping[str, Any], champion: str | None) -> None:
+def describe(client: MlflowClient, case: str, validation: Validation | None, champion: str | None) -> None:
     """Say on the page of every controller of a case where it stands."""
     for model in client.search_registered_models(f"tags.`case` = '{case}'", max_results=1000):
         law = model.tags["law"]

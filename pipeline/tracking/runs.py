@@ -13,6 +13,7 @@ from mlflow import MlflowClient
 from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run
 from mlflow.utils.time import get_current_time_millis
 
+from pipeline.evaluation.validation import Validation
 from pipeline.tracking.headline import curves, headline, of_gate, table
 from pipeline.tracking.lock import StageResult
 from pipeline.tracking.notes import item_of, run_note
@@ -64,7 +65,7 @@ def write_run(
     result: StageResult,
     root: Path,
     records: Mapping[str, str],
-    validation: Mapping[str, Any],
+    validation: Validation | None,
     tags: Mapping[str, str],
 ) -> str:
     """Write the run of one stage result; its status turns to FINISHED last. Returns the run's id.
@@ -96,7 +97,7 @@ def write_run(
     return run_id
 
 
-def refresh(client: MlflowClient, run: Run, law: str, validation: Mapping[str, Any]) -> None:
+def refresh(client: MlflowClient, run: Run, law: str, validation: Validation | None) -> None:
     """Write the score of a validation anew where the report has changed it since the run was written."""
     figures = of_gate(law, validation)
     now = get_current_time_millis()
@@ -114,7 +115,7 @@ def describe_experiment(client: MlflowClient, experiment: str, note: str) -> Non
 def _dataset(path: str, digest: str, result: StageResult, root: Path) -> DatasetInput:
     """A record as MLflow's data set; the run that made it says so."""
     at = PurePosixPath(path)
-    rows = headline("excite", _read(root / at / "metrics.json"), {}).get("rows")
+    rows = headline("excite", _read(root / at / "metrics.json"), None).get("rows")
     dataset = Dataset(
         name=at.stem,
         digest=digest.removesuffix(".dir")[:DIGEST_CHARACTERS],
@@ -164,7 +165,7 @@ def _read(path: Path) -> Any:
 
 
 def _metrics(
-    result: StageResult, trees: Mapping[str, Any], validation: Mapping[str, Any], at_ms: int
+    result: StageResult, trees: Mapping[str, Any], validation: Validation | None, at_ms: int
 ) -> Iterator[Metric]:
     own, sweep = trees.get("metrics.json", {}), trees.get("sweep.json", {})
     for name, value in headline(result.kind, own, validation).items():

@@ -13,7 +13,7 @@ from pipeline.cases import CASES
 from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
 from pipeline.cases.jacketed_batch_reactor.paper import CLAIMS, _quiet
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.trial import together
+from pipeline.evaluation.metric import together
 from pipeline.evaluation.verdicts import acceptance, statements
 from pipeline.simulation.scenario import Scenario
 
@@ -49,7 +49,11 @@ def test_worst_figures_stay_worst_over_several_sequences() -> None:
         {"mae": 1.0, "max_overshoot": 0.3, "min_jacket": 20.0},
         {"mae": 3.0, "max_overshoot": 0.1, "min_jacket": 19.0},
     ]
-    assert together(rows) == {"mae": 2.0, "max_overshoot": 0.3, "min_jacket": 19.0}
+    assert together(rows, CASES["jacketed_batch_reactor"].metrics) == {
+        "mae": 2.0,
+        "max_overshoot": 0.3,
+        "min_jacket": 19.0,
+    }
 
 
 @pytest.mark.parametrize(("name", "share"), [("theta_10", 0.1), ("theta_20", 0.2)])

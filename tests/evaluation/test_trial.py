@@ -11,8 +11,8 @@ import pytest
 
 from pipeline.cases import CASES
 from pipeline.evaluation import trial
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck, together, try_file
+from pipeline.evaluation.case import Case, Curve, Figure
+from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck, try_file
 from serving.errors import OutputError
 
 
@@ -90,11 +90,6 @@ def test_a_loop_at_its_limit_is_locked_up_and_a_start_up_is_not(case: Case) -> N
     assert not stuck(case, test, loop)
 
 
-def test_together_takes_the_largest_of_the_largest_steady_errors() -> None:
-    rows = [{"sse": 1.0, "max_asse": 0.3}, {"sse": 3.0, "max_asse": 0.1}]
-    assert together(rows) == {"sse": 2.0, "max_asse": 0.3}
-
-
 def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trial, "Controller", lambda path: Proportional())
     monkeypatch.setattr(type(case), "noise_draws", 2)
@@ -105,6 +100,7 @@ def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: p
     variant = try_file(case, 0, ("gain=1", 3, Path("p.onnx")))
     assert list(variant.metrics) == fixed  # with noise, because the plant has no other measurements
     assert np.isnan(variant.development)
+    assert base.locked_up == {}
     assert base.lock_ups == base.development_lock_ups == 0
     # The development is judged by the case's metric, under the noise that the plant always has.
     controller: Any = Proportional()
@@ -117,15 +113,26 @@ def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: p
     assert base.curves["trajectory"].info[-1, 1] == 49
 
 
+def test_a_case_says_what_variants_run_and_figures_of_a_paper_add_no_test(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "Controller", lambda path: Proportional(gain=-1.0))  # full cooling for ever
+    monkeypatch.setattr(type(case), "noise_draws", 1)
+    monkeypatch.setattr(type(case), "figures", (Figure(9, "x", (Curve("p"),), "fouling"),))
+    monkeypatch.setattr(type(case), "variants_run", lambda self, tests: tests[0].name == "fouling")
+    test = case.scenarios()["trajectory"][0]
+    monkeypatch.setattr(type(case), "unscored", lambda self: {"longer": test})
+    found = try_file(case, 0, ("gain=1", 3, Path("p.onnx")))
+    assert list(found.metrics) == ["fouling", "fouling_noise"]
+    assert list(found.curves) == ["fouling", "fouling_noise", "longer"]
+    # Every run that got stuck counts, the one that is not scored too.
+    assert found.locked_up == {"fouling": 1, "fouling_noise": 1, "longer": 1}
+    assert found.lock_ups == 3
+
+
 def test_variants_run_without_noise_where_the_plant_does(monkeypatch: pytest.MonkeyPatch) -> None:
     case = CASES["ph_neutralization"]
     monkeypatch.setattr(trial, "Controller", lambda path: Proportional(0.0))
     monkeypatch.setattr(Proportional, "step", lambda self, **kw: (kw["mv_applied"], kw["state"], np.zeros(2)))
     found = try_file(case, 0, ("penalty=20", 0, Path("p.onnx")))
     assert list(found.metrics) == ["set_point", "disturbance", "buffer", "base"]
-
-
-def test_the_worst_of_several_sequences_stays_the_worst() -> None:
-    rows = [{"overshoot_max": 0.05, "max_asse": 3.0, "min_jacket": 20.0, "mae": 1.0}]
-    rows.append({"overshoot_max": 0.25, "max_asse": 1.0, "min_jacket": 19.0, "mae": 2.0})
-    assert together(rows) == {"overshoot_max": 0.25, "max_asse": 3.0, "min_jacket": 19.0, "mae": 1.5}

@@ -19,6 +19,7 @@ from pipeline.errors import PlantError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.metric import METRICS
 from pipeline.laws.reference_model import ReferenceModel
 from pipeline.optimal.bounds import load_bounds, plant_digest
 from pipeline.optimal.horizon import Horizon
@@ -81,8 +82,8 @@ def test_the_nmpc_over_the_signed_flow_is_ahead_of_any_switching_by_hand(vessel:
         return {"mae": float(np.mean(np.abs(test.sp - pv[:, :1])))}
 
     loop = simulate_closed(vessel, by_hand, test)
-    found = run_nmpc(PerfectNmpc(vessel.relaxed(), "mae", QUICK), test, score=score)
-    best = run_offline(vessel.relaxed(), test, "mae", False, QUICK)
+    found = run_nmpc(PerfectNmpc(vessel.relaxed(), METRICS["mae"], QUICK), test, score=score)
+    best = run_offline(vessel.relaxed(), test, METRICS["mae"], False, QUICK)
     assert found["failures"] == best["failures"] == 0
     assert found["mae"] == pytest.approx(best["mae"], rel=1e-3)
     assert found["mae"] < float(np.mean(np.abs(sp - loop.pv[:, :1])))
@@ -105,9 +106,9 @@ def test_limits_of_a_state_are_kept_by_nmpc_and_offline_optimum(vessel: Jacketed
         return {"mae": float(np.mean(np.abs(test.sp - pv[:, :1])))}
 
     effort = replace(QUICK, every=every)
-    free = run_nmpc(PerfectNmpc(signed, "mae", effort), test, score=score)
-    kept = run_nmpc(PerfectNmpc(signed, "mae", effort, limits), test, score=score)
-    best = run_offline(signed, test, "mae", False, effort, score, limits)
+    free = run_nmpc(PerfectNmpc(signed, METRICS["mae"], effort), test, score=score)
+    kept = run_nmpc(PerfectNmpc(signed, METRICS["mae"], effort, limits), test, score=score)
+    best = run_offline(signed, test, METRICS["mae"], False, effort, score, limits)
     assert kept["failures"] == best["failures"] == 0
     assert seen[0][:, 1].max() > 60
     assert seen[0][:, 1].min() < 19
@@ -161,12 +162,12 @@ def tracking(test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
 
 def test_a_reference_that_can_be_followed_is_followed(followed: Scenario) -> None:
     plant = ReversibleCstr()
-    closed = run_nmpc(PerfectNmpc(plant, "tracking", QUICK), followed, recipe=True, score=tracking)
-    best = run_offline(plant, followed, "tracking", True, QUICK, tracking)
+    closed = run_nmpc(PerfectNmpc(plant, METRICS["tracking"], QUICK), followed, recipe=True, score=tracking)
+    best = run_offline(plant, followed, METRICS["tracking"], True, QUICK, tracking)
     assert closed["tracking"] < 1e-5
     assert best["tracking"] < 1e-6
     # Without sight of the course the set point itself is all that there is to go to.
-    assert run_nmpc(PerfectNmpc(plant, "tracking", QUICK), followed, score=tracking)["tracking"] > 1e-3
+    assert run_nmpc(PerfectNmpc(plant, METRICS["tracking"], QUICK), followed, score=tracking)["tracking"] > 1e-3
 
 
 @pytest.mark.parametrize("sp", [(0.02, 0.03), (0.13, 0.10)])
@@ -174,15 +175,15 @@ def test_a_plan_that_comes_true_need_not_be_solved_again(sp: tuple[float, float]
     plant = HensonSeborgCstr()
     x0, mv0 = plant.steady_state_at(sp[0])
     test = Scenario("step", "", held(list(sp), 40), x0, mv0, {}, 40)
-    each, some = (run_nmpc(PerfectNmpc(plant, "mae", replace(QUICK, every=every)), test) for every in (1, 5))
-    finer = run_offline(plant, test, "mae", False, Effort(fine=3, reaches=(3,)))
+    each, some = (run_nmpc(PerfectNmpc(plant, METRICS["mae"], replace(QUICK, every=every)), test) for every in (1, 5))
+    finer = run_offline(plant, test, METRICS["mae"], False, Effort(fine=3, reaches=(3,)))
     assert some["mae"] == pytest.approx(each["mae"], rel=1e-3)
     assert some["mae"] == pytest.approx(finer["mae"], rel=1e-3)
 
 
 def test_a_plan_is_followed_until_it_is_old_or_something_surprises() -> None:
     plant = ReversibleCstr()
-    nmpc, step, p = PerfectNmpc(plant, "sse", replace(QUICK, every=4)), plant.stepper(), plant.parameters()
+    nmpc, step, p = PerfectNmpc(plant, METRICS["sse"], replace(QUICK, every=4)), plant.stepper(), plant.parameters()
     x = plant.steady_state_at(0.46)[0]
 
     def go(sp: float, p: Array, shift: float = 0.0) -> int:

@@ -14,6 +14,7 @@ from pipeline.cases.batch_reactor.plant import BatchReactor
 from pipeline.errors import PlantError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import METRICS
 from pipeline.metrics import mae
 from pipeline.optimal.horizon import Horizon
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline, search
@@ -133,7 +134,7 @@ def test_the_plan_for_squared_errors_is_that_of_single_shooting(tank: Plant, sta
         least_squares(lambda u: np.array(error(u)).ravel(), s, lambda u: np.array(slope(u)), (850, 1050))
         for s in starts
     ]
-    horizon = Horizon(tank, 12, metric="sse")
+    horizon = Horizon(tank, 12, metric=METRICS["sse"])
     plan = search(horizon, x0, np.full((12, 1), end), np.tile(tank.parameters(), (12, 1)), tank.stepper())
     span = tank.sp_signals[0].high - tank.sp_signals[0].low
     assert plan.solved
@@ -144,7 +145,7 @@ def test_an_unforeseen_disturbance_costs_the_nmpc_one_sample(tank: Plant) -> Non
     x0, mv0 = tank.steady_state_at(8.0)
     q1 = np.repeat([tank.parameters()[tank.parameter_names().index("q1")], 1010.0], 6)
     scenario = Scenario("acid", "", np.full((12, 1), 8.0), x0, mv0, {"q1": q1})
-    nmpc = PerfectNmpc(tank, "sse", Effort(periods=10))
+    nmpc = PerfectNmpc(tank, METRICS["sse"], Effort(periods=10))
     assert run_nmpc(nmpc, scenario)["sse"] < 1e-9
     missed = tank.measure(tank.stepper()(x0, mv0, tank.dv_nominal, tank.parameters({"q1": 1010.0})))
     assert run_nmpc(nmpc, scenario, unforeseen=True)["sse"] == pytest.approx((8 - float(missed[0])) ** 2, rel=1e-4)
@@ -165,8 +166,8 @@ def test_a_recipe_is_followed_as_closely_as_can_be(batch: Case, period_s: float,
     time_s = np.arange(0.0, 300.0, period_s)
     sp = 54.0 + 71.0 * np.exp(-2.5e-3 * time_s)[:, None]
     test = replace(printed, sp=sp, late_from=round(200 / period_s))
-    best = run_offline(plant, test, "sse", True, Effort(fine=2))
-    nmpc = PerfectNmpc(plant, "sse", Effort(periods=12))
+    best = run_offline(plant, test, METRICS["sse"], True, Effort(fine=2))
+    nmpc = PerfectNmpc(plant, METRICS["sse"], Effort(periods=12))
     aware, blind = run_nmpc(nmpc, test, recipe=True), run_nmpc(nmpc, test)
     assert best["sse"] == pytest.approx(lowest, abs=1.0)
     assert aware["sse"] == pytest.approx(best["sse"], rel=1e-4)
@@ -177,21 +178,23 @@ def test_each_set_point_is_planned_by_itself_unless_it_is_a_recipe(tank: Plant) 
     # Equal neighbours are one set point, of whatever length: its plan ends at rest. A recipe's plan starts early.
     x0, mv0 = tank.steady_state_at(7.0)
     test = Scenario("steps", "", np.repeat([7.0, 7.0, 9.0], 5)[:, None], x0, mv0, {}, 5)
-    steps, course = (run_offline(tank, test, "sse", recipe, Effort(fine=3)) for recipe in (False, True))
+    steps, course = (run_offline(tank, test, METRICS["sse"], recipe, Effort(fine=3)) for recipe in (False, True))
     assert steps["sse"] == pytest.approx(4 + 1.0393, rel=1e-3)
     assert course["sse"] < steps["sse"]
 
 
-def test_an_unknown_metric_is_refused(tank: Plant) -> None:
-    with pytest.raises(PlantError, match="no horizon for the metric 'itae'; it may be mae, sse, tracking"):
-        Horizon(tank, 5, metric="itae")
+def test_a_metric_without_a_floor_is_refused(tank: Plant) -> None:
+    with pytest.raises(
+        PlantError, match="no horizon for the metric 'masse', which has no floor; it may be mae, sse, tracking"
+    ):
+        Horizon(tank, 5, metric=METRICS["masse"])
 
 
 def test_noise_on_what_is_no_state_is_refused(tank: Plant) -> None:
     x0, mv0 = tank.steady_state_at(7.0)
     scenario = Scenario("rest", "", np.full((3, 1), 7.0), x0, mv0)
     with pytest.raises(PlantError, match="measures other things than its states; its NMPC cannot be given noise"):
-        run_nmpc(PerfectNmpc(tank, "sse", Effort(periods=5)), scenario, [0.02])
+        run_nmpc(PerfectNmpc(tank, METRICS["sse"], Effort(periods=5)), scenario, [0.02])
 
 
 def test_an_unknown_scenario_is_named(capsys: pytest.CaptureFixture[str]) -> None:

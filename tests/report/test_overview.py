@@ -15,6 +15,7 @@ from rich.console import Console
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.standing import Standing, tally
+from pipeline.evaluation.validation import SCHEMA
 from pipeline.report.overview import write_overview
 from pipeline.report.results import show_results
 from pipeline.stages.overview import main
@@ -24,32 +25,46 @@ def verdict(what: str, holds: bool | None, because: str = "") -> dict[str, Any]:
     return {"what": what, "limit": "asked | found", "measured": "3 < 4", "holds": holds, "because": because}
 
 
+def printed(paper: float | None, holds: bool | None) -> dict[str, Any]:
+    return {"table": 1, "label": "x", "metric": "e", "paper": paper, "ours": 1.0, "verdict": "words", "holds": holds}
+
+
 def a_case(name: str, metric: str, bound: float | None, errors: dict[str, float], floor: float = 0.0) -> dict[str, Any]:
     """A validation.json; the main test is the noisy one, and its bound may be missing."""
     rows = {
         law: {metric: e, f"{metric}_min": 0.9 * e, f"{metric}_max": 1.1 * e, "seeds": 3} for law, e in errors.items()
     }
     return {
+        "schema": SCHEMA,
         "case": name,
         "metric": metric,
         "best": "alpha",
         "main": "steps_noise",
         "scenarios": {"steps": rows, "steps_noise": rows, "held_out": rows},
         "bounds": {} if bound is None else {"steps_noise": {"nmpc": {metric: bound}}},
-        "gate": {"weights": {"steps_noise": 0.7, "held_out": 0.3}, "floors": {"steps": floor, "held_out": floor}},
+        "gate": {
+            "id": "g1",
+            "weights": {"steps_noise": 0.7, "held_out": 0.3},
+            "baseline": "pid",
+            "baseline_name": "PID",
+            "floor": floor,
+            "floors": {"steps": floor, "held_out": floor},
+            "laws": {},
+        },
         "laws": {law: {"seeds": 3, "lock_ups": 0, "step_us": 20.0} for law in errors},
         "requirements": [verdict("fast", True), verdict("exact", False, "noise"), verdict("cheap", None)],
         "claims": [verdict(f"{name} is <stable>", False), verdict("it is quick", True)],
         "paper": [
-            {"paper": 1.0, "holds": True},
-            {"paper": 1.0, "holds": None},
-            {"paper": 1.0, "holds": False},
-            {"paper": None, "holds": True},  # printed nowhere
+            printed(1.0, True),
+            printed(1.0, None),
+            printed(1.0, False),
+            printed(None, True),  # printed nowhere
         ],
         "titles": {
             "case": f"The {name}",
             "metric": "error in words",
             "metric_short": "ERR",
+            "figures": {},
             "laws": {law: f"Law {law.title()}" for law in errors},
             "scenarios": {"steps": "Steps up"},
         },
@@ -168,6 +183,19 @@ def test_the_terminal_has_one_table_over_all_cases(artifacts: Path) -> None:
     assert "registry   make registry" in text
 
 
+def test_a_lock_up_stands_beside_the_laws_name(artifacts: Path) -> None:
+    assert not any("!" in line for line in shown(artifacts))
+    path = artifacts / "tank" / "validation.json"
+    tree = json.loads(path.read_text())
+    tree["laws"]["pid"] |= {"lock_ups": 9, "locked_up": {"steps": {"0": 9}}, "as_printed": True}
+    path.write_text(json.dumps(tree))
+    lines = shown(artifacts)
+    assert max(map(len, lines)) <= 120
+    assert any(" pid !9 " in line for line in lines)
+    assert any(line.startswith("!  ") and "do not run it on a plant" in line for line in lines)
+    assert ["lock-ups", "0", "0", "9"] in [line.split() for line in shown(artifacts, "tank")]
+
+
 def test_one_case_is_shown_in_all_of_its_tests(artifacts: Path) -> None:
     text = "\n".join(shown(artifacts, "tank"))
     assert "steps_noise / NMPC" in text
@@ -184,7 +212,7 @@ def test_what_cannot_be_read_is_one_clear_error(artifacts: Path, tmp_path: Path)
     with pytest.raises(PipelineError, match="make run"):
         show_results(tmp_path / "none")
     (artifacts / "tank" / "validation.json").write_text('{"scenarios": {}}')
-    with pytest.raises(PipelineError, match=r"tank.validation\.json cannot be read .*dvc repro"):
+    with pytest.raises(PipelineError, match=r"tank.validation\.json has schema None.*dvc repro"):
         Standing.read(artifacts / "tank")
 
 

@@ -22,6 +22,7 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import ReportError, parse_setting
 from pipeline.evaluation.verdicts import PLAIN, acceptance, close, paper_row, requirement, statements
 from pipeline.optimal import bounds
+from pipeline.report.verdict_words import statement, table_row
 from pipeline.stages.report import report
 
 LAWS = ("inc", "incad", "incadec", "pid", "inverse_dob", "forward_dob")
@@ -83,7 +84,7 @@ def test_pages_refer_only_to_what_exists(out):
 
 def test_the_same_evidence_gives_the_same_files(root, out, tmp_path):
     again = load(root)
-    assert made_up.for_programs(again) == json.loads((out / "validation.json").read_text())
+    assert made_up.for_programs(again).to_json() == (out / "validation.json").read_text()
     alone = replace(again, laws={"pid": again.laws["pid"]})
     made_up.report(alone, root / "work" / CASE / "models", tmp_path)
     picture = Path("figures") / "closed_loop_pid.png"
@@ -110,7 +111,8 @@ def test_verdicts_follow_the_measurement(tmp_path):
     table = {(r.label, t.number): r for t in CASES[CASE].tables for r in t.rows}
 
     def verdict(label: str, number: int):
-        return paper_row(table[label, number], load(tmp_path), claims.reason)
+        evidence = load(tmp_path)
+        return table_row(paper_row(table[label, number], evidence, claims.reason), evidence)
 
     assert verdict("INC", 2).holds
     assert verdict("PID", 2).verdict.startswith("does not, because IMC")
@@ -173,7 +175,7 @@ def test_requirements_are_met_or_not(root, tmp_path):
     assert met(Requirement("incad", "sp_b", "mae", 0.018, setting={"r": 1.5})) is True
     assert met(Requirement("incad", "sp_b", "mae", 0.018, setting={"r": 1.6})) is None
     assert met(Requirement(None, "tin", "mae", 1.2, times="offline")) is None
-    rows = {v.what: v for v in acceptance(evidence, made_up.claims_of(CASE))}
+    rows = {v.what: v for v in (statement(v, evidence) for v in acceptance(evidence, made_up.claims_of(CASE)))}
     assert rows["best controller, data seeds"].holds is False  # three were made up
     assert rows["eigenvalues at the middle steady state [1/s]"].holds
     assert rows["steady states at Tj = 250 K"].holds
@@ -181,9 +183,13 @@ def test_requirements_are_met_or_not(root, tmp_path):
     made_up.write_validation(tmp_path, "pid", 1.3, lock_ups=1)
     locked = load(tmp_path)
     assert locked.best is None
-    assert {v.what: v.holds for v in acceptance(locked, PLAIN)}["best controller, data seeds"] is False
+    rows = {v.what: v for v in (statement(v, locked) for v in acceptance(locked, PLAIN))}
+    assert rows["best controller, data seeds"].holds is False
     made_up.report(locked, tmp_path / "none", tmp_path / "out")  # a report also of a case where nothing works
     assert "No law qualifies" in (tmp_path / "out" / "report.html").read_text()
+    for page in ("report.html", "report.md"):
+        text = (tmp_path / "out" / page).read_text()
+        assert re.search(r"`?pid(`|</code>) locked up in one closed loop(\*\*|</b>): sp_a \(seed 0\); shipped as", text)
 
 
 @pytest.mark.parametrize(
@@ -201,7 +207,7 @@ def test_a_figure_may_say_how_near_ours_must_be(root):
     assert ours is not None
 
     def judged(paper: float, within: float | None):
-        return paper_row(replace(row, paper=paper, within=within), evidence, PLAIN.reason)
+        return table_row(paper_row(replace(row, paper=paper, within=within), evidence, PLAIN.reason), evidence)
 
     assert judged(ours * 1.001, None).verdict == "reproduces"
     slip = judged(ours * 1.001, 5e-4 * ours)
@@ -222,14 +228,14 @@ def test_settings_find_their_variant(root):
     assert incadec.variant_of({"r": 10}) == "r=10"
     assert incadec.variant_of({"back": True}) == "r=5.5, back"
     assert incadec.variant_of({"r": 10, "back": True}) == "r=10, back"
-    loop = evidence.loop(Curve("incad", {"r": 2.5}), "sp_a", 160)
+    loop = evidence.loop(Curve("incad", {"r": 2.5}), "sp_a_hold160")
     assert loop is not None
     assert loop["pv"].shape == (1120, 2)
     assert np.all(np.diff(loop["time_s"]) > 0)
-    assert evidence.loop(Curve("inc"), "sp_a", 7) is None
+    assert evidence.loop(Curve("inc"), "sp_a_hold7") is None
     plain = PaperFigure("x", "pid", "sp_a", "mae", 0.2)
-    assert "times the paper's" in paper_row(plain, evidence, PLAIN.reason).verdict
-    row = paper_row(replace(plain, printed=False), evidence, PLAIN.reason)
+    assert "times the paper's" in table_row(paper_row(plain, evidence, PLAIN.reason), evidence).verdict
+    row = table_row(paper_row(replace(plain, printed=False), evidence, PLAIN.reason), evidence)
     assert row.paper is None  # nor does it count among the paper's figures
     assert "times the independent implementation's" in row.verdict
 
@@ -267,9 +273,7 @@ def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
     (own / "params.yaml").write_text(yaml.safe_dump(params))
     monkeypatch.chdir(own)
     report(CASE)
-    assert (
-        "has no nmpc figures of scenario 'ua' as it is now; run `loopwright bounds" in capsys.readouterr().err
-    )
+    assert "has no nmpc figures of scenario 'ua' as it is now; run `loopwright bounds" in capsys.readouterr().err
     folder = own / "artifacts" / CASE
     tree = json.loads((folder / "validation.json").read_text())
     assert "ua" not in tree["bounds"]

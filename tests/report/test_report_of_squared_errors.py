@@ -12,19 +12,22 @@ import made_up_case as made_up
 import numpy as np
 import pytest
 from made_up_case import BATCH, PH, Miniature
+from pipeline.evaluation.for_programs import gate_id
 from rich.console import Console
 
 from pipeline.cases import CASES
 from pipeline.evaluation.case import Curve, Figure, PaperFigure, Requirement
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.for_programs import gate_id
+from pipeline.evaluation.metric import METRICS
 from pipeline.evaluation.model_evidence import candidates, model_figure
+from pipeline.evaluation.validation import Validation
 from pipeline.evaluation.verdicts import paper_row, plain_reason, requirement, statements
 from pipeline.pictures.loop_picture import History, summary
 from pipeline.pictures.loop_pictures import info_picture
 from pipeline.pictures.words import ratio
 from pipeline.report.page import headline
 from pipeline.report.results import show_results
+from pipeline.report.verdict_words import statement, table_row
 from pipeline.tracking.card import version_description
 from pipeline.tracking.gate import Gate
 
@@ -59,7 +62,7 @@ def test_programs_learn_which_metric_counts(written):
     assert tree["metric"] == "sse"
     assert tree["titles"]["metric"] == "sum of squared errors"
     assert tree["best"] == "gauss_newton_pid"
-    assert tree == made_up.for_programs(evidence)
+    assert made_up.for_programs(evidence).to_json() == (out / "validation.json").read_text()
     for laws in tree["scenarios"].values():
         for row in laws.values():
             assert row["sse_min"] <= row["sse"] <= row["sse_max"]
@@ -125,7 +128,7 @@ def test_the_headline_is_the_cases_own(written):
     else:
         assert "on held-out set points" in rows[0][1]
         assert "on disturbance" in words
-        assert "less squared error than the PID" in words
+        assert "lower sum of squared errors than the PID" in words
 
 
 def test_requirements_with_noise_with_late_errors_and_of_variants(batch):
@@ -143,16 +146,18 @@ def test_requirements_with_noise_with_late_errors_and_of_variants(batch):
     assert met(None, "held_out_noise", "sse", 2.0, times="nmpc") is None  # no bound with noise
     assert met("linearized_pid", "trajectory", "sse", 1e9, setting={"calmed": True}) is True
     assert met("linearized_pid", "trajectory", "sse", 1e9, setting={"penalty": 3.0}) is None
-    row = requirement(Requirement("linearized_pid", "trajectory", "sse", 13_320.0, setting={"calmed": True}), evidence)
+    need = Requirement("linearized_pid", "trajectory", "sse", 13_320.0, setting={"calmed": True})
+    row = statement(requirement(need, evidence), evidence)
     assert row.what == "linearized PID (calmed), trajectory"
-    assert row.limit == "SSE ≤ 13,320"
+    assert row.limit == "SSE ≤ 13,320 °C²"
 
 
 def test_a_model_sets_figures_have_their_place_in_a_table(batch):
     evidence = load(batch, BATCH)
 
     def judged(path: str, paper: float):
-        return paper_row(PaperFigure("x", "identification_example", "", path, paper), evidence, plain_reason)
+        row = PaperFigure("x", "identification_example", "", path, paper)
+        return table_row(paper_row(row, evidence, plain_reason), evidence)
 
     row = judged("one_step.recursive_0.8", 2.6)
     assert (row.ours, row.holds, row.metric) == (2.6, True, "one step")
@@ -218,7 +223,7 @@ def test_claims_of_the_tank_follow_the_measurement(tmp_path):
     assert before["the disturbance is one of the buffer's flow"] is False
     assert before["the best settings without bounds are negative"] is False  # no made-up gain lies at a bound
     row = next(r for t in CASES[PH.case].tables for r in t.rows if r.law == "self_tuning_pid")
-    assert "its tuning is not printed" in paper_row(row, load(tmp_path, PH), claims.reason).verdict
+    assert "its tuning is not printed" in paper_row(row, load(tmp_path, PH), claims.reason).reason
 
 
 def test_claims_of_the_reactor_follow_the_measurement(tmp_path):
@@ -236,7 +241,7 @@ def test_claims_of_the_reactor_follow_the_measurement(tmp_path):
     assert outcome(ahead) is True
     assert outcome("filter and update criterion calm the settings") is True
     row = CASES[BATCH.case].tables[0].rows[1]
-    said = paper_row(row, load(tmp_path, BATCH), claims.reason).verdict
+    said = paper_row(row, load(tmp_path, BATCH), claims.reason).reason
     assert "13,252 is lost while full heating cannot reach the profile" in said
     assert "the paper's 11,121" in said
 
@@ -278,7 +283,7 @@ def test_the_table_in_the_terminal_and_the_card_in_the_registry(written):
     assert own is not None
     assert bound is not None
     assert ratio(own / bound) in row
-    tree = made_up.for_programs(evidence)
+    tree = Validation.read(out / "validation.json")
     card = version_description(tree, Gate.of(tree, "gauss_newton_pid"), "run", None)
     assert "Scenario (sum of squared errors)" in card
     assert f"{own / bound:.2f}" in card
@@ -289,7 +294,7 @@ def test_a_loop_tried_by_hand_is_told_in_the_cases_metric():
     sp, pv = (np.array([[7.0], [8.0]]), np.array([[7.0], [7.5]]))
     mv = np.array([[900.0], [950.0]])
     history = History([0.0, 60.0], ["AUTO"] * 2, list(sp), list(pv), list(pv), list(mv), ["", ""])
-    assert summary(PH.of.plant, history, "sse").splitlines() == [
+    assert summary(PH.of.plant, history, METRICS["sse"]).splitlines() == [
         "SSE pH 0.25, MAE pH 0.25, final error 0.5",
         "travel of q3 50 ml/min",
     ]

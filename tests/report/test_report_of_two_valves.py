@@ -20,12 +20,14 @@ from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.evaluation.case import Array, Case, Requirement
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import ReportError
+from pipeline.evaluation.metric import Metric
+from pipeline.evaluation.validation import Validation
 from pipeline.evaluation.verdicts import PLAIN, CasePicture, requirement
 from pipeline.pictures.loop_pictures import overview_picture
-from pipeline.pictures.words import metric_name
 from pipeline.plants.base import Plant
 from pipeline.report.figures import draw_all
 from pipeline.report.page import headline, write_report
+from pipeline.report.verdict_words import statement
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.tracking.card import version_description
 from pipeline.tracking.gate import Gate
@@ -49,11 +51,11 @@ class TwoValves(Case):
     noise: ClassVar[Mapping[str, float]] = {"T": 0.05, "T_w": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"levels": 1.0}
     metric: ClassVar[str] = "tracking"
-    metric_words: ClassVar[Mapping[str, str]] = {
-        "switches": "switches of the mode",
-        "radius": "spectral radius",
-        "colour": "nothing has this",
-    }
+    own_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("switches", "switches of the mode"),
+        Metric("radius", "spectral radius"),
+        Metric("colour", "nothing has this"),
+    )
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         x0, mv0 = self.plant.start
@@ -202,7 +204,7 @@ def test_programs_get_the_analysis_and_the_verdicts(out: Path) -> None:
 
 
 def test_the_registry_tells_of_the_analysis(out: Path) -> None:
-    tree = json.loads((out / "validation.json").read_text())
+    tree = Validation.read(out / "validation.json")
     card = version_description(tree, Gate.of(tree, "fuzzy"), "run", None)
     for words in ("spectral radius", "0.91", "pairs proved", "<li>Not proved.</li>"):
         assert words in card, words
@@ -211,10 +213,11 @@ def test_the_registry_tells_of_the_analysis(out: Path) -> None:
 
 
 def test_a_case_names_its_figures(root: Path) -> None:
-    assert metric_name("switches") == "switches"
-    assert metric_name("switches", TwoValves.metric_words) == "switches of the mode"
-    assert metric_name("tracking") == "tracking RMS"
-    row = requirement(Requirement("fuzzy", "levels", "switches", 3.0), load(root))
+    assert TwoValves((9,)).label("switches") == "switches of the mode"
+    assert TwoValves((9,)).label("tracking") == "tracking RMS [°C]"
+    assert TwoValves((9,)).label("nrmse_free.run") == "nrmse free"
+    evidence = load(root)
+    row = statement(requirement(Requirement("fuzzy", "levels", "switches", 3.0), evidence), evidence)
     assert (row.limit, row.measured, row.holds) == ("switches of the mode ≤ 3", "4", False)
 
 

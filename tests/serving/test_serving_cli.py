@@ -54,6 +54,24 @@ def test_any_evidence_can_be_shown(
     assert text in capsys.readouterr().out
 
 
+def test_lock_ups_are_said_first(pi_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    locked = {"sp_a": {"0": 2, "3": 1}, "held_out_noise": {"1": 1}}
+    evidence = {"seeds": 5, "lock_ups": 4, "locked_up": locked, "as_printed": True, "scenarios": {"sp_a": {"mae": 0.1}}}
+    with_evidence(pi_file, tmp_path / "x.onnx", evidence)
+    assert main(["inspect", str(tmp_path / "x.onnx")]) == 0
+    assert capsys.readouterr().out.splitlines()[:5] == [
+        "formula for tank",
+        "  LOCKED UP in 4 closed loops of its validation: do not run it on a plant",
+        "    sp_a (seed 0: 2, seed 3: 1)",
+        "    held_out_noise (seed 1: 1)",
+        "    shipped as printed, to reproduce a paper",
+    ]
+    for sound in ({"lock_ups": 0}, {"lock_ups": "none"}, {}):
+        with_evidence(pi_file, tmp_path / "x.onnx", sound)
+        assert main(["inspect", str(tmp_path / "x.onnx")]) == 0
+        assert "LOCKED UP" not in capsys.readouterr().out
+
+
 def test_json(pi_file: Path, capsys: Capture) -> None:
     assert main(["inspect", "--json", str(pi_file)]) == 0
     row = json.loads(capsys.readouterr().out)

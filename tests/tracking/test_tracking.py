@@ -17,11 +17,13 @@ import numpy as np
 import pytest
 from made_up_case import CASE
 from mlflow.entities import Run
-from pipeline.tracking.__main__ import CHAMPIONS, main
 
 import pipeline
+from pipeline.__main__ import main as loopwright
+from pipeline.commands.registry import CHAMPIONS
 from pipeline.engine.start import VARIABLE, receipt_path
 from pipeline.errors import TrackingError
+from pipeline.evaluation.validation import Validation
 from pipeline.tracking.gate import Gate
 from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_current, read_lock
 from pipeline.tracking.notes import item_of
@@ -45,6 +47,11 @@ def write_evidence(root: Path, *args, **kwargs) -> None:
     made_up.write_json(root / "artifacts" / CASE / "validation.json", made_up.evidence(*args, **kwargs))
 
 
+def main(arguments: list[str]) -> int:
+    """One of the registry's commands."""
+    return loopwright(["registry", *arguments])
+
+
 @pytest.fixture(scope="module")
 def empty_store(tmp_path_factory) -> Path:
     """A store made from nothing, once: mlflow takes seconds to lay its tables."""
@@ -66,8 +73,10 @@ def root(tmp_path, monkeypatch, empty_store) -> Path:
     made_up.write_lock(tmp_path, LAWS)
     write_evidence(tmp_path, SCORES)
     evidence = tmp_path / "artifacts" / CASE / "validation.json"
-    told = {"inverse_dob": {"analysis": {"base": {"figures": {"spectral_radius": 0.93}, "notes": ["Not <proved>."]}}}}
-    made_up.write_json(evidence, {**json.loads(evidence.read_text()), "laws": told})
+    tree = json.loads(evidence.read_text())
+    analysis = {"base": {"figures": {"spectral_radius": 0.93}, "notes": ["Not <proved>."]}}
+    tree["laws"]["inverse_dob"]["analysis"] = analysis
+    made_up.write_json(evidence, tree)
     picture = tmp_path / "artifacts" / CASE / "figures" / "closed_loop_pid.png"
     picture.parent.mkdir()
     picture.write_bytes(b"\x89PNG made up")
@@ -219,8 +228,10 @@ def test_the_best_version_falls_only_to_better_evidence(root, capsys):
         ("incad", {"pid": 1.4}, {}, "no gate score"),
     ],
 )
-def test_who_passes_the_gate(law, scores, lock_ups, reason):
-    refusal = Gate.of(made_up.evidence(scores, lock_ups), law).refusal()
+def test_who_passes_the_gate(law, scores, lock_ups, reason, tmp_path):
+    path = tmp_path / "validation.json"
+    made_up.write_json(path, made_up.evidence(scores, lock_ups))
+    refusal = Gate.of(Validation.read(path), law).refusal()
     assert (refusal is None) if reason is None else (reason in refusal)
 
 

@@ -12,6 +12,7 @@ from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
 from pipeline.evaluation.closed_loop import overshoots
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import Metric
 from pipeline.plants.base import Array, Plant
 from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
 
@@ -112,25 +113,25 @@ class HensonSeborgCstrCase(Case):
         "feed_temperature": 0.1,
         "feed_concentration": 0.1,
     }
-    metric_words: ClassVar[Mapping[str, str]] = {
-        "iae": "IAE [mol/l min]",
-        "overshoot_max": "largest overshoot",
-        "overshoot_last": "overshoot of the last step",
-        "last_error": "error at the end [mol/l]",
-        "fit_C": "fit of C [%]",
-        "fit_T": "fit of T [%]",
-        "frozen_radius": "largest spectral radius of the frozen loops",
-        "frozen_radius_over_range": "the same over all set points",
-        "gain_margin": "upper gain margin",
-        "lyapunov_pairs": "neighbour pairs with a Lyapunov function",
-        "neighbour_pairs": "neighbour pairs",
-        "lyapunov_contraction": "slowest contraction per period",
-        "starts": "Monte Carlo starts",
-        "recovered": "of them recovered",
-        "left_range": "of them went out",
-        "recovery_min": "median time to recover [min]",
-        "states_of_no_return": "states from which it does not return",
-    }
+    own_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("iae", "IAE", unit="mol/l min"),
+        Metric("overshoot_max", "largest overshoot", together="max"),
+        Metric("overshoot_last", "overshoot of the last step"),
+        Metric("last_error", "error at the end", unit="mol/l"),
+        Metric("fit_C", "fit of C", unit="%"),
+        Metric("fit_T", "fit of T", unit="%"),
+        Metric("frozen_radius", "largest spectral radius of the frozen loops"),
+        Metric("frozen_radius_over_range", "the same over all set points"),
+        Metric("gain_margin", "upper gain margin"),
+        Metric("lyapunov_pairs", "neighbour pairs with a Lyapunov function"),
+        Metric("neighbour_pairs", "neighbour pairs"),
+        Metric("lyapunov_contraction", "slowest contraction per period"),
+        Metric("starts", "Monte Carlo starts"),
+        Metric("recovered", "of them recovered"),
+        Metric("left_range", "of them went out"),
+        Metric("recovery_min", "median time to recover", unit="min"),
+        Metric("states_of_no_return", "states from which it does not return"),
+    )
     tables: ClassVar[tuple[PaperTable, ...]] = (
         PaperTable(
             1,

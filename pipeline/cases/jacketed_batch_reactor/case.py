@@ -13,6 +13,7 @@ from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
 from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import Metric
 from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import Scenario, random_levels, stepwise
 
@@ -65,15 +66,15 @@ class JacketedBatchReactorCase(Case):
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     noise: ClassVar[Mapping[str, float]] = {"T": 0.05, "T_w": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"profile": 0.3, "held_out": 0.4, "feed": 0.1, "loss": 0.1, "fouling": 0.1}
-    metric_words: ClassVar[Mapping[str, str]] = {
-        "masse": "offset [°C]",
-        "max_asse": "largest offset [°C]",
-        "max_overshoot": "largest overshoot [°C]",
-        "tail_rms": "tail RMS [°C]",
-        "switches": "switches of the mode",
-        "min_jacket": "lowest jacket [°C]",
-        "max_jacket": "highest jacket [°C]",
-    }
+    own_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("masse", "offset", unit="°C"),
+        Metric("max_asse", "largest offset", unit="°C", together="max"),
+        Metric("max_overshoot", "largest overshoot", unit="°C", together="max"),
+        Metric("tail_rms", "tail RMS", unit="°C"),
+        Metric("switches", "switches of the mode"),
+        Metric("min_jacket", "lowest jacket", unit="°C", together="min"),
+        Metric("max_jacket", "highest jacket", unit="°C", together="max"),
+    )
     figures: ClassVar[tuple[Figure, ...]] = (
         Figure(
             4,

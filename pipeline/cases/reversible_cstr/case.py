@@ -12,6 +12,7 @@ from pipeline.cases.reversible_cstr.plant import ReversibleCstr
 from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, PaperTable, Requirement
 from pipeline.evaluation.closed_loop import itae
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import Metric
 from pipeline.laws.reference_model import ReferenceModel
 from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
@@ -50,21 +51,20 @@ class ReversibleCstrCase(Case):
     name: ClassVar[str] = "reversible_cstr"
     title: ClassVar[str] = "CSTR with a reversible reaction"
     metric: ClassVar[str] = "tracking"
-    metric_words: ClassVar[Mapping[str, str]] = {
-        "iae": "IAE [mol/l s]",
-        "itae": "ITAE [mol/l s²]",
-        "tracking": "RMS from the reference model [mol/l]",
-        "max_asse": "largest end offset [mol/l]",
-        "training_rms": "RMS from the reference model, training loops [mol/l]",
-        "validation_rms": "the same, validation loops [mol/l]",
-        "iterations": "iterations of the training",
-        "other_roots": "points at rest with a move of the wrong sign",
-        "least_gain": "least move at rest over error [l/s per mol/l]",
-        "largest_gain": "largest move at rest over error [l/s per mol/l]",
-        "mv_at_zero_errors": "F at zero errors [l/s]",
-        "kc": "Kc [l/s per mol/l]",
-        "ti_s": "Ti [s]",
-    }
+    own_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("iae", "IAE", unit="mol/l s"),
+        Metric("itae", "ITAE", unit="mol/l s²"),
+        Metric("max_asse", "largest end offset", unit="mol/l", together="max"),
+        Metric("training_rms", "RMS from the reference model, training loops", unit="mol/l"),
+        Metric("validation_rms", "the same, validation loops", unit="mol/l"),
+        Metric("iterations", "iterations of the training"),
+        Metric("other_roots", "points at rest with a move of the wrong sign"),
+        Metric("least_gain", "least move at rest over error", unit="l/s per mol/l"),
+        Metric("largest_gain", "largest move at rest over error", unit="l/s per mol/l"),
+        Metric("mv_at_zero_errors", "F at zero errors", unit="l/s"),
+        Metric("kc", "Kc", unit="l/s per mol/l"),
+        Metric("ti_s", "Ti", unit="s"),
+    )
     unforeseen: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 3
     seen: ClassVar[str] = (

@@ -1,0 +1,165 @@
+"""What a figure of a closed loop is: its name, unit and words, and how the figures of several loops make one."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from numpy.typing import ArrayLike
+
+from pipeline import metrics
+from pipeline.errors import ParamsError
+
+Figures = dict[str, float]
+How = Literal["mean", "max", "min", "sum"]
+REDUCE: Mapping[How, Callable[[Iterable[float]], float]] = {
+    "mean": statistics.fmean,
+    "max": max,
+    "min": min,
+    "sum": sum,
+}
+NO_UNIT = frozenset({"", "-", "1"})
+"""How a signal says that it is a plain number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Floor:
+    """The error that measurement noise would hide in a test: a loop below it is as good as perfect.
+
+    ``error`` gives it from the noise's standard deviation [CV] and the test's samples; ``text`` says the
+    same, with ``{noise}`` for the deviation.
+    """
+
+    error: Callable[[float, float], float]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A figure of a closed loop.
+
+    ``unit`` holds ``{cv}`` where the controlled variable's unit stands. ``together`` is how the figures of
+    several sequences make one: the worst of them stays the worst for a figure that is itself a worst case.
+    A case may be compared by a metric that has a ``floor``; the bounds then minimize its errors, ``squared``
+    or absolute, from the ``reference`` or from the set point. ``of`` gives the figure from the set points
+    and the controlled variable alone, each (n,), where that is enough.
+    """
+
+    name: str
+    short: str  # in a table
+    long: str = ""  # in a sentence
+    unit: str = ""
+    together: How = "mean"
+    floor: Floor | None = None
+    squared: bool = False
+    reference: bool = False
+    of: Callable[[ArrayLike, ArrayLike], float] | None = None
+
+    def unit_of(self, cv: str) -> str:
+        """The unit where the controlled variable has the unit ``cv``; empty for a plain number."""
+        cv = cv.replace("deg", "°")
+        if cv in NO_UNIT:  # an error without a unit leaves only what stands beside it
+            return self.unit.replace("{cv}²", "").replace("{cv}", "").strip()
+        return self.unit.replace("{cv}²", f"({cv})²" if {" ", "/"} & set(cv) else f"{cv}²").replace("{cv}", cv)
+
+    def label(self, cv: str) -> str:
+        """Short words and unit, for the head of a table: IAE [mol/l min]."""
+        unit = self.unit_of(cv)
+        return f"{self.short} [{unit}]" if unit else self.short
+
+
+def _deviation(noise: float, samples: float) -> float:
+    return noise
+
+
+def _sum_of_squares(noise: float, samples: float) -> float:
+    return noise**2 * samples
+
+
+def _tells_apart(noise: float, samples: float) -> float:
+    """An error whose square is the deviation of the mean square of so many noisy samples.
+
+    A loop that can stay on its reference throughout is well within the noise.
+    """
+    return float(noise * (2 / samples) ** 0.25)
+
+
+_ABSOLUTE = Floor(_deviation, "{noise} (the measurement noise)")
+_SUM = Floor(
+    _sum_of_squares,
+    "what the measurement noise alone adds up to ({noise:g} squared times the samples)",
+)
+_MEAN_SQUARE = Floor(
+    _tells_apart,
+    "what the test's samples tell apart from their noise ({noise:g} times (2/samples)^(1/4))",
+)
+
+METRICS: dict[str, Metric] = {
+    metric.name: metric
+    for metric in (
+        Metric("mae", "MAE", "mean absolute error", "{cv}", floor=_ABSOLUTE, of=metrics.mae),
+        Metric("sse", "SSE", "sum of squared errors", "{cv}²", floor=_SUM, squared=True, of=metrics.sse),
+        Metric(
+            "tracking",
+            "tracking RMS",
+            "RMS distance from the reference model",
+            "{cv}",
+            floor=_MEAN_SQUARE,
+            squared=True,
+            reference=True,
+        ),
+        Metric("sse_late", "late SSE", "sum of squared errors after the start", "{cv}²"),
+        Metric("ise", "ISE", "integral of the squared error", "{cv}² s"),
+        Metric("masse", "MASSE", "mean absolute steady-state error", "{cv}"),
+        Metric("max_asse", "MaxASSE", "largest absolute steady-state error", "{cv}", "max"),
+        Metric("overshoot", "overshoot", "mean overshoot of the steps"),
+        Metric("settling", "settling time", "median settling time", "s"),
+        Metric("mv_travel", "MV travel", "travel of the MVs"),
+        # Of the bounds alone.
+        Metric("failures", "failures", "plans that were not solved", together="sum"),
+        Metric("step_ms_p50", "step, median", "median time of a step", "ms"),
+        Metric("step_ms_p99", "step, 99 %", "time that one step in a hundred exceeds", "ms", "max"),
+    )
+}
+"""The figures that every case has, and those of its bounds; a case adds its own, ``Case.own_metrics``."""
+
+
+def together(sequences: Iterable[Figures], known: Mapping[str, Metric] = METRICS) -> Figures:
+    """Figures of several sequences of a test as one, each by its metric's rule.
+
+    This is the one rule, for laws and for bounds: means, but the largest of what is itself a largest value
+    (``max_asse``), the least of a least one, and the sum of a count. Raises ParamsError for a figure that
+    is no known metric: nobody could say how to put it together.
+    """
+    rows = list(sequences)
+    for name in rows[0]:
+        if name not in known:
+            raise ParamsError(
+                f"the figure {name!r} is scored, but is no metric; add Metric({name!r}, ...) to the case's own_metrics"
+            )
+    return {name: float(REDUCE[known[name].together](row[name] for row in rows)) for name in rows[0]}
+
+
+def mean_of_draws(draws: Iterable[Figures]) -> Figures:
+    """Figures of one sequence under several draws of the noise: means, of every figure.
+
+    A draw is a repeated measurement of the same loop. The largest value over the draws would grow with
+    their number, and would say nothing of the loop.
+    """
+    rows = list(draws)
+    return {name: statistics.fmean(row[name] for row in rows) for name in rows[0]}
+
+
+def ratio_to_bound(own: float, bound: float, floor: float) -> float | None:
+    """Error over the bound's; None where noise would hide the bound, which is then no yardstick.
+
+    An NMPC that knows of a disturbance before it acts leaves an error of 1e-11.
+    """
+    return own / bound if bound > 0 and bound >= floor else None
+
+
+def gate_ratio(own: float, bound: float, floor: float) -> float:
+    """Error over the bound's, both at least ``floor`` > 0: 1 is the bound, or an error that noise would hide."""
+    return max(own, floor) / max(bound, floor)

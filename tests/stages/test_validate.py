@@ -1,0 +1,108 @@
+"""What validate ships, and what it refuses to ship: real files of the repository over short tests of a real plant."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.cases import CASES
+from pipeline.cases.thiosulfate_cstr.case import TJ, ThiosulfateCstrCase
+from pipeline.engine.command import run_stage
+from pipeline.errors import LawError
+from pipeline.simulation.scenario import Scenario, held
+from pipeline.stages import validate as stage
+from serving import Controller
+
+CASE, LAW = "thiosulfate_cstr", "pid"
+FILE = Path(__file__).parents[2] / "artifacts" / CASE / f"{LAW}.onnx"
+
+
+@dataclass(frozen=True)
+class ShortCase(ThiosulfateCstrCase):
+    """One step that the PID follows; ``hard`` adds a set point out of the plant's reach."""
+
+    hard: bool = False
+
+    def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        levels = {"step": [0.9872, 0.9]} | ({"beyond": [-0.3]} if self.hard else {})
+        return {n: (self._test(n, sp),) for n, sp in levels.items()}
+
+    def unscored(self) -> dict[str, Scenario]:
+        return {"longer": self._test("longer", [0.9872, 0.9], 80)}
+
+    def development(self) -> tuple[Scenario, ...]:
+        return (self._test("development", [0.9872]),)
+
+    def _test(self, name: str, levels: list[float], hold: int = 40) -> Scenario:
+        return Scenario(name, name, held(levels, hold), self._steady["cold"], np.array([TJ]), hold=hold)
+
+
+@pytest.fixture
+def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Puts a designed controller, of two data seeds, and its section of params.yaml into a folder of its own."""
+
+    def make(hard: bool, **section: object) -> None:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setitem(CASES, CASE, ShortCase(hard=hard))
+        monkeypatch.setattr(stage, "parallel_map", lambda run, work, _: list(map(run, work)))
+        designed = tmp_path / "work" / CASE / "controllers" / LAW
+        (designed / "base").mkdir(parents=True)
+        for seed in (0, 4):
+            shutil.copy(FILE, designed / "base" / f"seed{seed}.onnx")
+        (designed / "metrics.json").write_text(json.dumps({"title": "PID", "controllers": []}))
+        tree = {
+            "cases": {CASE: {"held_out_seeds": [9001], "noise_seed": 0}},
+            "controllers": {f"{CASE}-{LAW}": {"case": CASE, "law": LAW, "model": "linearized", **section}},
+        }
+        (tmp_path / "params.yaml").write_text(yaml.safe_dump(tree))
+
+    return make
+
+
+SHIPPED = Path("artifacts") / CASE / f"{LAW}.onnx"
+MEASURED = Path("work") / CASE / "validation" / LAW / "metrics.json"
+
+
+def test_a_law_that_locked_up_is_not_shipped(made: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    made(hard=True)
+    with pytest.raises(
+        LawError, match=r"locked up on beyond \(seeds 0, 4\), beyond_noise \(seeds 0, 4\), so nothing is"
+    ):
+        stage.validate(f"{CASE}-{LAW}")
+    assert not SHIPPED.exists()
+    assert run_stage(stage.validate, ["validate", f"{CASE}-{LAW}"], "CONTROLLER") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "as_printed: true" in line
+
+
+def test_a_reproduction_is_shipped_and_says_so(made: Callable[..., None]) -> None:
+    made(hard=True, as_printed=True)
+    stage.validate(f"{CASE}-{LAW}")
+    evidence = Controller(SHIPPED).manifest.evidence
+    assert evidence["lock_ups"] == 4
+    assert evidence["locked_up"] == {"beyond": {"0": 1, "4": 1}, "beyond_noise": {"0": 1, "4": 1}}
+    assert evidence["as_printed"] is True
+    measured = json.loads(MEASURED.read_text())
+    assert (measured["lock_ups"], measured["as_printed"]) == (4, True)
+    assert measured["locked_up"] == evidence["locked_up"]
+
+
+def test_a_sound_law_is_shipped_without_a_word(made: Callable[..., None]) -> None:
+    made(hard=False)
+    stage.validate(f"{CASE}-{LAW}")
+    evidence = Controller(SHIPPED).manifest.evidence
+    assert evidence["lock_ups"] == 0
+    assert not {"locked_up", "as_printed"} & set(evidence)
+    measured = json.loads(MEASURED.read_text())
+    assert measured["locked_up"] == {}
+    # What is not scored leaves its curve, and no figure.
+    assert list(measured["scenarios"]) == ["step"]
+    with np.load(MEASURED.with_name("trajectories.npz")) as curves:
+        assert curves[f"longer/base/{measured['shipped_seed']}/pv"].shape == (160, 2)
