@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import yaml
 from onnx import TensorProto, helper
-from pipeline.evaluation.for_programs import validation
 
 from pipeline.cases import CASES, beside
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.validation import SCHEMA, Validation
 from pipeline.evaluation.verdicts import PLAIN, Claims, judge
+from pipeline.report.for_programs import validation
 from pipeline.report.page import write_report
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 

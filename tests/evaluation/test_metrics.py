@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from pipeline import metrics
+from pipeline.evaluation import closed_loop
 from pipeline.evaluation.closed_loop import closed_loop_metrics, locked_up
 
 KEYS = {"mae", "sse", "ise", "masse", "max_asse", "overshoot", "settling", "mv_travel"}
@@ -63,43 +64,45 @@ def test_mae_pairs_set_point_and_output_of_the_same_sample() -> None:
 def test_overshoot_of_a_second_order_response(zeta: float) -> None:
     y = second_order(zeta, 4000, 0.01)
     expected = np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2))
-    assert metrics.overshoots(np.ones(4000), y, 0) == pytest.approx([expected], rel=1e-3)
+    assert closed_loop.overshoots(np.ones(4000), y, 0) == pytest.approx([expected], rel=1e-3)
 
 
 def test_overshoot_does_not_depend_on_the_direction_or_size_of_the_step() -> None:
     y = second_order(0.3, 300, 0.1)
     sp = np.concatenate([np.full(300, 0.5), np.full(300, 0.2)])
     pv = np.concatenate([0.5 * y, 0.5 - 0.3 * y])
-    first, second = metrics.overshoots(sp, pv, 300)
+    first, second = closed_loop.overshoots(sp, pv, 300)
     assert first == pytest.approx(second)
 
 
 def test_a_disturbance_is_no_step() -> None:
-    assert metrics.overshoots(np.ones(50), 1 + 0.01 * np.sin(np.arange(50)), 0).size == 0
+    assert closed_loop.overshoots(np.ones(50), 1 + 0.01 * np.sin(np.arange(50)), 0).size == 0
 
 
 def test_settling_of_a_first_order_lag() -> None:
     tau, h = 2.0, 0.01
     y = 1 - np.exp(-h * np.arange(3000) / tau)
-    assert h * metrics.settling_samples(np.ones(3000), y, 0)[0] == pytest.approx(-tau * np.log(0.02), abs=2 * h)
+    assert h * closed_loop.settling_samples(np.ones(3000), y, 0)[0] == pytest.approx(-tau * np.log(0.02), abs=2 * h)
 
 
 def test_a_hold_that_never_settles_counts_whole() -> None:
     sp = np.repeat([1.0, 2.0], 25)
-    assert metrics.settling_samples(sp, np.zeros(50), 25).tolist() == [25.0, 25.0]
+    assert closed_loop.settling_samples(sp, np.zeros(50), 25).tolist() == [25.0, 25.0]
 
 
 def test_steady_state_error_averages_noise_but_not_offset() -> None:
     noise = np.tile([0.01, -0.02, 0.03, -0.01, -0.01], 20)
     sp = np.repeat([0.2, 0.7], 50)
-    assert metrics.max_asse(sp, sp + noise, 50) == pytest.approx(0.0, abs=1e-12)
-    assert metrics.steady_errors(sp, sp + noise + np.repeat([0.0, 0.1], 50), 50) == pytest.approx([0.0, 0.1], abs=1e-12)
+    assert closed_loop.max_asse(sp, sp + noise, 50) == pytest.approx(0.0, abs=1e-12)
+    assert closed_loop.steady_errors(sp, sp + noise + np.repeat([0.0, 0.1], 50), 50) == pytest.approx(
+        [0.0, 0.1], abs=1e-12
+    )
 
 
 def test_itae_starts_again_at_each_hold() -> None:
     sp, pv = np.ones(20), np.zeros(20)
-    assert metrics.itae(sp, pv, 10, 0.5) == pytest.approx(2 * 0.25 * sum(range(10)))
-    assert metrics.itae(sp, pv, 0, 0.5) == pytest.approx(0.25 * sum(range(20)))
+    assert closed_loop.itae(sp, pv, 10, 0.5) == pytest.approx(2 * 0.25 * sum(range(10)))
+    assert closed_loop.itae(sp, pv, 0, 0.5) == pytest.approx(0.25 * sum(range(20)))
 
 
 def test_several_loops_average_but_keep_the_worst_steady_state_error() -> None:

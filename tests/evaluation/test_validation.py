@@ -141,7 +141,7 @@ def test_without_a_validation_there_is_no_evidence() -> None:
     gate = Gate.of(None, "pid")
     assert gate.refusal() == "its validation has no gate score"
     assert version_description(None, gate, "run", None).startswith("No closed-loop evidence yet")
-    assert "<b>pid</b> for tank" in model_description("tank", "pid", None)
+    assert "<b>pid</b> for tank" in model_description("tank", "pid", None, None)
 
 
 def test_lock_ups_name_tests_and_seeds() -> None:

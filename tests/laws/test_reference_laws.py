@@ -21,10 +21,10 @@ from pipeline.laws.reference.pi_reference import PiReference
 from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
 from pipeline.laws.reference.reference_networks import IncrementalNetwork, Trainable, TrainablePi, TwoErrorNetwork
 from pipeline.laws.reference.reference_training import follow, train
-from pipeline.laws.reference_model import ReferenceModel
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.plants.base import Plant
 from pipeline.simulation.simulate import Trajectory, simulate_closed
+from pipeline.tuning.reference_model import ReferenceModel
 from pipeline.tuning.rules import AllPole
 
 CASE = CASES["reversible_cstr"]

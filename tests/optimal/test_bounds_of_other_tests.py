@@ -20,7 +20,6 @@ from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.metric import METRICS
-from pipeline.laws.reference_model import ReferenceModel
 from pipeline.optimal.bounds import load_bounds, plant_digest
 from pipeline.optimal.horizon import Horizon
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
@@ -28,6 +27,7 @@ from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.simulation.simulate import simulate_closed, simulate_open
 from pipeline.stages import bounds as oracle
+from pipeline.tuning.reference_model import ReferenceModel
 
 QUICK = Effort(periods=20, elements=1, fine=1, degree=2, reaches=(3,), tail=10, every=5, noisy=False)
 

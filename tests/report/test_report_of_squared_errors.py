@@ -12,7 +12,6 @@ import made_up_case as made_up
 import numpy as np
 import pytest
 from made_up_case import BATCH, PH, Miniature
-from pipeline.evaluation.for_programs import gate_id
 from rich.console import Console
 
 from pipeline.cases import CASES
@@ -25,6 +24,7 @@ from pipeline.evaluation.verdicts import paper_row, plain_reason, requirement, s
 from pipeline.pictures.loop_picture import History, summary
 from pipeline.pictures.loop_pictures import info_picture
 from pipeline.pictures.words import ratio
+from pipeline.report.for_programs import gate_id
 from pipeline.report.page import headline
 from pipeline.report.results import show_results
 from pipeline.report.verdict_words import statement, table_row

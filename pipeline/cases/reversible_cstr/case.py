@@ -13,9 +13,9 @@ from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, Pa
 from pipeline.evaluation.closed_loop import itae
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import Metric
-from pipeline.laws.reference_model import ReferenceModel
 from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
+from pipeline.tuning.reference_model import ReferenceModel
 
 LEVELS = [0.46, 0.40, 0.52, 0.36, 0.48, 0.54, 0.42, 0.38, 0.50, 0.44, 0.35, 0.55]  # [mol/l]
 HOLD = 200

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure as Canvas
 
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.verdicts import Verdict
-from pipeline.laws.reference_model import CLASSIC, ORDERS, ReferenceModel
 from pipeline.pictures.drawing import SHADES, SIZE
+from pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel
 
 SPAN, STEP = 13.0, 0.02  # of the time wn t that is drawn
 HEAD = ("order", "found: coefficients of $s^{n-1}..s^1$", "ITAE", "classic table", "ITAE")

@@ -15,11 +15,11 @@ from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from pipeline.laws.reference.reference_loops import Training
 from pipeline.laws.reference.reference_networks import BEFORE, COURSE, IncrementalNetwork, R, U, Y
 from pipeline.laws.reference.reference_training import Trained, gain_sign, story, train
-from pipeline.laws.reference_model import ReferenceModel
 from pipeline.models.base import Model
 from pipeline.models.memory import Named
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.plants.base import Array, Plant
+from pipeline.tuning.reference_model import ReferenceModel
 
 POINTS = 21  # of MV and CV each, at which the roots are looked for
 ERRORS = np.geomspace(1e-4, 1.0, 41)  # of the CV's range

@@ -14,11 +14,11 @@ from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from pipeline.laws.reference.reference_loops import Training
 from pipeline.laws.reference.reference_networks import TrainablePi
 from pipeline.laws.reference.reference_training import Trained, gain_sign, story, train
-from pipeline.laws.reference_model import ReferenceModel
 from pipeline.models.base import Model
 from pipeline.models.memory import Named
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.plants.base import Plant
+from pipeline.tuning.reference_model import ReferenceModel
 
 
 class PiReference(ReferenceLaw):

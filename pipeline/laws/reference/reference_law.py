@@ -11,8 +11,8 @@ from torch import Tensor
 
 from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
-from pipeline.laws.reference_model import ReferenceModel
 from pipeline.models.memory import Named, Stage
+from pipeline.tuning.reference_model import ReferenceModel
 
 FOLLOWED = 0.01  # of the MV's range: an applied MV this close to the last request is the request
 

@@ -13,9 +13,9 @@ from pipeline.errors import LawError
 from pipeline.laws.base import Analysis, LawSignals
 from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
 from pipeline.laws.reference.reference_networks import Trainable
-from pipeline.laws.reference_model import ReferenceModel
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.models.training.jacobian import input_jacobian
+from pipeline.tuning.reference_model import ReferenceModel
 
 Array = NDArray[np.float64]
 
