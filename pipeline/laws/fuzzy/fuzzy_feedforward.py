@@ -28,7 +28,7 @@ class FuzzyFeedforward(FuzzyLaw):
     name: ClassVar[str] = "fuzzy_feedforward"
     title: ClassVar[str] = "Fuzzy feedforward"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
         """Numbers of the law.
 
@@ -39,8 +39,8 @@ class FuzzyFeedforward(FuzzyLaw):
         """
 
         part: str | None = None
-        jacket_low: float = 20.0
-        jacket_high: float = 70.0
+        jacket_low: float
+        jacket_high: float
         switch_penalty: float = 0.0
         mv_rate: float | None = None
 

@@ -36,7 +36,7 @@ class FuzzyFeedforwardPi(FuzzyLaw):
     name: ClassVar[str] = "fuzzy_feedforward_pi"
     title: ClassVar[str] = "Fuzzy feedforward with PI"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
         """Numbers of the law; the first five as in ``fuzzy_feedforward``.
 
@@ -45,14 +45,14 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         """
 
         part: str | None = None
-        jacket_low: float = 20.0
-        jacket_high: float = 70.0
-        switch_penalty: float = 2.0
+        jacket_low: float
+        jacket_high: float
+        switch_penalty: float = 0.0
         mv_rate: float | None = None
-        kc: float = 12.0
-        ti_s: float = 500.0
-        approach: float = 0.2
-        k_jacket: float = 0.8
+        kc: float
+        ti_s: float
+        approach: float
+        k_jacket: float
 
         def __post_init__(self) -> None:
             require_numbers(self)

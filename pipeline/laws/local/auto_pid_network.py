@@ -69,11 +69,11 @@ class AutoPidNetwork(LocalControllers):
     name: ClassVar[str] = "auto_pid_network"
     title: ClassVar[str] = "Local controller network, one knob"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(BlendedParams):
         """``wc`` [rad/min] is the one knob: how fast the closed loop shall be at every operating point."""
 
-        wc: float = 5.0
+        wc: float
 
         def __post_init__(self) -> None:
             BlendedParams.__post_init__(self)

@@ -115,7 +115,7 @@ class LocalControllers(ControlLaw):
         cls, params: BlendedParams, signals: LawSignals, models: LocalModels, pids: Sequence[LocalPid], plant: Plant
     ) -> Self:
         """The law with these local controllers, the rest as ``params`` says; raises LawError."""
-        states, given = len(plant.state_signals), len(params.stability.low)
+        states, given = len(plant.state_signals), len(params.stability.box(plant)[0])
         if params.stability.starts and given != states:
             raise LawError(
                 f"law {cls.name!r}: stability.low and stability.high have {given} numbers; plant {plant.name!r} has "

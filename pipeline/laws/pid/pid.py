@@ -82,7 +82,7 @@ class PID(ControlLaw):
         set_point_weight: float | None = None
         lambda_s: float | None = None
         operating_cv: float | None = None
-        development_seeds: tuple[int, ...] = (7001, 7002, 7003)
+        development_seeds: tuple[int, ...] = (1, 2, 3)
         development_set_points: int = 12
         development_hold: int = 60
         sampling: float = 0.5

@@ -40,7 +40,7 @@ class ModelReference(ReferenceLaw):
     title: ClassVar[str] = "Model-reference network"
     incremental: ClassVar[bool] = True
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):
         """The reference model, and how the network is trained to follow it."""
 

@@ -33,7 +33,7 @@ class ModelReferenceTwoError(ReferenceLaw):
     name: ClassVar[str] = "model_reference_two_error"
     title: ClassVar[str] = "Model-reference network, two errors"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):
         """The reference model, and how the network is trained to follow it."""
 
