@@ -115,6 +115,8 @@ class Case(ABC):
     # A figure that `score` adds, or that a law's analysis has -> its words in a table, unit and all ("IAE [K s]").
     # What a case names here, its report shows of every test.
     metric_words: ClassVar[Mapping[str, str]] = {}
+    # A test -> its words inside a sentence, where they are not its name's.
+    test_words: ClassVar[Mapping[str, str]] = {}
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
     seen: ClassVar[str] = ""  # in words for the report: which scored figures were looked at while numbers were chosen

@@ -118,7 +118,7 @@ class Evidence:
         """What a picture of the main test shows, and what the test is to somebody who doubts a tuning."""
         name, recipe = self.main_test, self.case.recipe
         if len(self.tests[name.removesuffix(NOISE_SUFFIX)]) == 1:
-            return (scenario_name(name, recipe),) * 2
+            return (scenario_name(name, recipe, self.case.test_words),) * 2
         if recipe:
             return "a held-out recipe", "recipes that nothing was tuned on"
         return "a held-out sequence", "set points that nothing was tuned on"

@@ -102,7 +102,7 @@ def read_stored(path: Path) -> dict[str, Any]:
 
 
 def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dict[str, float]]]:
-    """The bounds by scenario: ``{"sp_a": {"nmpc": {"mae": ...}, "offline": {...}}, "sp_a_noise": {"nmpc": ...}}``.
+    """The bounds by scenario: ``{"held_out": {"nmpc": {"mae": ...}, "offline": {...}}, ...}``.
 
     Figures of several sequences are put ``together``. Where ``kinds`` has no ``nmpc_noise``,
     the NMPC's figures with noise are those without. Tests without bounds

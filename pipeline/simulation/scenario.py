@@ -18,7 +18,7 @@ from pipeline.plants.base import Plant
 Array = NDArray[np.float64]
 
 NOISE_SUFFIX = "_noise"
-"""A scenario's name with measurement noise is its name with this at the end: ``sp_a_noise``."""
+"""A scenario's name with measurement noise is its name with this at the end: ``held_out_noise``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,8 +17,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture
 def params(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The repository's own params.yaml in a folder of its own, which ``checked`` writes anew."""
-    shutil.copytree(ROOT / "pipeline" / "plants", tmp_path / "pipeline" / "plants")
-    shutil.copytree(ROOT / "pipeline" / "models", tmp_path / "pipeline" / "models")
+    shutil.copytree(ROOT / "pipeline" / "cases", tmp_path / "pipeline" / "cases")
     monkeypatch.chdir(tmp_path)
     tree: dict[str, Any] = yaml.safe_load((ROOT / "params.yaml").read_text())
     return tree

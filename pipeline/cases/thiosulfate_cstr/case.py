@@ -58,6 +58,7 @@ class ThiosulfateCstrCase(Case):
     )
     title: ClassVar[str] = "Thiosulfate CSTR"
     plant_class: ClassVar[type[Plant]] = ThiosulfateCstr
+    test_words: ClassVar[Mapping[str, str]] = {"sp_a": "SP-A", "sp_b": "SP-B"}
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     noise: ClassVar[Mapping[str, float]] = {"C_A": 5e-4, "T": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"sp_a": 0.2, "sp_b": 0.2, "held_out": 0.4, "tin": 0.1, "ua": 0.1}
