@@ -44,4 +44,4 @@ bench: $(STAMP) ## run the benchmarks, about 7 minutes
 	@for script in benchmarks/[a-z]*.py; do echo "== $$script"; python $$script || exit 1; done
 
 clean: ## remove what can be rebuilt (the virtual environment stays)
-	rm -rf work receipts published.json mlflow.db mlruns mlartifacts .pytest_cache .mypy_cache .ruff_cache build
+	rm -rf work timing receipts published.json mlflow.db mlruns mlartifacts .pytest_cache .mypy_cache .ruff_cache build

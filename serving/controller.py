@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import stat
+from collections.abc import Callable
 from math import isfinite
 from os import PathLike
 from pathlib import Path
@@ -221,20 +224,48 @@ def _vectors(lengths: list[int]) -> tuple[Array, list[Array]]:
 def _read(path: Path, pinned: str | None) -> bytes:
     """The file's bytes, read once: what is checked is what is loaded."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ArtifactError(f"the file has {path.stat().st_size} bytes; a controller has at most {MAX_BYTES}")
-        data = path.read_bytes()
-    except OSError as error:
-        raise ArtifactError(f"the file cannot be read: {error.strerror or error}") from error
+        _check_kind(path.stat())  # before it is opened: opening a device may already do something
+        with open(path, "rb", opener=_without_waiting) as file:
+            info = os.fstat(file.fileno())
+            _check_kind(info)
+            data = file.read(info.st_size)
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+        raise ArtifactError(f"the file cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if pinned is not None and file_digest(data) != pinned.lower():
         raise ArtifactError(f"the file's SHA-256 is {file_digest(data)}, not the pinned {pinned}")
     unseal(data)
     return data
 
 
+def _check_kind(info: os.stat_result) -> None:
+    """ArtifactError unless it is a regular file of at most MAX_BYTES: a pipe or a device may never end."""
+    if not stat.S_ISREG(info.st_mode):
+        kind = next((word for is_kind, word in _KINDS if is_kind(info.st_mode)), "no regular file")
+        raise ArtifactError(f"the path is {kind}; a controller is a regular file")
+    if info.st_size > MAX_BYTES:
+        raise ArtifactError(f"the file has {info.st_size} bytes; a controller has at most {MAX_BYTES}")
+
+
+_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
+    (stat.S_ISDIR, "a directory"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a path; a pipe without a writer, put in the file's place since it was checked, does not block."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
 def _manifest(metadata: dict[str, str]) -> Manifest:
     if MANIFEST_KEY not in metadata or DIGEST_KEY not in metadata:
         raise ArtifactError(f"the file has no {MANIFEST_KEY}: it is an ONNX model, but no Loopwright controller")
+    strange = sorted(set(metadata) - {MANIFEST_KEY, DIGEST_KEY})
+    if strange:  # onnxruntime takes settings from some entries
+        raise ArtifactError(f"the file has the metadata entry {strange[0]!r}, which no controller has")
     return Manifest.from_json(metadata[MANIFEST_KEY])
 
 
@@ -248,6 +279,8 @@ def _session(data: bytes) -> Any:
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
     options.enable_mem_reuse = False  # 8 % faster on small graphs; the bits are the same
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # The bytes were read as ONNX; onnxruntime would guess its own format from bytes 4 to 8.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
     options.log_severity_level = 4  # what goes wrong is raised, not logged
     try:
         return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])

@@ -13,6 +13,12 @@ from serving.errors import ArtifactError
 SCHEMA = 1
 MANIFEST_KEY = "loopwright.manifest"
 INPUTS = ("sp", "pv", "dv", "mv_applied", "state")
+MAX_CHARACTERS = 2**20
+MAX_NAME = 200  # characters
+MAX_DEPTH = 20  # of lists and objects in each other
+MAX_DIGITS = 300  # of an integer
+MAX_STATE = 1_000_000
+SHORTEST_S, LONGEST_S = 1e-6, 1e9  # a period
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +64,17 @@ class Signal:
 
     @classmethod
     def from_dict(cls, row: dict[str, Any]) -> Self:
-        """The signal that ``to_dict`` wrote."""
+        """The signal that ``to_dict`` wrote; TypeError or ValueError if it is none."""
+        unknown = sorted(set(row) - {f.name for f in fields(cls)})
+        if unknown:
+            raise ValueError(f"a signal has unknown entries: {', '.join(unknown)}")
         values = row.get("values")
         return cls(
-            name=str(row["name"]),
-            unit=str(row["unit"]),
-            low=float(row["low"]),
-            high=float(row["high"]),
-            values=None if values is None else tuple(float(v) for v in values),
+            name=_name(row["name"]),
+            unit=_name(row["unit"]),
+            low=_number(row["low"]),
+            high=_number(row["high"]),
+            values=None if values is None else tuple(map(_number, _list(values))),
         )
 
 
@@ -99,10 +108,12 @@ class Manifest:
                 raise ArtifactError(f"the manifest's {name} has a name twice: {', '.join(names)}")
         if not self.mv:
             raise ArtifactError("the manifest has no manipulated variable")
-        if not (math.isfinite(self.period_s) and self.period_s > 0):
-            raise ArtifactError(f"the manifest has the period {self.period_s} s; it must be positive")
-        if self.n_state < 0:
-            raise ArtifactError(f"the manifest has n_state = {self.n_state}; it must not be negative")
+        if not SHORTEST_S <= self.period_s <= LONGEST_S:
+            raise ArtifactError(
+                f"the manifest has the period {self.period_s} s; it must be positive, {SHORTEST_S:g} to {LONGEST_S:g} s"
+            )
+        if not 0 <= self.n_state <= MAX_STATE:
+            raise ArtifactError(f"the manifest has n_state = {self.n_state}; it must be 0 to {MAX_STATE}")
         strange = [n for n in self.inputs if n not in INPUTS]
         if strange or len(set(self.inputs)) < len(self.inputs):
             raise ArtifactError(
@@ -130,15 +141,21 @@ class Manifest:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """The manifest in ``text``; ArtifactError names what is missing or malformed."""
+        if len(text) > MAX_CHARACTERS:
+            raise ArtifactError(f"the manifest has {len(text)} characters; it may have {MAX_CHARACTERS}")
         try:
-            row = json.loads(text, parse_constant=_not_finite)
-        except (json.JSONDecodeError, RecursionError) as error:
+            row = json.loads(
+                text, parse_constant=_finite, parse_float=_finite, parse_int=_integer, object_pairs_hook=_object
+            )
+        except (ValueError, RecursionError) as error:
             raise ArtifactError(f"the manifest is not JSON: {error}") from error
+        _check_depth(row)
         if not isinstance(row, dict):
             raise ArtifactError("the manifest is not a JSON object")
-        if row.get("schema") != SCHEMA:
+        schema = row.get("schema")
+        if type(schema) is not int or schema != SCHEMA:
             raise ArtifactError(
-                f"the manifest has schema {row.get('schema')!r}; this runtime reads schema {SCHEMA}: "
+                f"the manifest has schema {str(schema)[:MAX_NAME]}; this runtime reads schema {SCHEMA}: "
                 "export the controller again or use the matching release of loopwright"
             )
         missing = [f.name for f in fields(cls) if f.name not in row]
@@ -146,28 +163,96 @@ class Manifest:
             raise ArtifactError(f"the manifest lacks {', '.join(missing)}")
         unknown = sorted(set(row) - {f.name for f in fields(cls)})
         if unknown:
-            raise ArtifactError(f"the manifest has unknown entries: {', '.join(unknown)}")
+            raise ArtifactError(f"the manifest has unknown entries: {', '.join(unknown)[:MAX_NAME]}")
         try:
-            signals = {k: tuple(Signal.from_dict(s) for s in row[k]) for k in ("sp", "pv", "dv", "mv")}
+            signals = {k: tuple(Signal.from_dict(_dict(s)) for s in _list(row[k])) for k in ("sp", "pv", "dv", "mv")}
+            if type(row["n_state"]) is not int:
+                raise TypeError(f"n_state is {_shown(row['n_state'])}; it must be an integer")
             return cls(
-                case=str(row["case"]),
-                law=str(row["law"]),
-                period_s=float(row["period_s"]),
-                n_state=int(row["n_state"]),
-                info=tuple(str(n) for n in row["info"]),
-                inputs=tuple(str(n) for n in row["inputs"]),
+                case=_name(row["case"]),
+                law=_name(row["law"]),
+                period_s=_number(row["period_s"]),
+                n_state=row["n_state"],
+                info=tuple(map(_name, _list(row["info"]))),
+                inputs=tuple(map(_name, _list(row["inputs"]))),
                 schema=SCHEMA,
-                provenance=dict(row["provenance"]),
-                evidence=dict(row["evidence"]),
+                provenance=_dict(row["provenance"]),
+                evidence=_dict(row["evidence"]),
                 **signals,
             )
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise ArtifactError(f"the manifest is malformed: {error!r}") from error
+        except KeyError as error:
+            raise ArtifactError(f"the manifest is malformed: a signal lacks {error}") from error
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ArtifactError(f"the manifest is malformed: {error}") from error
 
 
 def _increasing(values: tuple[float, ...]) -> bool:
     return all(a < b for a, b in pairwise(values))
 
 
-def _not_finite(text: str) -> float:
-    raise ArtifactError(f"the manifest holds {text}, which is not a number")
+# ---------------------------------------------------------------------- JSON, strictly
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ArtifactError(f"the manifest holds {text[:MAX_NAME]}, which is not a finite number")
+    return value
+
+
+def _integer(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        raise ArtifactError(f"the manifest holds an integer of {len(text)} digits; it may have {MAX_DIGITS}")
+    return int(text)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    row = dict(pairs)
+    if len(row) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ArtifactError(f"the manifest has the entry {twice[:MAX_NAME]!r} twice in one object")
+    return row
+
+
+def _check_depth(value: object) -> None:
+    """ArtifactError above MAX_DEPTH: whoever walks or writes the manifest again would fail there."""
+    level, depth = [value], 0
+    while level:
+        depth += 1
+        if depth > MAX_DEPTH + 1:
+            raise ArtifactError(f"the manifest has lists or objects nested more than {MAX_DEPTH} deep")
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+
+
+def _name(value: object) -> str:
+    if not isinstance(value, str) or len(value) > MAX_NAME:
+        raise TypeError(f"a name is {_shown(value)}; it must be a text of at most {MAX_NAME} characters")
+    value.encode()  # half a surrogate pair cannot be printed
+    return value
+
+
+def _number(value: object) -> float:
+    if type(value) not in (int, float):
+        raise TypeError(f"{_shown(value)} stands where a number belongs")
+    return float(value)  # type: ignore[arg-type]  # just checked
+
+
+def _list(value: object) -> list[Any]:
+    if not isinstance(value, list):
+        raise TypeError(f"{_shown(value)} stands where a list belongs")
+    return value
+
+
+def _dict(value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TypeError(f"{_shown(value)} stands where an object belongs")
+    return value
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."

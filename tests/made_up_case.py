@@ -184,7 +184,7 @@ def write_models(root: Path) -> None:
     for c in range(4, 101, 8):
         rmse = 60 * np.exp(-c / 20) + 18 + 0.05 * abs(c - 84)
         score = {"rmse": rmse, "r2": 0.97, "regions": {"hot": rmse / 5, "middle": rmse * 4}}
-        rows.append({"partitions": c, "centres": int(c**1.4), "train": score, "validation": score, "seconds": 1.0})
+        rows.append({"partitions": c, "centres": int(c**1.4), "train": score, "validation": score})
     write_json(folder / "sweep.json", {"chosen": 84, "unit": "K", "rows": rows})
     actual = np.random.default_rng(0).uniform(0, 500, 200)
     np.savez(folder / "predictions.npz", time_s=np.arange(200) * 0.5, actual=actual, predicted=actual * 0.97 + 5)
@@ -240,9 +240,9 @@ def write_validation(
             v: {name: spread(error * (1.2 + 0.1 * i), metric) for name, error in errors.items()}
             for i, v in enumerate(variants)
         },
-        "step_us": {"p50": 25.0, "p99": 60.0},
     }
     write_json(folder / "metrics.json", metrics)
+    write_json(root / "timing" / mini.case / f"{law}-step.json", {"p50": 25.0, "p99": 60.0})
     loops = {**tests, **{name + NOISE_SUFFIX: test for name, test in tests.items()}}
     loops |= {
         f"{f.scenario}_hold{f.hold}": tests[f.scenario].with_hold(f.hold) for f in case.figures if f.hold and f.scenario

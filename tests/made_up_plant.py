@@ -1,4 +1,4 @@
-"""Two linear plants whose answers are known: one in other units and minutes, one with two MVs. Not a test."""
+"""Linear plants whose answers are known: in other units and minutes, with two MVs, with dead time. Not a test."""
 
 from __future__ import annotations
 
@@ -53,3 +53,26 @@ class Mixer(Plant):
 
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
         return ca.vertcat(self.k * (mv[0] + mv[1]), self.k * (mv[0] - mv[1])) - x / self.tau
+
+
+@dataclass(frozen=True)
+class Chain(Plant):
+    """Five equal lags in series, nearly a dead time; with ``back`` above 0 the output first goes the wrong way."""
+
+    tau: float = field(default=4.0, metadata={"unit": "s"})
+    back: float = field(default=0.0, metadata={"unit": "-"})
+
+    name: ClassVar[str] = "chain"
+    title: ClassVar[str] = "Chain"
+    state_signals: ClassVar[tuple[Signal, ...]] = tuple(Signal(f"x{i}", "m", -2.0, 2.0) for i in range(5))
+    pv_signals: ClassVar[tuple[Signal, ...]] = (Signal("y", "m", -2.0, 2.0),)
+    sp_signals: ClassVar[tuple[Signal, ...]] = (Signal("y", "m", -1.0, 1.0),)
+    mv_signals: ClassVar[tuple[Signal, ...]] = (Signal("u", "m", -3.0, 3.0),)
+    period_s: ClassVar[float] = 2.0
+    substeps: ClassVar[int] = 4
+
+    def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
+        return (ca.vertcat(mv[0], x[0], x[1], x[2], x[3]) - x) / self.tau
+
+    def output(self, x: Any) -> Any:
+        return (1 + self.back) * x[4] - self.back * x[0]

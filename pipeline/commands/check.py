@@ -7,7 +7,7 @@ import sys
 
 from pipeline.config.params import sections
 from pipeline.errors import PipelineError
-from pipeline.stages.check import CHECKS, mistakes
+from pipeline.stages.check import CHECKS, mistakes, notes
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +22,8 @@ def run(options: argparse.Namespace) -> int:
         found = [str(error)]
     for line in found:
         print(f"check: {line}", file=sys.stderr)
+    for line in [] if found else notes():
+        print(f"check: note: {line}", file=sys.stderr)
     if not found:
         print("check: params.yaml has no mistake: " + ", ".join(f"{len(sections(kind))} {kind}" for kind in CHECKS))
     return 2 if found else 0

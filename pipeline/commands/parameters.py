@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import re
 import textwrap
+import typing
 from typing import Any
 
 WIDTH = 110
@@ -25,6 +26,11 @@ def show(params: type[Any]) -> None:
         for block in re.split(r"\n\s*\n", text):
             words = " ".join(block.replace("``", "").split())
             print("\n".join(textwrap.wrap(words, WIDTH)) if not block.startswith("    ") else block)
+    hints = typing.get_type_hints(params)
+    for f in dataclasses.fields(params):
+        if dataclasses.is_dataclass(hints[f.name]):
+            print(f"\n{f.name}:\n")
+            show(hints[f.name])
 
 
 def texts(params: type[Any]) -> list[str]:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import socket
 import sys
 from pathlib import Path
 from urllib.parse import quote
 
-from mlflow.entities.model_registry import RegisteredModel
-
 from pipeline.errors import TrackingError
 from pipeline.tracking.publish import publish
-from pipeline.tracking.registry import CHAMPION, fetch, promote, versions
+from pipeline.tracking.registry import CHAMPION, fetch, promote, registered, versions
 from pipeline.tracking.store import store, store_uri
 
 HOST = "127.0.0.1"
@@ -28,26 +25,14 @@ def _publish(args: argparse.Namespace) -> None:
 
 def _list(args: argparse.Namespace) -> None:
     with store() as client:
-        models = client.search_registered_models(max_results=1000)
-        for model in sorted(models, key=_place):
+        models = registered(client)
+        for model in models:
             for version in versions(client, model.name):
                 aliases = " ".join(f"@{a}" for a in version.aliases)
                 score = version.tags.get("gate_score", "-")
                 print(f"{model.name:40} {version.version:>4}  gate {score:10} {aliases}")
         if not models:
             print("the registry is empty; run `dvc repro`, or `loopwright registry publish`")
-
-
-def _place(model: RegisteredModel) -> tuple[str, bool, int, str]:
-    """Cases by name; within a case the champion first, then by rank."""
-    standing = model.tags.get("standing", "")
-    rank = re.search(r"(\d+) of \d+", standing)
-    return (
-        model.tags.get("case", ""),
-        not standing.startswith(CHAMPION),
-        int(rank[1]) if rank else sys.maxsize,
-        str(model.name),
-    )
 
 
 def _promote(args: argparse.Namespace) -> None:

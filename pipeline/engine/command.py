@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from serving.errors import LoopwrightError
 
 
@@ -18,5 +20,12 @@ def run_stage(stage: Callable[[str], None], argv: Sequence[str], what: str) -> i
         stage(argv[1])
     except (LoopwrightError, OSError) as error:
         print(f"{program} {argv[1]}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except np.linalg.LinAlgError as error:
+        print(
+            f"{program} {argv[1]}: a system of linear equations has no single solution ({error}); check the plant's "
+            "equations at the operating point, and that the data excite every input",
+            file=sys.stderr,
+        )
         return 2
     return 0

@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ParamsError
+from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
 from pipeline.metrics import rmse
@@ -137,7 +137,13 @@ class Case(ABC):
 
     @cached_property
     def plant(self) -> Plant:
-        """The nominal plant."""
+        """The nominal plant; raises PlantError where ``plant_class`` is abstract."""
+        lacking = ", ".join(sorted(self.plant_class.__abstractmethods__))
+        if lacking:
+            raise PlantError(
+                f"case {self.name!r}: its plant class {self.plant_class.__name__} is abstract, as it lacks {lacking}; "
+                "write that, or name another class as plant_class"
+            )
         return self.plant_class()
 
     @property
@@ -149,6 +155,18 @@ class Case(ABC):
     def noise_std(self) -> Array:
         """Standard deviation of each PV's measurement noise, shape (n_pv,)."""
         return np.array([self.noise[s.name] for s in self.plant_class.pv_signals])
+
+    def tests(self) -> dict[str, tuple[Scenario, ...]]:
+        """``scenarios``; raises ParamsError where there are none, or one of them has no sequence."""
+        found = self.scenarios()
+        if not found:
+            raise ParamsError(f"case {self.name!r} has no tests: its scenarios() is empty; return at least one")
+        for name, sequences in found.items():
+            if not sequences:
+                raise ParamsError(
+                    f"case {self.name!r}: its test {name!r} has no sequence; give it at least one Scenario"
+                )
+        return found
 
     def with_held_out(self, seeds: tuple[int, ...]) -> Self:
         """The case scored on other held-out sequences."""

@@ -40,8 +40,11 @@ class Evidence:
         laws: Collection[str] | None = None,
         models_of: Collection[str] | None = None,
         own_data: bool = False,
+        timing: Path | None = None,
     ) -> Self:
         """What lies under ``work`` = work/<case>, of the named laws and model sets in their order (None: all).
+
+        ``timing`` = timing/<case> holds the times of a step; a law without a file there was not timed.
 
         A law or set that params.yaml no longer lists leaves its folder behind; it is no evidence any more.
         Raises ReportError where no law was validated.
@@ -56,7 +59,12 @@ class Evidence:
             case,
             bounds,
             {
-                n: LawEvidence(n, read_metrics(validation / n / "metrics.json"), validation / n / "trajectories.npz")
+                n: LawEvidence(
+                    n,
+                    read_metrics(validation / n / "metrics.json"),
+                    validation / n / "trajectories.npz",
+                    {} if timing is None else _step_time(timing / f"{n}-step.json"),
+                )
                 for n in names
             },
             {
@@ -212,3 +220,7 @@ class Evidence:
         """The trajectory behind a curve of a figure; None where none was stored."""
         law = self.laws.get(curve.law)
         return None if law is None else law.loop(scenario + (f"_hold{hold}" if hold else ""), curve.setting)
+
+
+def _step_time(path: Path) -> dict[str, float]:
+    return {key: float(value) for key, value in read_metrics(path).items()} if path.exists() else {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import statistics
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,11 +48,12 @@ def parse_setting(name: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class LawEvidence:
-    """What validate measured of one law: metrics.json and, loaded when asked for, trajectories.npz."""
+    """What validate measured of one law: metrics.json, the time of a step and, when asked for, trajectories.npz."""
 
     law: str
     metrics: Mapping[str, Any]
     trajectories: Path
+    step_time: Mapping[str, float] = field(default_factory=dict)  # [us] p50, p99; empty: not timed
 
     @property
     def title(self) -> str:
@@ -89,9 +90,7 @@ class LawEvidence:
     @property
     def step_us(self) -> float | None:
         """Median time of a step [us]."""
-        found = self.metrics.get("step_us")
-        value = found.get("p50") if isinstance(found, Mapping) else found
-        return None if value is None else float(value)
+        return self.step_time.get("p50")
 
     def variant_of(self, setting: Mapping[str, Any]) -> str | None:
         """Name of the variant with exactly this setting beside the shipped one; "" is the shipped law itself."""

@@ -136,6 +136,10 @@ class ControlLaw(nn.Module, ABC):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step."""
 
+    @classmethod
+    def check(cls, params: Any, models: Mapping[str, Model], plant: Plant) -> None:
+        """Raise LawError where ``design`` would refuse the plant; without training, so ``models`` may lack parts."""
+
     def analysis(self, plant: Plant) -> Analysis:
         """What the law says of itself beside its closed loops over ``plant``; nothing, unless it has a theory."""
         return Analysis()

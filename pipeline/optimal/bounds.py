@@ -20,6 +20,7 @@ from pipeline.evaluation.effort import Effort
 from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
+Bounds = dict[str, dict[str, dict[str, float]]]
 SCHEMA = 1
 DEFAULTS: dict[str, Any] = {
     "metric": "mae",
@@ -101,13 +102,22 @@ def read_stored(path: Path) -> dict[str, Any]:
     return stored if isinstance(stored, dict) and stored.get("schema") == SCHEMA else {}
 
 
-def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dict[str, float]]]:
-    """The bounds by scenario: ``{"held_out": {"nmpc": {"mae": ...}, "offline": {...}}, ...}``.
+def load_bounds(case: Case, path: Path | None = None) -> Bounds:
+    """All bounds of a case, as ``stored_bounds`` gives them; raises LawError also where figures are missing."""
+    found, missing = stored_bounds(case, path)
+    if missing:
+        raise LawError(missing[0])
+    return found
 
-    Figures of several sequences are put ``together``. Where ``kinds`` has no ``nmpc_noise``,
-    the NMPC's figures with noise are those without. Tests without bounds
-    (``bounded``) are left out. Raises LawError where figures are missing or belong to another plant,
-    metric, effort or scenario than the case has now.
+
+def stored_bounds(case: Case, path: Path | None = None) -> tuple[Bounds, list[str]]:
+    """The bounds that are there, and a sentence for each figure that is missing.
+
+    By scenario: ``{"held_out": {"nmpc": {"mae": ...}, "offline": {...}}, ...}``.
+    Figures of several sequences are put ``together``; where one sequence's are missing, so is the test's.
+    Where ``kinds`` has no ``nmpc_noise``, the NMPC's figures with noise are those without. Tests without
+    bounds (``bounded``) are left out. Raises LawError where the file holds no bounds, or those of another
+    plant, metric or effort than the case has now.
     """
     path = path or bounds_path(case)
     stored = read_stored(path)
@@ -121,22 +131,29 @@ def load_bounds(case: Case, path: Path | None = None) -> dict[str, dict[str, dic
         if stored.get(key, default) != current[key]:
             was = f"{key} {stored.get(key, default)!r}, and the case has {current[key]!r}"
             raise LawError(f"the bounds in {path} were computed for the {was}; {remedy}")
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    found: Bounds = {}
+    absent: list[str] = []
     for name, scenarios in case.scenarios().items():
         for kind in kinds(case) if bounded(case, scenarios) else ():
             rows = [stored["figures"].get(name, {}).get(s.digest(), {}).get(kind) for s in scenarios]
             missing = [s.seed for s, row in zip(scenarios, rows, strict=True) if row is None]
             if missing:
                 which = f" (seeds {missing})" if missing[0] is not None else ""
-                raise LawError(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
+                absent.append(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
+                continue
             key = name + NOISE_SUFFIX if kind == "nmpc_noise" else name
             found.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows)
-        if name in found:
+        if "nmpc" in found.get(name, {}):
             found.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(found[name]["nmpc"])})
-    return found
+    return found, absent
 
 
 def together(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Figures of several loops as one: means, the largest ``max_asse`` and ``step_ms_p99``, the sum of ``failures``."""
+    """Figures of several loops as one: means, the largest ``max_asse`` and ``step_ms_p99``, sums of what is counted.
+
+    Counted are ``failures``, and ``from_nmpc``, which only some of the loops may have.
+    """
     how: dict[str, Callable[[list[float]], float]] = {"max_asse": max, "step_ms_p99": max, "failures": sum}
-    return {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0]}
+    found = {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0] if key != "from_nmpc"}
+    taken = sum(row.get("from_nmpc", 0.0) for row in rows)
+    return found | ({"from_nmpc": taken} if taken else {})

@@ -221,8 +221,12 @@ class Horizon:
         mv = np.vstack([plan.mv[1:], plan.mv[-1:]])
         return Plan(mv, x, plan.cost, plan.solved, 0, values, plan.multipliers)
 
-    def rollout(self, x0: Array, sp: Array, p: Array, reach: int, step: Callable[..., Array]) -> Plan:
+    def rollout(
+        self, x0: Array, sp: Array, p: Array, reach: int, step: Callable[..., Array], moves: Array | None = None
+    ) -> Plan:
         """A start for ``solve``: the exact inverse over ``reach`` periods, simulated by ``step``.
+
+        ``moves`` (m, n_mv) are taken over the first m periods in place of the inverse's.
 
         Each move is the MV that, held for ``reach`` periods, brings the first CV to its set point;
         bisection, so an unreachable one saturates. A plant that ignites has several locally best
@@ -233,6 +237,7 @@ class Horizon:
         mv = self._mv_low + 0.5 * self._mv_span
         values = np.zeros((self._rows, self.n))
         n_z = self._n_x * self._points
+        given = np.zeros((0, self._n_mv)) if moves is None else moves
         for k in range(self.n):
 
             def miss(fraction: float, x: Array = x, k: int = k) -> float:
@@ -242,14 +247,10 @@ class Horizon:
                     x = step(x, trial, dv, p[k])
                 return float(sp[k, 0]) - float(np.array(self.plant.measure(x))[0, 0])
 
-            low, high = 0.0, 1.0
-            at_low, at_high = miss(low), miss(high)
-            if at_low * at_high > 0:
-                low = high = 0.0 if abs(at_low) < abs(at_high) else 1.0
-            for _ in range(12 if low < high else 0):
-                middle = 0.5 * (low + high)
-                low, high = (middle, high) if miss(middle) * at_low > 0 else (low, middle)
-            mv[0] = self._mv_low[0] + self._kept(x, 0.5 * (low + high), mv, p[k], step) * self._mv_span[0]
+            if k < len(given):
+                mv[:] = given[k]
+            else:
+                mv[0] = self._mv_low[0] + self._kept(x, _root(miss), mv, p[k], step) * self._mv_span[0]
             passed = np.array(self._trace(x, mv, p[k])).T
             x = passed[-1]
             values[:n_z, k] = ((passed - self._x_low) / self._x_span).ravel()
@@ -257,3 +258,15 @@ class Horizon:
             error = (sp[k] - np.array(self.plant.measure(x))[: self._n_cv, 0]) / self._cv_span
             values[n_z + self._n_mv :, k] = error if self._squared else np.abs(error)
         return self._plan(np.asarray(x0), sp, values)
+
+
+def _root(miss: Callable[[float], float]) -> float:
+    """The root of ``miss`` in [0, 1] by bisection; without a change of sign, the end where it is nearer to zero."""
+    low, high = 0.0, 1.0
+    at_low, at_high = miss(low), miss(high)
+    if at_low * at_high > 0:
+        return low if abs(at_low) < abs(at_high) else high
+    for _ in range(12):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if miss(middle) * at_low > 0 else (low, middle)
+    return 0.5 * (low + high)

@@ -69,6 +69,7 @@ class PerfectNmpc:
         """Forget the past: plan, set points and the count of failures."""
         self.failures = 0
         self.age = 0  # samples since the plan was solved
+        self.moves: list[Array] = []  # every MV that ``step`` gave
         self._plan: Plan | None = None
         self._target: Array | None = None
         self._parameters: Array | None = None
@@ -94,6 +95,7 @@ class PerfectNmpc:
                 self.failures += 1
                 plan = rest or plan
         self._plan, self._target, self._parameters = plan, target, p[0]
+        self.moves.append(plan.mv[0])
         return plan.mv[0]
 
     def _follow(self, x: Array, rest: Plan, p: Array) -> bool:
@@ -112,9 +114,16 @@ def search(
     p: Array,
     simulate: Callable[..., Array],
     reaches: Sequence[int] = DEFAULT.reaches,
+    moves: Array | None = None,
 ) -> Plan:
-    """The best plan found from several rollouts; the best rollout itself where none was solved."""
+    """The best plan found from several rollouts; the best rollout itself where none was solved.
+
+    ``moves`` (m, n_mv) are one more start: what another controller did over the first m periods.
+    """
     starts = [horizon.rollout(x, sp, p, reach, simulate) for reach in reaches]
+    if moves is not None:
+        replayed = horizon.rollout(x, sp, p, reaches[0], simulate, moves)
+        starts += [replayed] if np.isfinite(replayed.values).all() else []
     plans = [horizon.solve(x, sp, p, start) for start in starts]
     return min([plan for plan in plans if plan.solved] or starts, key=lambda plan: plan.cost)
 
@@ -168,8 +177,12 @@ def run_offline(
     effort: Effort = DEFAULT,
     score: Score | None = None,
     limits: Limits | None = None,
+    moves: Array | None = None,
 ) -> dict[str, float]:
     """Closed-loop metrics of the offline optimum, and how many of its plans were not solved.
+
+    ``moves`` (n, n_mv) are a controller's over the same test, such as ``PerfectNmpc.moves``: each plan is
+    also searched from there, so that it need not be worse than what is known to be feasible.
 
     There is one plan for every stretch of equal set points, or a single one for a ``recipe``,
     which ends with its last sample: nothing comes after it that it must be at rest for.
@@ -185,7 +198,8 @@ def run_offline(
         ahead = k + np.arange(horizon.n)
         target = course[np.minimum(ahead + 1, k + length - 1)]
         p = everything[np.minimum(ahead, scenario.samples - 1)]
-        plan = search(horizon, x, target, p, simulate, effort.reaches)
+        known = None if moves is None else moves[k : k + length]
+        plan = search(horizon, x, target, p, simulate, effort.reaches, known)
         failures += not plan.solved
         states.append(plan.x[:length])
         mv.append(plan.mv[:length])

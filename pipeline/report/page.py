@@ -12,6 +12,7 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.for_programs import validation
 from pipeline.evaluation.model_evidence import candidates, model_rows
 from pipeline.evaluation.verdicts import RULE, Claims, Judged, judge
+from pipeline.optimal.bounds import bounded
 from pipeline.pictures.words import LONG, NO_UNIT, SHORT, law_name, metric_name, number, ratio, scenario_name
 from pipeline.report.figures import draw_all
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
@@ -65,6 +66,7 @@ def context(evidence: Evidence, claims: Claims, judged: Judged, pictures: Mappin
         "scenarios": _rows(evidence),
         "further": _further(evidence),
         "analyses": _analyses(evidence),
+        "bound_notes": _bound_notes(evidence),
         "bounded": any(evidence.bound(name) is not None for name in evidence.scenarios),
         "models": models,
         "free_run": any(row["free_run"] is not None for row in models),
@@ -72,6 +74,25 @@ def context(evidence: Evidence, claims: Claims, judged: Judged, pictures: Mappin
         "step_ms": evidence.bound(evidence.main_test, "step_ms_p50"),
         "registry": REGISTRY_URL,
     }
+
+
+def _bound_notes(evidence: Evidence) -> list[str]:
+    """What a reader of the bounds must know: tests that have none, and optima that no search improved on."""
+    bounds = evidence.bounds
+    lacking = {
+        kind: [
+            n for n, tests in evidence.tests.items() if bounded(evidence.case, tests) and kind not in bounds.get(n, {})
+        ]
+        for kind in ("nmpc", "offline")
+    }
+    words = {"nmpc": "The perfect-model NMPC", "offline": "The offline optimum"}
+    notes = [f"{words[kind]} was not computed for: {', '.join(names)}." for kind, names in lacking.items() if names]
+    taken = [n for n, of in bounds.items() if of.get("offline", {}).get("from_nmpc")]
+    if taken:
+        notes.append(
+            f"No plan better than the NMPC was found, whose figures stand for the optimum: {', '.join(taken)}."
+        )
+    return notes if bounds else []
 
 
 def _seeds(count: int) -> str:

@@ -5,6 +5,9 @@
 A plant with a discrete MV is replaced by its ``relaxed()``, the figures' MVs being those that stand
 for its own. A test on a plant in discrete time has no bounds.
 
+An optimum is no worse than a policy that was seen to be feasible: the offline optimum is searched from the
+NMPC's moves too, and where no plan is better than the NMPC its figures stand for the optimum (``from_nmpc``).
+
 ``loopwright bounds CASE`` computes both for every scenario of a case, NMPC also with
 measurement noise, and stores them in ``pipeline/cases/<case>.bounds.json``, from where
 ``pipeline.optimal.bounds.load_bounds`` gives them as long as neither the plant nor the scenario has changed.
@@ -20,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
@@ -34,27 +38,46 @@ DRAW = 1_000
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One figure to compute."""
+    """Figures to compute together: the offline optimum starts from what the NMPC did."""
 
     scenario: Scenario
     index: int  # among the sequences of its name
-    kind: str  # nmpc, nmpc_noise, offline
+    kinds: tuple[str, ...]  # (nmpc, offline), or (nmpc_noise,)
 
 
-def _compute(case: Case, job: Job) -> tuple[Job, dict[str, float], float]:
+def _compute(case: Case, job: Job) -> tuple[Job, dict[str, dict[str, float]], float]:
     begun = time.perf_counter()
     plant = (job.scenario.plant or case.plant).relaxed()
     ahead = case.recipe or case.metric == "tracking"
+    first = job.kinds[0]
     with threadpool_limits(1):
-        if job.kind == "offline":
-            figures = run_offline(plant, job.scenario, case.metric, ahead, case.effort, case.score, case.limits)
-        else:
-            nmpc = PerfectNmpc(plant, case.metric, case.effort, case.limits)
-            noise, draws = (case.noise_std.tolist(), case.noise_draws) if job.kind == "nmpc_noise" else (None, 1)
-            seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
-            know = (ahead, case.unforeseen, case.score)
-            figures = together([run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds])
+        nmpc = PerfectNmpc(plant, case.metric, case.effort, case.limits)
+        noise, draws = (case.noise_std.tolist(), case.noise_draws) if first == "nmpc_noise" else (None, 1)
+        seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
+        know = (ahead, case.unforeseen, case.score)
+        figures = {first: together([run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds])}
+        if "offline" in job.kinds:
+            aim = (case.metric, ahead, case.effort, case.score, case.limits)
+            best = run_offline(plant, job.scenario, *aim, np.array(nmpc.moves))
+            figures["offline"] = better(best, figures[first], case.metric)
     return job, figures, time.perf_counter() - begun
+
+
+def better(offline: dict[str, float], nmpc: dict[str, float], metric: str) -> dict[str, float]:
+    """The offline optimum's figures; the NMPC's, and ``from_nmpc`` 1, where they are better or the others no numbers.
+
+    ``failures`` stays the number of offline plans that were not solved.
+    """
+    if offline[metric] <= nmpc[metric]:
+        return offline
+    return {key: nmpc[key] for key in offline} | {"failures": offline["failures"], "from_nmpc": 1.0}
+
+
+def _remark(figures: dict[str, float]) -> str:
+    """What a person must know of an offline optimum; empty where all is well."""
+    said = [f"{figures['failures']:.0f} plans were not solved"] if figures.get("failures") else []
+    said += ["no plan was better than the NMPC, whose figures stand here"] if figures.get("from_nmpc") else []
+    return f" - {'; '.join(said)}" if said else ""
 
 
 def _current(rows: dict[str, Any], tests: Sequence[Scenario]) -> dict[str, Any]:
@@ -63,8 +86,9 @@ def _current(rows: dict[str, Any], tests: Sequence[Scenario]) -> dict[str, Any]:
 
 
 def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = None) -> Iterator[str]:
-    """Compute and store the bounds of some scenarios; yields a line for a person after each figure.
+    """Compute and store the bounds of some scenarios; yields a line for a person for each figure.
 
+    The line says where an offline optimum did not converge, or is the NMPC's.
     Every figure is stored at once, so an interruption loses only the figure in work.
     """
     path = path or bounds_path(case)
@@ -72,22 +96,23 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
     current = problem(case)
     if any((DEFAULTS | stored).get(key) != value for key, value in current.items()):
         stored = {"schema": SCHEMA, "case": case.name, **current, "figures": {}}
-    scenarios = case.scenarios()
+    scenarios = case.tests()
     stored["figures"] = {n: _current(rows, scenarios[n]) for n, rows in stored["figures"].items() if n in scenarios}
     work = [
-        Job(s, i, kind)
+        Job(s, i, tuple(k for k in kinds(case) if (k == "nmpc_noise") is noisy))
         for name in names
         if bounded(case, scenarios[name])
         for i, s in enumerate(scenarios[name])
-        for kind in kinds(case)
+        for noisy in ((False, True) if "nmpc_noise" in kinds(case) else (False,))
     ]
     results = Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(_compute)(case, job) for job in work)
     for done, (job, figures, seconds) in enumerate(results, start=1):
-        rounded = {key: float(f"{value:.6g}") for key, value in figures.items()}
         entry = stored["figures"].setdefault(job.scenario.name, {}).setdefault(job.scenario.digest(), {})
-        entry[job.kind] = rounded
+        for kind, found in figures.items():
+            entry[kind] = {key: float(f"{value:.6g}") for key, value in found.items()}
         draft = path.with_suffix(".draft")
         draft.write_text(json.dumps(stored, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
         os.replace(draft, path)
-        which = f"{job.scenario.name} {job.index} {job.kind}"
-        yield f"[{done}/{len(work)}] {which}: {case.metric} {rounded[case.metric]:.6g} ({seconds:.0f} s)"
+        for kind in figures:
+            which, figure = f"{job.scenario.name} {job.index} {kind}", entry[kind][case.metric]
+            yield f"[{done}/{len(work)}] {which}: {case.metric} {figure:.6g} ({seconds:.0f} s){_remark(entry[kind])}"

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from pipeline.cases import CASES
 from pipeline.config.params import (
     CaseParams,
@@ -20,11 +22,16 @@ from pipeline.config.params import (
     sections,
 )
 from pipeline.errors import ParamsError, PipelineError
+from pipeline.evaluation.case import Case
 from pipeline.laws import LAWS
+from pipeline.models.local.linearized import LinearizedPart
+from pipeline.models.part import Part
 from pipeline.models.training.network_parts import trainer_of
+from pipeline.optimal.bounds import bounds_path, stored_bounds
 from pipeline.stages.excite import excitations
 from pipeline.stages.fit import part_of
 from pipeline.stages.paths import WORK, record_folder
+from serving.errors import LoopwrightError
 
 
 def mistakes() -> list[str]:
@@ -34,14 +41,35 @@ def mistakes() -> list[str]:
         for name in sections(kind):
             try:
                 check(name)
-            except (PipelineError, OSError) as error:
+            except (PipelineError, OSError, np.linalg.LinAlgError) as error:
                 found.append(" ".join(str(error).split()))
     return list(dict.fromkeys(found))  # a record that cannot be read is met by every model set
 
 
-def _case(name: str) -> None:
+def notes() -> list[str]:
+    """One line for each bound that a report will lack: no mistake, as the report says so and comes without."""
+    found = []
+    for name in sections("cases"):
+        try:
+            case = _case_of(name)
+            if bounds_path(case).exists():
+                found += stored_bounds(case)[1]
+            else:
+                found.append(f"case {name!r} has no bounds; run `loopwright bounds {name}`")
+        except LoopwrightError as error:
+            found.append(" ".join(str(error).split()))
+    return found
+
+
+def _case_of(name: str) -> Case:
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
-    choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+    return choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+
+
+def _case(name: str) -> None:
+    case = _case_of(name)
+    _ = case.plant  # raises where its class is abstract
+    case.tests()
 
 
 def _record(name: str) -> None:
@@ -72,11 +100,35 @@ def _controller(name: str) -> None:
     params, where = ControllerParams.read(name), f"controllers.{name}"
     _known_case(params.case, where)
     law = choose(LAWS, params.law, "law", where)
-    for form, settings in {"": {}, **params.variants}.items():
-        parse(law.Params, {**params.settings, **settings}, where + (f".variants.{form}" if form else ""))
+    forms = {
+        where + (f".variants.{form}" if form else ""): {**params.settings, **settings}
+        for form, settings in {"": {}, **params.variants}.items()
+    }
+    read = {place: parse(law.Params, settings, place) for place, settings in forms.items()}
     models = {m.model for m in map(ModelParams.read, sections("models")) if m.case == params.case}
     if params.model not in models:
         raise ParamsError(f"{where}.model is {params.model!r}; {params.case} has the model sets {_listed(models)}")
+    plant = CASES[params.case].plant
+    parts = {k: p.learn(None, plant, {}, 0).model for k, p in _parts(params).items() if isinstance(p, LinearizedPart)}
+    for place, settings in read.items():
+        try:
+            law.check(settings, parts, plant)
+        except PipelineError as error:
+            raise ParamsError(f"{place}: {error}") from None
+
+
+def _parts(params: ControllerParams) -> dict[str, Part]:
+    """The parts of a controller's model set, as params.yaml describes them; none of one that cannot be read."""
+    for name in sections("models"):
+        of = ModelParams.read(name)
+        if (of.case, of.model) == (params.case, params.model):
+            try:
+                return {
+                    k: part_of(CASES[of.case], values, f"models.{name}.parts.{k}") for k, values in of.parts.items()
+                }
+            except ParamsError:  # the check of that model set tells it
+                return {}
+    return {}
 
 
 def _known_case(case: str, where: str) -> None:

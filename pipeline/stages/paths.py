@@ -7,6 +7,7 @@ from pathlib import Path
 
 WORK = Path("work")
 ARTIFACTS = Path("artifacts")
+TIMING = Path("timing")  # durations; apart from WORK, because no stage may depend on them
 
 
 def record_folder(case: str, record: str) -> Path:
@@ -37,6 +38,15 @@ def analysis_file(case: str, law: str, form: str, seed: int) -> Path:
 def validation_folder(case: str, law: str) -> Path:
     """Folder of a controller's validation."""
     return WORK / case / "validation" / law
+
+
+def step_time_file(case: str, law: str) -> Path:
+    """The time of one step of a shipped controller [us], as validate measured it: {"p50": ..., "p99": ...}.
+
+    An output of validate that is no dependency of any stage: a rerun gives other microseconds,
+    and these must not mark the report as changed. The report shows what it finds here.
+    """
+    return TIMING / case / f"{law}-step.json"
 
 
 def receipt_file(case: str) -> Path:

@@ -12,22 +12,23 @@ from pipeline.engine.command import run_stage
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.verdicts import PLAIN
 from pipeline.files import write_json
-from pipeline.optimal.bounds import bounds_path, load_bounds
+from pipeline.optimal.bounds import bounds_path, stored_bounds
 from pipeline.report.page import write_report
-from pipeline.stages.paths import ARTIFACTS, WORK, receipt_file
+from pipeline.stages.paths import ARTIFACTS, TIMING, WORK, receipt_file
 
 
 def report(name: str) -> None:
     """Write artifacts/<case>/{validation.json,report.html,report.md,figures/} from work/<case>."""
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
     case = choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+    case.tests()  # raises where there are none
     # A new case has no bounds until the oracle has run; stale ones are an error, never shown.
-    bounds = load_bounds(case) if bounds_path(case).exists() else {}
-    if not bounds:
-        print(f"report {name}: no bounds yet; `loopwright bounds {name}` computes them", file=sys.stderr)
+    bounds, missing = stored_bounds(case) if bounds_path(case).exists() else ({}, [])
+    for line in missing or ([] if bounds else [f"no bounds yet; `loopwright bounds {name}` computes them"]):
+        print(f"report {name}: {line}", file=sys.stderr)
     laws, models = entries("controllers", name, "law"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
-    evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data)
+    evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data, TIMING / name)
     for path in write_report(
         evidence, beside(case, "paper", "CLAIMS", PLAIN), WORK / name / "models", ARTIFACTS / name
     ):

@@ -22,7 +22,14 @@ from pipeline.evaluation.trial import BASE, Metrics, Trial, step_us, try_file
 from pipeline.export.controller_file import with_evidence
 from pipeline.files import read_json, write_json
 from pipeline.simulation.scenario import NOISE_SUFFIX
-from pipeline.stages.paths import ARTIFACTS, analysis_file, controller_file, design_folder, validation_folder
+from pipeline.stages.paths import (
+    ARTIFACTS,
+    analysis_file,
+    controller_file,
+    design_folder,
+    step_time_file,
+    validation_folder,
+)
 from serving.controller import Controller
 
 FIELDS = ("time_s", "sp", "pv", "mv", "info")  # of the trajectories that are kept
@@ -33,6 +40,7 @@ def validate(name: str) -> None:
     params = ControllerParams.read(name)
     choices = parse(CaseParams, read_section("cases", params.case), f"cases.{params.case}")
     case = choose(CASES, params.case, "case", f"controllers.{name}").with_held_out(choices.held_out_seeds)
+    case.tests()  # before hours of closed loops: raises where there are none
     seeds = sorted(
         int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.law) / BASE).glob("*.onnx")
     )
@@ -55,9 +63,11 @@ def validate(name: str) -> None:
         **_summary(params, base, trials, shipped),
         "analysis": analysis,
         "metric": case.metric,
-        "step_us": step_us(Controller(source), next(iter(shipped.curves.values()))),
     }
     write_json(folder / "metrics.json", metrics)
+    took = step_us(Controller(source), next(iter(shipped.curves.values())))
+    write_json(step_time_file(params.case, params.law), took)
+    print(f"validate {name}: one step takes {took['p50']:.0f} us (median)", file=sys.stderr)
     curves = {f"{s}/{t.form}/{t.seed}": c for t in trials if t.seed == shipped.seed for s, c in t.curves.items()}
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
@@ -18,7 +20,7 @@ import numpy as np
 import onnx
 from mlflow import MlflowClient
 from mlflow.entities import LoggedModelOutput
-from mlflow.entities.model_registry import ModelVersion
+from mlflow.entities.model_registry import ModelVersion, RegisteredModel
 from mlflow.exceptions import MlflowException
 from mlflow.models import ModelSignature
 from mlflow.types import Schema, TensorSpec
@@ -37,6 +39,22 @@ REQUIREMENTS = ["onnxruntime>=1.20", "numpy>=2.0"]
 def file_digest(path: Path) -> str:
     """sha256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def registered(client: MlflowClient) -> list[RegisteredModel]:
+    """Every registered controller: cases by name, within a case the champion first, then by rank."""
+    return sorted(client.search_registered_models(max_results=1000), key=_order)
+
+
+def _order(model: RegisteredModel) -> tuple[str, bool, int, str]:
+    standing = model.tags.get("standing", "")
+    rank = re.search(r"(\d+) of \d+", standing)
+    return (
+        model.tags.get("case", ""),
+        not standing.startswith(CHAMPION),
+        int(rank[1]) if rank else sys.maxsize,
+        str(model.name),
+    )
 
 
 def versions(client: MlflowClient, name: str) -> list[ModelVersion]:

@@ -63,33 +63,54 @@ class AllPole:
         size = np.linalg.norm(c) * np.linalg.norm(b)
         if n > 2 or any(abs(m) > 1e-9 * size * np.linalg.norm(a) ** k for k, m in enumerate(markov[:-1])):
             raise LawError(
-                f"IMC and SIMC need one or two poles and no zero; the linearized plant has {n} poles and the "
-                f"Markov parameters {', '.join(f'{m:.3g}' for m in markov)}: choose tuning `manual`"
+                f"IMC and SIMC need one or two poles and no zero; the linearized plant has {n} poles and the Markov "
+                f"parameters {', '.join(f'{m:.3g}' for m in markov)}: choose tuning {_applicable(small)}"
             )
         values = np.linalg.eigvals(a).astype(np.complex128)
         return cls(markov[-1], values[np.argsort(-values.real)])
 
     @classmethod
-    def near(cls, lin: Linearization, pv: int = 0, mv: int = 0) -> AllPole:
-        """G as ``of`` gives it; where a stable plant has a zero, the lag of its initial slope and final gain.
+    def near(cls, lin: Linearization, pv: int = 0, mv: int = 0) -> AllPole | LagWithDeadTime:
+        """G as ``of`` gives it; of another stable plant a lag, or a lag with dead time, that resembles it.
 
-        For tunings that are then judged in closed loop over the plant itself. Raises LawError where slope
-        and gain differ in sign: no lag resembles that plant.
+        The lag has the initial slope and the final gain of the step response. Where these differ in sign
+        (an inverse response) or the slope is zero (dead time, a chain of lags), it is the lag with dead
+        time of ``LagWithDeadTime.of``. For tunings that are then judged in closed loop over the plant itself.
+
+        Raises LawError where neither resembles the plant, and where it is not stable.
         """
         try:
             return cls.of(lin, pv, mv)
         except LawError as error:
-            slope = float(lin.c[pv] @ lin.b[:, mv])
-            gain = -float(lin.c[pv] @ np.linalg.solve(lin.a, lin.b[:, mv]))
-            if lin.eigenvalues[0].real >= 0 or not slope * gain > 0:
-                raise LawError(
-                    f"{error}; its step response starts with a slope of {slope:.3g}, ends at {gain:.3g}"
-                ) from None
+            refused = error
+        small = minimal(lin, pv, mv)
+        if small.eigenvalues[0].real >= 0:
+            raise refused
+        slope = float(small.c[0] @ small.b[:, 0])
+        try:
+            gain = -float(small.c[0] @ np.linalg.solve(small.a, small.b[:, 0]))
+        except np.linalg.LinAlgError:  # a pole at zero but for rounding
+            raise refused from None
+        size = float(np.linalg.norm(small.c[0]) * np.linalg.norm(small.b[:, 0]))
+        if slope * gain > 0 and abs(slope) > 1e-9 * size:
             return cls(slope, np.array([-slope / gain + 0j]))
+        try:
+            return LagWithDeadTime.of(small)
+        except LawError:
+            raise refused from None
 
 
-def imc_pid(process: AllPole, lambda_s: float) -> PidSettings:
-    """The PID that internal model control gives for one or two poles without zeros.
+def _applicable(small: Linearization) -> str:
+    """The tunings that a linearized plant of least order has when IMC and SIMC do not hold for it, in words."""
+    try:
+        LagWithDeadTime.of(small)
+    except LawError:
+        return "`manual`"
+    return "`optimized` or `itae`, which take it for a lag with dead time"
+
+
+def imc_pid(process: AllPole | LagWithDeadTime, lambda_s: float) -> PidSettings:
+    """The PID that internal model control gives for one or two poles without zeros, or for a lag with dead time.
 
         C = G^-1 f / (1 - f),   f = 1/(lambda s + 1)  or, with one pole p > 0,
         f = (alpha s + 1)/(lambda s + 1)^2,   alpha = lambda^2 p + 2 lambda
@@ -100,13 +121,23 @@ def imc_pid(process: AllPole, lambda_s: float) -> PidSettings:
         poles p > 0 > -1/tau:   Kc = (1 + alpha/tau)/(b0 lambda^2),  Ti = alpha + tau,  Td = alpha tau/(alpha + tau)
         two stable poles:       Kc = a1/(b0 lambda),  Ti = a1/a0,  Td = 1/a1,  of s^2 + a1 s + a0
 
-    and a PI for one pole. Raises LawError for two poles that are not stable.
+    and a PI for one pole. For the lag with dead time k exp(-theta s)/(tau s + 1), with the dead time as
+    its first-order Pade approximation:
+
+        Kc = (tau + theta/2)/(k (lambda + theta/2)),  Ti = tau + theta/2,  Td = tau theta/(2 tau + theta)
+
+    Raises LawError for two poles that are not stable.
 
     Source: seed 000_0a422d3e5d968dac.txt, section 4.3, names the procedure; the filter for
-    unstable plants is the textbook's (Morari and Zafiriou, Robust Process Control).
+    unstable plants is the textbook's (Morari and Zafiriou, Robust Process Control). The lag with dead
+    time: Rivera, Morari and Skogestad, Internal Model Control: PID Controller Design, 1986, table 2.
     """
     if not lambda_s > 0:
         raise LawError(f"lambda_s is {lambda_s}; the IMC filter's time constant must be above 0")
+    if isinstance(process, LagWithDeadTime):
+        half, tau = process.dead_time_s / 2, process.tau_s
+        kc = (tau + half) / (process.gain * (lambda_s + half))
+        return PidSettings(kc, ti_s=tau + half, td_s=tau * half / (tau + half))
     b0, poles = process.b0, process.poles
     unstable = [float(p.real) for p in poles if p.real >= 0]
     if len(unstable) > 1:
@@ -233,7 +264,7 @@ def robust_imc(lin: Linearization, period_s: float, peak: float = 2.0) -> PidSet
 
 
 def optimized_imc(
-    process: AllPole,
+    process: AllPole | LagWithDeadTime,
     period_s: float,
     cost: Callable[[Sequence[PidSettings]], Array],
     base: PidSettings,
@@ -260,7 +291,10 @@ def optimized_imc(
             raise LawError("no IMC filter gave a finite closed loop; check the MV's range or tune by hand (`manual`)")
         return rows[best]
 
-    coarse = np.geomspace(0.8, LONGEST_FILTER, 12) * period_s
+    longest = LONGEST_FILTER
+    if isinstance(process, LagWithDeadTime):  # a filter much shorter than the dead time has no margin
+        longest = max(longest, 3 * process.dead_time_s / period_s)
+    coarse = np.geomspace(0.8, longest, 12) * period_s
     at, first = cheapest(coarse, (0.3, 0.6, 1.0) if optimize_weight else (base.set_point_weight,))
     ratio = float(np.sqrt(coarse[1] / coarse[0]))
     weight = first.set_point_weight

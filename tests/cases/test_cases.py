@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,14 @@ import pytest
 import yaml
 
 from pipeline.cases import CASES
+from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from pipeline.engine.command import run_stage
 from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
+from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from pipeline.simulation.timetable import _scenario as first_scenario
 
 DISTURBANCES = {"tin", "ua", "ua_gradual"}
 
@@ -198,3 +202,46 @@ def test_a_champion_has_something_to_beat(name: str) -> None:
     laws = {c["law"] for c in tree["controllers"].values() if c["case"] == name}
     assert CASES[name].baseline in laws
     assert len(laws) > 1
+
+
+# ---------------------------------------------------------------------- what a case may lack
+@dataclass(frozen=True)
+class NoTests(PhNeutralizationCase):
+    """A case that nothing is asked of."""
+
+    def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        return {}
+
+
+class Unwritten(Plant):
+    """A plant without equations."""
+
+
+def test_a_case_without_tests_is_one_error() -> None:
+    with pytest.raises(ParamsError, match=r"has no tests: its scenarios\(\) is empty; return at least one"):
+        NoTests().tests()
+    with pytest.raises(ParamsError, match="has no tests"):
+        first_scenario(NoTests(), None)
+
+
+def test_a_test_without_sequences_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = PhNeutralizationCase().scenarios()
+    monkeypatch.setattr(NoTests, "scenarios", lambda self: own | {"buffer": ()})
+    with pytest.raises(ParamsError, match="its test 'buffer' has no sequence"):
+        NoTests().tests()
+
+
+def test_an_abstract_plant_class_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(NoTests, "plant_class", Unwritten)
+    with pytest.raises(PlantError, match="plant class Unwritten is abstract, as it lacks derivative; write that"):
+        _ = NoTests().plant
+
+
+def test_a_singular_system_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    def fit(name: str) -> None:
+        np.linalg.solve(np.zeros((2, 2)), np.ones(2))
+
+    assert run_stage(fit, ["fit", "x"], "MODEL") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("fit x: a system of linear equations has no single solution (Singular matrix); check the")
+    assert said.count("\n") == 1

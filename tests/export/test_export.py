@@ -199,3 +199,43 @@ def test_gate_tells_a_law_from_another(pi_law: ControlLaw, pi_file: Path, make_f
 
     with pytest.raises(ExportError, match=r"differ by .* first at step .* in valve"):
         parity_gate(make_formula(off, 2, ("error", "move")), Controller(pi_file))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "refused"),
+    [
+        (lambda move: move * (1 + 1.1e-8), False),  # what rounding makes of a ratio such as tau_i = Kp/Ki
+        (lambda move: move * (1 + 1e-5), True),
+        (lambda move: -move, True),
+        (lambda move: torch.zeros_like(move), True),
+    ],
+)
+def test_info_may_differ_by_rounding_and_not_in_meaning(
+    pi_law: ControlLaw, pi_file: Path, make_formula: MakeFormula, wrong: Callable[[Tensor], Tensor], refused: bool
+) -> None:
+    def told(law: ControlLaw, *inputs: Tensor) -> Any:
+        mv, state, info = pi_law(*inputs)
+        return mv, state, torch.cat([info[..., :1], wrong(info[..., 1:])], dim=-1)
+
+    law = make_formula(told, 2, ("error", "move"))
+    if refused:
+        with pytest.raises(ExportError, match=r"differ by .* \(allowed 1e-06\), first at step .* in move"):
+            parity_gate(law, Controller(pi_file))
+    else:
+        assert parity_gate(law, Controller(pi_file)) <= GATE_TOLERANCE
+
+
+def test_a_large_info_excuses_no_difference_in_mv_or_state(make_formula: MakeFormula, tmp_path: Path) -> None:
+    """1e10 in info, of which 1e-13 is a thousandth: an MV off by that much is refused all the same."""
+
+    def formula(shift: float) -> Any:
+        def told(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
+            return law.limited(sp * 0.7 + shift, mv_applied), state, sp * 1e10
+
+        return told
+
+    small = (Signal("x", "-", 0.0, 1.0),)
+    signals = loop_signals(sp=small, pv=small, mv=small)
+    export(make_formula(formula(0.0), 0, ("large",), signals), tmp_path / "law.onnx", case="none", provenance={})
+    with pytest.raises(ExportError, match=r"\(allowed 1e-09\), first at step .* in x"):
+        parity_gate(make_formula(formula(5e-4), 0, ("large",), signals), Controller(tmp_path / "law.onnx"))

@@ -194,6 +194,21 @@ def test_a_dearer_switch_switches_less() -> None:
     assert found[0] > 5 * found[1]
 
 
+@pytest.mark.parametrize("name", ["fuzzy_feedforward_pi", "fuzzy_feedforward_observer"])
+def test_a_stuck_throttle_that_comes_free_on_set_point_does_not_kick(name: str) -> None:
+    """Stuck with the core at rest, the set point 15 degC below it for ten minutes, then there: nothing is wound up."""
+    step, stuck, away, after = plants(PRINTED.consequents.numpy()[None]), 1200, 60, 200
+    throttle = (0.4, HOT)
+
+    def run(level: float) -> Loops:
+        sp = np.repeat([level, level - 15.0, level], [stuck - away, away, after])
+        return loops(made(name), step, sp=sp, by_hand=lambda k: throttle if k < stuck else None)
+
+    level = float(run(30.0).pv[0, stuck, 0])
+    span = SIGNALS.sp[0].high - SIGNALS.sp[0].low
+    assert np.abs(run(level).pv[0, stuck:, 0] - level).sum() / span < 0.2
+
+
 def test_a_core_that_lags_draws_its_reference_along() -> None:
     """A level beyond the jacket's limit for good: nothing winds up, and the way back begins at once."""
     for name in ("fuzzy_feedforward_pi", "fuzzy_feedforward_observer"):

@@ -18,6 +18,7 @@ from pipeline.config.params import parse
 from pipeline.errors import LawError
 from pipeline.export.gate import export
 from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.laws.reference.reference_law import ReferenceLaw
 from pipeline.plants.base import Plant
 from serving import Controller
 
@@ -25,6 +26,7 @@ from serving import Controller
 repeated = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 seeds = st.integers(0, 2**32 - 1)
 RATE = 0.014  # of the MV's range
+KICK = 0.05  # of the MV's range
 
 
 class Step(NamedTuple):
@@ -191,6 +193,32 @@ def test_manual_to_auto_does_not_bump(law: ControlLaw, law_plant: Plant) -> None
     for _ in range(3):
         state = step(law, rest, state).state
     torch.testing.assert_close(step(law, rest, state).mv, rest.mv_applied, rtol=0, atol=1e-3 * span(law))
+
+
+@pytest.mark.parametrize("held", [3, 60])
+@pytest.mark.parametrize("away", [0.1, 0.9])
+def test_a_stuck_actuator_that_comes_free_on_set_point_does_not_kick(
+    law: ControlLaw, law_plant: Plant, away: float, held: int
+) -> None:
+    """The plant rests under an MV that is stuck; the set point is elsewhere, and then put where the plant is.
+
+    Nothing is to be done, and a law without a past does nothing. What the law did with the error while it stood, the
+    actuator has never received; to take it back is a kick. What remains is a `ramp` law's slope of the set point.
+    """
+    if not law.incremental:
+        pytest.skip("computes its MV afresh: where its model says, whatever was applied")
+    if isinstance(law, ReferenceLaw):
+        pytest.skip("follows its reference on while its request is within 1 % of the applied MV")
+    rest = at_rest(law, law_plant, rest_points(law_plant)[1])
+    sp = law_plant.sp_signals[0]
+    elsewhere = rest._replace(sp=torch.full_like(rest.sp, sp.low + away * (sp.high - sp.low)))
+    state = None
+    for inputs in [rest] * 3 + [elsewhere] * held:
+        state = step(law, inputs, state).state
+    for _ in range(20):
+        out = step(law, rest, state)
+        torch.testing.assert_close(out.mv, rest.mv_applied, rtol=0, atol=KICK * span(law))
+        state = out.state
 
 
 @pytest.mark.parametrize("group", ["sp", "pv"])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_up_plant import Lag
+from made_up_plant import Chain, Lag
 
 from pipeline.cases.batch_reactor.plant import BatchReactor
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
@@ -207,3 +207,24 @@ def test_optimized_pid_holds_the_unstable_point(plant: Plant, signals: LawSignal
     disturbed = simulate_closed(plant, stepper(law), loop_test(plant, np.full(250, 0.66613), 0.66613, UA=10_000.0))
     assert np.abs(disturbed.pv[:, 0] - 0.66613).mean() < 0.004
     assert abs(disturbed.pv[-1, 0] - 0.66613) < 1e-4
+
+
+@pytest.mark.parametrize("back", [0.0, 0.1])
+@pytest.mark.parametrize("tuning", ["optimized", "itae"])
+def test_plants_with_dead_time_and_zeros_are_tuned(tuning: str, back: float, loop_test) -> None:
+    """Five lags in series, also with an inverse response: the default tuning settles a step, and so does `itae`."""
+    plant = Chain(back=back)
+    params = PID.Params(tuning=tuning, development_seeds=(3,), development_set_points=4, development_hold=50)
+    law = PID.design(params, {}, LawSignals.of(plant), plant)
+    levels = np.full(120, 0.5)
+    track = simulate_closed(plant, stepper(law), loop_test(plant, levels, 0.0))
+    assert np.abs(track.pv[-20:, 0] - 0.5).max() < 0.005
+    assert track.pv[:, 0].max() < 0.5 * 1.35
+    assert np.abs(track.pv[50:, 0] - 0.5).max() < 0.1
+
+
+@pytest.mark.parametrize("tuning", ["imc", "simc"])
+def test_rules_that_do_not_hold_name_those_that_do(tuning: str) -> None:
+    plant = Chain(back=0.1)
+    with pytest.raises(LawError, match=r"no zero; .* choose tuning `optimized` or `itae`"):
+        PID.design(PID.Params(tuning=tuning), {}, LawSignals.of(plant), plant)

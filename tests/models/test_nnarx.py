@@ -157,7 +157,7 @@ def test_search_says_what_a_size_may_be() -> None:
 
 
 def candidate(parameters: int, free_run_rmse: float) -> Candidate:
-    return Candidate(1, 1, (1,), parameters, 0.0, free_run_rmse, 0.0)
+    return Candidate(1, 1, (1,), parameters, 0.0, free_run_rmse)
 
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.floats(0.01, 10.0)), min_size=1, max_size=8))

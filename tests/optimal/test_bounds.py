@@ -19,7 +19,18 @@ from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import LawError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
-from pipeline.optimal.bounds import DEFAULTS, bounded, bounds_path, load_bounds, plant_digest, problem
+from pipeline.optimal.bounds import (
+    DEFAULTS,
+    bounded,
+    bounds_path,
+    load_bounds,
+    plant_digest,
+    problem,
+    stored_bounds,
+    together,
+)
+from pipeline.optimal.horizon import Horizon, Plan
+from pipeline.optimal.perfect import run_offline
 from pipeline.simulation.scenario import Scenario
 from pipeline.stages import bounds as oracle
 
@@ -62,6 +73,59 @@ def test_bounds_are_means_over_the_sequences_with_all_metrics(stored: Path) -> N
 def test_figures_of_other_sequences_are_missed(stored: Path) -> None:
     with pytest.raises(LawError, match=r"no nmpc figures of scenario 'held_out' \(seeds \[3\]\).*loopwright bounds"):
         load_bounds(TinyCase((1, 3)), stored)
+
+
+def test_what_a_file_lacks_is_said_and_the_rest_is_given(stored: Path, tmp_path: Path) -> None:
+    tree = json.loads(stored.read_text())
+    for row in tree["figures"]["held_out"].values():
+        del row["offline"]
+    partial = tmp_path / "partial.json"
+    partial.write_text(json.dumps(tree))
+    bounds, missing = stored_bounds(TinyCase(), partial)
+    whole = load_bounds(TinyCase(), stored)
+    assert bounds["held_out"] == {"nmpc": whole["held_out"]["nmpc"]}
+    assert bounds["held_out_noise"] == whole["held_out_noise"]
+    (line,) = missing
+    assert "has no offline figures of scenario 'held_out'" in line
+    assert stored_bounds(TinyCase(), stored) == (whole, [])
+
+
+@dataclass(frozen=True)
+class LongTail(TinyCase):
+    """The offline optimum's plans are longer than the NMPC's, so that a test can tell them apart."""
+
+    held_out_seeds: tuple[int, ...] = (1,)
+    effort: ClassVar[Effort] = Effort(periods=8, tail=6, reaches=(3,))
+
+
+def test_an_optimum_is_no_worse_than_the_nmpc_and_says_that_it_did_not_converge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On another plant every long plan failed, and the best rollout was stored as the optimum."""
+    case, solve, path = LongTail(), Horizon.solve, tmp_path / "long.json"
+
+    def gives_up(self: Horizon, *given: Any) -> Plan:
+        plan = solve(self, *given)
+        return plan if self.n == case.effort.periods else replace(plan, solved=False)
+
+    monkeypatch.setattr(Horizon, "solve", gives_up)
+    lines = list(oracle.compute(case, ["held_out"], path=path))
+    bounds = load_bounds(case, path)["held_out"]
+    alone = run_offline(case.plant, case.scenarios()["held_out"][0], "mae", False, case.effort)
+    assert alone["mae"] > 1.1 * bounds["nmpc"]["mae"]
+    assert bounds["offline"]["mae"] <= bounds["nmpc"]["mae"]
+    assert bounds["offline"]["failures"] == 1
+    (line,) = [line for line in lines if " offline:" in line]
+    assert "1 plans were not solved" in line
+
+
+def test_the_nmpc_stands_for_an_optimum_that_is_worse() -> None:
+    nmpc, worse = {"sse": 1.0, "failures": 0.0, "step_ms_p50": 3.0}, {"sse": 6.0, "failures": 2.0}
+    assert oracle.better(worse, nmpc, "sse") == {"sse": 1.0, "failures": 2.0, "from_nmpc": 1.0}
+    assert oracle.better(worse | {"sse": float("nan")}, nmpc, "sse")["sse"] == 1.0
+    best = {"sse": 0.5, "failures": 0.0}
+    assert oracle.better(best, nmpc, "sse") == best
+    assert together([oracle.better(worse, nmpc, "sse"), best]) == {"sse": 0.75, "failures": 2.0, "from_nmpc": 1.0}
 
 
 def test_figures_of_another_plant_are_refused(stored: Path, tmp_path: Path) -> None:

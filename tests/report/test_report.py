@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,6 +13,7 @@ from pathlib import Path
 import made_up_case as made_up
 import numpy as np
 import pytest
+import yaml
 from made_up_case import CASE
 
 from pipeline.cases import CASES
@@ -19,12 +21,14 @@ from pipeline.evaluation.case import Curve, PaperFigure, Requirement
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import ReportError, parse_setting
 from pipeline.evaluation.verdicts import PLAIN, acceptance, close, paper_row, requirement, statements
+from pipeline.optimal import bounds
+from pipeline.stages.report import report
 
 LAWS = ("inc", "incad", "incadec", "pid", "inverse_dob", "forward_dob")
 
 
 def load(root: Path) -> Evidence:
-    return Evidence.load(CASES[CASE], made_up.bounds(), root / "work" / CASE)
+    return Evidence.load(CASES[CASE], made_up.bounds(), root / "work" / CASE, timing=root / "timing" / CASE)
 
 
 @pytest.fixture(scope="module")
@@ -243,3 +247,34 @@ def test_the_report_needs_no_heavy_import():
     code = "import sys, pipeline.stages.report; print({'torch', 'mlflow', 'onnxruntime'} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert found.stdout.strip() == "set()"
+
+
+def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored = json.loads(bounds.bounds_path(CASES[CASE]).read_text())
+    del stored["figures"]["ua"]
+    partial = tmp_path / "partial.json"
+    partial.write_text(json.dumps(stored))
+    for module in ("pipeline.bounds", "pipeline.stages.report"):
+        monkeypatch.setattr(f"{module}.bounds_path", lambda case: partial)
+    laws = {f"{CASE}-{law}": {"case": CASE, "law": law, "model": "one_step"} for law in LAWS}
+    case = {"held_out_seeds": list(CASES[CASE].held_out_seeds)}
+    models = {f"{CASE}-one_step": {"case": CASE, "model": "one_step", "data": "work", "parts": {}}}
+    params = {"cases": {CASE: case}, "records": {}, "models": models, "controllers": laws}
+    own = tmp_path / "own"
+    shutil.copytree(root, own)
+    (own / "params.yaml").write_text(yaml.safe_dump(params))
+    monkeypatch.chdir(own)
+    report(CASE)
+    assert (
+        "has no nmpc figures of scenario 'ua' as it is now; run `loopwright bounds" in capsys.readouterr().err
+    )
+    folder = own / "artifacts" / CASE
+    tree = json.loads((folder / "validation.json").read_text())
+    assert "ua" not in tree["bounds"]
+    assert tree["bounds"]["held_out"]["nmpc"]["mae"] > 0
+    for name in ("report.html", "report.md"):
+        text = (folder / name).read_text()
+        assert "The perfect-model NMPC was not computed for: ua." in text
+        assert "No bounds were computed" not in text

@@ -31,7 +31,9 @@ from pipeline.tracking.gate import Gate
 
 def load(root: Path, mini: Miniature, own_data: bool = False) -> Evidence:
     work = root / "work" / mini.case
-    return Evidence.load(mini.of, made_up.bounds(mini), work, tuple(mini.quality), own_data=own_data)
+    return Evidence.load(
+        mini.of, made_up.bounds(mini), work, tuple(mini.quality), own_data=own_data, timing=root / "timing" / mini.case
+    )
 
 
 @pytest.fixture(scope="module", params=[PH, BATCH], ids=lambda mini: mini.case)

@@ -85,7 +85,9 @@ MINI = TwoValvesMade(
 
 def load(root: Path) -> Evidence:
     bounds = {"levels": made_up.bounds(MINI)["levels"]}  # of the other plants nobody knows the bound
-    return Evidence.load(MINI.of, bounds, root / "work" / MINI.case, tuple(MINI.quality))
+    return Evidence.load(
+        MINI.of, bounds, root / "work" / MINI.case, tuple(MINI.quality), timing=root / "timing" / MINI.case
+    )
 
 
 def tell(root: Path, law: str, **figures: float) -> None:

@@ -5,6 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
+import resource
+import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -222,6 +227,44 @@ def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
         Controller(tmp_path)
 
 
+LOADS = """
+import sys
+from serving import ArtifactError, Controller
+for path in sys.argv[1:]:
+    try:
+        Controller(path)
+    except ArtifactError as error:
+        print(error)
+"""
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
+    """In a process of its own with little memory: a pipe would wait for ever, /dev/zero has no end."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("/dev/zero")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(str(tmp_path / "s"))
+        paths = [tmp_path / "pipe", "/dev/zero", tmp_path / "link", tmp_path / "s", tmp_path, tmp_path / "loop"]
+        done = subprocess.run(
+            [sys.executable, "-c", LOADS, *map(str, paths)],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32)),
+        )
+    assert done.returncode == 0, done.stderr
+    kinds = ["a pipe", "a device", "a device", "a socket", "a directory", "symbolic links"]
+    for line, path, kind in zip(done.stdout.splitlines(), paths, kinds, strict=True):
+        assert line.startswith(f"{path}: ")
+        assert kind in line
+
+
+def test_a_path_with_a_nul_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArtifactError, match="cannot be read"):
+        Controller(tmp_path / "a\0b")
+
+
 def test_a_pinned_digest_refuses_another_file(pi_file: Path, controller: Controller) -> None:
     Controller(pi_file, sha256=controller.sha256.upper())
     with pytest.raises(ArtifactError, match="not the pinned"):
@@ -263,6 +306,98 @@ def test_a_manifest_that_does_not_fit_its_graph_is_refused(
     for text in ("", "[]", "{", '{"schema": NaN}', "{}"):
         with pytest.raises(ArtifactError, match="manifest"):
             Controller(sealed(path, model, text))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"n_state": True}, "n_state is True; it must be an integer"),
+        ({"n_state": 2.0}, "n_state is 2.0; it must be an integer"),
+        ({"n_state": 10**9}, "it must be 0 to 1000000"),
+        ({"n_state": 10**200}, "it must be 0 to 1000000"),
+        ({"period_s": 1e-300}, "must be positive, 1e-06 to 1e"),
+        ({"period_s": 10**299}, "must be positive"),
+        ({"period_s": True}, "True stands where a number belongs"),
+        ({"period_s": "1"}, "'1' stands where a number belongs"),
+        ({"schema": True}, "schema True"),
+        ({"schema": 1.0}, "schema 1.0"),
+        ({"law": 7}, "a name is 7"),
+        ({"law": None}, "a name is None"),
+        ({"case": "x" * 201}, "at most 200 characters"),
+        ({"case": "x" * 2**20}, "the manifest has 10.* characters"),
+        ({"case": "\ud800"}, "surrogates not allowed"),
+        ({"info": "ab"}, "'ab' stands where a list belongs"),
+        ({"info": ["a", 1]}, "a name is 1"),
+        ({"inputs": {"sp": 1}}, "stands where a list belongs"),
+        ({"provenance": []}, "stands where an object belongs"),
+        ({"evidence": None}, "None stands where an object belongs"),
+        ({"sp": [["level", "m", 0, 1]]}, "stands where an object belongs"),
+        ({"sp": [{"name": "level", "unit": "m", "low": 0}]}, "a signal lacks 'high'"),
+        ({"sp": [{"name": "level", "unit": "m", "low": 0, "high": 1, "x": 1}]}, "unknown entries: x"),
+        ({"sp": [{"name": "level", "unit": 1, "low": 0, "high": 1}]}, "a name is 1"),
+        ({"sp": [{"name": "level", "unit": "m", "low": False, "high": 1}]}, "False stands where a number belongs"),
+        ({"mv": [{"name": "v", "unit": "%", "low": 0, "high": 1, "values": "01"}]}, "stands where a list belongs"),
+        ({"mv": [{"name": "v", "unit": "%", "low": 0, "high": 1, "values": [0, True]}]}, "True stands where a number"),
+    ],
+)
+def test_a_manifest_of_wrong_types_or_sizes_is_refused(
+    controller: Controller, changed: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ArtifactError, match=message) as caught:
+        Manifest.from_json(edited(controller, **changed))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("9" * 5000, "an integer of 5000 digits"),
+        ("-" + "9" * 5000, "an integer of 5001 digits"),
+        ("1e999", "1e999, which is not a finite number"),
+        ("-1e999", "not a finite number"),
+        ("NaN", "not a finite number"),
+        ('{"a": 1, "a": 2}', "'a' twice"),
+        ("[" * 21 + "]" * 21, "nested more than 20 deep"),
+        ("[" * 100_000 + "]" * 100_000, "nested more|not JSON"),
+        ('{"a":' * 100_000 + "1" + "}" * 100_000, "nested more|not JSON"),
+    ],
+    ids=lambda v: v[:12],
+)
+@pytest.mark.parametrize("entry", ["n_state", "period_s", "evidence"])
+def test_a_manifest_with_a_monstrous_value_is_refused(
+    controller: Controller, entry: str, value: str, message: str
+) -> None:
+    text = edited(controller, **{entry: "HERE"}).replace('"HERE"', value)
+    with pytest.raises(ArtifactError, match=message) as caught:
+        Manifest.from_json(text)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_a_manifest_with_an_entry_twice_is_refused(controller: Controller) -> None:
+    text = controller.manifest.to_json()
+    with pytest.raises(ArtifactError, match="'law' twice"):
+        Manifest.from_json(text[:-1] + ', "law": "another"}')
+
+
+def test_a_metadata_entry_of_no_controller_is_refused(pi_file: Path, tmp_path: Path) -> None:
+    """onnxruntime takes session options from such an entry where the environment says so."""
+    model = onnx.ModelProto.FromString(pi_file.read_bytes()[:-TRAILER_BYTES])
+    model.metadata_props.append(onnx.StringStringEntryProto(key="ort_config", value="{}"))
+    with pytest.raises(ArtifactError, match="metadata entry 'ort_config'"):
+        Controller(write(tmp_path / "x.onnx", seal(model.SerializeToString())))
+
+
+def test_a_file_is_read_as_onnx_whatever_its_fifth_byte_on(pi_file: Path, tmp_path: Path) -> None:
+    """onnxruntime takes a file with "ORTM" there for its own format, which nobody audited."""
+    model = onnx.ModelProto.FromString(pi_file.read_bytes()[:-TRAILER_BYTES])
+    model.producer_name = "ORTM"
+    data = model.SerializeToString()
+    assert data[4:8] == b"ORTM"
+    with pytest.raises(Exception, match="ORT model verification failed"):
+        ort.InferenceSession(data)
+    Controller(write(tmp_path / "x.onnx", seal(data)))
 
 
 def narrowed(model: onnx.ModelProto) -> None:
@@ -308,6 +443,10 @@ def undefined(model: onnx.ModelProto) -> None:
     model.graph.node[0].input[0] = "nowhere"
 
 
+def mistyped(model: onnx.ModelProto) -> None:
+    model.graph.node[0].attribute.append(helper.make_attribute("surprise", 1))
+
+
 def headless(model: onnx.ModelProto) -> None:
     model.ClearField("graph")
 
@@ -323,7 +462,8 @@ def headless(model: onnx.ModelProto) -> None:
         (foreign_operator, "operator com.example"),
         (future_ir, "IR 11"),
         (future_opset, "opset 22"),
-        (undefined, "onnxruntime does not load the graph"),
+        (undefined, "reads 'nowhere', which nothing before it gives"),
+        (mistyped, "onnxruntime does not load the graph"),
         (headless, "it has no graph"),
     ],
 )

@@ -9,6 +9,9 @@ from typing import Any
 import pytest
 import yaml
 
+from pipeline.cases import CASES
+from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from pipeline.plants.base import Plant
 from pipeline.stages import check
 
 ROOT = Path(__file__).parents[2]
@@ -69,3 +72,50 @@ def test_every_mistake_is_told_and_the_exit_says_so(params: dict[str, Any], caps
     assert check.main() == 2
     lines = capsys.readouterr().err.splitlines()
     assert [line.partition(":")[0] for line in lines] == ["check", "check"]
+
+
+class Unwritten(Plant):
+    """A plant without equations."""
+
+
+def test_an_abstract_plant_is_told_before_the_run(params: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    class Case(PhNeutralizationCase):
+        plant_class = Unwritten
+
+    monkeypatch.setitem(CASES, "ph_neutralization", Case())
+    lines = checked(params)
+    assert len(lines) == 1 + sum("controllers.ph_neutralization-" in line for line in lines)
+    assert "plant class Unwritten is abstract, as it lacks derivative" in lines[0]
+
+
+def test_a_case_without_tests_is_told_before_the_run(params: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    class Case(PhNeutralizationCase):
+        def scenarios(self) -> Any:
+            return {}
+
+    monkeypatch.setitem(CASES, "ph_neutralization", Case())
+    (line,) = checked(params)
+    assert "case 'ph_neutralization' has no tests" in line
+
+
+@pytest.mark.parametrize(
+    ("tuning", "said"), [("simc", "SIMC needs stable real poles"), ("itae", "needs a stable plant")]
+)
+def test_a_tuning_that_does_not_apply_is_told_before_the_run(params: dict[str, Any], tuning: str, said: str) -> None:
+    params["controllers"]["thiosulfate_cstr-pid"]["tuning"] = tuning  # at the unstable point
+    (line,) = checked(params)
+    assert line.startswith("controllers.thiosulfate_cstr-pid")
+    assert said in line
+
+
+def test_bounds_that_are_missing_are_a_note_and_no_mistake(
+    params: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    params["cases"]["thiosulfate_cstr"]["held_out_seeds"] = [90_001]
+    assert checked(params) == []
+    assert check.main() == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said
+    for line in said:
+        assert line.startswith("check: note: ")
+        assert "figures of scenario 'held_out' (seeds [90001])" in line

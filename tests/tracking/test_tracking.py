@@ -303,11 +303,12 @@ def test_a_run_has_the_times_of_its_stage(root):
 
 
 def test_a_stage_under_dvc_leaves_a_receipt_that_fits_its_files(tmp_path):
-    package = tmp_path / "pipeline"
-    (package / "stages").mkdir(parents=True)
-    for name in ("__init__.py", "start.py"):
-        shutil.copy(Path(pipeline.__file__).parent / name, package)
-    (package / "stages" / "__init__.py").touch()
+    package, sources = tmp_path / "pipeline", Path(pipeline.__file__).parent
+    for room in ("stages", "engine"):
+        (package / room).mkdir(parents=True)
+        (package / room / "__init__.py").touch()
+    (package / "__init__.py").touch()
+    shutil.copy(sources / "engine" / "start.py", package / "engine")
     probe = (
         "from pathlib import Path\nimport sys\nPath(sys.argv[1]).write_text('made')\nsys.exit(sys.argv[1] == 'bad')\n"
     )

@@ -184,6 +184,10 @@ def test_simc_is_skogestads_example() -> None:
     assert (pi.kc, pi.ti_s, pi.td_s) == (pytest.approx(kc), pytest.approx(tau_i), 0.0)
 
 
+UNSTABLE_WITH_ZERO = linear([[0.2, 1.0], [0.0, -1.0]], [1.0, 1.0], [1.0, 0.5])
+INTEGRATOR_WITH_ZERO = linear([[0.0, 1.0], [0.0, -1.0]], [0.0, 1.0], [1.0, 0.5])  # its matrix is singular
+
+
 @pytest.mark.parametrize(
     ("rule", "message"),
     [
@@ -192,6 +196,9 @@ def test_simc_is_skogestads_example() -> None:
         (lambda: imc_pid(AllPole.of(second_order(1.0, -3.0, 2.0)), 0.5), "two poles in the right half plane"),
         (lambda: imc_pid(AllPole.of(first_order(1.0, 1.0)), 0.0), "lambda_s is 0"),
         (lambda: AllPole.of(linear([[0.0, 1.0], [-1.0, -1.0]], [0.0, 1.0], [1.0, 0.5])), "no zero"),
+        (lambda: AllPole.of(linear([[-1.0, 1.0], [0.0, -1.0]], [1.0, 1.0], [1.0, 0.5])), "`optimized` or `itae`"),
+        (lambda: AllPole.near(UNSTABLE_WITH_ZERO), "no zero.* choose tuning `manual`"),
+        (lambda: AllPole.near(INTEGRATOR_WITH_ZERO), "no zero.* choose tuning `manual`"),
         (lambda: AllPole.of(linear([[-1.0, 0.0], [0.0, -2.0]], [1.0, 0.0], [0.0, 1.0])), "does not act"),
         (lambda: robust_imc(second_order(1.0, -20.0, -30.0), 0.5), "no IMC filter"),
         (lambda: LagWithDeadTime.of(second_order(1.0, 0.3, -0.1)), "needs a stable plant"),
@@ -253,3 +260,27 @@ def test_time_weighted_errors_count_what_comes_late(plant: Plant) -> None:
 def test_development_loops_must_be_asked_for(plant: Plant) -> None:
     with pytest.raises(PlantError, match="need seeds"):
         DevelopmentLoops.draw(plant, (), 3, 5)
+
+
+@given(st.floats(0.0, 3.0), st.floats(0.3, 5.0), st.sampled_from([-2.0, 0.5]))
+@settings(max_examples=30, deadline=None)
+def test_imc_of_a_lag_with_dead_time_gives_the_filter_where_pade_is_exact(
+    theta: float, lambda_s: float, gain: float
+) -> None:
+    """With the dead time as (1 - s theta/2)/(1 + s theta/2) the closed loop is that numerator over lambda s + 1."""
+    tau, at = 4.0, 0.07 + 0.4j
+    s = imc_pid(LagWithDeadTime(gain, tau, theta), lambda_s)
+    g = gain / (tau * at + 1) * (1 - at * theta / 2) / (1 + at * theta / 2)
+    loop = s.kc * (1 + 1 / (s.ti_s * at) + s.td_s * at) * g
+    assert loop / (1 + loop) == pytest.approx((1 - at * theta / 2) / (lambda_s * at + 1), rel=1e-9)
+
+
+def test_a_plant_that_no_lag_resembles_is_taken_with_dead_time() -> None:
+    """Four equal lags start without a slope: the lag with dead time has their area, mean and variance."""
+    n, tau = 4, 5.0
+    a = (np.eye(n, k=-1) - np.eye(n)) / tau
+    chain = linear(a.tolist(), [2.0 / tau, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+    found = AllPole.near(chain)
+    assert isinstance(found, LagWithDeadTime)
+    assert (found.gain, found.tau_s) == (pytest.approx(2.0), pytest.approx(tau * np.sqrt(n)))
+    assert found.dead_time_s == pytest.approx(n * tau - tau * np.sqrt(n))

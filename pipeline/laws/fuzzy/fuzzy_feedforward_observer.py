@@ -32,8 +32,10 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         R(k+2) = c_t R + c_w T_w,adj - c (R - T^(k+1)) + d_c,
 
     which is what was aimed at where that is within reach, and otherwise what is: a core that lags
-    draws R along, so that nothing winds up. With g = 1 as in the feedforward alone, a jacket that
-    lies in the gap between the modes makes R overcorrect, and the modes alternate.
+    draws R along, so that nothing winds up. R(k+1) is formed at sample k, with the jacket temperature
+    that the model reaches under the applied MVs: a stuck throttle holds R too. With g = 1 as in the
+    feedforward alone, a jacket that lies in the gap between the modes makes R overcorrect, and the
+    modes alternate.
 
     Source: the feedback part that seed 003_9cd6247d31a7c2db.txt, section 6, leaves open; ours.
     """
@@ -43,7 +45,12 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
-        """Numbers of the law; the first five as in ``fuzzy_feedforward``.
+        """Numbers of the law.
+
+        ``part`` names the model of the set (None: its only one). ``jacket_low`` and ``jacket_high``
+        [degC] are what the jacket may have. ``switch_penalty`` [degC] is how much nearer another mode
+        must come to the wanted jacket temperature to be taken. ``mv_rate`` is the throttle's largest
+        change a sample, None unlimited.
 
         ``k_jacket``, ``k_core`` are the shares of an innovation that correct an estimate, ``l_jacket``,
         ``l_core`` those that go into its offset; ``core_gain`` (c) is the share of the core's distance to
@@ -82,7 +89,8 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         }
         for name, value in numbers.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
-        # started, predicted T(k), R(k+1), both modes' T_w(k) at k_M = 0 and what k_M = 1 adds, offsets (core, jacket)
+        # started, predicted T(k), R(k+1) less the jacket's share, both modes' T_w(k) at k_M = 0 and what k_M = 1 adds,
+        # offsets (core, jacket)
         self.n_state = 9
         self.info = (
             "adjusted_reference",
@@ -97,9 +105,10 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
-        started, t, reference, line, offsets = torch.split(state, [1, 1, 1, 4, 2], dim=-1)
+        started, t, left, line, offsets = torch.split(state, [1, 1, 1, 4, 2], dim=-1)
         side = self.side(started, mv_applied)
-        predicted = torch.cat([t, self.followed(line, side, mv_applied)], dim=-1)
+        followed = self.followed(line, side, mv_applied)
+        predicted = torch.cat([t, followed], dim=-1)
         predicted = torch.where(started > 0, predicted, pv)
         innovation = pv - predicted
         x = predicted + self.correct * innovation
@@ -107,13 +116,14 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         core_offset, jacket_offset = torch.split(offsets, 1, dim=-1)
         t, t_w = torch.split(x, 1, dim=-1)
         t_next = self.model.core_next(t, t_w) + core_offset
-        reference = torch.where(started > 0, reference, t_next)
+        reference = torch.where(started > 0, left + self.model.core[:1] * followed, t_next)
         spent = self.core_gain * (reference - t_next) - core_offset
         target = reference + self.approach * (sp - reference)
         wanted = self.allowed(self.wanted(target + spent, reference))
         reach = self.model.jacket(t, t_w)
         reach = JacketAffine(reach.base + jacket_offset, reach.gain)
         mv, reached = self.move(reach, wanted, side, mv_applied)
-        adjusted = self.model.core_next(reference, reached) - spent
-        state = torch.cat([torch.ones_like(t), t_next, adjusted, *reach, offsets], dim=-1)
+        left = self.model.core[1:] * reference - spent
+        adjusted = left + self.model.core[:1] * reached
+        state = torch.cat([torch.ones_like(t), t_next, left, *reach, offsets], dim=-1)
         return mv, state, torch.cat([adjusted, wanted, reached, mv[..., 1:], offsets], dim=-1)

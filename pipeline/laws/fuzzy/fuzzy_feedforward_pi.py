@@ -27,7 +27,8 @@ class FuzzyFeedforwardPi(FuzzyLaw):
     distance to the measured one: a model whose throttle does too little or too much would ring with
     the measured jacket alone. Where the jacket gives all that was asked for, R approaches the set
     point; where it does not, R takes what is left beside the controller's share, so that a core
-    that lags draws R along and the integral does not wind up.
+    that lags draws R along and the integral does not wind up. R(k+1) is formed at sample k, with the
+    jacket temperature that the model reaches under the applied MVs: a stuck throttle holds R too.
 
     Source: seed 003_9cd6247d31a7c2db.txt, section 2, which splits the law so and leaves this part
     open; ours.
@@ -38,7 +39,12 @@ class FuzzyFeedforwardPi(FuzzyLaw):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
-        """Numbers of the law; the first five as in ``fuzzy_feedforward``.
+        """Numbers of the law.
+
+        ``part`` names the model of the set (None: its only one). ``jacket_low`` and ``jacket_high``
+        [degC] are what the jacket may have. ``switch_penalty`` [degC] is how much nearer another mode
+        must come to the wanted jacket temperature to be taken. ``mv_rate`` is the throttle's largest
+        change a sample, None unlimited.
 
         ``kc`` [degC of the jacket per degC of the core] and ``ti_s`` [s] are the PI controller's,
         ``approach`` (g) and ``k_jacket`` the shares above, in 0..1 [-], g above 0.
@@ -75,20 +81,22 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         }
         for name, value in numbers.items():
             self.register_buffer(name, torch.tensor([value], dtype=torch.float64))
-        self.n_state = 8  # started, R(k), R(k+1), I(k-1), both modes' T_w(k) at k_M = 0 and what k_M = 1 adds
+        # started, R(k), R(k+1) less the jacket's share, I(k-1), both modes' T_w(k) at k_M = 0 and what k_M = 1 adds
+        self.n_state = 8
         self.info = ("adjusted_reference", "wanted_jacket", "reached_jacket", "mode", "integral")
 
     def forward(
         self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One step; shapes as in ControlLaw."""
-        started, now, reference, integral, line = torch.split(state, [1, 1, 1, 1, 4], dim=-1)
+        started, now, left, integral, line = torch.split(state, [1, 1, 1, 1, 4], dim=-1)
         t, measured = torch.split(pv, 1, dim=-1)
         side = self.side(started, mv_applied)
-        t_w = torch.where(started > 0, self.followed(line, side, mv_applied), measured)
+        followed = self.followed(line, side, mv_applied)
+        t_w = torch.where(started > 0, followed, measured)
         t_w = t_w + self.k_jacket * (measured - t_w)
         now = torch.where(started > 0, now, t)
-        reference = torch.where(started > 0, reference, self.model.core_next(t, t_w))
+        reference = torch.where(started > 0, left + self.model.core[:1] * followed, self.model.core_next(t, t_w))
         error = now - t
         integral = integral + self.integral * error
         u = self.kc * error + integral
@@ -96,6 +104,7 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         wanted = self.allowed(self.wanted(target, reference) + u)
         reach = self.model.jacket(t, t_w)
         mv, reached = self.move(reach, wanted, side, mv_applied)
-        adjusted = self.model.core_next(reference, reached - u)
-        state = torch.cat([torch.ones_like(t), reference, adjusted, integral, *reach], dim=-1)
+        left = self.model.core_next(reference, -u)
+        adjusted = left + self.model.core[:1] * reached
+        state = torch.cat([torch.ones_like(t), reference, left, integral, *reach], dim=-1)
         return mv, state, torch.cat([adjusted, wanted, reached, mv[..., 1:], integral], dim=-1)

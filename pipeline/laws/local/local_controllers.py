@@ -12,6 +12,7 @@ from torch import Tensor
 from pipeline.errors import LawError
 from pipeline.laws.base import Analysis, ControlLaw, LawSignals, require_single_loop
 from pipeline.laws.local.local_stability import StabilityTest, stability_analysis
+from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.local.local_models import LocalModels
 from pipeline.plants.base import Plant
 
@@ -64,7 +65,9 @@ class LocalControllers(ControlLaw):
 
     Anti-windup: the integral keeps its value while the limited MV lies behind the request in the
     direction of the error. A cold start, and an actuator that someone else moved, set the integral
-    to where the MV is, less the proportional part, so that taking over does not bump.
+    to where the MV is, less the proportional part, so that taking over does not bump. Where the
+    actuator stood still, a set point that moves to the process variable does not take back the
+    proportional part that the actuator never received (``never_given``).
 
     Source: seed 004_643aaacd7e46828e.txt, section III (blended outputs, in words); blending the
     gains around one integrator is not in the paper.
@@ -107,7 +110,8 @@ class LocalControllers(ControlLaw):
         self.blending, self.pids = blending, tuple(pids)
         self.stability = stability or StabilityTest()
         self.points = tuple(float(v) for v in models.x[:, 0])  # [CV]
-        self.n_state = 6  # started, I or J/h, the proportional part before, y(k-1), v(k-1), the last MV given
+        # started, I or J/h, the proportional part before, y(k-1), v(k-1), the last MV given, mv_applied(k-1), r(k-1)
+        self.n_state = 8
         self.info = ("kc", "tau_i_s", "tau_d_s", "mv_requested")
 
     @classmethod
@@ -145,25 +149,27 @@ class LocalControllers(ControlLaw):
         beside = error if self.blending == "velocity" else proportional
         # What one unit of the integral is in the MV's.
         unit = ki if self.blending == "outputs" else torch.ones_like(y)
-        fresh = torch.cat([(mv_applied - beside) / unit, beside, y, nothing, mv_applied], dim=-1)
+        fresh = torch.cat([(mv_applied - beside) / unit, beside, y, nothing, mv_applied, mv_applied, sp], dim=-1)
         past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
-        integral, beside1, y1, slope1, given = (past[..., i : i + 1] for i in range(5))
+        integral, beside1, y1, slope1, given, applied1, r1 = (past[..., i : i + 1] for i in range(7))
         followed = (mv_applied - given).abs() <= self.near
         # A derivative from the time when somebody else held the actuator would still fade in the MV.
         slope1 = torch.where(followed, slope1, nothing)
+        still = stood_still(mv_applied, applied1, given, self.near)
+        start = mv_applied + torch.where(still, kp * never_given(sp - r1, r1 - y1), nothing)
         slope = keep * slope1 + (1 - keep) * (y - y1)
         if self.blending == "velocity":
-            requested = mv_applied + kp * (error - beside1) + ki * error - kd * (slope - slope1)
+            requested = start + kp * (error - beside1) + ki * error - kd * (slope - slope1)
             mv = self.limited(requested, mv_applied)
             kept = nothing
         else:
-            integral = torch.where(followed, integral, (mv_applied - beside1) / unit)
+            integral = torch.where(followed, integral, (start - beside1) / unit)
             grown = integral + ki / unit * error
             requested = proportional - kd * slope + unit * grown
             mv = self.limited(requested, mv_applied)
             kept = torch.where((requested - mv) * error > 0, integral, grown)
         info = torch.cat([kp, kp / ki * self.period, kd / kp * self.period, requested], dim=-1)
-        return mv, torch.cat([torch.ones_like(y), kept, beside, y, slope, mv], dim=-1), info
+        return mv, torch.cat([torch.ones_like(y), kept, beside, y, slope, mv, mv_applied, sp], dim=-1), info
 
     def analysis(self, plant: Plant) -> Analysis:
         """The stability of the loop along the operating points and from many starts, as ``stability`` asks for it."""

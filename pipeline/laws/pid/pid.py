@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.errors import LawError
 from pipeline.laws.base import Analysis, ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.base import Model
 from pipeline.plants.base import Array, Linearization, Plant
 from pipeline.tuning import rules as tuning
@@ -43,7 +44,9 @@ class PID(ControlLaw):
     law's own limits a share is remembered, fading with the tracking time Tt: without it
     (Tt = h, the plain velocity form) one saturated sample erases the proportional and derivative
     kicks, whose end then pulls the MV the wrong way. An actuator that did not follow the limited
-    request (manual, stuck) is believed at once.
+    request (manual, stuck) is believed at once. Where it stood still, a set point that moves to the
+    process variable does not take back the proportional action that the actuator never received
+    (``never_given``).
 
     Source: the PID that seed 000_0a422d3e5d968dac.txt, section 4.3, compares with; the tracking
     is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
@@ -60,12 +63,13 @@ class PID(ControlLaw):
         ``tuning``: ``optimized`` (IMC, its filter and the set-point weight chosen in closed loop, by the
         ``criterion`` mean absolute error or integral of the time-weighted one),
         ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``itae`` (the rule for the
-        least ITAE after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``.
+        least ITAE after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``
+        and the derivative's filter ``filter_s`` [s].
         ``tracking_s`` [s] None is sqrt(Ti Td). ``set_point_weight`` None is 1, or optimized with the
         filter.
         ``operating_cv`` [pv] is the steady state to linearize where the model set has no part
         ``linearized``; None is the middle of the set point's range. The development set points
-        are drawn for the optimization alone, ``development_set_points`` of them for each seed,
+        are drawn for the optimization alone, ``development_set_points`` of them for each of the ``development_seeds``,
         each held for ``development_hold`` samples. ``sampling`` is what ``itae`` counts of a period as
         dead time: 0.5 is the textbook's, 1 more cautious. ``examined_cv`` [pv] is the range over which
         the linear closed loops are examined; None: not at all. ``mv_rate`` [mv] is the largest change
@@ -123,7 +127,7 @@ class PID(ControlLaw):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64).reshape(shape))
         self.register_buffer("near", 1e-3 * (self.high - self.low))
         self.settings = rows[0]
-        self.n_state = 6  # started, p(k-1), y(k-1), d(k-1), the last request, the same limited
+        self.n_state = 7  # started, p(k-1), y(k-1), d(k-1), the last request, the same limited, mv_applied(k-1)
         self.info = ("mv_requested",)
 
     @classmethod
@@ -132,6 +136,15 @@ class PID(ControlLaw):
         law = cls._tuned(params, models, signals, plant)
         law.examined_cv = params.examined_cv
         return law
+
+    @classmethod
+    def check(cls, params: Any, models: Mapping[str, Model], plant: Plant) -> None:
+        """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
+        require_single_loop(LawSignals.of(plant), cls.name)
+        if params.tuning == "optimized":
+            AllPole.near(_linearization(params, models, plant))
+        else:
+            cls._tuned(params, models, LawSignals.of(plant), plant)
 
     @classmethod
     def _tuned(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
@@ -173,16 +186,19 @@ class PID(ControlLaw):
         """One step; shapes as in ControlLaw."""
         y = pv[..., :1]
         p = self.weight * sp - y
-        fresh = torch.cat([p, y, torch.zeros_like(p), mv_applied, mv_applied], dim=-1)
+        fresh = torch.cat([p, y, torch.zeros_like(p), mv_applied, mv_applied, mv_applied], dim=-1)
         past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
-        p1, y1, d1, asked, given = (past[..., i : i + 1] for i in range(5))
+        p1, y1, d1, asked, given, applied1 = (past[..., i : i + 1] for i in range(6))
         # Where the actuator is not at the limited request, someone else moved it: nothing was unmet.
         unmet = torch.where((mv_applied - given).abs() <= self.near, asked - given, torch.zeros_like(asked))
         d = self.keep * d1 + self.derivative * (y - y1)
-        move = p - p1 + self.integral * (sp - y) - (d - d1)
+        still = stood_still(mv_applied, applied1, given, self.near)
+        # p alone tells b (r - r1) and b (r1 - y1): the state holds no set point.
+        spared = never_given(p - p1 + (y - y1), p1 + (1 - self.weight) * y1)
+        move = p - p1 + torch.where(still, spared, torch.zeros_like(p)) + self.integral * (sp - y) - (d - d1)
         requested = mv_applied + self.fade * unmet + self.kc * move
         mv = self.limited(requested, mv_applied)
-        return mv, torch.cat([torch.ones_like(p), p, y, d, requested, mv], dim=-1), requested
+        return mv, torch.cat([torch.ones_like(p), p, y, d, requested, mv, mv_applied], dim=-1), requested
 
     def analysis(self, plant: Plant) -> Analysis:
         """Stability and gain margin of the linear closed loops over ``examined_cv``; nothing where that is None."""

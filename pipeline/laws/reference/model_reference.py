@@ -42,7 +42,7 @@ class ModelReference(ReferenceLaw):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):
-        """The reference model, and how the network is trained to follow it."""
+        """The reference model, and in ``training`` how the network is trained to follow it."""
 
         training: Training = field(default_factory=Training)
 

@@ -28,6 +28,7 @@ class HybridFuzzyPart(Part):
 
     ``identification`` is what the modes share (hybrid_fuzzy_identification). ``centres`` are the rules' jacket
     temperatures [degC]. ``free_run`` is the length of the free runs whose error is reported [samples].
+    ``train_fraction`` of the record trains, the rest validates.
     """
 
     model: ClassVar[type[Model]] = HybridFuzzy

@@ -77,6 +77,7 @@ class ArxPart(Part):
     """An ARX predictor of ``target`` (None: the controlled variable) by least squares.
 
     ``n_y``, ``n_u``, ``delay`` the lags; ``steps`` the length of the free run whose error is reported.
+    ``train_fraction`` of the record trains, the rest validates.
     """
 
     model: ClassVar[type[LaggedModel]] = ARX

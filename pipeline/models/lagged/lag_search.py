@@ -34,7 +34,6 @@ class Candidate:
     parameters: int
     rmse: float
     free_run_rmse: float
-    seconds: float
 
     def row(self, chosen: bool) -> dict[str, Any]:
         """JSON-ready values for the metrics."""

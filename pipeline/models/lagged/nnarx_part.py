@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -39,6 +38,9 @@ class NnarxPart(Part):
     ``long_run`` periods of free runs, end to end over the validation data, whose fit is told for the network
     trained on one step and for the one that is kept; 0 for none. ``free_run_iterations`` limit the second
     training; None: as the first.
+    ``residual`` has the network learn the change from one sample to the next instead of the level. ``train_fraction``
+    of the record train, the rest validates. ``trainer`` names a trainer by ``kind`` (lm, lbfgs, adam) and its numbers.
+    ``forgetting`` are the factors of the recursive linear models that the one-step predictions are compared with.
     ``compared`` validation samples show the one-step predictions beside those of linear models; 0 none, which
     leaves the picture to the free runs.
     """
@@ -108,7 +110,6 @@ class NnarxPart(Part):
     def _trial(
         self, train: Record, validation: Record, target: int, back: int, seed: int
     ) -> tuple[NNARX, FitHistory, dict[str, LongRun], Candidate]:
-        begun = time.perf_counter()
         lags = (self.n_y, self.n_u, target, self.delay)
         fitted, held = nnarx_pairs(train, *lags), nnarx_pairs(validation, *lags)
         model = NNARX.scaled_to(
@@ -135,8 +136,7 @@ class NnarxPart(Part):
             error = float(free.loss(model.net).sqrt() * model.net.y_scale)
         size = sum(p.numel() for p in model.parameters())
         one_step = rmse(held.y, predict(model, held.x))
-        seconds = time.perf_counter() - begun
-        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step, error, seconds)
+        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step, error)
 
     def _run_free(
         self, model: NNARX, trainer: Trainer, train: Record, validation: Record, target: int, seed: int

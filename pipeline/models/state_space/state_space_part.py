@@ -30,7 +30,8 @@ class StateSpacePart(Part):
     ``hidden`` widths. ``steps`` the periods of the free runs that are trained on after the fit of one step;
     1 leaves it at that. ``free_run_iterations`` limit the second training; None: as the first. ``long_run``
     the periods of the free runs, end to end over the validation data, by whose fit the networks are judged
-    before and after. ``trainer`` {kind: lm | lbfgs | adam, and its options}.
+    before and after. ``train_fraction`` of the record trains, the rest validates.
+    ``trainer`` {kind: lm | lbfgs | adam, and its options}.
     """
 
     model: ClassVar[type[Model]] = StateSpace

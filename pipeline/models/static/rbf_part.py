@@ -24,7 +24,7 @@ class RbfPart(StaticPart):
     """A fuzzy-means RBF network.
 
     ``partitions`` c fuzzy sets an input; ``basis``, ``width``, ``ridge`` as in FuzzyMeansRBF; ``sweep``
-    [first, last] partitions to try on the first data seed, for the picture, none where empty.
+    [first, last] partitions to try on the data seed ``sweep_seed``, for the picture, none where empty.
     """
 
     model: ClassVar[type[Model]] = RBF

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SHIPPED = sorted(f"{file.parent.name}/{file.stem}" for file in (ROOT / "artifacts").glob("*/*.onnx"))
 DEPENDENCIES = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
 Runs = Mapping[str, Mapping[str, np.ndarray]]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-FILE = Path(__file__).parents[1] / "benchmarks" / "step.py"
+FILE = Path(__file__).parents[2] / "benchmarks" / "step.py"
 TITLE = 2  # lines before the first row: what is measured, and the table's head
 
 

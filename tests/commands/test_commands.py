@@ -1,0 +1,113 @@
+"""``loopwright``: every command tells what it takes, and what cannot be is one line and status 2."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.__main__ import main
+from pipeline.commands import COMMANDS
+from pipeline.commands.parameters import texts
+from pipeline.laws import LAWS
+from pipeline.models import MODELS
+
+ROOT = Path(__file__).parents[2]
+COMMANDS_OF_TODAY = {
+    "run", "check", "results", "simulate", "inspect", "bench", "laws", "models", "bounds", "registry",
+}  # fmt: skip
+
+
+def test_the_commands_are_these() -> None:
+    assert set(COMMANDS) == COMMANDS_OF_TODAY
+    for name in COMMANDS:
+        module = importlib.import_module(f"pipeline.commands.{name}")
+        assert callable(module.options)
+        assert callable(module.run)
+
+
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_every_command_tells_what_it_takes(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if name:
+        with pytest.raises(SystemExit) as end:
+            main([name, "--help"])
+        assert end.value.code == 0
+    else:
+        assert main([]) == main(["--help"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith(f"usage: loopwright {name or 'COMMAND'}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["simulat"], "unknown command 'simulat'; did you mean 'simulate'?"),
+        (["inspect", "none.onnx"], "none.onnx: the file cannot be read"),
+        (["bench", "none.onnx"], "none.onnx: the file cannot be read"),
+        (["results", "--artifacts", "nowhere"], "nowhere holds no validation.json yet"),
+        (["laws", "pidd"], "unknown law 'pidd'; did you mean 'pid'?"),
+        (["models", "rbff"], "unknown kind of model 'rbff'; did you mean 'rbf'?"),
+        (["bounds", "nowhere"], "unknown case 'nowhere'"),
+        (["check"], "params.yaml is not here"),
+        (["run"], "params.yaml is not here"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+
+
+def test_options_that_cannot_be_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["results", "--nonsense"])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == "loopwright results: unrecognized arguments: --nonsense\n"
+
+
+@pytest.mark.parametrize("kind", ["laws", "models"])
+def test_lists_name_every_member(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([kind]) == 0
+    listed = {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+    assert listed == set(LAWS if kind == "laws" else MODELS)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_every_parameter_of_a_law_is_shown_and_explained(law: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["laws", law]) == 0
+    told, params = capsys.readouterr().out, LAWS[law].Params
+    words = " ".join(texts(params))
+    for field in dataclasses.fields(params):
+        assert f"\n{field.name} " in told, field.name
+        assert field.name in words, f"{law}: the docstring of its parameters says nothing of {field.name}"
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_parameter_of_a_model_is_shown_and_explained(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["models", kind]) == 0
+    told, words = capsys.readouterr().out, " ".join(texts(MODELS[kind]))
+    for field in dataclasses.fields(MODELS[kind]):
+        assert f"\n{field.name} " in told, field.name
+        assert field.name in words, f"{kind}: the docstring says nothing of {field.name}"
+
+
+def test_help_loads_no_library_of_the_work() -> None:
+    code = """import sys
+from pipeline.__main__ import main
+main([])
+sys.exit(len({'torch', 'casadi', 'mlflow'} & set(sys.modules)))
+"""
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, timeout=60).returncode == 0
