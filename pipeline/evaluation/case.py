@@ -108,7 +108,6 @@ class Case(ABC):
     tables: ClassVar[tuple[PaperTable, ...]] = ()
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = ()
-    claims: ClassVar[Mapping[str, str]] = {}  # what the paper states -> what an independent implementation found
     # The figure that laws are compared by: "mae", "sse" (sum of squared errors over a test's samples), or "tracking"
     # (root mean square of reference - CV, where the tests have a reference).
     metric: ClassVar[str] = "mae"

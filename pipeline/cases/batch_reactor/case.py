@@ -87,10 +87,6 @@ class BatchReactorCase(Case):
         Requirement(None, "trajectory_noise", "sse", 13_320.0),
         Requirement(None, "trajectory_noise", "sse_late", 15.0),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "the linearized PID tracks better than the recursive one": "does not reproduce: 13,301 against 13,282",
-        "filter and update criterion calm the settings": "not measured",
-    }
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """Closed-loop tests: trajectory and fouling (one scenario each) and held_out (one a seed)."""

@@ -172,15 +172,6 @@ class HensonSeborgCstrCase(Case):
         Requirement(None, "feed_temperature", "max_asse", 1e-4),
         Requirement(None, "feed_concentration", "max_asse", 1e-4),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "only a small overshoot at C = 0.13": "reproduces: 8.4 % of the step",
-        "the network matches the plant with high accuracy": "only roughly: fit 96.6 %, steady error to -5.4 %",
-        "five local models are the best tradeoff": "not examined by the independent implementation",
-        "stable for C below 0.13566 and q_c below 110.8": "does not reproduce: C = 0.14028, q_c = 111.77",
-        "the second operating point has q_c = 98.899": "a slip: the balances give 98.984 at T = 442 K",
-        "the network is ahead of a single PID": "does not reproduce: PID 1 alone is, except on the jump down",
-        "the local PIDs are from Ziegler-Nichols' ultimate gain": "impossible on these models: relative degree 2",
-    }
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """up, down, jump, jump_down, feed_temperature, feed_concentration (one each) and held_out (one a seed)."""

@@ -20,7 +20,7 @@ from pipeline.cases.henson_seborg_cstr.pictures import (
 from pipeline.evaluation.case import Curve, PaperFigure
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import CasePicture, Check, Claims, Verdict, plain_reason
+from pipeline.evaluation.verdicts import CasePicture, Check, Claim, Claims, Verdict, plain_reason
 from pipeline.pictures.words import number
 from pipeline.plants.base import Linearization, Plant
 
@@ -303,15 +303,15 @@ BOTH = (GAINS, AUTO)
 NETWORKS = ((GAINS, "network"), (AUTO, "one knob"), (PID_1, "PID 1"))
 CLAIMS = Claims(
     reason=reason,
-    statements={
-        "only a small overshoot at C = 0.13": _overshoot,
-        "the network matches the plant with high accuracy": _accuracy,
-        "five local models are the best tradeoff": _five,
-        "stable for C below 0.13566 and q_c below 110.8": _hopf,
-        "the second operating point has q_c = 98.899": _second_point,
-        "the network is ahead of a single PID": _ahead,
-        "the local PIDs are from Ziegler-Nichols' ultimate gain": _ziegler_nichols,
-    },
+    statements=(
+        Claim("only a small overshoot at C = 0.13", _overshoot),
+        Claim("the network matches the plant with high accuracy", _accuracy),
+        Claim("five local models are the best tradeoff", _five),
+        Claim("stable for C below 0.13566 and q_c below 110.8", _hopf),
+        Claim("the second operating point has q_c = 98.899", _second_point),
+        Claim("the network is ahead of a single PID", _ahead),
+        Claim("the local PIDs are from Ziegler-Nichols' ultimate gain", _ziegler_nichols),
+    ),
     acceptance=(
         _fits,
         _analysis("frozen spectral radius over C", "frozen_radius", f"< {RADIUS:g}", BOTH, high=RADIUS),

@@ -104,16 +104,6 @@ class JacketedBatchReactorCase(Case):
         Requirement(None, "loss_noise", "max_asse", 0.05),
         Requirement(None, "fouling_noise", "max_asse", 0.05),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "feedforward follows its adjusted reference ideally where the model is the plant": (
-            "reproduces: to 1.4e-14, 251 of 2,000 steps adjusted"
-        ),
-        "a simple feedback part is enough where it is not": (
-            "at 10 %: feedforward 2.14 (8.9), with a PI 0.019 (0.04), with observers 0.008 (0.025)"
-        ),
-        "the jacket stays between 20 and 70 degC": "reproduces where the model is the plant",
-        "an extreme input gives an extreme output in each mode": "holds: hot at least 1.69, cold at most -0.070",
-    }
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """same_model, profile, feed, loss, fouling (one scenario each), theta_10, theta_20 and held_out (several)."""

@@ -25,7 +25,7 @@ from pipeline.cases.jacketed_batch_reactor.pictures import AHEAD, offsets_pictur
 from pipeline.evaluation.case import Curve
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import CasePicture, Claims, Verdict, plain_reason
+from pipeline.evaluation.verdicts import CasePicture, Claim, Claims, Verdict, plain_reason
 from pipeline.pictures.words import law_name, number
 
 SET = "hybrid_fuzzy"
@@ -159,12 +159,12 @@ OFF = {
 }
 CLAIMS = Claims(
     reason=plain_reason,
-    statements={
-        "feedforward follows its adjusted reference ideally where the model is the plant": _ideal,
-        "a simple feedback part is enough where it is not": _feedback,
-        "the jacket stays between 20 and 70 degC": _limits,
-        "an extreme input gives an extreme output in each mode": _monotone,
-    },
+    statements=(
+        Claim("feedforward follows its adjusted reference ideally where the model is the plant", _ideal),
+        Claim("a simple feedback part is enough where it is not", _feedback),
+        Claim("the jacket stays between 20 and 70 degC", _limits),
+        Claim("an extreme input gives an extreme output in each mode", _monotone),
+    ),
     acceptance=(
         _followed,
         _identified,

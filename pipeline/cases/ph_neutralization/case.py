@@ -116,16 +116,6 @@ class PhNeutralizationCase(Case):
         Requirement(None, "buffer", "max_asse", 1e-2),
         Requirement(None, "base", "max_asse", 1e-2),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "the PID with fixed settings overshoots and oscillates": "ITAE settings give 8.29, the adaptive form 18.57",
-        "a fixed penalty of 20 is slow": "reproduces: 43.4",
-        "the adaptive penalty is needed": "does not reproduce: a fixed penalty of 1 gives 7.8 against 18.6",
-        "the linearized PID is ahead of the recursive one": "does not reproduce: 7.8 against 7.4 with a penalty of 1",
-        "the linearized PID is ahead of the self-tuning one": "does not reproduce: the best of 160 tunings gives 6.6",
-        "the recursive PID is unstable under disturbances": "does not reproduce: 0.75 with a penalty of 5, 0.23 with 1",
-        "the disturbance is one of the buffer's flow": "cannot be: pH would move by 0.002; as the acid's flow it fits",
-        "the best settings without bounds are negative": "not unique: every one of them gives the same move",
-    }
 
     @property
     def hold(self) -> int:

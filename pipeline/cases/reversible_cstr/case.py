@@ -104,22 +104,6 @@ class ReversibleCstrCase(Case):
         Requirement("model_reference", "tin", "iae", 0.35),
         Requirement("model_reference", "held_out", "tracking", 0.0015),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "feedback brings the reaction almost to complete conversion": "cannot be: the equilibrium is at 0.60 to 0.75",
-        "the temperature of the open loop rises without end": "does not reproduce: it rises by 4.9 K",
-        "the best PID setting has Kc = +3.15": "saturates: the plant's gain is negative; with Kc = -3.15 it holds",
-        "the network follows random set points without overshoot, the PID overshoots": "not measured",
-        "under a hotter feed the network returns sooner than the PID": "reproduces: IAE 0.25 to 0.30 against 1.09",
-        "with a 20 % change of the heat of reaction the network is far slower than the PID": (
-            "no test: it moves CB by 2e-4"
-        ),
-        "a network of two errors needs no integral action": "does not reproduce: an end offset of 0.019",
-        "a network follows set points better than a controller with fixed gains": (
-            "does not reproduce: PI on the same model 3.5e-4 from it, networks 8e-4 to 1.4e-3"
-        ),
-        "a small one-step error makes a good plant model": "does not hold: free runs fit 36 to 95 % at 1.2e-5",
-        "a random search finds better reference models than the tables in use": "reproduces: for every order",
-    }
 
     @property
     def reference_model(self) -> ReferenceModel:

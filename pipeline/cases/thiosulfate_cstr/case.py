@@ -147,14 +147,6 @@ class ThiosulfateCstrCase(Case):
         Requirement(None, "ua", "mae", 1e-3),
         Requirement(None, "ua_gradual", "mae", 5e-4),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "88 fuzzy sets an input give 726 centres": "reproduces: 724",
-        "validation RMSE 18.76 K": "reproduces: 15.6 to 22.2 K over six data seeds, output limited to the MV's range",
-        "INC cannot hold the unstable point": "reproduces: the sampled plant has a zero at -1.046 there",
-        "the MAE over r has a minimum": "reproduces, shifted by 1.7: the minimum lies lower than r = 2.5",
-        "the PID is slow, or unstable when tuned faster": "does not reproduce: IMC with anti-windup holds every point",
-        "the error correction leaves no offset": "does not reproduce with an accurate inverse: the loop gets unstable",
-    }
 
     @property
     def regions(self) -> Mapping[str, tuple[float, float]]:
