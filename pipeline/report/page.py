@@ -143,9 +143,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
     if own and other and own < other:
         what = "less squared error" if case.metric == "sse" else "less error"
-        where = name_of(evidence.main_test) + (
-            f", from {late_s:g} s on" if late_s else ""
-        )
+        where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
         rows.append((f"{100 * (1 - own / other):.0f} %", f"{what} than the {law_name(case.baseline)} on {where}"))
     return rows
 

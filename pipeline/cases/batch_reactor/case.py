@@ -34,7 +34,7 @@ def profile(numbers: Sequence[float], period_s: float) -> Array:
 
 @dataclass(frozen=True)
 class BatchReactorCase(Case):
-    """Seed 002_4e35f3d541bda8ae.txt, section 5.2, at the sampling period that its figures fit, 20 s.
+    """[chen2004, section 5.2], at the sampling period that its figures fit, 20 s.
 
     The profile is out of reach until 171 s, so that the sum of squared errors from 200 s on says
     more than that of the whole batch. Temperature is measured with a variance of 1 always.

@@ -1,6 +1,6 @@
 """The batch reactor: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: seed 002_4e35f3d541bda8ae.txt, section 5.2.
+Source of the claims: [chen2004, section 5.2].
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def _margin(label: str, curve: Curve, found: float) -> PaperFigure:
 
 @dataclass(frozen=True)
 class HensonSeborgCstrCase(Case):
-    """Seed 004_643aaacd7e46828e.txt, section IV, whose figures show one course up through the range.
+    """[gao2002, section IV], whose figures show one course up through the range.
 
     Made precise, and extended by the way back, by one jump over the whole range, by random set points
     a little beyond the paper's range, and by changes of the feed's temperature and concentration that

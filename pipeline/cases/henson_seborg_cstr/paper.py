@@ -1,6 +1,6 @@
 """The coolant-held CSTR: checks of the paper's claims, and pictures of network, stability and responses.
 
-Source of the claims: seed 004_643aaacd7e46828e.txt, sections IV and V.
+Source of the claims: [gao2002, sections IV and V].
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ ROUNDING = 1e-9  # [deg C]
 
 @dataclass(frozen=True)
 class JacketedBatchReactorCase(Case):
-    """Seed 003_9cd6247d31a7c2db.txt, section 5, at a period of 10 s, which its core's time constant fits.
+    """[karer, section 5], at a period of 10 s, which its core's time constant fits.
 
     The printed test runs on the printed fuzzy model (``same_model``). What the paper leaves open is
     tested beside it: the same recipe on the reactor that is behind the model (``profile``), with

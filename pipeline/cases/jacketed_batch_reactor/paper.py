@@ -1,6 +1,6 @@
 """The jacketed batch reactor: checks of what its paper states and of what an independent implementation found.
 
-Source of the claims: seed 003_9cd6247d31a7c2db.txt, sections 4.2, 5 and 6.
+Source of the claims: [karer, sections 4.2, 5 and 6].
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ _COMPARED = (ADAPTIVE, Curve("recursive_pid", {"penalty": 5.0}), Curve("self_tun
 
 @dataclass(frozen=True)
 class PhNeutralizationCase(Case):
-    """Seed 002_4e35f3d541bda8ae.txt, section 5.1, made precise where the paper shows only a curve.
+    """[chen2004, section 5.1], made precise where the paper shows only a curve.
 
     The printed disturbance of the buffer's flow, 990 to 1020 ml/min, is that of the acid's: the
     buffer's is 33 ml/min. Beyond the printed tests: random set points, the buffer's flow halved

@@ -1,6 +1,6 @@
 """The pH neutralization: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: seed 002_4e35f3d541bda8ae.txt, sections 2.1 and 5.1. The flows at the steady
+Source of the claims: [chen2004, sections 2.1 and 5.1]. The flows at the steady
 states and the plant's gains come from an independent implementation.
 """
 

@@ -38,7 +38,7 @@ def _rows(label: str, curve: Curve, *found: float) -> tuple[PaperFigure, ...]:
 
 @dataclass(frozen=True)
 class ReversibleCstrCase(Case):
-    """Seed 001_4ed8acfa2fdd36af.txt, section "Simulation Result and Discussion", which prints curves and no figure.
+    """[reference_ann, section "Simulation Result and Discussion"], which prints curves and no figure.
 
     The levels of its random set points and everything in its tables here come from an independent
     implementation. Its 20 % change of the heat of reaction hardly acts on this reactor, so that slower

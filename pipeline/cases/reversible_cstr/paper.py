@@ -1,7 +1,7 @@
 """The reversible CSTR: checks of the paper's claims, and pictures of levels, disturbances and trainings.
 
-Source of the claims: seed 001_4ed8acfa2fdd36af.txt, sections "Optimal Models for Model Reference Control",
-"ANN Controller Design" and "Simulation Result and Discussion".
+Source of the claims: [reference_ann, sections "Optimal Models for Model Reference Control",
+"ANN Controller Design" and "Simulation Result and Discussion"].
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ _DISTURBED = (Curve("inc"), Curve("incad", _r(10)), Curve("incadec", _r(10)), Cu
 
 @dataclass(frozen=True)
 class ThiosulfateCstrCase(Case):
-    """Seed 000_0a422d3e5d968dac.txt, section 4, made precise where the paper shows only a curve.
+    """[inverse_rbf, section 4], made precise where the paper shows only a curve.
 
     The paper's set-point test is taken as SP-A. Disturbances act from the first period on, so that
     all 350 samples see them; in the gradual test UA falls by 40 J/(s K) before every period but the

@@ -1,6 +1,6 @@
 """The thiosulfate CSTR: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: seed 000_0a422d3e5d968dac.txt, section 4. The reference states, turning
+Source of the claims: [inverse_rbf, section 4]. The reference states, turning
 points and eigenvalues come from an independent implementation of eq. 25.
 """
 

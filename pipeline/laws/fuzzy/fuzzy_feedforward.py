@@ -22,7 +22,7 @@ class FuzzyFeedforward(FuzzyLaw):
     the core is at the adjusted reference two samples later to rounding; where it is not, nothing
     corrects the difference.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, eqs. 18-23.
+    Source: [karer, eqs. 18-23].
     """
 
     name: ClassVar[str] = "fuzzy_feedforward"

@@ -37,7 +37,7 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
     feedforward alone, a jacket that lies in the gap between the modes makes R overcorrect, and the
     modes alternate.
 
-    Source: the feedback part that seed 003_9cd6247d31a7c2db.txt, section 6, leaves open; ours.
+    Source: the feedback part that [karer, section 6] leaves open; ours.
     """
 
     name: ClassVar[str] = "fuzzy_feedforward_observer"

@@ -30,7 +30,7 @@ class FuzzyFeedforwardPi(FuzzyLaw):
     that lags draws R along and the integral does not wind up. R(k+1) is formed at sample k, with the
     jacket temperature that the model reaches under the applied MVs: a stuck throttle holds R too.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, section 2, which splits the law so and leaves this part
+    Source: [karer, section 2], which splits the law so and leaves this part
     open; ours.
     """
 

@@ -62,7 +62,7 @@ def one_knob(model: Linearization, wc: float) -> LocalPid:
 class AutoPidNetwork(LocalControllers):
     """A local controller network whose settings follow from its local models and one wanted speed.
 
-    Source: what seed 004_643aaacd7e46828e.txt, section V, leaves as further work; pole placement for
+    Source: what [gao2002, section V] leaves as further work; pole placement for
     a second-order model, after Astrom and Hagglund, Advanced PID Control, section 6.4.
     """
 

@@ -69,7 +69,7 @@ class LocalControllers(ControlLaw):
     actuator stood still, a set point that moves to the process variable does not take back the
     proportional part that the actuator never received (``never_given``).
 
-    Source: seed 004_643aaacd7e46828e.txt, section III (blended outputs, in words); blending the
+    Source: [gao2002, section III] (blended outputs, in words); blending the
     gains around one integrator is not in the paper.
     """
 

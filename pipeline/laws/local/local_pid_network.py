@@ -16,7 +16,7 @@ from pipeline.plants.base import Plant
 class LocalPidNetwork(LocalControllers):
     """One PID an operating point, blended over the validity functions of the local models.
 
-    Source: seed 004_643aaacd7e46828e.txt, section IV.C.
+    Source: [gao2002, section IV.C].
     """
 
     name: ClassVar[str] = "local_pid_network"

@@ -48,7 +48,7 @@ class PID(ControlLaw):
     process variable does not take back the proportional action that the actuator never received
     (``never_given``).
 
-    Source: the PID that seed 000_0a422d3e5d968dac.txt, section 4.3, compares with; the tracking
+    Source: the PID that [inverse_rbf, section 4.3] compares with; the tracking
     is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
     """
 

@@ -40,7 +40,7 @@ class SelfTuningPid(ControlLaw):
     estimated slope over the MV does not tell the way. The move is added to the applied MV.
 
     Source: Cameron and Seborg, A self-tuning controller with a PID structure, Int. J. Control 38
-    (1983), 401; named as STPID in seed 002_4e35f3d541bda8ae.txt, section 5.1, without its equations.
+    (1983), 401; named as STPID in [chen2004, section 5.1], without its equations.
     """
 
     name: ClassVar[str] = "self_tuning_pid"

@@ -27,7 +27,7 @@ class ModelReferenceTwoError(ReferenceLaw):
     A loop without offset has both errors zero, and then one MV, N(0, 0), for every set point: but each set
     point needs another. So it rests with an offset at all set points except one, however it is trained.
 
-    Source: seed 001_4ed8acfa2fdd36af.txt, section "ANN Controller Design" and figure 4.
+    Source: [reference_ann, section "ANN Controller Design" and figure 4].
     """
 
     name: ClassVar[str] = "model_reference_two_error"
