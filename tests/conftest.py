@@ -28,7 +28,7 @@ from pipeline.plants.base import Plant
 from pipeline.simulation.simulate import simulate_batch
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
-QUICK: dict[str, dict[str, Any]] = {name: required(name) for name in LAWS}
+QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
 QUICK["pid"] |= {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613}
 for _name in ("model_reference", "model_reference_two_error", "pi_reference"):
     QUICK[_name] |= reversible_cstr_parts.QUICK

@@ -93,7 +93,7 @@ def _law(evidence: Evidence, law: str) -> dict[str, Any]:
 
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:
-    """A requirement, whose ``limit`` is what was asked, or a claim, where it is an independent finding."""
+    """A requirement, whose ``limit`` is what was asked, or a claim, which has none."""
     return {
         "what": verdict.what,
         "limit": verdict.limit,

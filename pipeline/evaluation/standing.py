@@ -36,7 +36,7 @@ class Statement:
     """A requirement or a claim of the paper, what was measured, and whether it holds; None: not measured."""
 
     what: str
-    limit: str  # of a requirement what was asked, of a claim what an independent implementation found
+    limit: str  # of a requirement what was asked; empty for a claim
     measured: str
     because: str
     holds: bool | None

@@ -49,7 +49,7 @@ class BatchReactorCase(Case):
     unforeseen: ClassVar[bool] = True
     recipe: ClassVar[bool] = True
     seen: ClassVar[str] = (
-        "the offset's filter was chosen with an eye on the printed profile, too. held_out served no choice."
+        "the offset's filter was chosen with an eye on the printed profile, too. No number was chosen on held_out."
     )
     noise_draws: ClassVar[int] = 10
     development_noise: ClassVar[bool] = True

@@ -24,7 +24,7 @@ C_F = (1.0, 1.1, 0.9)  # [mol/l] feed concentration, at one where it does
 
 GAINS, OUTPUTS, VELOCITY = (Curve("local_pid_network", {"blending": b}) for b in ("gains", "outputs", "velocity"))
 AUTO, PID_1 = Curve("auto_pid_network"), Curve("pid")
-# By its bandwidth: what an independent implementation measured is of this one, whatever params.yaml ships.
+# By its bandwidth, whatever params.yaml ships.
 FIVE, SLOW = (Curve("auto_pid_network", {"wc": wc}) for wc in (5.0, 3.0))
 ALONE = tuple(Curve("pid", {"printed": float(i)}) for i in (2, 3, 4, 5))
 
@@ -96,8 +96,8 @@ class HensonSeborgCstrCase(Case):
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
     noise: ClassVar[Mapping[str, float]] = {"C": 2e-4, "T": 0.2}
     seen: ClassVar[str] = (
-        "gains and bandwidth are the paper's and an independent implementation's; the feed's changes were enlarged "
-        "after their errors had turned out to be less than noise hides. held_out served no choice."
+        "the gains are the paper's, the bandwidth is a round number; the feed's changes were enlarged "
+        "after their errors had turned out to be less than noise hides. No number was chosen on held_out."
     )
     data_seeds: ClassVar[int] = 1
     unforeseen: ClassVar[bool] = True  # nobody measures the feed

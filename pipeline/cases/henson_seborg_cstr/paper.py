@@ -265,18 +265,18 @@ def _gone_out(evidence: Evidence) -> Verdict:
 
 
 def _alone(evidence: Evidence) -> Verdict:
-    """That PID 1 alone, beside which the network has to stand, is the one that another implementation found."""
+    """That PID 1 alone, beside which the network has to stand, has the figures that it is known by."""
     what = "PID 1 alone, IAE on up, down and the jump"
     limit = f"{', '.join(number(v) for v in REFERENCE_1)} ± {100 * NEAR_1:g} %"
     known = _iaes(evidence, PID_1)
     if known is None:
         return Verdict(what, limit, "not measured", None)
     holds = all(abs(v - wanted) <= NEAR_1 * wanted for v, wanted in zip(known, REFERENCE_1, strict=True))
-    return Verdict(what, limit, ", ".join(number(v) for v in known), holds, "an independent implementation's figures")
+    return Verdict(what, limit, ", ".join(number(v) for v in known), holds)
 
 
 def _rest_alone(evidence: Evidence) -> Verdict:
-    """That each of PIDs 2 to 5 alone oscillates as far as another implementation found, in the same three tests."""
+    """That each of PIDs 2 to 5 alone oscillates as far as it is known to, in the same three tests."""
     what = "PIDs 2 to 5 alone, least and largest IAE on up, down and the jump"
     limit = f"{_spans(REFERENCE_REST)}, ends ± {100 * NEAR_REST:g} %"
     rows = [row for curve in ALONE if (row := _iaes(evidence, curve)) is not None]

@@ -40,7 +40,7 @@ class JacketedBatchReactorCase(Case):
     whose jacket coefficients is off by up to 10 or 20 % (of a1 its distance to 1: of a1 itself, most
     would not be stable; the core's two stay as they are); and random recipes. Each with measurement
     noise, too. The shipped laws have an identified model (``tied``) there, too, which is off on every
-    printed model: an independent implementation's had the printed one.
+    printed model.
     """
 
     held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
@@ -54,7 +54,7 @@ class JacketedBatchReactorCase(Case):
         "the observers' l_core and the PI's limits followed figures of fouling and theta_10, the observers' approach "
         "one of profile; fouling itself was set to a change whose levels can be reached in time. The PI's switch "
         "penalty was chosen on other recipes, plants and noise, but chosen anew because it had failed in "
-        "profile_noise and held_out_noise. held_out served no choice among numbers."
+        "profile_noise and held_out_noise. No number was chosen on held_out."
     )
     baseline: ClassVar[str] = "fuzzy_feedforward"  # the paper's own law; no PID moves a valve that is open or shut
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {"T_w": (20.0, 70.0)}

@@ -44,7 +44,7 @@ class PhNeutralizationCase(Case):
     seen: ClassVar[str] = (
         "penalties were chosen with the scored figures on the screen, that of gauss_newton_pid with an eye on "
         "disturbance; the development got its tank with less buffer after a smaller penalty had failed buffer. "
-        "held_out served no choice."
+        "No number was chosen on held_out."
     )
     unforeseen: ClassVar[bool] = True
     plant_class: ClassVar[type[Plant]] = PhNeutralization

@@ -1,7 +1,6 @@
 """The pH neutralization: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: [chen2004, sections 2.1 and 5.1]. The flows at the steady
-states and the plant's gains come from an independent implementation.
+Source of the claims: [chen2004, sections 2.1 and 5.1].
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class ReversibleCstrCase(Case):
     data_seeds: ClassVar[int] = 3
     seen: ClassVar[str] = (
         "the trainings' numbers were chosen with the figures of levels and of the disturbances on the screen; "
-        "held_out served no choice."
+        "No number was chosen on held_out."
     )
     baseline: ClassVar[str] = "pi_reference"  # the printed PID follows no reference model: to beat it is easy
     # Periods of 2 s beside a reference model of some 50 s.

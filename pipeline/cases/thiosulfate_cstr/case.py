@@ -54,7 +54,7 @@ class ThiosulfateCstrCase(Case):
     name: ClassVar[str] = "thiosulfate_cstr"
     seen: ClassVar[str] = (
         "horizon, widths and partitions of three_periods were chosen with an eye on sp_a and ua. "
-        "held_out served no choice."
+        "No number was chosen on held_out."
     )
     title: ClassVar[str] = "Thiosulfate CSTR"
     plant_class: ClassVar[type[Plant]] = ThiosulfateCstr

@@ -1,7 +1,6 @@
 """The thiosulfate CSTR: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: [inverse_rbf, section 4]. The reference states, turning
-points and eigenvalues come from an independent implementation of eq. 25.
+Source of the claims: [inverse_rbf, section 4].
 """
 
 from __future__ import annotations
