@@ -5,8 +5,8 @@ python benchmarks/trainers.py --seconds 5 --seeds 3
 
 (a) The thiosulfate CSTR's CA(k+3) from CA(k), T(k) and Tj held for 3 periods, at states that a
     feedback loop visits: RMSE of the best network by validation, on an experiment of another seed.
-(b) z(t) = z(t-1) / (1 + z(t-1)^2) + u(t-1)^3 seen through noise (seed 002_4e35f3d541bda8ae.txt,
-    eq. 15): free-run RMSE over 20 steps without noise, after training on 1 and on 8 steps.
+(b) z(t) = z(t-1) / (1 + z(t-1)^2) + u(t-1)^3 seen through noise [chen2004, eq. 15]:
+    free-run RMSE over 20 steps without noise, after training on 1 and on 8 steps.
 (c) The pH tank sampled every 15 s, 2,000 samples: RMSE of one step and of a free run over 30 steps,
     on an experiment of another seed.
 Every trainer starts from the same weights and keeps the network that was best on validation data

@@ -22,7 +22,7 @@ def errors(sp: ArrayLike, pv: ArrayLike) -> Array:
 def mae(sp: ArrayLike, pv: ArrayLike) -> float:
     """Mean absolute error, MAE = (1/Kt) sum_k |r(k) - y(k)|, in the CV's unit.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eq. 27.
+    Source: [inverse_rbf, eq. 27].
     """
     return float(np.mean(np.abs(errors(sp, pv))))
 

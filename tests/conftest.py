@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import reversible_cstr_parts
 import torch
+from shipped import required
 
 from pipeline.cases import PLANTS
 from pipeline.laws import LAWS, ControlLaw, LawSignals
@@ -26,11 +27,11 @@ from pipeline.models.training.objectives import Samples
 from pipeline.plants.base import Plant
 from pipeline.simulation.simulate import simulate_batch
 
-# What a law's params need other than their defaults to be designed quickly; a law not named here is designed as it is.
-QUICK: dict[str, dict[str, Any]] = {
-    "pid": {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613},
-    **dict.fromkeys(("model_reference", "model_reference_two_error", "pi_reference"), reversible_cstr_parts.QUICK),
-}
+# What a law's params need beside their defaults, and what lets it be designed quickly.
+QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
+QUICK["pid"] |= {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613}
+for _name in ("model_reference", "model_reference_two_error", "pi_reference"):
+    QUICK[_name] |= reversible_cstr_parts.QUICK
 # Forms of a law that its defaults do not reach, under the contract too.
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "incadec": [{"correction": "back_calculation"}],
@@ -160,7 +161,7 @@ def make_law() -> LawFactory:
 
     def make(name: str, **params: Any) -> ControlLaw:
         cls, plant = LAWS[name], plant_of(name)
-        given = cls.Params(**{**QUICK.get(name, {}), **params})
+        given = cls.Params(**{**QUICK[name], **params})
         return cls.design(given, quick_parts(plant.name), LawSignals.of(plant), plant).eval()
 
     return make

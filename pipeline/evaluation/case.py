@@ -108,11 +108,12 @@ class Case(ABC):
     tables: ClassVar[tuple[PaperTable, ...]] = ()
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = ()
-    claims: ClassVar[Mapping[str, str]] = {}  # what the paper states -> what an independent implementation found
     metric: ClassVar[str] = "mae"  # the figure that laws are compared by, one with a floor: mae, sse, tracking
     # Figures that `score` adds, or that a law's analysis has, and other words for a common one. The report shows
     # them of every test.
     own_metrics: ClassVar[tuple[Metric, ...]] = ()
+    # A test -> its words inside a sentence, where they are not its name's.
+    test_words: ClassVar[Mapping[str, str]] = {}
     recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
     seen: ClassVar[str] = ""  # in words for the report: which scored figures were looked at while numbers were chosen

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 class Effort:
     """How far and how finely the bounds' plans look: what the sampling period asks for.
 
-    The defaults are for a plant that may ignite within one period. The NMPC of the first case does
-    2 % worse with 20 periods, and half a percent better with 60. Where many periods pass until a
+    The defaults are for a plant that changes much within one period. Where many periods pass until a
     move shows, it takes more of them and coarser ones, longer reaches, and the patience to follow a
     plan for a while.
     """

@@ -23,7 +23,7 @@ class Statement:
     """A requirement or a claim in words, what was measured, and whether it holds; None: not measured."""
 
     what: str
-    limit: str  # of a requirement what was asked, of a claim what else is known of it
+    limit: str  # of a requirement what was asked, empty for a claim
     measured: str
     holds: bool | None
     because: str = ""

@@ -8,7 +8,7 @@ What a row says when it does not is chosen by what was measured, never written d
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from matplotlib.figure import Figure as Canvas
 
@@ -45,15 +45,23 @@ class CasePicture:
 
 
 @dataclass(frozen=True, slots=True)
+class Claim:
+    """A statement of the paper, and the check of it."""
+
+    text: str
+    check: Check
+
+
+@dataclass(frozen=True, slots=True)
 class Claims:
     """What only somebody who knows the case can say: reasons for differences, and further checks and pictures.
 
-    ``reason`` gives the words for a table's figure that does not reproduce; ``statements`` maps
-    each of ``Case.claims`` to its check; ``acceptance`` are checks beyond ``Case.requirements``.
+    ``reason`` gives the words for a table's figure that does not reproduce; ``statements`` are the paper's;
+    ``acceptance`` are checks beyond ``Case.requirements``.
     """
 
     reason: Reason
-    statements: dict[str, Check] = field(default_factory=dict)
+    statements: tuple[Claim, ...] = ()
     acceptance: tuple[Check, ...] = ()
     pictures: tuple[CasePicture, ...] = ()
 
@@ -178,10 +186,6 @@ def judge(evidence: Evidence, claims: Claims) -> Judged:
 
 
 def statements(evidence: Evidence, claims: Claims) -> list[Verdict]:
-    """The paper's claims in words, each with its check's outcome; ``limit`` holds the independent finding."""
-    rows = []
-    for text, independent in evidence.case.claims.items():
-        check = claims.statements.get(text)
-        found = check(evidence) if check else Verdict(text, "", "no check is written for it", None)
-        rows.append(Verdict(text, independent, found.measured, found.holds, found.because))
-    return rows
+    """The paper's claims in words, each with its check's outcome."""
+    found = [(claim.text, claim.check(evidence)) for claim in claims.statements]
+    return [Verdict(text, "", verdict.measured, verdict.holds, verdict.because) for text, verdict in found]

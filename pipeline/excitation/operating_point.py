@@ -14,7 +14,7 @@ from pipeline.excitation.base import Excitation
 from pipeline.plants.base import Array, Plant
 from pipeline.records.record import Record
 from pipeline.simulation.simulate import measured, noise_draws, simulate_batch
-from pipeline.tuning.rules import AllPole, PidSettings, imc_pid
+from pipeline.tuning.rules import AllPole, PidSettings, imc_pid, robust_imc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,14 +46,15 @@ class OperatingPoint(Excitation):
         Range of the set points [unit of the CV]; default: its signal's, less 2 % at both ends.
     sp_hold_low, sp_hold_high : int
         Fewest and most samples for which a set point is held [-].
-    filter_s : float
-        Time constant of the IMC filter that sets the PID for the plant linearized at ``tune_cv`` [s].
+    filter_s : float, optional
+        Time constant of the IMC filter that sets the PID for the plant linearized at ``tune_cv`` [s];
+        default: the shortest one that is robust (``robust_imc``).
     tune_cv : float, optional
         CV of that steady state [unit of the CV]; default: the middle of the set points' range.
     kc, ti_s, td_s : float, optional
         The PID itself, instead of IMC: gain [MV/CV], integral and derivative time [s].
-    dither : float
-        The dither is uniform over +-dither [unit of the MV].
+    dither : float, optional
+        The dither is uniform over +-dither [unit of the MV]; default: 5 % of the MV's range.
     dither_hold : int
         Samples for which a dither is held [-].
     restarts : int
@@ -63,9 +64,9 @@ class OperatingPoint(Excitation):
         visits to those which a controller meets that uses the whole MV.
     move_hold : int
         Samples for which each MV of a short run is held [-].
-    near : float
+    near : float, optional
         Standard deviation, around the MV that the feedback had used in that state, of the MVs that
-        are not drawn over the whole range [unit of the MV].
+        are not drawn over the whole range [unit of the MV]; default: 10 % of the MV's range.
     near_fraction : float
         Fraction of the short runs whose first MV is such a one [-], 0 to 1.
     end_fraction : float
@@ -79,17 +80,17 @@ class OperatingPoint(Excitation):
     sp_high: float | None = None
     sp_hold_low: int = 20
     sp_hold_high: int = 80
-    filter_s: float = 1.7
+    filter_s: float | None = None
     tune_cv: float | None = None
     kc: float | None = None
     ti_s: float | None = None
     td_s: float = 0.0
-    dither: float = 30.0
+    dither: float | None = None
     dither_hold: int = 3
     restarts: int = 60_000
     moves: int = 1
     move_hold: int = 3
-    near: float = 40.0
+    near: float | None = None
     near_fraction: float = 0.5
     end_fraction: float = 0.0
 
@@ -98,8 +99,11 @@ class OperatingPoint(Excitation):
         for name in ("run_length", "sp_hold_low", "dither_hold", "moves", "move_hold"):
             self.require(name, 1)
         self.require("sp_hold_high", self.sp_hold_low)
-        for name in ("restarts", "dither", "near", "td_s"):
+        for name in ("restarts", "td_s"):
             self.require(name, 0)
+        for name in ("dither", "near"):
+            if getattr(self, name) is not None:
+                self.require(name, 0)
         for name in ("near_fraction", "end_fraction"):
             self.require(name, 0, 1)
 
@@ -134,7 +138,8 @@ class OperatingPoint(Excitation):
         if self.kc is not None:
             return PidSettings(self.kc, np.inf if self.ti_s is None else self.ti_s, self.td_s)
         cv = sum(self.set_points(plant)) / 2 if self.tune_cv is None else self.tune_cv
-        return imc_pid(AllPole.of(plant.linearize(*plant.steady_state_at(cv))), self.filter_s)
+        lin = plant.linearize(*plant.steady_state_at(cv))
+        return robust_imc(lin, plant.period_s) if self.filter_s is None else imc_pid(AllPole.of(lin), self.filter_s)
 
     def closed_loop(self, plant: Plant, pid: PidSettings, n: int, rng: np.random.Generator) -> Loop:
         """One run of n samples around random set points, from the steady state of a random one.
@@ -145,6 +150,7 @@ class OperatingPoint(Excitation):
         """
         sp_low, sp_high = self.set_points(plant)
         low, high, h = plant.mv_signals[0].low, plant.mv_signals[0].high, plant.period_s
+        reach = 0.05 * (high - low) if self.dither is None else self.dither
         step, dv, p = plant.stepper(), plant.dv_nominal, plant.parameters()
         state, steady_mv = plant.steady_state_at(float(rng.uniform(sp_low, sp_high)))
         noise = noise_draws(plant, n, self.noise, rng)
@@ -161,7 +167,7 @@ class OperatingPoint(Excitation):
                 )
             left -= 1
             if k % self.dither_hold == 0:
-                dither = float(rng.uniform(-self.dither, self.dither))
+                dither = float(rng.uniform(-reach, reach))
             y = float(pv[k, 0])
             e1, y1, y2 = (sp - y, y, y) if past is None else past
             v += pid.kc * (sp - y - e1 + h / pid.ti_s * (sp - y) - pid.td_s / h * (y - 2 * y1 + y2))
@@ -202,6 +208,7 @@ class OperatingPoint(Excitation):
         anywhere = rng.uniform(signal.low, signal.high, shape)
         end = np.where(rng.random(shape) < 0.5, signal.low, signal.high)
         found = np.where(rng.random(shape) < self.end_fraction, end, anywhere)
-        close = np.clip(used + self.near * rng.standard_normal(len(used)), signal.low, signal.high)
+        spread = 0.1 * (signal.high - signal.low) if self.near is None else self.near
+        close = np.clip(used + spread * rng.standard_normal(len(used)), signal.low, signal.high)
         found[:, 0] = np.where(rng.random(len(used)) < self.near_fraction, close, found[:, 0])
         return found

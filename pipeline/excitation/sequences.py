@@ -54,7 +54,7 @@ class RandomSteps(OpenLoop):
     hold : int
         Samples for which a level is held [-].
 
-    Source: seed 000_0a422d3e5d968dac.txt, section 4.2 (0..500 K, held one period, 60,000 samples).
+    Source: [inverse_rbf, section 4.2] (0..500 K, held one period, 60,000 samples).
     """
 
     kind: ClassVar[str] = "random_steps"

@@ -142,7 +142,7 @@ class AdaptiveGains(nn.Module):
     A law gives ``slots`` to its Memory and ``terms`` to its Stage, and then calls ``update``,
     ``free``, ``settled`` and ``move`` in this order with the stage's results.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs 2-4, 19-28.
+    Source: [chen2004, eqs 2-4, 19-28].
 
     Parameters
     ----------

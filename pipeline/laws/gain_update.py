@@ -40,7 +40,7 @@ def gain_update(
     lo, hi : (3,)
         Bounds.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs 20-26. The matrix of eq. 22 has rank one and is never
+    Source: [chen2004, eqs 20-26]. The matrix of eq. 22 has rank one and is never
     inverted; the stiffness, not in the paper, makes the optimum unique.
     """
     short = v - (rho * z_prev).sum(dim=-1, keepdim=True)
@@ -74,7 +74,7 @@ class PidForm(nn.Module):
     largest
         Upper bounds of the gains.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eq. 4; eq. 25 there is the inverse of another form, without the
+    Source: [chen2004, eq. 4]; eq. 25 there is the inverse of another form, without the
     trapezoidal integral.
     """
 

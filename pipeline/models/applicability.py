@@ -31,7 +31,7 @@ class Leverage:
 
     An input is inside where h(u) <= h* = 3 (N+1)/K, three times the mean leverage of the data.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs 13-15, with the intercept that centring stands for.
+    Source: [inverse_rbf, eqs 13-15], with the intercept that centring stands for.
     """
 
     mean: Array  # (N,) of the data; the last entry is w's
@@ -88,6 +88,6 @@ def narrowed(w_min: Array, w_max: Array, r: float) -> tuple[Array, Array]:
 
         w'_min = ((r+1) w_min + (r-1) w_max) / (2r),   w'_max = ((r+1) w_max + (r-1) w_min) / (2r)
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs 18 and 19, both with plus signs.
+    Source: [inverse_rbf, eqs 18 and 19], both with plus signs.
     """
     return ((r + 1) * w_min + (r - 1) * w_max) / (2 * r), ((r + 1) * w_max + (r - 1) * w_min) / (2 * r)

@@ -114,7 +114,7 @@ def load_bounds(case: Case, path: Path | None = None) -> Bounds:
 def stored_bounds(case: Case, path: Path | None = None) -> tuple[Bounds, list[str]]:
     """The bounds that are there, and a sentence for each figure that is missing.
 
-    By scenario: ``{"sp_a": {"nmpc": {"mae": ...}, "offline": {...}}, "sp_a_noise": {"nmpc": ...}}``.
+    By scenario: ``{"held_out": {"nmpc": {"mae": ...}, "offline": {...}}, ...}``.
     Figures of several sequences are put ``together``; where one sequence's are missing, so is the test's.
     Where ``kinds`` has no ``nmpc_noise``, the NMPC's figures with noise are those without. Tests without
     bounds (``bounded``) are left out. Raises LawError where the file holds no bounds, or those of another

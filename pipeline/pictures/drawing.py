@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFo
 from pipeline.evaluation.law_evidence import Array
 from pipeline.evaluation.metric import NO_UNIT
 
-BASELINE, BASELINE_COLOUR = "pid", "#7f7f7f"
+BASELINE_COLOUR = "#7f7f7f"
 PALETTE = ("#d55e00", "#0072b2", "#cc79a7", "#009e73", "#56b4e9", "#e69f00", "#8c564b", "#332288")
 """Of the other laws of a case, in their order; told apart also by the colour-blind."""
 SHADES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9")
@@ -50,11 +50,11 @@ LEGEND_GAP = 0.03  # of the axes' height, between a legend and the curves
 LONGEST_IN_S, LONGEST_IN_MIN = 3000.0, 30_000.0  # [s] of a picture whose axis counts seconds, minutes
 
 
-def colour_of(law: str, laws: Iterable[str]) -> str:
-    """The law's colour among all of its case."""
-    if law == BASELINE:
+def colour_of(law: str, laws: Iterable[str], baseline: str) -> str:
+    """The law's colour among all of its case, whose ``baseline`` is grey."""
+    if law == baseline:
         return BASELINE_COLOUR
-    others = [name for name in laws if name != BASELINE]
+    others = [name for name in laws if name != baseline]
     return PALETTE[others.index(law) % len(PALETTE)] if law in others else OTHER_COLOUR
 
 

@@ -219,7 +219,7 @@ def colours(evidence: Evidence, figure: Figure) -> dict[int, str]:
     laws = [c.law for c in figure.curves]
     if len(set(laws)) < len(laws):
         return {i: SHADES[i % len(SHADES)] for i in range(len(laws))}
-    return {i: colour_of(law, evidence.laws) for i, law in enumerate(laws)}
+    return {i: colour_of(law, evidence.laws, evidence.case.baseline) for i, law in enumerate(laws)}
 
 
 def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
@@ -357,7 +357,7 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
     loops = {label: loop for label, (loop, _) in drawn.items()}
     panels = LoopPanels(evidence.case, title, loops, late_from, reference)
     for label, (loop, name) in drawn.items():
-        panels.add(loop, label, colour_of(name, evidence.laws))
+        panels.add(loop, label, colour_of(name, evidence.laws, evidence.case.baseline))
     return panels.finish(own)
 
 

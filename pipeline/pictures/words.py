@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -41,13 +40,13 @@ def setting_text(setting: Mapping[str, Any]) -> str:
     )
 
 
-def scenario_name(scenario: str, recipe: bool) -> str:
-    """A test inside a sentence: held-out set points, SP-A, set point, trajectory with noise."""
+def scenario_name(scenario: str, recipe: bool, own: Mapping[str, str] | None = None) -> str:
+    """A test inside a sentence: held-out set points, set point with noise; ``own`` is ``Case.test_words``."""
     bare = scenario.removesuffix(NOISE_SUFFIX)
-    if bare == "held_out":
+    if own and bare in own:
+        words = own[bare]
+    elif bare == "held_out":
         words = "held-out recipes" if recipe else "held-out set points"
-    elif re.fullmatch(r"[a-z]{1,3}_[a-z0-9]", bare):
-        words = bare.upper().replace("_", "-")
     else:
         words = bare.replace("_", " ")
     return words + (" with noise" if scenario != bare else "")

@@ -72,7 +72,7 @@ def main_words(evidence: Evidence) -> tuple[str, str]:
     """What a picture of the main test shows, and what the test is to somebody who doubts a tuning."""
     name, recipe = evidence.main_test, evidence.case.recipe
     if len(evidence.tests[name.removesuffix(NOISE_SUFFIX)]) == 1:
-        return (scenario_name(name, recipe),) * 2
+        return (scenario_name(name, recipe, evidence.case.test_words),) * 2
     if recipe:
         return "a held-out recipe", "recipes that nothing was tuned on"
     return "a held-out sequence", "set points that nothing was tuned on"

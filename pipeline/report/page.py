@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     bounds = {"nmpc": "perfect-model NMPC", "offline": "offline optimum"}
     needs = [n for n in case.requirements if n.law in (None, best) and not n.low and not n.setting]
     asked = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
+    name_of = partial(scenario_name, recipe=case.recipe, own=case.test_words)
     rows = []
     for name, kind in dict.fromkeys(asked):
         value = evidence.ratio(best, name, kind)
@@ -126,13 +128,13 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
             rows.append(
                 (
                     ratio(value),
-                    f"× {case.criterion.short} of the {bounds.get(kind, kind)} on {scenario_name(name, case.recipe)}",
+                    f"× {case.criterion.short} of the {bounds.get(kind, kind)} on {name_of(name)}",
                 )
             )
     for need in needs:
         late = evidence.figure(best, need.scenario, need.metric) if need.metric == "sse_late" else None
         if late is not None:
-            where = scenario_name(need.scenario, case.recipe)
+            where = name_of(need.scenario)
             rows.append(
                 (number(late), f"{case.metrics[need.metric].short} on {where}; at most {number(need.high)} is asked")
             )
@@ -141,7 +143,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     metric = "sse_late" if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
     if own and other and own < other:
-        where = scenario_name(evidence.main_test, case.recipe) + (f", from {late_s:g} s on" if late_s else "")
+        where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
         rows.append(
             (
                 f"{100 * (1 - own / other):.0f} %",

@@ -29,7 +29,7 @@ class StageResult:
 
     @property
     def kind(self) -> str:
-        """The stage without its item: ``fit`` of ``fit@thiosulfate_cstr-one_step``."""
+        """The stage without its item: ``fit`` of ``fit@tank-nnarx``."""
         return self.name.partition("@")[0]
 
     @property

@@ -65,7 +65,7 @@ class ReferenceModel:
     ValueError
         An order, a number of coefficients or a frequency that make no model, or poles that are not stable.
 
-    Source: seed 001_4ed8acfa2fdd36af.txt, eq. 7 and 8.
+    Source: [reference_ann, eq. 7 and 8].
     """
 
     order: int
@@ -164,7 +164,7 @@ def searched(order: int, seed: int = 0, neighbours: int = 400) -> tuple[float, .
     after failures. It comes close, and a Nelder-Mead simplex goes the rest of the way, which from
     order 6 on the search alone does not. Raises ValueError for an order below 1.
 
-    Source: seed 001_4ed8acfa2fdd36af.txt, section on optimal models (the search).
+    Source: [reference_ann, section on optimal models] (the search).
     """
     if order < 1:
         raise ValueError(f"the order of a reference model is {order}; it must be at least 1")

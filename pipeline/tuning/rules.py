@@ -128,7 +128,7 @@ def imc_pid(process: AllPole | LagWithDeadTime, lambda_s: float) -> PidSettings:
 
     Raises LawError for two poles that are not stable.
 
-    Source: seed 000_0a422d3e5d968dac.txt, section 4.3, names the procedure; the filter for
+    Source: [inverse_rbf, section 4.3] names the procedure; the filter for
     unstable plants is the textbook's (Morari and Zafiriou, Robust Process Control). The lag with dead
     time: Rivera, Morari and Skogestad, Internal Model Control: PID Controller Design, 1986, table 2.
     """

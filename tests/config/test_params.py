@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import pytest
 import yaml
+from shipped import required
 
 from pipeline.cases import CASES
 from pipeline.config.params import ControllerParams, ModelParams, RecordParams, choose, digest, parse, read_section
@@ -151,7 +152,7 @@ def test_the_reduced_run_shows_every_case_and_law_and_lacks_nothing_that_it_need
     ("cls", "values", "said"),
     [
         (LAWS["linearized_pid"].Params, {"slope_min": -1.0}, "slope_min is -1.0"),
-        (LAWS["self_tuning_pid"].Params, {"slope_min": -1.0}, "slope_min is -1.0"),
+        (LAWS["self_tuning_pid"].Params, {**required("self_tuning_pid"), "slope_min": -1.0}, "slope_min is -1.0"),
         (MODELS["nnarx"], {"slack": -1.0}, "slack is -1.0; it must be at least 0"),
         (MODELS["nnarx"], {"steps": 0}, "steps is 0; it must be at least 1"),
     ],

@@ -33,7 +33,7 @@ SMALL = {
     "prbs": {"samples": 300, "order": 5},
     "aprbs": {"samples": 300, "order": 5},
     "multisine": {"samples": 300, "cycle": 100, "lines": 10},
-    "operating_point": {"samples": 300, "run_length": 120, "restarts": 50},
+    "operating_point": {"samples": 300, "run_length": 120, "restarts": 50, "filter_s": 1.7},
     "batches": {"samples": 30, "batches": 10},
     "jacket_pulses": {"samples": 300},
 }
@@ -238,7 +238,9 @@ def test_random_steps_hold_one_percent_of_the_unstable_region(cstr):
 
 @pytest.fixture(scope="module")
 def around(cstr) -> tuple[OperatingPoint, Record]:
-    excitation = OperatingPoint(samples=4_000, run_length=800, restarts=3_000, sp_low=0.03, sp_high=0.985)
+    excitation = OperatingPoint(
+        samples=4_000, run_length=800, restarts=3_000, sp_low=0.03, sp_high=0.985, filter_s=1.7, dither=30.0, near=40.0
+    )
     return excitation, excitation.run(cstr, 3)
 
 
@@ -286,7 +288,7 @@ def test_share_of_moves_near_the_feedback(cstr):
 
 
 def test_feedback_holds_its_set_point_without_dither(cstr):
-    excitation = OperatingPoint(dither=0.0, sp_low=0.6, sp_high=0.7, sp_hold_low=200, sp_hold_high=200)
+    excitation = OperatingPoint(dither=0.0, sp_low=0.6, sp_high=0.7, sp_hold_low=200, sp_hold_high=200, filter_s=1.7)
     loop = excitation.closed_loop(cstr, excitation.settings(cstr), 200, np.random.default_rng(0))
     assert np.ptp(loop.pv[-30:, 0]) < 1e-3
     assert 0.6 < loop.pv[-1, 0] < 0.7

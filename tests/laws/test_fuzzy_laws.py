@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shipped import required
 from torch import Tensor
 
 from pipeline.cases import CASES, PLANTS
@@ -38,7 +39,7 @@ class Loops(NamedTuple):
 
 def made(name: str, model: HybridFuzzy = PRINTED, **params: object) -> FuzzyLaw:
     cls = LAWS[name]
-    law = cls.design(cls.Params(**params), {"any": model}, SIGNALS, PLANT).eval()
+    law = cls.design(cls.Params(**required(name) | params), {"any": model}, SIGNALS, PLANT).eval()
     assert isinstance(law, FuzzyLaw)
     return law
 
@@ -229,19 +230,19 @@ def test_a_model_without_an_inverse_is_refused() -> None:
 
 
 def test_parts_signals_and_numbers_that_cannot_be_are_refused() -> None:
-    cls = LAWS["fuzzy_feedforward_observer"]
+    cls, needed = LAWS["fuzzy_feedforward_observer"], required("fuzzy_feedforward_observer")
     two = {"a": PRINTED, "b": PRINTED}
     with pytest.raises(LawError, match="name it as `part`: the model set has a, b"):
-        cls.design(cls.Params(), two, SIGNALS, PLANT)
+        cls.design(cls.Params(**needed), two, SIGNALS, PLANT)
     with pytest.raises(LawError, match="which 'c' is not; the model set has a, b"):
-        cls.design(cls.Params(part="c"), two, SIGNALS, PLANT)
+        cls.design(cls.Params(**needed, part="c"), two, SIGNALS, PLANT)
     other = PLANTS["thiosulfate_cstr"]()
     with pytest.raises(LawError, match=r"T_j \(continuous\)"):
-        cls.design(cls.Params(), {"a": PRINTED}, LawSignals.of(other), other)
+        cls.design(cls.Params(**needed), {"a": PRINTED}, LawSignals.of(other), other)
     with pytest.raises(ParamsError, match=r"core_gain is 1\.5"):
-        parse(cls.Params, {"core_gain": 1.5}, "controllers.x")
+        parse(cls.Params, {**needed, "core_gain": 1.5}, "controllers.x")
     with pytest.raises(ParamsError, match="ti_s 0"):
-        parse(LAWS["fuzzy_feedforward_pi"].Params, {"ti_s": 0.0}, "controllers.x")
+        parse(LAWS["fuzzy_feedforward_pi"].Params, {**required("fuzzy_feedforward_pi"), "ti_s": 0.0}, "controllers.x")
 
 
 @pytest.mark.parametrize("law", jacketed_batch_reactor_parts.LAWS)
@@ -258,7 +259,7 @@ def test_parts_signals_and_numbers_that_cannot_be_are_refused() -> None:
 )
 def test_numbers_of_the_cascade_that_make_no_sense_are_refused(law: str, numbers: dict[str, float], told: str) -> None:
     with pytest.raises(ParamsError, match=told):
-        parse(LAWS[law].Params, numbers, "controllers.x")
+        parse(LAWS[law].Params, required(law) | numbers, "controllers.x")
 
 
 @pytest.mark.parametrize(
@@ -277,4 +278,4 @@ def test_numbers_of_the_cascade_that_make_no_sense_are_refused(law: str, numbers
 )
 def test_numbers_of_a_feedback_that_make_no_sense_are_refused(law: str, numbers: dict[str, float], told: str) -> None:
     with pytest.raises(ParamsError, match=told):
-        parse(LAWS[law].Params, numbers, "controllers.x")
+        parse(LAWS[law].Params, required(law) | numbers, "controllers.x")

@@ -11,6 +11,7 @@ import torch
 from conftest import QUICK, plant_of, rest_points
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from shipped import required
 from torch import Tensor
 
 from pipeline.config.params import parse
@@ -78,8 +79,8 @@ def span(law: ControlLaw) -> float:
 def test_name_and_params(law: ControlLaw) -> None:
     assert LAWS[law.name] is type(law)
     assert law.title
-    params = parse(law.Params, {}, law.name)
-    assert params == law.Params()
+    params = parse(law.Params, required(law.name), law.name)
+    assert params == law.Params(**required(law.name))
     assert params.mv_rate is None
     assert dataclasses.fields(law.Params)
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -237,7 +238,7 @@ def test_a_law_without_models_names_the_part_it_lacks_or_needs_none(
     cls, plant = LAWS[name], plant_of(name)
     signals = LawSignals.of(plant)
     try:
-        law = cls.design(cls.Params(**QUICK.get(name, {})), {}, signals, plant).eval()
+        law = cls.design(cls.Params(**QUICK[name]), {}, signals, plant).eval()
     except LawError as error:
         said = str(error)
     else:

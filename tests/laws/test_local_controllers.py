@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from henson_seborg_cstr_parts import local_models
+from shipped import required
 
 from pipeline.cases import CASES
 from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
@@ -39,7 +40,9 @@ def plant() -> HensonSeborgCstr:
 
 def designed(name: str, **params) -> LocalControllers:
     cls, plant = LAWS[name], HensonSeborgCstr()
-    law = cls.design(cls.Params(**params), {"local_models": local_models(plant)}, LawSignals.of(plant), plant)
+    law = cls.design(
+        cls.Params(**required(name) | params), {"local_models": local_models(plant)}, LawSignals.of(plant), plant
+    )
     assert isinstance(law, LocalControllers)
     return law.eval()
 
@@ -92,7 +95,7 @@ def test_blended_outputs_are_unstable_between_points(plant):
 
 
 def test_analysis_tells_of_loops_starts_and_the_reactor_gone_out(plant):
-    test = StabilityTest(between=3, starts=24, samples=600, watched=4)
+    test = StabilityTest(between=3, starts=24, low=(0.005, 400.0), high=(0.2, 500.0), samples=600, watched=4)
     told = designed("auto_pid_network", stability=test).analysis(plant)
     assert told.figures["lyapunov_pairs"] == told.figures["neighbour_pairs"] == 4
     assert told.figures["frozen_radius"] <= told.figures["lyapunov_contraction"] < 0.98
@@ -222,8 +225,8 @@ def test_senseless_settings_are_errors(name, params, words):
         ("local_pid_network", {"derivative_limit": 0.0}, "derivative_limit is 0.0"),
         ("auto_pid_network", {"derivative_limit": -1.0}, "derivative_limit is -1.0"),
         ("auto_pid_network", {"wc": -1.0}, "wc is -1"),
-        ("auto_pid_network", {"stability": {"low": [0.005]}}, "low is .*0.005.* for every state"),
-        ("auto_pid_network", {"stability": {"low": [0.3, 400.0]}}, "each low below its high"),
+        ("auto_pid_network", {"stability": {"low": [0.005], "high": [0.2, 500.0]}}, "low is .*0.005.* for every state"),
+        ("auto_pid_network", {"stability": {"low": [0.3, 400.0], "high": [0.2, 500.0]}}, "each low below its high"),
         ("auto_pid_network", {"stability": {"between": 1}}, "between is 1; it must be at least 2"),
         ("auto_pid_network", {"stability": {"starts": -1}}, "starts is -1"),
         ("auto_pid_network", {"stability": {"band": 0.0}}, "band is 0.0"),
@@ -231,7 +234,7 @@ def test_senseless_settings_are_errors(name, params, words):
 )
 def test_numbers_that_make_no_sense_are_refused_where_they_stand(name, values, words):
     with pytest.raises(ParamsError, match=f"here.*: .*{words}"):
-        parse(LAWS[name].Params, values, "here")
+        parse(LAWS[name].Params, required(name) | values, "here")
 
 
 def test_blended_gains_lose_stability_where_plain_pids_with_those_gains_do(plant):

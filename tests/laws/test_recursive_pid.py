@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from shipped import required
 
 from pipeline.cases import CASES
 from pipeline.errors import LawError
@@ -63,7 +64,7 @@ def sse(track: Trajectory, start: int = 0) -> float:
 
 
 def designed(law: type[ControlLaw], arx: Model, case: Case = PH, **params) -> ControlLaw:
-    return law.design(law.Params(**params), {"arx": arx}, LawSignals.of(case.plant), case.plant)
+    return law.design(law.Params(**required(law.name) | params), {"arx": arx}, LawSignals.of(case.plant), case.plant)
 
 
 def scenario(name: str, case: Case = PH) -> Scenario:
@@ -208,8 +209,8 @@ def test_what_it_cannot_use_is_said(arx: Model, parts, law) -> None:
         ({"arx": ARX(2, 1)}, "which way to move"),
     ):
         with pytest.raises(LawError, match=message):
-            law.design(law.Params(), models, signals, PH.plant)
+            law.design(law.Params(**required(law.name)), models, signals, PH.plant)
     with pytest.raises(LawError, match="forgetting factor is"):
         designed(law, arx, forgetting=0.2)
     with pytest.raises(ValueError, match="it must"):
-        law.Params(**({"offset_filter": 1.5} if law is RecursivePid else {"integral": 0.0}))
+        law.Params(**required(law.name) | ({"offset_filter": 1.5} if law is RecursivePid else {"integral": 0.0}))

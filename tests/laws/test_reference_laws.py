@@ -61,7 +61,7 @@ def trained(reactor: Plant, network: StateSpace, signals: LawSignals) -> dict[st
     """Each law, trained for about a second."""
     made = {}
     for cls in (ModelReference, ModelReferenceTwoError, PiReference):
-        params: Any = cls.Params(training=TRAINING if cls is not PiReference else replace(TRAINING, decay=0.0))
+        params: Any = cls.Params(wn=0.05, training=TRAINING if cls is not PiReference else replace(TRAINING, decay=0.0))
         made[cls.name] = cls.design(params, {"state_space": network}, signals, reactor).eval()
     return made
 
@@ -267,11 +267,11 @@ def test_the_printed_pid_and_its_sign(reactor: Plant, signals: LawSignals) -> No
 # ---------------------------------------------------------------- what cannot be
 def test_clear_errors(network: StateSpace, signals: LawSignals, reactor: Plant) -> None:
     with pytest.raises(LawError, match="part 'state_space'"):
-        ModelReference.design(ModelReference.Params(), {}, signals, reactor)
+        ModelReference.design(ModelReference.Params(wn=0.05), {}, signals, reactor)
     with pytest.raises(LawError, match="needs kc and ti_s"):
-        PiReference.design(PiReference.Params(tuning="manual", kc=-4.0), {}, signals, reactor)
+        PiReference.design(PiReference.Params(wn=0.05, tuning="manual", kc=-4.0), {}, signals, reactor)
     with pytest.raises(LawError, match="ti_s = 0"):
-        PiReference.design(PiReference.Params(tuning="manual", kc=-4.0, ti_s=0.0), {}, signals, reactor)
+        PiReference.design(PiReference.Params(wn=0.05, tuning="manual", kc=-4.0, ti_s=0.0), {}, signals, reactor)
     with pytest.raises(LawError, match="natural frequency"):
         PiReference.design(PiReference.Params(tuning="manual", kc=-4.0, ti_s=1.0, wn=0.0), {}, signals, reactor)
     for name in ("lanes", "iterations", "hold"):

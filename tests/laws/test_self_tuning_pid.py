@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from shipped import required
 
 from pipeline.cases import CASES
 from pipeline.excitation.sequences import RandomSteps
@@ -19,6 +20,7 @@ from pipeline.simulation.simulate import simulate_closed
 DV = torch.zeros(0, dtype=torch.float64)
 PH = CASES["ph_neutralization"]
 SIGNALS = LawSignals.of(PH.plant)
+NUMBERS = required("self_tuning_pid")
 HALF = 100.0  # ml/min, one unit of move
 
 
@@ -32,7 +34,7 @@ def tensor(*values: float) -> torch.Tensor:
 
 
 def designed(arx: Model, **params) -> SelfTuningPid:
-    return SelfTuningPid.design(SelfTuningPid.Params(**params), {"arx": arx}, SIGNALS, PH.plant)
+    return SelfTuningPid.design(SelfTuningPid.Params(**NUMBERS | params), {"arx": arx}, SIGNALS, PH.plant)
 
 
 def stepper(law: ControlLaw):
@@ -123,8 +125,8 @@ def test_leaves_no_steady_error(arx: Model) -> None:
 
 def test_wrong_numbers_are_named() -> None:
     with pytest.raises(ValueError, match="4 coefficients"):
-        SelfTuningPid.Params(prefilter=(0.1,) * 4)
+        SelfTuningPid.Params(**NUMBERS | {"prefilter": (0.1,) * 4})
     with pytest.raises(ValueError, match="integral is -1"):
-        SelfTuningPid.Params(integral=-1.0)
+        SelfTuningPid.Params(**NUMBERS | {"integral": -1.0})
     with pytest.raises(ValueError, match="gain_high is"):
-        SelfTuningPid.Params(gain_high=(1.0, 0.0, 1.0))
+        SelfTuningPid.Params(**NUMBERS, gain_high=(1.0, 0.0, 1.0))

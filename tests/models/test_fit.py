@@ -28,7 +28,7 @@ def network(hidden: tuple[int, ...], n_out: int = 1, residual: bool = True, seed
 
 
 def eq_15(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """z(t) = z(t-1) / (1 + z(t-1)^2) + u(t-1)^3, seed 002_4e35f3d541bda8ae.txt, eq. 15."""
+    """z(t) = z(t-1) / (1 + z(t-1)^2) + u(t-1)^3, [chen2004, eq. 15]."""
     u = np.random.default_rng(seed).uniform(-1.2, 1.2, n)
     z = np.zeros(n)
     for t in range(1, n):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.evaluation.law_evidence import parse_setting
-from pipeline.pictures.drawing import PALETTE, colour_of, ratio_unit, time_axis
+from pipeline.pictures.drawing import BASELINE_COLOUR, PALETTE, colour_of, ratio_unit, time_axis
 from pipeline.pictures.loop_pictures import finite, moves, over_orders
 from pipeline.pictures.words import law_name, number, ratio, scenario_name, setting_text
 
@@ -41,8 +41,9 @@ def test_names_are_written_as_people_do():
         "inverse DOB",
     ]
     assert [ratio(v) for v in (1.0012, 1.16, 0.999, 2.345)] == ["1.001", "1.16", "0.999", "2.35"]
-    assert [scenario_name(s, False) for s in ("sp_a", "set_point_noise", "held_out")] == [
+    assert [scenario_name(s, False, {"sp_a": "SP-A"}) for s in ("sp_a", "up_b", "set_point_noise", "held_out")] == [
         "SP-A",
+        "up b",
         "set point with noise",
         "held-out set points",
     ]
@@ -79,5 +80,6 @@ def test_scales_and_marks_follow_the_data():
 
 def test_each_law_of_a_case_has_its_colour():
     laws = ("linearized_pid", "pid", *(f"law_{i}" for i in range(len(PALETTE) - 1)))
-    assert len({colour_of(law, laws) for law in laws}) == len(laws)
-    assert colour_of("pid", laws) == colour_of("pid", ("pid",))
+    for baseline in ("pid", "linearized_pid"):
+        assert len({colour_of(law, laws, baseline) for law in laws}) == len(laws)
+        assert colour_of(baseline, laws, baseline) == BASELINE_COLOUR

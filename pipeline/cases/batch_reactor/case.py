@@ -34,7 +34,7 @@ def profile(numbers: Sequence[float], period_s: float) -> Array:
 
 @dataclass(frozen=True)
 class BatchReactorCase(Case):
-    """Seed 002_4e35f3d541bda8ae.txt, section 5.2, at the sampling period that its figures fit, 20 s.
+    """[chen2004, section 5.2], at the sampling period that its figures fit, 20 s.
 
     The profile is out of reach until 171 s, so that the sum of squared errors from 200 s on says
     more than that of the whole batch. Temperature is measured with a variance of 1 always.
@@ -49,7 +49,7 @@ class BatchReactorCase(Case):
     unforeseen: ClassVar[bool] = True
     recipe: ClassVar[bool] = True
     seen: ClassVar[str] = (
-        "the offset's filter was chosen with an eye on the printed profile, too. held_out served no choice."
+        "the offset's filter was chosen with an eye on the printed profile, too. No number was chosen on held_out."
     )
     noise_draws: ClassVar[int] = 10
     development_noise: ClassVar[bool] = True
@@ -87,10 +87,6 @@ class BatchReactorCase(Case):
         Requirement(None, "trajectory_noise", "sse", 13_320.0),
         Requirement(None, "trajectory_noise", "sse_late", 15.0),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "the linearized PID tracks better than the recursive one": "does not reproduce: 13,301 against 13,282",
-        "filter and update criterion calm the settings": "not measured",
-    }
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """Closed-loop tests: trajectory and fouling (one scenario each) and held_out (one a seed)."""

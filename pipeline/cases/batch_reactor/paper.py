@@ -1,6 +1,6 @@
 """The batch reactor: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: seed 002_4e35f3d541bda8ae.txt, section 5.2.
+Source of the claims: [chen2004, section 5.2].
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.evaluation.case import Curve, PaperFigure
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import Claims, Verdict, plain_reason
+from pipeline.evaluation.verdicts import Claim, Claims, Verdict, plain_reason
 from pipeline.pictures.words import law_name, number
 
 TEST, NOISY = "trajectory", "trajectory_noise"
@@ -70,10 +70,10 @@ def _travel(evidence: Evidence, curve: Curve) -> float | None:
 
 CLAIMS = Claims(
     reason=reason,
-    statements={
-        "the linearized PID tracks better than the recursive one": _ahead,
-        "filter and update criterion calm the settings": _calm,
-    },
+    statements=(
+        Claim("the linearized PID tracks better than the recursive one", _ahead),
+        Claim("filter and update criterion calm the settings", _calm),
+    ),
     acceptance=(
         step_within(80.0, "linearized_pid"),
         faster_than_nmpc(20.0, TEST, TEST, "linearized_pid"),

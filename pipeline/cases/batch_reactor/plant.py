@@ -32,7 +32,7 @@ class BatchReactor(Plant):
     (tuning a PID, starting a test at a temperature) is the reactor with A and B used up:
     u = -(a1 + a2 T) / (b1 + b2 T).
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs. 37-41 and Table 4 (E in kJ/kmol).
+    Source: [chen2004, eqs. 37-41 and Table 4] (E in kJ/kmol).
     """
 
     A10: float = field(default=1.1, metadata={"unit": "m3/(kmol s)"})

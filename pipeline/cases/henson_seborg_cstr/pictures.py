@@ -182,7 +182,9 @@ def _with_figure(evidence: Evidence, curve: Curve, test: str, label: str) -> str
 
 def _colour(evidence: Evidence, curves: Sequence[tuple[Curve, str]], i: int) -> str:
     laws = [curve.law for curve, _ in curves]
-    return colour_of(laws[i], evidence.laws) if len(set(laws)) == len(laws) else PALETTE[i % len(PALETTE)]
+    if len(set(laws)) < len(laws):
+        return PALETTE[i % len(PALETTE)]
+    return colour_of(laws[i], evidence.laws, evidence.case.baseline)
 
 
 def _label(evidence: Evidence, state: int) -> str:

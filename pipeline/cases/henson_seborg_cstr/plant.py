@@ -23,7 +23,7 @@ class HensonSeborgCstr(Plant):
     three steady states, one of them extinguished at C about 0.96 mol/l; the ignited branch loses
     its stability at C = 0.140 mol/l (a Hopf point).
 
-    Source: seed 004_643aaacd7e46828e.txt, section IV.A and Table 1, its exponents as in the plant
+    Source: [gao2002, section IV.A and Table 1], its exponents as in the plant
     of Henson and Seborg (E/R = 1e4 K, K0 = 7.2e10 1/min).
     """
 

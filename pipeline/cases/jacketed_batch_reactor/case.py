@@ -33,7 +33,7 @@ ROUNDING = 1e-9  # [deg C]
 
 @dataclass(frozen=True)
 class JacketedBatchReactorCase(Case):
-    """Seed 003_9cd6247d31a7c2db.txt, section 5, at a period of 10 s, which its core's time constant fits.
+    """[karer, section 5], at a period of 10 s, which its core's time constant fits.
 
     The printed test runs on the printed fuzzy model (``same_model``). What the paper leaves open is
     tested beside it: the same recipe on the reactor that is behind the model (``profile``), with
@@ -41,7 +41,7 @@ class JacketedBatchReactorCase(Case):
     whose jacket coefficients is off by up to 10 or 20 % (of a1 its distance to 1: of a1 itself, most
     would not be stable; the core's two stay as they are); and random recipes. Each with measurement
     noise, too. The shipped laws have an identified model (``tied``) there, too, which is off on every
-    printed model: an independent implementation's had the printed one.
+    printed model.
     """
 
     held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)
@@ -55,7 +55,7 @@ class JacketedBatchReactorCase(Case):
         "the observers' l_core and the PI's limits followed figures of fouling and theta_10, the observers' approach "
         "one of profile; fouling itself was set to a change whose levels can be reached in time. The PI's switch "
         "penalty was chosen on other recipes, plants and noise, but chosen anew because it had failed in "
-        "profile_noise and held_out_noise. held_out served no choice among numbers."
+        "profile_noise and held_out_noise. No number was chosen on held_out."
     )
     baseline: ClassVar[str] = "fuzzy_feedforward"  # the paper's own law; no PID moves a valve that is open or shut
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {"T_w": (20.0, 70.0)}
@@ -105,16 +105,6 @@ class JacketedBatchReactorCase(Case):
         Requirement(None, "loss_noise", "max_asse", 0.05),
         Requirement(None, "fouling_noise", "max_asse", 0.05),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "feedforward follows its adjusted reference ideally where the model is the plant": (
-            "reproduces: to 1.4e-14, 251 of 2,000 steps adjusted"
-        ),
-        "a simple feedback part is enough where it is not": (
-            "at 10 %: feedforward 2.14 (8.9), with a PI 0.019 (0.04), with observers 0.008 (0.025)"
-        ),
-        "the jacket stays between 20 and 70 degC": "reproduces where the model is the plant",
-        "an extreme input gives an extreme output in each mode": "holds: hot at least 1.69, cold at most -0.070",
-    }
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """same_model, profile, feed, loss, fouling (one scenario each), theta_10, theta_20 and held_out (several)."""

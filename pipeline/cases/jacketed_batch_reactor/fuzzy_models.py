@@ -21,7 +21,7 @@ ORDER = ("printed", "local", "global", "tied")
 """Identifications, from the one that leaves most out of reach."""
 GAP = "#444444"
 WARM = 45.0  # core temperature [deg C] of the picture of what is reached, the middle of the recipe
-WITHIN = 0.2  # of an independent figure: what another draw of the excitation may change
+WITHIN = 0.2  # relative: what another draw of the excitation may change
 NO_GAP = 1e-9  # [deg C]
 
 Coefficients = Mapping[str, float]  # "b_hot_40" -> its median over the data seeds
@@ -135,18 +135,18 @@ def drift_when_shut(evidence: Evidence, model_set: str, how: str, at: float) -> 
     return moved[0], moved[1]
 
 
-def one_step_errors_as(model_set: str, independent: Mapping[str, float]) -> Check:
-    """A check of the identifications' one-step errors [deg C] against those of an independent implementation."""
+def one_step_errors_as(model_set: str, expected: Mapping[str, float]) -> Check:
+    """A check of the identifications' one-step errors [deg C] against expected ones."""
 
     def check(evidence: Evidence) -> Verdict:
         parts = _parts(evidence, model_set)
-        found = {how: float(parts[how]["rmse"]) for how in independent if "rmse" in parts.get(how, {})}
-        limit = ", ".join(f"{how} {number(value)}" for how, value in independent.items())
+        found = {how: float(parts[how]["rmse"]) for how in expected if "rmse" in parts.get(how, {})}
+        limit = ", ".join(f"{how} {number(value)}" for how, value in expected.items())
         what, limit = "one-step error of each identification", f"{limit} °C, each within {WITHIN:.0%}"
-        if len(found) < len(independent):
+        if len(found) < len(expected):
             return Verdict(what, limit, "not measured", None)
         shown = ", ".join(f"{how} {number(value)}" for how, value in found.items())
-        holds = all(abs(value - independent[how]) <= WITHIN * independent[how] for how, value in found.items())
+        holds = all(abs(value - expected[how]) <= WITHIN * expected[how] for how, value in found.items())
         return Verdict(what, limit, f"{shown} °C", holds)
 
     return check
@@ -168,33 +168,33 @@ def ties_close_the_gap(model_set: str) -> Check:
     return check
 
 
-def printed_gap(model_set: str, independent: float) -> Check:
-    """A check of the printed model's gap [deg C a period] against that of an independent implementation."""
+def printed_gap(model_set: str, expected: float) -> Check:
+    """A check of the printed model's gap [deg C a period] against the expected one."""
 
     def check(evidence: Evidence) -> Verdict:
         gaps = [float(found["gap"]) for how, found in _parts(evidence, model_set).items() if how == "printed"]
-        what, limit = "gap between the printed modes", f"{number(independent)} °C a period, within {WITHIN:.0%}"
+        what, limit = "gap between the printed modes", f"{number(expected)} °C a period, within {WITHIN:.0%}"
         if not gaps:
             return Verdict(what, limit, "not measured", None)
-        return Verdict(what, limit, f"{gaps[0]:.2f} °C a period", abs(gaps[0] - independent) <= WITHIN * independent)
+        return Verdict(what, limit, f"{gaps[0]:.2f} °C a period", abs(gaps[0] - expected) <= WITHIN * expected)
 
     return check
 
 
-def cold_authority(model_set: str, centre: float, independent: float) -> Check:
+def cold_authority(model_set: str, centre: float, expected: float) -> Check:
     """A check of how many times weaker the printed cold valve is at one rule than the reactor's."""
 
     def check(evidence: Evidence) -> Verdict:
         printed = _parts(evidence, model_set).get("printed", {})
         key = f"b_cold_{centre:g}"
         what = f"authority of the cold valve at {centre:g} °C"
-        limit = f"printed {number(independent)} times weaker than the reactor's, within {WITHIN:.0%}"
+        limit = f"printed {number(expected)} times weaker than the reactor's, within {WITHIN:.0%}"
         sides = [printed.get("physics", {}), printed.get("parameters", {})]
         if not all(key in side for side in sides):
             return Verdict(what, limit, "not measured", None)
         reactor, ours = (float(side[key]) for side in sides)
         ratio = reactor / ours
         shown = f"{ours:.2f} printed, {reactor:.2f} °C in the reactor: {ratio:.2f} times weaker"
-        return Verdict(what, limit, shown, abs(ratio - independent) <= WITHIN * independent)
+        return Verdict(what, limit, shown, abs(ratio - expected) <= WITHIN * expected)
 
     return check

@@ -40,7 +40,7 @@ class FuzzyBatchReactor(Plant):
     It is a map from sample to sample: ``transition`` is that map itself, and ``derivative`` is
     its difference quotient, whose zeros are the map's steady states.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, eqs. 24-31.
+    Source: [karer, eqs. 24-31].
     """
 
     core_jacket: float = _of(0.0033)

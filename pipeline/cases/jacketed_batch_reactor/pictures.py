@@ -109,7 +109,7 @@ def offsets_picture(laws: Sequence[str], scenarios: Mapping[str, str]) -> Draw:
         for i, law in enumerate(laws):
             at = np.arange(len(scenarios)) + (i - (len(laws) - 1) / 2) * wide
             mean, largest = (np.array(table[law], dtype=np.float64) for table in (rows, worst))
-            colour = colour_of(law, evidence.laws)
+            colour = colour_of(law, evidence.laws, evidence.case.baseline)
             axes.bar(at, mean, 0.9 * wide, color=colour, label=law_name(law))
             axes.vlines(at, mean, largest, color=colour, linewidth=1.2)
             axes.plot(at, largest, "_", color=colour, markersize=9)

@@ -29,7 +29,7 @@ class JacketedBatchReactor(Plant):
     States T (core) and T_w (jacket) [deg C], both measured. MVs: the throttle k_M in 0..1, and the
     mode, which is 1 or 2 and nothing between.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, the reactor behind its fuzzy model; the numbers are those
+    Source: [karer], the reactor behind its fuzzy model; the numbers are those
     that agree best with the printed consequents (eqs. 30 and 31).
     """
 

@@ -28,7 +28,7 @@ _COMPARED = (ADAPTIVE, Curve("recursive_pid", {"penalty": 5.0}), Curve("self_tun
 
 @dataclass(frozen=True)
 class PhNeutralizationCase(Case):
-    """Seed 002_4e35f3d541bda8ae.txt, section 5.1, made precise where the paper shows only a curve.
+    """[chen2004, section 5.1], made precise where the paper shows only a curve.
 
     The printed disturbance of the buffer's flow, 990 to 1020 ml/min, is that of the acid's: the
     buffer's is 33 ml/min. Beyond the printed tests: random set points, the buffer's flow halved
@@ -44,7 +44,7 @@ class PhNeutralizationCase(Case):
     seen: ClassVar[str] = (
         "penalties were chosen with the scored figures on the screen, that of gauss_newton_pid with an eye on "
         "disturbance; the development got its tank with less buffer after a smaller penalty had failed buffer. "
-        "held_out served no choice."
+        "No number was chosen on held_out."
     )
     unforeseen: ClassVar[bool] = True
     plant_class: ClassVar[type[Plant]] = PhNeutralization
@@ -116,16 +116,6 @@ class PhNeutralizationCase(Case):
         Requirement(None, "buffer", "max_asse", 1e-2),
         Requirement(None, "base", "max_asse", 1e-2),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "the PID with fixed settings overshoots and oscillates": "ITAE settings give 8.29, the adaptive form 18.57",
-        "a fixed penalty of 20 is slow": "reproduces: 43.4",
-        "the adaptive penalty is needed": "does not reproduce: a fixed penalty of 1 gives 7.8 against 18.6",
-        "the linearized PID is ahead of the recursive one": "does not reproduce: 7.8 against 7.4 with a penalty of 1",
-        "the linearized PID is ahead of the self-tuning one": "does not reproduce: the best of 160 tunings gives 6.6",
-        "the recursive PID is unstable under disturbances": "does not reproduce: 0.75 with a penalty of 5, 0.23 with 1",
-        "the disturbance is one of the buffer's flow": "cannot be: pH would move by 0.002; as the acid's flow it fits",
-        "the best settings without bounds are negative": "not unique: every one of them gives the same move",
-    }
 
     @property
     def hold(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -28,4 +27,3 @@ class PhNeutralization15sCase(PhNeutralizationCase):
         Requirement(None, "buffer", "max_asse", 1e-2),
         Requirement(None, "base", "max_asse", 1e-2),
     )
-    claims: ClassVar[Mapping[str, str]] = {}

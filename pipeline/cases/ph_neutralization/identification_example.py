@@ -34,7 +34,7 @@ def example_record(u: Array, noise: Array | None = None) -> Record:
 
         z(t) = z(t-1) / (1 + z(t-1)^2) + u(t-1)^3,     y(t) = z(t) + v(t)
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eq. 15, after Narendra and Parthasarathy, IEEE Trans.
+    Source: [chen2004, eq. 15], after Narendra and Parthasarathy, IEEE Trans.
     Neural Networks 1 (1990), 4.
     """
     n = len(u)

@@ -1,7 +1,6 @@
 """The pH neutralization: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: seed 002_4e35f3d541bda8ae.txt, sections 2.1 and 5.1. The flows at the steady
-states and the plant's gains come from an independent implementation.
+Source of the claims: [chen2004, sections 2.1 and 5.1].
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 from pipeline.evaluation.case import Curve, PaperFigure
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import Claims, Verdict, plain_reason
+from pipeline.evaluation.verdicts import Claim, Claims, Verdict, plain_reason
 from pipeline.pictures.loop_pictures import LONGEST
 from pipeline.pictures.words import law_label, number, ratio
 
@@ -218,16 +217,16 @@ def _one_step(evidence: Evidence, kind: str) -> list[float]:
 
 CLAIMS = Claims(
     reason=reason,
-    statements={
-        "the PID with fixed settings overshoots and oscillates": _fixed,
-        "a fixed penalty of 20 is slow": _slow,
-        "the adaptive penalty is needed": _adaptive,
-        "the linearized PID is ahead of the recursive one": _ahead_of_recursive,
-        "the linearized PID is ahead of the self-tuning one": _ahead_of_self_tuning,
-        "the recursive PID is unstable under disturbances": _unstable,
-        "the disturbance is one of the buffer's flow": _buffer_flow,
-        "the best settings without bounds are negative": _at_bounds,
-    },
+    statements=(
+        Claim("the PID with fixed settings overshoots and oscillates", _fixed),
+        Claim("a fixed penalty of 20 is slow", _slow),
+        Claim("the adaptive penalty is needed", _adaptive),
+        Claim("the linearized PID is ahead of the recursive one", _ahead_of_recursive),
+        Claim("the linearized PID is ahead of the self-tuning one", _ahead_of_self_tuning),
+        Claim("the recursive PID is unstable under disturbances", _unstable),
+        Claim("the disturbance is one of the buffer's flow", _buffer_flow),
+        Claim("the best settings without bounds are negative", _at_bounds),
+    ),
     acceptance=(
         _flows,
         _one_step_order,

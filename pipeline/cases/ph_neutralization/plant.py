@@ -27,7 +27,7 @@ class PhNeutralization(Plant):
     the pH as the root of the titration curve, see ``ph_of``. Flows are in ml/min, the unit in
     which the published tests state them.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs. 30-35 and Table 2 (the exponent of eq. 35 is
+    Source: [chen2004, eqs. 30-35 and Table 2] (the exponent of eq. 35 is
     pH - 14); the plant is that of Nahas, Henson and Seborg, 1992.
     """
 
@@ -93,7 +93,7 @@ def ph_of(wa: Any, wb: Any, pk1: Any, pk2: Any) -> Any:
     not); a root beyond the bracket is not found. The last Newton step has the root's exact
     derivative, which the halvings lack: the same expression serves simulation and optimization.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eq. 35, with the sign of its exponent put right.
+    Source: [chen2004, eq. 35], with the sign of its exponent put right.
     """
     low, high = PH_RANGE
     ph, width = (low + high) / 2, (high - low) / 2

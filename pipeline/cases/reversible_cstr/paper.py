@@ -1,7 +1,7 @@
 """The reversible CSTR: checks of the paper's claims, and pictures of levels, disturbances and trainings.
 
-Source of the claims: seed 001_4ed8acfa2fdd36af.txt, sections "Optimal Models for Model Reference Control",
-"ANN Controller Design" and "Simulation Result and Discussion".
+Source of the claims: [reference_ann, sections "Optimal Models for Model Reference Control",
+"ANN Controller Design" and "Simulation Result and Discussion"].
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pipeline.evaluation.case import Curve, PaperFigure
 from pipeline.evaluation.closed_loop import overshoots
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.timing import step_within
-from pipeline.evaluation.verdicts import CasePicture, Claims, Verdict, plain_reason
+from pipeline.evaluation.verdicts import CasePicture, Claim, Claims, Verdict, plain_reason
 from pipeline.pictures.free_runs import free_run_fit_at_least, free_run_picture, one_step_says_little
 from pipeline.pictures.words import number
 
@@ -205,18 +205,18 @@ def _no_other_root(evidence: Evidence) -> Verdict:
 
 CLAIMS = Claims(
     reason=reason,
-    statements={
-        "feedback brings the reaction almost to complete conversion": _conversion,
-        "the temperature of the open loop rises without end": _temperature,
-        "the best PID setting has Kc = +3.15": _sign,
-        "the network follows random set points without overshoot, the PID overshoots": _overshoot,
-        "under a hotter feed the network returns sooner than the PID": _hotter,
-        "with a 20 % change of the heat of reaction the network is far slower than the PID": _heat,
-        "a network of two errors needs no integral action": _no_memory,
-        "a network follows set points better than a controller with fixed gains": _ahead,
-        "a small one-step error makes a good plant model": _one_step,
-        "a random search finds better reference models than the tables in use": beats_the_classic_tables,
-    },
+    statements=(
+        Claim("feedback brings the reaction almost to complete conversion", _conversion),
+        Claim("the temperature of the open loop rises without end", _temperature),
+        Claim("the best PID setting has Kc = +3.15", _sign),
+        Claim("the network follows random set points without overshoot, the PID overshoots", _overshoot),
+        Claim("under a hotter feed the network returns sooner than the PID", _hotter),
+        Claim("with a 20 % change of the heat of reaction the network is far slower than the PID", _heat),
+        Claim("a network of two errors needs no integral action", _no_memory),
+        Claim("a network follows set points better than a controller with fixed gains", _ahead),
+        Claim("a small one-step error makes a good plant model", _one_step),
+        Claim("a random search finds better reference models than the tables in use", beats_the_classic_tables),
+    ),
     acceptance=(
         free_run_fit_at_least(99.0, SET, "state_space", "C_B", "T"),
         _no_other_root,

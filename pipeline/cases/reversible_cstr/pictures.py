@@ -127,7 +127,7 @@ def training_picture(laws: Sequence[str]) -> Draw:
         axes = canvas.subplots()
         for name, values in found.items():
             history, best = values["history"], int(values["best"][0])
-            colour = colour_of(name, evidence.laws)
+            colour = colour_of(name, evidence.laws, evidence.case.baseline)
             axes.plot(history[:, 0], color=colour, linewidth=1.3, label=law_name(name))
             axes.plot(history[:, 1], ":", color=colour, linewidth=1.5)
             axes.plot([best], history[best, 1], "o", color=colour, markersize=5)

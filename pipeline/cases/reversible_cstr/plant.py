@@ -23,7 +23,7 @@ class ReversibleCstr(Plant):
     States C_B [mol/l] and T [K] are both measured; the feed rate F [l/s] is the MV. The gain is
     negative: more feed, less time to react. Below 0.106 l/s it would change its sign.
 
-    Source: seed 001_4ed8acfa2fdd36af.txt, sections 4 and 5, whose numbers are partly illegible;
+    Source: [reference_ann, sections 4 and 5], whose numbers are partly illegible;
     read as the classic reactor of Economou and Morari, with 427 K as the feed's temperature.
     """
 

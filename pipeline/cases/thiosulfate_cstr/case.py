@@ -42,7 +42,7 @@ _DISTURBED = (Curve("inc"), Curve("incad", _r(10)), Curve("incadec", _r(10)), Cu
 
 @dataclass(frozen=True)
 class ThiosulfateCstrCase(Case):
-    """Seed 000_0a422d3e5d968dac.txt, section 4, made precise where the paper shows only a curve.
+    """[inverse_rbf, section 4], made precise where the paper shows only a curve.
 
     The paper's set-point test is taken as SP-A. Disturbances act from the first period on, so that
     all 350 samples see them; in the gradual test UA falls by 40 J/(s K) before every period but the
@@ -54,10 +54,11 @@ class ThiosulfateCstrCase(Case):
     name: ClassVar[str] = "thiosulfate_cstr"
     seen: ClassVar[str] = (
         "horizon, widths and partitions of three_periods were chosen with an eye on sp_a and ua. "
-        "held_out served no choice."
+        "No number was chosen on held_out."
     )
     title: ClassVar[str] = "Thiosulfate CSTR"
     plant_class: ClassVar[type[Plant]] = ThiosulfateCstr
+    test_words: ClassVar[Mapping[str, str]] = {"sp_a": "SP-A", "sp_b": "SP-B"}
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     noise: ClassVar[Mapping[str, float]] = {"C_A": 5e-4, "T": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"sp_a": 0.2, "sp_b": 0.2, "held_out": 0.4, "tin": 0.1, "ua": 0.1}
@@ -146,14 +147,6 @@ class ThiosulfateCstrCase(Case):
         Requirement(None, "ua", "mae", 1e-3),
         Requirement(None, "ua_gradual", "mae", 5e-4),
     )
-    claims: ClassVar[Mapping[str, str]] = {
-        "88 fuzzy sets an input give 726 centres": "reproduces: 724",
-        "validation RMSE 18.76 K": "reproduces: 15.6 to 22.2 K over six data seeds, output limited to the MV's range",
-        "INC cannot hold the unstable point": "reproduces: the sampled plant has a zero at -1.046 there",
-        "the MAE over r has a minimum": "reproduces, shifted by 1.7: the minimum lies lower than r = 2.5",
-        "the PID is slow, or unstable when tuned faster": "does not reproduce: IMC with anti-windup holds every point",
-        "the error correction leaves no offset": "does not reproduce with an accurate inverse: the loop gets unstable",
-    }
 
     @property
     def regions(self) -> Mapping[str, tuple[float, float]]:

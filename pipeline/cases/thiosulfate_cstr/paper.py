@@ -1,7 +1,6 @@
 """The thiosulfate CSTR: why a figure may differ from the paper's, and checks of its claims.
 
-Source of the claims: seed 000_0a422d3e5d968dac.txt, section 4. The reference states, turning
-points and eigenvalues come from an independent implementation of eq. 25.
+Source of the claims: [inverse_rbf, section 4].
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from pipeline.evaluation.case import PaperFigure
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import parse_setting
 from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import Claims, Verdict, plain_reason
+from pipeline.evaluation.verdicts import Claim, Claims, Verdict, plain_reason
 from pipeline.plants.base import Linearization
 
 TJ = 250.0  # K
@@ -230,14 +229,14 @@ def _middle_zero(evidence: Evidence) -> float:
 
 CLAIMS = Claims(
     reason=reason,
-    statements={
-        "88 fuzzy sets an input give 726 centres": _centres,
-        "validation RMSE 18.76 K": _rmse,
-        "INC cannot hold the unstable point": _inc,
-        "the MAE over r has a minimum": _minimum,
-        "the PID is slow, or unstable when tuned faster": _slow_pid,
-        "the error correction leaves no offset": _no_offset,
-    },
+    statements=(
+        Claim("88 fuzzy sets an input give 726 centres", _centres),
+        Claim("validation RMSE 18.76 K", _rmse),
+        Claim("INC cannot hold the unstable point", _inc),
+        Claim("the MAE over r has a minimum", _minimum),
+        Claim("the PID is slow, or unstable when tuned faster", _slow_pid),
+        Claim("the error correction leaves no offset", _no_offset),
+    ),
     acceptance=(
         _steady_states,
         _turning_points,

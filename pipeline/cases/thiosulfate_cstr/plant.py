@@ -21,7 +21,7 @@ class ThiosulfateCstr(Plant):
     States and process variables CA [mol/l] and T [K]; manipulated variable Tj [K], whose range
     0..500 K is absurd physically but is what the published tests need.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eq. 25 and Table 1 (the R beside -dH is a subscript).
+    Source: [inverse_rbf, eq. 25 and Table 1] (the R beside -dH is a subscript).
     """
 
     V: float = field(default=100.0, metadata={"unit": "l"})

@@ -22,13 +22,13 @@ class FuzzyFeedforward(FuzzyLaw):
     the core is at the adjusted reference two samples later to rounding; where it is not, nothing
     corrects the difference.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, eqs. 18-23.
+    Source: [karer, eqs. 18-23].
     """
 
     name: ClassVar[str] = "fuzzy_feedforward"
     title: ClassVar[str] = "Fuzzy feedforward"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
         """Numbers of the law.
 
@@ -39,8 +39,8 @@ class FuzzyFeedforward(FuzzyLaw):
         """
 
         part: str | None = None
-        jacket_low: float = 20.0
-        jacket_high: float = 70.0
+        jacket_low: float
+        jacket_high: float
         switch_penalty: float = 0.0
         mv_rate: float | None = None
 

@@ -37,13 +37,13 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
     feedforward alone, a jacket that lies in the gap between the modes makes R overcorrect, and the
     modes alternate.
 
-    Source: the feedback part that seed 003_9cd6247d31a7c2db.txt, section 6, leaves open; ours.
+    Source: the feedback part that [karer, section 6] leaves open; ours.
     """
 
     name: ClassVar[str] = "fuzzy_feedforward_observer"
     title: ClassVar[str] = "Fuzzy feedforward with offset observers"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
         """Numbers of the law.
 
@@ -59,16 +59,16 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         """
 
         part: str | None = None
-        jacket_low: float = 20.0
-        jacket_high: float = 70.0
-        switch_penalty: float = 0.6
+        jacket_low: float
+        jacket_high: float
+        switch_penalty: float = 0.0
         mv_rate: float | None = None
-        k_jacket: float = 0.3
-        l_jacket: float = 0.05
-        k_core: float = 0.1
-        l_core: float = 0.003
-        core_gain: float = 0.04
-        approach: float = 0.2
+        k_jacket: float
+        l_jacket: float
+        k_core: float
+        l_core: float
+        core_gain: float
+        approach: float
 
         def __post_init__(self) -> None:
             require_numbers(self)

@@ -30,14 +30,14 @@ class FuzzyFeedforwardPi(FuzzyLaw):
     that lags draws R along and the integral does not wind up. R(k+1) is formed at sample k, with the
     jacket temperature that the model reaches under the applied MVs: a stuck throttle holds R too.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, section 2, which splits the law so and leaves this part
+    Source: [karer, section 2], which splits the law so and leaves this part
     open; ours.
     """
 
     name: ClassVar[str] = "fuzzy_feedforward_pi"
     title: ClassVar[str] = "Fuzzy feedforward with PI"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
         """Numbers of the law.
 
@@ -51,14 +51,14 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         """
 
         part: str | None = None
-        jacket_low: float = 20.0
-        jacket_high: float = 70.0
-        switch_penalty: float = 2.0
+        jacket_low: float
+        jacket_high: float
+        switch_penalty: float = 0.0
         mv_rate: float | None = None
-        kc: float = 12.0
-        ti_s: float = 500.0
-        approach: float = 0.2
-        k_jacket: float = 0.8
+        kc: float
+        ti_s: float
+        approach: float
+        k_jacket: float
 
         def __post_init__(self) -> None:
             require_numbers(self)

@@ -42,7 +42,7 @@ class FuzzyLaw(ControlLaw):
     is taken, the present one where two are equal, and with it k_M = (adj_d - base_d) / gain_d. What
     it reaches, and the core after it, are the adjusted reference, which the law goes on from.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, eqs. 13-23 and section 4.2; the switching cost, and the
+    Source: [karer, eqs. 13-23 and section 4.2]; the switching cost, and the
     two samples, which the printed cascade needs, are ours.
 
     Raises LawError for a model whose gain is 0 or changes its sign, as no inverse exists there.

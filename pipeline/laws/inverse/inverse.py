@@ -52,7 +52,7 @@ class INC(ControlLaw):
 
         mv(k) = RBF(x(k), w(k)),   x = pv (..., n_pv), w = sp (..., n_sp)
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs 11 and 12.
+    Source: [inverse_rbf, eqs 11 and 12].
     """
 
     name: ClassVar[str] = "inc"
@@ -95,7 +95,7 @@ class INCAD(ControlLaw):
     extrapolation: it slows an inverse whose exact form rings, the sampled plant's zero being
     its closed-loop eigenvalue.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs 15-20.
+    Source: [inverse_rbf, eqs 15-20].
     """
 
     name: ClassVar[str] = "incad"
@@ -156,7 +156,7 @@ class INCADEC(ControlLaw):
     points go through the network as one batch, in the step before, so that a step costs no
     second pass; an MV that was applied as asked gives w' = w_EC exactly.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs 21-23; the back-calculation is not in the paper.
+    Source: [inverse_rbf, eqs 21-23]; the back-calculation is not in the paper.
     """
 
     name: ClassVar[str] = "incadec"

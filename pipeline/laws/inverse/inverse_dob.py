@@ -51,7 +51,7 @@ class ObserverLaw(ControlLaw):
     to have predicted the observed variable T; it is fed the MV that the plant really received, so
     it knows no saturation and cannot wind up. The integral only takes the rest.
 
-    Source: the remedy is not in the paper, seed 000_0a422d3e5d968dac.txt; eqs 12 and 21-23 are what it replaces.
+    Source: the remedy is ours; it replaces [inverse_rbf, eqs 12 and 21-23].
     """
 
     @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ class GaussNewtonPid(NnarxPid):
     the actuator can do; the gains are then updated towards that move. Where a single linearization
     needs a large penalty not to overshoot a curved plant, this needs next to none.
 
-    Source: not in seed 002_4e35f3d541bda8ae.txt, which linearizes once and adapts the penalty instead
+    Source: not in [chen2004], which linearizes once and adapts the penalty instead
     (eqs 16-29).
     """
 

@@ -32,7 +32,7 @@ class LinearizedPid(NnarxPid):
     next sample, down to ``penalty_low``, where it agrees to eps_low already. All doublings are
     computed at once, as candidates, so that a step costs the same whatever it finds.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs 16-29 and section 4; see ``NextOutput``,
+    Source: [chen2004, eqs 16-29 and section 4]; see ``NextOutput``,
     ``AdaptiveGains`` and ``gain_update`` for where this departs from it and why.
     """
 

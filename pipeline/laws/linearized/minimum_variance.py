@@ -27,7 +27,7 @@ class MinimumVariance(ControlLaw):
     by Gauss-Newton steps within the actuator's range; one of them is the minimum-variance law of
     the linearized network.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs 16 and 17, without the PID form of du.
+    Source: [chen2004, eqs 16 and 17], without the PID form of du.
     """
 
     name: ClassVar[str] = "minimum_variance"

@@ -62,18 +62,18 @@ def one_knob(model: Linearization, wc: float) -> LocalPid:
 class AutoPidNetwork(LocalControllers):
     """A local controller network whose settings follow from its local models and one wanted speed.
 
-    Source: what seed 004_643aaacd7e46828e.txt, section V, leaves as further work; pole placement for
+    Source: what [gao2002, section V] leaves as further work; pole placement for
     a second-order model, after Astrom and Hagglund, Advanced PID Control, section 6.4.
     """
 
     name: ClassVar[str] = "auto_pid_network"
     title: ClassVar[str] = "Local controller network, one knob"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(BlendedParams):
         """``wc`` [rad/min] is the one knob: how fast the closed loop shall be at every operating point."""
 
-        wc: float = 5.0
+        wc: float
 
         def __post_init__(self) -> None:
             BlendedParams.__post_init__(self)

@@ -69,7 +69,7 @@ class LocalControllers(ControlLaw):
     actuator stood still, a set point that moves to the process variable does not take back the
     proportional part that the actuator never received (``never_given``).
 
-    Source: seed 004_643aaacd7e46828e.txt, section III (blended outputs, in words); blending the
+    Source: [gao2002, section III] (blended outputs, in words); blending the
     gains around one integrator is not in the paper.
     """
 
@@ -119,7 +119,7 @@ class LocalControllers(ControlLaw):
         cls, params: BlendedParams, signals: LawSignals, models: LocalModels, pids: Sequence[LocalPid], plant: Plant
     ) -> Self:
         """The law with these local controllers, the rest as ``params`` says; raises LawError."""
-        states, given = len(plant.state_signals), len(params.stability.low)
+        states, given = len(plant.state_signals), len(params.stability.box(plant)[0])
         if params.stability.starts and given != states:
             raise LawError(
                 f"law {cls.name!r}: stability.low and stability.high have {given} numbers; plant {plant.name!r} has "

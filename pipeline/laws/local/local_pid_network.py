@@ -14,26 +14,21 @@ from pipeline.plants.base import Plant
 
 
 class LocalPidNetwork(LocalControllers):
-    """The paper's controllers, blended over the validity functions of the local models.
+    """One PID an operating point, blended over the validity functions of the local models.
 
-    Source: seed 004_643aaacd7e46828e.txt, section IV.C. Its settings are from a Ziegler-Nichols
-    experiment and then corrected by hand; on these models, of relative degree two, proportional
-    feedback in continuous time has no ultimate gain, so only the correction can have made them.
+    Source: [gao2002, section IV.C].
     """
 
     name: ClassVar[str] = "local_pid_network"
     title: ClassVar[str] = "Local controller network, printed gains"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(BlendedParams):
-        """``kc`` [mv/pv], ``ti_s`` and ``td_s`` [s] of each local controller, in the order of the local models.
+        """``kc`` [mv/pv], ``ti_s`` and ``td_s`` [s] of each local controller, in the order of the local models."""
 
-        The defaults are the printed settings.
-        """
-
-        kc: tuple[float, ...] = (2550.0, 331.0, 404.2, 2080.0, 20100.0)
-        ti_s: tuple[float, ...] = (57.54, 30.72, 16.02, 26.04, 32.1)
-        td_s: tuple[float, ...] = (13.2, 0.0, 0.0, 0.0, 0.0)
+        kc: tuple[float, ...]
+        ti_s: tuple[float, ...]
+        td_s: tuple[float, ...]
 
         def __post_init__(self) -> None:
             BlendedParams.__post_init__(self)

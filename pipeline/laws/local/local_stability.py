@@ -21,18 +21,19 @@ class StabilityTest:
     """How the stability of a law is examined.
 
     ``between``: linear loops from one operating point to the next, both included. ``starts``: loops
-    that begin anywhere between the states ``low`` and ``high`` (none where ``starts`` is 0), at any
-    MV, their set points anywhere between the outer operating points; ``seed`` draws them. One has
-    recovered when it stays within ``band`` [CV] for ``holding`` samples, before ``samples`` are over.
-    The courses of the first ``watched`` are kept.
+    that begin anywhere between the states ``low`` and ``high`` (None: over the states' ranges; none
+    where ``starts`` is 0), at any MV, their set points anywhere between the outer operating points;
+    ``seed`` draws them. One has recovered when it stays within ``band`` [CV] (None: 1 % of the set
+    point's range) for ``holding`` samples, before ``samples`` are over. The courses of the first
+    ``watched`` are kept.
     """
 
     between: int = 9
     starts: int = 2_000
-    low: tuple[float, ...] = (0.005, 400.0)
-    high: tuple[float, ...] = (0.2, 500.0)
+    low: tuple[float, ...] | None = None
+    high: tuple[float, ...] | None = None
     seed: int = 1
-    band: float = 1e-3
+    band: float | None = None
     holding: int = 50
     samples: int = 1_000
     watched: int = 60
@@ -41,13 +42,21 @@ class StabilityTest:
         for name, least in (("between", 2), ("starts", 0), ("holding", 1), ("samples", 1), ("watched", 0)):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-        if not self.band > 0:
+        if self.band is not None and not self.band > 0:
             raise ValueError(f"band is {self.band}; give the width in the CV's unit, above 0")
-        if len(self.low) != len(self.high) or not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+        low, high = self.low, self.high
+        if low is None and high is None:
+            return
+        if low is None or high is None or len(low) != len(high) or any(a >= b for a, b in zip(low, high, strict=True)):
             raise ValueError(
-                f"low is {list(self.low)} and high is {list(self.high)}; give a number of each for every state of the "
-                "plant, each low below its high"
+                f"low is {low} and high is {high}; give both, a number of each for every state of the plant, each low "
+                "below its high, or neither"
             )
+
+    def box(self, plant: Plant) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Least and largest states at which a loop starts, each (n_x,), in the plant's units."""
+        low, high = zip(*((s.low, s.high) for s in plant.state_signals), strict=True)
+        return self.low or low, self.high or high
 
 
 def stability_analysis(law: ControlLaw, plant: Plant, points: Sequence[float], test: StabilityTest) -> Analysis:
@@ -96,16 +105,17 @@ def _recoveries(
     law: ControlLaw, plant: Plant, edges: Array, test: StabilityTest
 ) -> tuple[dict[str, float], dict[str, Array], list[str]]:
     rng, sp, mv = np.random.default_rng(test.seed), plant.sp_signals[0], plant.mv_signals[0]
-    n = test.starts
+    n, (low, high) = test.starts, test.box(plant)
+    band = 0.01 * (sp.high - sp.low) if test.band is None else test.band
     starts = Starts(
-        rng.uniform(test.low, test.high, (n, len(test.low))),
+        rng.uniform(low, high, (n, len(low))),
         rng.uniform(edges[0], edges[-1], (n, 1)),
         rng.uniform(mv.low, mv.high, (n, 1)),
     )
 
     def run(begun: Starts, watched: int) -> Recovery:
         options = {"samples": test.samples, "holding": test.holding, "watched": watched}
-        return recover(plant, law, law.n_state, begun, band=test.band, **options)
+        return recover(plant, law, law.n_state, begun, band=band, **options)
 
     ended = run(starts, test.watched)
     minutes = plant.period_s / 60.0

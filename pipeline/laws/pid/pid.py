@@ -48,7 +48,7 @@ class PID(ControlLaw):
     process variable does not take back the proportional action that the actuator never received
     (``never_given``).
 
-    Source: the PID that seed 000_0a422d3e5d968dac.txt, section 4.3, compares with; the tracking
+    Source: the PID that [inverse_rbf, section 4.3] compares with; the tracking
     is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
     """
 
@@ -86,7 +86,7 @@ class PID(ControlLaw):
         set_point_weight: float | None = None
         lambda_s: float | None = None
         operating_cv: float | None = None
-        development_seeds: tuple[int, ...] = (7001, 7002, 7003)
+        development_seeds: tuple[int, ...] = (1, 2, 3)
         development_set_points: int = 12
         development_hold: int = 60
         sampling: float = 0.5

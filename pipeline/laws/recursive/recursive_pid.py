@@ -35,7 +35,7 @@ class RecursivePid(ControlLaw):
     part ``arx``; parameters and covariance are in the state. It knows only what the recent past
     has shown, where ``linearized_pid`` knows the plant at the point it is at.
 
-    Source: REC-LINPID of seed 002_4e35f3d541bda8ae.txt, section 5, with eqs 16-28 as its control law.
+    Source: REC-LINPID of [chen2004, section 5], with eqs 16-28 as its control law.
     """
 
     name: ClassVar[str] = "recursive_pid"

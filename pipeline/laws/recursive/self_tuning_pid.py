@@ -40,18 +40,16 @@ class SelfTuningPid(ControlLaw):
     estimated slope over the MV does not tell the way. The move is added to the applied MV.
 
     Source: Cameron and Seborg, A self-tuning controller with a PID structure, Int. J. Control 38
-    (1983), 401; named as STPID in seed 002_4e35f3d541bda8ae.txt, section 5.1, without its equations.
+    (1983), 401; named as STPID in [chen2004, section 5.1], without its equations.
     """
 
     name: ClassVar[str] = "self_tuning_pid"
     title: ClassVar[str] = "Self-tuning PID"
     incremental: ClassVar[bool] = True
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
         """Numbers of the law; MVs count in units of half the MV's range, PVs in their own.
-
-        The defaults suit the pH tank sampled every minute, by search on its development sequences.
 
         Parameters
         ----------
@@ -73,10 +71,10 @@ class SelfTuningPid(ControlLaw):
             Largest change of the MV a sample [mv]; None is unlimited.
         """
 
-        prefilter: tuple[float, ...] = (0.5, -0.3, 0.12)
-        integral: float = 0.68
-        forgetting: float = 0.96
-        covariance: float = 0.44
+        prefilter: tuple[float, ...]
+        integral: float
+        forgetting: float
+        covariance: float
         gain_high: tuple[float, float, float] = (10.0, 10.0, 10.0)
         plant_gain: Literal["auto", "positive", "negative"] = "auto"
         slope_min: float = 1e-3

@@ -32,7 +32,7 @@ class ModelReference(ReferenceLaw):
     offset, whatever the plant. The network is trained through the plant's state-space network by forward
     sensitivities and Levenberg-Marquardt, over random set points, noise and loads.
 
-    Source: seed 001_4ed8acfa2fdd36af.txt, section "ANN Controller Design", whose network has two errors
+    Source: [reference_ann, section "ANN Controller Design"], whose network has two errors
     as its only inputs and no memory (``ModelReferenceTwoError``); the incremental form is ours.
     """
 
@@ -40,7 +40,7 @@ class ModelReference(ReferenceLaw):
     title: ClassVar[str] = "Model-reference network"
     incremental: ClassVar[bool] = True
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):
         """The reference model, and in ``training`` how the network is trained to follow it."""
 

@@ -27,13 +27,13 @@ class ModelReferenceTwoError(ReferenceLaw):
     A loop without offset has both errors zero, and then one MV, N(0, 0), for every set point: but each set
     point needs another. So it rests with an offset at all set points except one, however it is trained.
 
-    Source: seed 001_4ed8acfa2fdd36af.txt, section "ANN Controller Design" and figure 4.
+    Source: [reference_ann, section "ANN Controller Design" and figure 4].
     """
 
     name: ClassVar[str] = "model_reference_two_error"
     title: ClassVar[str] = "Model-reference network, two errors"
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):
         """The reference model, and in ``training`` how the network is trained to follow it."""
 

@@ -32,7 +32,7 @@ class PiReference(ReferenceLaw):
     title: ClassVar[str] = "PI on the reference model"
     incremental: ClassVar[bool] = True
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):
         """The reference model; ``tuning`` trained as ``training`` says, or manual with ``kc`` [mv/pv] and ``ti_s``."""
 

@@ -17,7 +17,7 @@ from pipeline.tuning.reference_model import ReferenceModel
 FOLLOWED = 0.01  # of the MV's range: an applied MV this close to the last request is the request
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReferenceParams:
     """Which reference model to follow.
 
@@ -26,7 +26,7 @@ class ReferenceParams:
     """
 
     order: int = 2
-    wn: float = 0.05
+    wn: float
     mv_rate: float | None = None
 
     def model(self, law: str) -> ReferenceModel:

@@ -52,7 +52,7 @@ class HybridFuzzy(Model):
     ModelError
         Shapes that do not fit, centres that do not ascend, a number that is not finite.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, eqs. 24-31.
+    Source: [karer, eqs. 24-31].
     """
 
     kind: ClassVar[str] = "hybrid_fuzzy"

@@ -72,7 +72,7 @@ def identify(data: Transitions, centres: Sequence[float], how: How) -> HybridFuz
 
     Raises ModelError where the pairs leave a coefficient undetermined, or the centres do not ascend.
 
-    Source: seed 003_9cd6247d31a7c2db.txt, section 5.2, which leaves the identification to its
+    Source: [karer, section 5.2], which leaves the identification to its
     reference [8]: rows multiplied by their membership, rule by rule.
     """
     # Refuses centres that cannot be, before anything is divided by their distances.

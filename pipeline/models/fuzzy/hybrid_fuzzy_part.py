@@ -1,14 +1,13 @@
-"""How a hybrid fuzzy model is learnt: as printed, or from a record by least squares."""
+"""How a hybrid fuzzy model is learnt from a record, and what is reported of one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 
-from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
 from pipeline.errors import ModelError
 from pipeline.metrics import r2, rmse
 from pipeline.models.base import Model
@@ -19,23 +18,22 @@ from pipeline.models.training.time_split import split_in_time
 from pipeline.plants.base import Array, Plant
 from pipeline.records.record import Record
 
-Identification = Literal["printed", "tied", "global", "local"]
+Identification = Literal["tied", "global", "local"]
 GRID_DEGC = 0.5  # of the search for gaps
 
 
 @dataclass(frozen=True, kw_only=True)
 class HybridFuzzyPart(Part):
-    """A hybrid fuzzy model of a jacketed vessel with a hot and a cold mode.
+    """A hybrid fuzzy model of a jacketed vessel with a hot and a cold mode, by least squares over a record.
 
-    ``identification`` printed takes the paper's matrices and needs no data; tied, global and local are least
-    squares over a record (hybrid_fuzzy_identification). ``centres`` are the rules' jacket temperatures [degC],
-    of the identified models. ``free_run`` is the length of the free runs whose error is reported [samples].
+    ``identification`` is what the modes share (hybrid_fuzzy_identification). ``centres`` are the rules' jacket
+    temperatures [degC]. ``free_run`` is the length of the free runs whose error is reported [samples].
     ``train_fraction`` of the record trains, the rest validates.
     """
 
     model: ClassVar[type[Model]] = HybridFuzzy
     identification: Identification
-    centres: tuple[float, ...] = tuple(map(float, CENTRES))
+    centres: tuple[float, ...]
     train_fraction: float = 0.7
     free_run: int = 360
 
@@ -46,56 +44,49 @@ class HybridFuzzyPart(Part):
     def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
         """The model; its figures are over the last part of the record, which no identification saw."""
         if record is None:
-            if self.identification != "printed":
-                raise ModelError(
-                    f"a hybrid fuzzy model identified as {self.identification!r} learns from a record; point `data:` "
-                    "of its set at one, or take the identification printed"
-                )
-            model = printed_model()
-            return Learnt(model, {**gap(model, plant), **coefficients(model, plant)})
-        train, validation = split_in_time(record, self.train_fraction)
-        data = Transitions.of(train)
-        how = self.identification
-        model = printed_model() if how == "printed" else identify(data, self.centres, how)
-        metrics = {
-            **self._scored(model, validation),
-            "n_train": len(data.row),
-            **gap(model, plant),
-            **coefficients(model, plant),
-        }
-        return Learnt(model, metrics)
-
-    def _scored(self, model: HybridFuzzy, validation: Record) -> dict[str, float]:
-        """Errors of the jacket and of the core, one step ahead and running free [degC]."""
-        data = Transitions.of(validation)
-        ahead = predict(model, data.before)
-        run, measured = self._free(model, validation)
-        return {
-            "rmse": rmse(data.after[:, 1], ahead[:, 1]),
-            "r2": r2(data.after[:, 1], ahead[:, 1]),
-            "core_rmse": rmse(data.after[:, 0], ahead[:, 0]),
-            "free_run_rmse": rmse(measured[..., 1], run[..., 1]),
-            "free_run_core_rmse": rmse(measured[..., 0], run[..., 0]),
-        }
-
-    def _free(self, model: HybridFuzzy, record: Record) -> tuple[Array, Array]:
-        """(predicted, measured) states of free runs end to end through the record, shape (runs, free_run, 2)."""
-        k = record.starts(self.free_run)
-        # Each begins where the one before has ended; what is left at the end of a run is not used.
-        first = [int(k[0])]
-        for start in k[1:]:
-            if start >= first[-1] + self.free_run:
-                first.append(int(start))
-        window = np.array(first)[:, None] + np.arange(self.free_run)
-        with torch.no_grad():
-            run = model.simulate(torch.from_numpy(record.pv[window[:, 0]]), torch.from_numpy(record.mv[window]))
-        return run.numpy(), record.pv[window + 1]
+            raise ModelError("a hybrid fuzzy model learns from a record; point `data:` of its set at one")
+        train, _ = split_in_time(record, self.train_fraction)
+        model = identify(Transitions.of(train), self.centres, self.identification)
+        return Learnt(model, figures(model, plant, record, self.train_fraction, self.free_run))
 
 
-def printed_model() -> HybridFuzzy:
-    """The paper's own matrices."""
-    printed = FuzzyBatchReactor()
-    return HybridFuzzy([float(c) for c in CENTRES], printed.consequents(), printed.core)
+def figures(model: HybridFuzzy, plant: Plant, record: Record, train_fraction: float, free_run: int) -> dict[str, Any]:
+    """What is reported of a model: errors over the record's last part, gap and coefficients."""
+    train, validation = split_in_time(record, train_fraction)
+    return {
+        **_scored(model, validation, free_run),
+        "n_train": len(Transitions.of(train).row),
+        **gap(model, plant),
+        **coefficients(model, plant),
+    }
+
+
+def _scored(model: HybridFuzzy, validation: Record, free_run: int) -> dict[str, float]:
+    """Errors of the jacket and of the core, one step ahead and running free [degC]."""
+    data = Transitions.of(validation)
+    ahead = predict(model, data.before)
+    run, measured = _free(model, validation, free_run)
+    return {
+        "rmse": rmse(data.after[:, 1], ahead[:, 1]),
+        "r2": r2(data.after[:, 1], ahead[:, 1]),
+        "core_rmse": rmse(data.after[:, 0], ahead[:, 0]),
+        "free_run_rmse": rmse(measured[..., 1], run[..., 1]),
+        "free_run_core_rmse": rmse(measured[..., 0], run[..., 0]),
+    }
+
+
+def _free(model: HybridFuzzy, record: Record, samples: int) -> tuple[Array, Array]:
+    """(predicted, measured) states of free runs end to end through the record, shape (runs, samples, 2)."""
+    k = record.starts(samples)
+    # Each begins where the one before has ended; what is left at the end of a run is not used.
+    first = [int(k[0])]
+    for start in k[1:]:
+        if start >= first[-1] + samples:
+            first.append(int(start))
+    window = np.array(first)[:, None] + np.arange(samples)
+    with torch.no_grad():
+        run = model.simulate(torch.from_numpy(record.pv[window[:, 0]]), torch.from_numpy(record.mv[window]))
+    return run.numpy(), record.pv[window + 1]
 
 
 def gap(model: HybridFuzzy, plant: Plant) -> dict[str, float]:

@@ -24,7 +24,7 @@ class ARX(LaggedModel):
 
     ``forward`` maps phi(t), as in LaggedModel, to y(t) = phi(t)' weight + bias in engineering units.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs. 10-13 (the form of its linearized and its recursive model).
+    Source: [chen2004, eqs. 10-13] (the form of its linearized and its recursive model).
     """
 
     kind: ClassVar[str] = "arx"

@@ -36,7 +36,7 @@ class Arx(NamedTuple):
 def linearize(model: NNARX, phi: Tensor) -> Linearized:
     """Value and slopes of an NNARX at regressors phi (..., n_phi), for a batch at once.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs 10, 11, 13 and 14.
+    Source: [chen2004, eqs 10, 11, 13 and 14].
     """
     rows = phi.reshape(-1, phi.shape[-1])
     return Linearized(model(phi), input_jacobian(model.net, rows)[:, 0].reshape(phi.shape))
@@ -47,7 +47,7 @@ def arx(model: NNARX, phi: Tensor) -> Arx:
 
         a_i = -dNN/dy(t-i),   b_i = dNN/du(t-d-i+1),   bias = NN(phi) + sum_i a_i y(t-i) - sum_i b_i u(t-d-i+1)
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs 9-12; eqs 13 and 14 there have both slopes positive.
+    Source: [chen2004, eqs 9-12]; eqs 13 and 14 there have both slopes positive.
     """
     value, slopes = linearize(model, phi)
     bias = value - (slopes * phi).sum(dim=-1, keepdim=True)

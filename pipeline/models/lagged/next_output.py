@@ -42,7 +42,7 @@ class NextOutput(nn.Module):
 
     A law gives ``slots`` to its Memory and ``terms`` to its Stage.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs 9 and 18, which linearize at phi(t) and have no filter.
+    Source: [chen2004, eqs 9 and 18], which linearize at phi(t) and have no filter.
 
     Parameters
     ----------

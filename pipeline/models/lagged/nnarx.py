@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 class NNARX(LaggedModel):
     """One-step predictor of one PV from lags, y(t) = NN(phi(t)), phi as in LaggedModel. Training goes through ``net``.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, section on the NNARX model.
+    Source: [chen2004, section on the NNARX model].
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ def compare_one_step(
     RecordError
         One that is too short for the lags.
 
-    Source: seed 002_4e35f3d541bda8ae.txt, eqs. 9-11, figure 3 and Table 1; the bias of eq. 12 has
+    Source: [chen2004, eqs. 9-11, figure 3 and Table 1]; the bias of eq. 12 has
     a wrong sign there, and here the linear model goes through the network's own value.
     """
     if (record.run != record.run[0]).any():

@@ -21,7 +21,7 @@ class Validity(nn.Module):
     (..., 1) -> (..., m). A softmax of the exponents, so that far from every centre the nearest one
     (in its own width) still gets the whole weight instead of 0/0.
 
-    Source: seed 004_643aaacd7e46828e.txt, section IV.B; its widths are not printed.
+    Source: [gao2002, section IV.B]; its widths are not printed.
     """
 
     centre: Tensor  # (m,) [CV], in units of the width
@@ -55,7 +55,7 @@ class LocalModels(Model):
     is a simulation that never sees the plant. The continuous matrices stay inside for laws that
     are tuned from them. The first state is the controlled variable, and every state is measured.
 
-    Source: seed 004_643aaacd7e46828e.txt, eq. 2, which blends the derivatives; blended are here
+    Source: [gao2002, eq. 2], which blends the derivatives; blended are here
     their exact integrals over a period, in which the weights stay as they are.
 
     Parameters

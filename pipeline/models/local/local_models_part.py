@@ -27,7 +27,7 @@ REST_PERIODS = 1_500  # simulated until it counts as steady
 class LocalModelsPart(Part):
     """The plant's own equations, linearized at some steady states; needs no data.
 
-    ``points`` are the operating points, each by one signal: ``{q_c: 110}`` or ``{T: 442}``.
+    ``points`` are the operating points, each by the value of one signal, an MV or a PV.
     ``overlap`` is the width of a validity function over the mean distance to its neighbours.
     The network's free runs are compared with the plant under three courses of the MV between
     ``mv_low`` and ``mv_high``, from rest: a staircase in steps of ``mv_step`` held ``hold`` samples

@@ -49,7 +49,7 @@ def select_centres(u: Array, partitions: int) -> NDArray[np.int64]:
     The pass is exact but not a loop over samples: the next uncovered one of a block is found at
     once, and the rest is thinned by all centres of a block before it is looked at.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs. 4-7.
+    Source: [inverse_rbf, eqs. 4-7].
     """
     g, near = to_grid(u, partitions)
     # da sqrt(N) in grid units is sqrt(N)/2; the margin is for rounding, far below any sample's resolution.
@@ -110,7 +110,7 @@ class FuzzyMeansRBF(RegressorMixin, BaseEstimator):
     The design matrix Z of a thin-plate spline has a condition number of about 1e8, which the
     normal equations of eq. 8 square; the weights come from the R factor of [Z y] instead.
 
-    Source: seed 000_0a422d3e5d968dac.txt, section 2, eqs. 1-8.
+    Source: [inverse_rbf, section 2, eqs. 1-8].
     """
 
     def __init__(

@@ -33,7 +33,7 @@ class LeverageDomain(Model):
 
     As a model: ``(..., N) -> (..., 1)``, the leverage. See ``pipeline.models.applicability.Leverage``.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs 13-20.
+    Source: [inverse_rbf, eqs 13-20].
     """
 
     kind: ClassVar[str] = "leverage_domain"

@@ -37,7 +37,7 @@ class RBF(Model):
     Buffers: low, span (n_in,); centres (n_in, n_centres), one column each so that no constant is
     transposed in the graph; weights (n_out, n_centres); out_low, out_high (n_out,).
 
-    Source: seed 000_0a422d3e5d968dac.txt, eqs. 1-3.
+    Source: [inverse_rbf, eqs. 1-3].
     """
 
     kind: ClassVar[str] = "rbf"

@@ -72,7 +72,7 @@ def inverse_pairs(record: Record, horizon: int = 1, cv: int = 0) -> Pairs:
 
     Raises RecordError where the record has no such row.
 
-    Source: seed 000_0a422d3e5d968dac.txt, eq. 10 (h = 1).
+    Source: [inverse_rbf, eq. 10] (h = 1).
     """
     k = _held(record, horizon)
     target = record.pv[k + horizon, cv]

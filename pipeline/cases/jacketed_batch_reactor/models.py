@@ -1,0 +1,43 @@
+"""The case's own kind of model: the paper's printed matrices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
+from pipeline.models.base import Model
+from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from pipeline.models.fuzzy.hybrid_fuzzy_part import coefficients, figures, gap
+from pipeline.models.part import Learnt, Part, Regions
+from pipeline.plants.base import Plant
+from pipeline.records.record import Record
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrintedFuzzyPart(Part):
+    """The hybrid fuzzy model with the paper's own matrices; a record serves its figures alone.
+
+    ``train_fraction`` of the record is left to the identified models beside it, ``free_run`` is the length
+    of the free runs whose error is reported [samples].
+    """
+
+    model: ClassVar[type[Model]] = HybridFuzzy
+    train_fraction: float = 0.7
+    free_run: int = 360
+
+    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+        """The printed model; without a record only what its coefficients say."""
+        model = printed_model()
+        if record is None:
+            return Learnt(model, {**gap(model, plant), **coefficients(model, plant)})
+        return Learnt(model, figures(model, plant, record, self.train_fraction, self.free_run))
+
+
+def printed_model() -> HybridFuzzy:
+    """The paper's own matrices."""
+    printed = FuzzyBatchReactor()
+    return HybridFuzzy([float(c) for c in CENTRES], printed.consequents(), printed.core)
+
+
+MODELS: dict[str, type[Part]] = {"printed_fuzzy": PrintedFuzzyPart}  # whose model is a HybridFuzzy
