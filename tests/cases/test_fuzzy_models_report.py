@@ -38,7 +38,10 @@ def measured() -> dict[str, Any]:
     record = JacketPulses(samples=12_000).run(plant, 0)
     ways: Any = ("tied", "global", "local", "printed")
     return {
-        "parts": {w: {"median": HybridFuzzyPart(identification=w).learn(record, plant, {}, 0).metrics} for w in ways}
+        "parts": {
+            w: {"median": HybridFuzzyPart(identification=w).learn(record, plant.signals, {}, 0, plant).metrics}
+            for w in ways
+        }
     }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, PaperTable, Requirement
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario, held, random_levels
 
 TJ = 250.0  # [K] of the three steady states
@@ -57,7 +57,7 @@ class ThiosulfateCstrCase(Case):
         "held_out served no choice."
     )
     title: ClassVar[str] = "Thiosulfate CSTR"
-    plant_class: ClassVar[type[Plant]] = ThiosulfateCstr
+    plant_class: ClassVar[type[EquationPlant]] = ThiosulfateCstr
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     noise: ClassVar[Mapping[str, float]] = {"C_A": 5e-4, "T": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"sp_a": 0.2, "sp_b": 0.2, "held_out": 0.4, "tin": 0.1, "ua": 0.1}
@@ -162,7 +162,7 @@ class ThiosulfateCstrCase(Case):
 
     @cached_property
     def _steady(self) -> dict[str, Array]:
-        return dict(zip(("hot", "middle", "cold"), self.plant.steady_states(TJ), strict=True))
+        return dict(zip(("hot", "middle", "cold"), self.equations.steady_states(TJ), strict=True))
 
     def _tracking(
         self, name: str, title: str, start: str, levels: list[float], hold: int, seed: int | None = None
