@@ -95,9 +95,7 @@ class Batches(OpenLoop):
 
     def initial_states(self, plant: Simulator, rng: np.random.Generator) -> Array:
         """State at the start of each batch, shape (batches, n_x)."""
-        states = (
-            plant.state_signals if isinstance(plant, EquationPlant) else ()
-        )  # others have no ranges of their states
+        states = plant.state_signals if isinstance(plant, EquationPlant) else ()
         spread = np.array(self.start_spread or np.zeros(plant.n_x))
         if spread.shape != (plant.n_x,) or not np.all(np.isfinite(spread) & (spread >= 0)):
             names = ", ".join(s.name for s in states) or str(plant.n_x)

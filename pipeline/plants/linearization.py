@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-
-from pipeline.errors import PlantError
 
 Array = NDArray[np.float64]
 
@@ -26,24 +23,6 @@ class Linearization:
     a: Array  # shape: (n_x, n_x), 1/s
     b: Array  # shape: (n_x, n_mv)
     c: Array  # shape: (n_pv, n_x)
-
-    @classmethod
-    def of_samples(cls, x: Array, mv: Array, phi: Array, gamma: Array, c: Array, period_s: float) -> Self:
-        """The continuous model whose zero-order-hold samples are (Phi, Gamma): the inverse of ``sampled``.
-
-        Raises PlantError where there is none: a sampled pole is zero or negative.
-        """
-        n, m = gamma.shape
-        poles = np.linalg.eigvals(phi)
-        if np.any((np.abs(poles.imag) <= 1e-12) & (poles.real <= 1e-12)):
-            raise PlantError(
-                f"no continuous linear model has the sampled poles {np.round(poles, 6).tolist()}: one is zero (a dead "
-                "time) or negative; tune the controller by hand, or on a part `linearized`"
-            )
-        block = np.eye(n + m)
-        block[:n, :n], block[:n, n:] = phi, gamma
-        rate = np.real(linalg.logm(block)) / period_s
-        return cls(x, mv, rate[:n, :n], rate[:n, n:], c)
 
     @property
     def eigenvalues(self) -> NDArray[np.complex128]:

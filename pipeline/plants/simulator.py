@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
-from pipeline.plants.linearization import Linearization
 from pipeline.plants.signals import Signals
 from serving.manifest import Signal
 
@@ -22,9 +21,6 @@ Advance = Callable[[Array, Array, Array, Array], Array]
 
 AdvanceMany = Callable[[Array, Array], Array]
 """``advance(x (n, n_x), mv (n, n_mv)) -> x (n, n_x)`` one period later."""
-
-DIFFERENCE = 1e-4  # of a signal's size: the step of the numerical linearization
-REST = 1e-6  # of a state's size: what the start may move in one period and count as at rest
 
 
 class Simulator(ABC):
@@ -134,27 +130,3 @@ class Simulator(ABC):
         """Index into ``region_names`` of each controlled variable, same shape as ``cv``."""
         bounds = [low for low, _ in self.regions.values()][1:]
         return np.asarray(np.searchsorted(bounds, np.asarray(cv, dtype=np.float64), side="right"), dtype=np.int64)
-
-    # ------------------------------------------------------------------ near the start
-    def linearized_start(self) -> Linearization:
-        """The plant near its start, by central differences over one period of ``step`` and of ``measure``.
-
-        Raises PlantError where the start is not at rest, or no continuous linear model has these samples.
-        """
-        x0, mv0 = (np.asarray(v, dtype=np.float64) for v in self.start)
-        dv, p = self.dv_nominal, self.parameters()
-        size = np.maximum(np.abs(x0), 1e-3 * max(1.0, float(np.abs(x0).max())))
-        moved = np.abs(self.step(x0, mv0, dv, p) - x0)
-        if not (moved <= REST * size).all():
-            raise PlantError(
-                f"plant {self.name!r} is not at rest at its start: {x0} moves by up to {moved.max():.3g} in a period "
-                "with the MV held; give a start at rest, or tune the controller by hand"
-            )
-
-        def slope(f: Callable[[Array], Array], at: Array, by: Array) -> Array:
-            return np.column_stack([(f(at + d) - f(at - d)) / (2 * h) for d, h in zip(np.diag(by), by, strict=True)])
-
-        span = DIFFERENCE * np.array([s.high - s.low for s in self.mv_signals])
-        phi = slope(lambda x: self.step(x, mv0, dv, p), x0, DIFFERENCE * size)
-        gamma = slope(lambda mv: self.step(x0, mv, dv, p), mv0, span)
-        return Linearization.of_samples(x0, mv0, phi, gamma, slope(self.measure, x0, DIFFERENCE * size), self.period_s)

@@ -187,7 +187,7 @@ def test_only_the_tied_model_keeps_the_ties_and_has_no_gap(how: How, reactor_rec
     shared = model.consequents[:, [0, 1, 3]]
     tied = torch.equal(shared[0], shared[1])
     assert tied == (how == "tied")
-    assert (gap(model, JacketedBatchReactor())["gap"] < 1e-12) == tied
+    assert (gap(model, JacketedBatchReactor().signals)["gap"] < 1e-12) == tied
 
 
 def test_least_squares_can_only_lose_by_ties_and_by_separate_rules(reactor_record: Record) -> None:
@@ -275,7 +275,7 @@ def test_physics_of_the_linear_part_are_the_matrix_exponential() -> None:
 
 def test_the_printed_gap_is_what_was_found_independently() -> None:
     # "Up to 1.4 degC a step" within core temperatures that the test's profile reaches.
-    found = gap(printed_model(), FuzzyBatchReactor())
+    found = gap(printed_model(), FuzzyBatchReactor().signals)
     assert found["gap"] == pytest.approx(1.4, abs=0.1)
 
 

@@ -22,6 +22,7 @@ from pipeline.tuning.development import DevelopmentLoops
 from pipeline.tuning.reduction import LagWithDeadTime
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
+from pipeline.tuning.start_lag import start_lag
 
 EXAMINED = 40  # linear closed loops over a range of the CV
 
@@ -203,7 +204,7 @@ class PID(ControlLaw):
 def _linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:
     """Of the part ``linearized`` where the model set has one, else of the plant at ``operating_cv``.
 
-    A plant without equations is linearized at its start, by differences.
+    A plant without equations counts as a lag, that near its start.
     """
     if "linearized" in models:
         part = models["linearized"]
@@ -211,7 +212,7 @@ def _linearization(params: Any, models: Mapping[str, Model], plant: Simulator | 
             raise LawError(f"law 'pid' needs a part 'linearized' that is a linearization; got one of kind {part.kind}")
         return part.linearization()
     if plant is not None and params.operating_cv is None and not isinstance(plant, EquationPlant):
-        return plant.linearized_start()
+        return start_lag(plant)
     known = equations(plant, f"PID tuning {params.tuning!r} without a part `linearized`")
     sp = known.sp_signals[0]
     cv = 0.5 * (sp.low + sp.high) if params.operating_cv is None else params.operating_cv
