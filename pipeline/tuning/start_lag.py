@@ -1,4 +1,4 @@
-"""A plant without equations as one lag near its start, for rules that tune from a linear model."""
+"""A plant without equations as one or two lags near its start, for rules that tune from a linear model."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ REST = 1e-6  # of a state's size: what the start may move in one period and coun
 
 
 def start_lag(plant: Simulator) -> Linearization:
-    """The lag with the gain and the mean residence time of the plant near its start, from the first MV to the CV.
+    """The lags with the gain and the residence times' mean and variance of the plant near its start, first MV to CV.
 
-        K = C (I - Phi)^-1 Gamma,   T = h sum_k (1 - y(k)/K) - h/2 = h [C (I - Phi)^-2 Gamma] / K - h/2
+        r(k) = 1 - y(k)/K,   T = h sum_k r(k) - h/2,   S = 2 h^2 sum_k k r(k) - T^2
+        G(s) = K / ((t1 s + 1) (t2 s + 1)),   t1 + t2 = T,   t1^2 + t2^2 = S
 
-    y is the response to a unit step of the MV, Phi, Gamma and C are central differences of ``step`` and ``measure``,
-    and h is the period. A dead time counts as part of T. Raises PlantError where the start is not at rest or not
+    y is the response to a unit step of the MV, K its end, h the period; it follows from central differences of
+    ``step`` and ``measure``. A dead time counts as part of T; where S is too small for two lags, they are equal, and
+    where the smaller one would be below h/2, there is one lag. Raises PlantError where the start is not at rest or not
     stable, or the CV does not follow the MV.
     """
     x0, mv0 = (np.asarray(v, dtype=np.float64) for v in plant.start)
@@ -42,16 +44,23 @@ def start_lag(plant: Simulator) -> Linearization:
         raise PlantError(
             f"plant {plant.name!r} is not stable at its start (a sampled pole of size {radius:.6g}); {remedy}"
         )
-    once = np.linalg.solve(np.eye(len(phi)) - phi, gamma)
-    gain = float(c @ once)
-    time_s = h * float(c @ np.linalg.solve(np.eye(len(phi)) - phi, once)) / gain - h / 2 if gain else 0.0
+    ends = np.linalg.inv(np.eye(len(phi)) - phi)
+    rest = ends @ gamma
+    gain = float(c @ rest)
+    time_s = h * float(c @ ends @ rest) / gain - h / 2 if gain else 0.0
     if not time_s > 0:
         raise PlantError(
             f"plant {plant.name!r} is no lag at its start: gain {gain:.3g}, mean residence time {time_s:.3g} s; "
             f"{remedy}"
         )
-    rate = np.array([[1 / time_s]])
-    return Linearization(np.zeros(1), mv0[:1], -rate, gain * rate, np.eye(1))
+    variance = 2 * h**2 * float(c @ phi @ ends @ ends @ rest) / gain - time_s**2
+    apart = np.sqrt(max(0.0, variance / 2 - time_s**2 / 4))
+    slow, fast = time_s / 2 + apart, time_s / 2 - apart
+    if fast < h / 2:
+        rate = np.array([[1 / time_s]])
+        return Linearization(np.zeros(1), mv0[:1], -rate, gain * rate, np.eye(1))
+    a, b = np.array([[-1 / slow, 0.0], [1 / fast, -1 / fast]]), np.array([[gain / slow], [0.0]])
+    return Linearization(np.zeros(2), mv0[:1], a, b, np.array([[0.0, 1.0]]))
 
 
 def _slope(f: Callable[[Array], Array], at: Array, by: Array) -> Array:

@@ -138,15 +138,29 @@ def test_records_and_models_of_a_users_own_simulator() -> None:
         assert np.array_equal(row, simulate_open(plant, x0, np.full((5, 1), 0.6), {"k": 0.4}))
 
 
-def test_a_plant_without_equations_is_tuned_as_the_lag_at_its_start() -> None:
+def test_a_plant_without_equations_is_tuned_as_the_lags_at_its_start() -> None:
     """A dh/dt = ...: time constants 2 A sqrt(h) / k of both tanks, and gain 2 sqrt(h) / k from u to h2.
 
     The first Euler step of 0.1 s already moves h1 by its end: half a step less.
     """
-    lag = start_lag(Tanks())
-    time_s = -1 / lag.a[0, 0]
-    assert (lag.c @ lag.b)[0, 0] * time_s == pytest.approx(2 / 0.5, rel=1e-4)
-    assert time_s == pytest.approx(8.0 + 8.0 - 0.05, rel=1e-4)
+    lags = start_lag(Tanks())
+    times_s = -1 / lags.eigenvalues.real
+    assert -(lags.c @ np.linalg.solve(lags.a, lags.b))[0, 0] == pytest.approx(2 / 0.5, rel=1e-4)
+    assert times_s.sum() == pytest.approx(8.0 + 8.0 - 0.05, rel=1e-4)
+    assert times_s == pytest.approx([8.0, 8.0], rel=0.1)
+
+
+class OneTank(Tanks):
+    """The second tank alone."""
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        return np.array([1.0, x[1] + (1 - np.exp(-0.125)) * (4 * (mv[0] - 0.5) + 1 - x[1])])
+
+
+def test_a_plant_of_one_lag_is_that_lag() -> None:
+    lag = start_lag(OneTank())
+    assert lag.a == pytest.approx(np.array([[-0.125]]), rel=2e-3)
+    assert lag.b == pytest.approx(np.array([[0.5]]), rel=2e-3)
 
 
 class Restless(Tanks):

@@ -204,7 +204,7 @@ class PID(ControlLaw):
 def _linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:
     """Of the part ``linearized`` where the model set has one, else of the plant at ``operating_cv``.
 
-    A plant without equations counts as a lag, that near its start.
+    A plant without equations counts as one or two lags, those near its start.
     """
     if "linearized" in models:
         part = models["linearized"]
