@@ -16,7 +16,7 @@ import torch
 from shipped import required
 
 from pipeline.cases import PLANTS
-from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.laws import LAWS, ControlLaw
 from pipeline.models import Model
 from pipeline.models.lagged.arx import ARX
 from pipeline.models.lagged.nnarx import NNARX
@@ -24,7 +24,8 @@ from pipeline.models.static.fuzzy_means import FuzzyMeansRBF
 from pipeline.models.static.leverage_domain import LeverageDomain
 from pipeline.models.training.fit import LevenbergMarquardt
 from pipeline.models.training.objectives import Samples
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.signals import Signals
 from pipeline.simulation.simulate import simulate_batch
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
@@ -73,22 +74,22 @@ def _one_thread() -> None:
 
 
 @pytest.fixture(scope="session")
-def plant() -> Plant:
+def plant() -> EquationPlant:
     """The plant of the first case."""
     return PLANTS["thiosulfate_cstr"]()
 
 
 @pytest.fixture(scope="session")
-def signals(plant: Plant) -> LawSignals:
-    return LawSignals.of(plant)
+def signals(plant: EquationPlant) -> Signals:
+    return plant.signals
 
 
-def plant_of(law: str) -> Plant:
+def plant_of(law: str) -> EquationPlant:
     """The plant that a law is designed over."""
     return PLANTS[PLANT_OF_LAW.get(law, "thiosulfate_cstr")]()
 
 
-def rest_points(plant: Plant) -> tuple[float, float, float]:
+def rest_points(plant: EquationPlant) -> tuple[float, float, float]:
     """Three set points that the plant can hold."""
     sp = plant.sp_signals[0]
     low, middle, high = (sp.low + f * (sp.high - sp.low) for f in (0.2, 0.5, 0.8))
@@ -107,7 +108,7 @@ def quick_parts(plant: str) -> dict[str, Model]:
     return PARTS[plant](PLANTS[plant]())
 
 
-def _thiosulfate_parts(plant: Plant) -> dict[str, Model]:
+def _thiosulfate_parts(plant: EquationPlant) -> dict[str, Model]:
     """A model set with every part that a law may ask for: small networks over short random runs.
 
     Good enough to be smooth and finite; nothing is asserted of their accuracy.
@@ -147,7 +148,7 @@ def _thiosulfate_parts(plant: Plant) -> dict[str, Model]:
     }
 
 
-PARTS: dict[str, Callable[[Plant], dict[str, Model]]] = {
+PARTS: dict[str, Callable[[EquationPlant], dict[str, Model]]] = {
     "thiosulfate_cstr": _thiosulfate_parts,
     "henson_seborg_cstr": henson_seborg_cstr_parts.parts,
     "jacketed_batch_reactor": jacketed_batch_reactor_parts.parts,
@@ -162,7 +163,7 @@ def make_law() -> LawFactory:
     def make(name: str, **params: Any) -> ControlLaw:
         cls, plant = LAWS[name], plant_of(name)
         given = cls.Params(**{**QUICK[name], **params})
-        return cls.design(given, quick_parts(plant.name), LawSignals.of(plant), plant).eval()
+        return cls.design(given, quick_parts(plant.name), plant.signals, plant).eval()
 
     return make
 
@@ -178,7 +179,7 @@ def law(request: pytest.FixtureRequest, make_law: LawFactory) -> ControlLaw:
 
 
 @pytest.fixture(scope="session")
-def law_plant(law: ControlLaw) -> Plant:
+def law_plant(law: ControlLaw) -> EquationPlant:
     """The plant of the law in turn."""
     return plant_of(law.name)
 
@@ -197,7 +198,7 @@ class LoopTest:
 def loop_test() -> Callable[..., LoopTest]:
     """``loop_test(plant, levels (n,), start, NAME=value)``: from the steady state at ``start``, parameters changed."""
 
-    def make(plant: Plant, levels: np.ndarray, start: float, **changed: float) -> LoopTest:
+    def make(plant: EquationPlant, levels: np.ndarray, start: float, **changed: float) -> LoopTest:
         x0, mv0 = plant.steady_state_at(start)
         changes = {name: np.full(len(levels), value) for name, value in changed.items()}
         return LoopTest(levels[:, None], x0, mv0, changes)

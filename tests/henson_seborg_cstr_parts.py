@@ -5,14 +5,14 @@ from __future__ import annotations
 from pipeline.models import Model
 from pipeline.models.local.local_models import LocalModels
 from pipeline.models.local.local_models_part import operating_cv
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 
 POINTS = ({"q_c": 110.0}, {"T": 442.0}, {"T": 450.0}, {"T": 465.0}, {"T": 481.0})
 
 
-def local_models(plant: Plant) -> LocalModels:
+def local_models(plant: EquationPlant) -> LocalModels:
     return LocalModels.at_set_points(plant, [operating_cv(plant, point) for point in POINTS], 0.3)
 
 
-def parts(plant: Plant) -> dict[str, Model]:
+def parts(plant: EquationPlant) -> dict[str, Model]:
     return {"local_models": local_models(plant)}

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
 from pipeline.models import Model
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 
 LAWS = ("fuzzy_feedforward", "fuzzy_feedforward_pi", "fuzzy_feedforward_observer")
 
 
-def parts(plant: Plant) -> dict[str, Model]:
+def parts(plant: EquationPlant) -> dict[str, Model]:
     """The paper's own matrices, whatever the plant's parameters."""
     printed = FuzzyBatchReactor()
     return {"printed": HybridFuzzy([float(c) for c in CENTRES], printed.consequents(), printed.core)}

@@ -122,7 +122,7 @@ def trajectory(case: Case, scenario: Scenario, quality: float, adaptive: bool = 
     plant = case.plant
     n, low, high = scenario.samples, plant.mv_signals[0].low, plant.mv_signals[0].high
     cv = np.empty(n)
-    now = float(np.asarray(plant.measure(scenario.x0)).ravel()[0])
+    now = float(plant.measure(scenario.x0)[0])
     for k in range(n):
         cv[k] = now
         now += (float(scenario.sp[k, 0]) - now) * 0.5 / quality

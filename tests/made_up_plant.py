@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from serving.manifest import Signal
 
 
 @dataclass(frozen=True)
-class Lag(Plant):
+class Lag(EquationPlant):
     """gain u = tau dx/dt + x, written in minutes, measured in tenths."""
 
     gain: float = field(default=2.0, metadata={"unit": "m/V"})
@@ -36,7 +36,7 @@ class Lag(Plant):
 
 
 @dataclass(frozen=True)
-class Mixer(Plant):
+class Mixer(EquationPlant):
     """dx/dt = k u - x / tau for level and temperature, each moved by both MVs."""
 
     k: float = field(default=0.5, metadata={"unit": "1/s"})
@@ -56,7 +56,7 @@ class Mixer(Plant):
 
 
 @dataclass(frozen=True)
-class Chain(Plant):
+class Chain(EquationPlant):
     """Five equal lags in series, nearly a dead time; with ``back`` above 0 the output first goes the wrong way."""
 
     tau: float = field(default=4.0, metadata={"unit": "s"})

@@ -11,10 +11,11 @@ import torch
 
 from pipeline.evaluation.case import Case
 from pipeline.excitation import Excitation
-from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.laws import LAWS, ControlLaw
 from pipeline.models import MODELS, Model
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.signals import Signals
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import Trajectory, simulate_closed
 from serving.manifest import Signal
@@ -22,17 +23,19 @@ from serving.manifest import Signal
 DV = torch.zeros(0, dtype=torch.float64)
 
 
-def trained(plant: Plant, excitation: Excitation, lags: int, seed: int = 0) -> NNARX:
+def trained(plant: EquationPlant, excitation: Excitation, lags: int, seed: int = 0) -> NNARX:
     """An NNARX as params.yaml asks for it, without the figures that its report shows."""
     part = MODELS["nnarx"](n_y=lags, n_u=lags, hidden=(10,), steps=10, compared=0)
-    model = part.learn(excitation.run(plant, seed), plant, {}, seed).model
+    model = part.learn(excitation.run(plant, seed), plant.signals, {}, seed).model
     assert isinstance(model, NNARX)
     return model
 
 
-def designed(name: str, model: Model, plant: Plant, signals: LawSignals | None = None, **params: Any) -> ControlLaw:
+def designed(
+    name: str, model: Model, plant: EquationPlant, signals: Signals | None = None, **params: Any
+) -> ControlLaw:
     law = LAWS[name]
-    return law.design(law.Params(**params), {"nnarx": model}, signals or LawSignals.of(plant), plant).eval()
+    return law.design(law.Params(**params), {"nnarx": model}, signals or plant.signals, plant).eval()
 
 
 def stepper(law: ControlLaw, through: Callable[[np.ndarray], np.ndarray] = lambda mv: mv):
@@ -90,7 +93,7 @@ def negated_in_pv(model: NNARX) -> NNARX:
     return other.eval()
 
 
-def negated_signals(signals: LawSignals) -> LawSignals:
+def negated_signals(signals: Signals) -> Signals:
     """The signals of a plant that measures -y."""
 
     def negated(group: tuple[Signal, ...]) -> tuple[Signal, ...]:

@@ -9,14 +9,14 @@ from pipeline.models import Model
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.models.training.fit import LevenbergMarquardt
 from pipeline.models.training.objectives import Samples
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 
 # What the laws of the reactor need to be trained quickly: good enough to hold their contract.
 QUICK = {"training": Training(hidden=4, lanes=12, holds=1, hold=40, noise=0.002, iterations=4, restarts=1)}
 LOW, HIGH = np.array([0.25, 365.0]), np.array([0.65, 430.0])
 
 
-def parts(plant: Plant) -> dict[str, Model]:
+def parts(plant: EquationPlant) -> dict[str, Model]:
     """Learnt from single periods that start anywhere; good to about 1e-6 mol/l a period."""
     rng = np.random.default_rng(0)
     n, mv = 2_000, plant.mv_signals[0]

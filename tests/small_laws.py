@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from pipeline.export.gate import export
-from pipeline.laws import ControlLaw, LawSignals
+from pipeline.laws import ControlLaw
+from pipeline.plants.signals import Signals
 from serving import Controller, Signal
 
-SIGNALS = LawSignals(
+SIGNALS = Signals(
     period_s=0.5,
     sp=(Signal("level", "m", 0.0, 2.0),),
     pv=(Signal("level", "m", 0.0, 2.0), Signal("T", "K", 250.0, 400.0)),
@@ -31,12 +32,12 @@ class FormulaLaw(ControlLaw):
     title = "Formula"
     Params = type(None)
 
-    def __init__(self, formula: Formula, n_state: int, info: tuple[str, ...], signals: LawSignals) -> None:
+    def __init__(self, formula: Formula, n_state: int, info: tuple[str, ...], signals: Signals) -> None:
         super().__init__(signals)
         self.formula, self.n_state, self.info = formula, n_state, info
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Any], signals: LawSignals, plant: Any) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Any], signals: Signals, plant: Any) -> Self:
         raise NotImplementedError
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -55,9 +56,7 @@ def pi(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, 
 def make_formula() -> Callable[..., ControlLaw]:
     """``make_formula(formula, n_state=0, info=(), signals=SIGNALS)``: a law from a function."""
 
-    def make(
-        formula: Formula, n_state: int = 0, info: tuple[str, ...] = (), signals: LawSignals = SIGNALS
-    ) -> ControlLaw:
+    def make(formula: Formula, n_state: int = 0, info: tuple[str, ...] = (), signals: Signals = SIGNALS) -> ControlLaw:
         return FormulaLaw(formula, n_state, info, signals).eval()
 
     return make

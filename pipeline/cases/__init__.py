@@ -18,7 +18,7 @@ from pipeline.cases.ph_neutralization.case_15s import PhNeutralization15sCase
 from pipeline.cases.reversible_cstr.case import ReversibleCstrCase
 from pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
 from pipeline.evaluation.case import Case
-from pipeline.plants.base import Plant
+from pipeline.plants.simulator import Simulator
 
 CASES: dict[str, Case] = {
     ThiosulfateCstrCase.name: ThiosulfateCstrCase(),
@@ -30,7 +30,7 @@ CASES: dict[str, Case] = {
     ReversibleCstrCase.name: ReversibleCstrCase(),
 }
 
-PLANTS: dict[str, type[Plant]] = {
+PLANTS: dict[str, type[Simulator]] = {
     plant.name: plant for case in CASES.values() for plant in (case.plant_class, *case.further_plants)
 }
 

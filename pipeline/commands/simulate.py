@@ -17,7 +17,7 @@ from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.metric import METRICS
 from pipeline.pictures.loop_picture import History, draw, summary, write_csv
-from pipeline.plants.base import Plant
+from pipeline.plants.simulator import Simulator
 from pipeline.simulation.live import SimulatedPlant, view_of
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def close_loop(
-    controller: Controller, plant: Plant, course: Timetable, *, title: str, speed: float | None = None
+    controller: Controller, plant: Simulator, course: Timetable, *, title: str, speed: float | None = None
 ) -> History:
     """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible."""
     endpoint, history = SimulatedPlant(plant, course), History()
@@ -172,7 +172,7 @@ def _ending(act: Callable[P, T], failed: list[Exception]) -> Callable[P, T]:
     return call
 
 
-def _plant_of(manifest: Manifest) -> tuple[Plant, Case | None]:
+def _plant_of(manifest: Manifest) -> tuple[Simulator, Case | None]:
     """The plant that the controller was made for, and its case if it has one."""
     case = CASES.get(manifest.case)
     if case is None and manifest.case not in PLANTS:

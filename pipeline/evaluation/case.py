@@ -16,7 +16,8 @@ from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import rmse
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.simulator import Simulator
 from pipeline.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -100,8 +101,8 @@ class Case(ABC):
 
     name: ClassVar[str]
     title: ClassVar[str]
-    plant_class: ClassVar[type[Plant]]
-    further_plants: ClassVar[tuple[type[Plant], ...]] = ()  # that some of its tests run on
+    plant_class: ClassVar[type[Simulator]]
+    further_plants: ClassVar[tuple[type[Simulator], ...]] = ()  # that some of its tests run on
     development_seeds: ClassVar[tuple[int, ...]]  # for tuning and selection, never scored
     noise: ClassVar[Mapping[str, float]]  # PV -> standard deviation of its measurement noise
     gate: ClassVar[Mapping[str, float]]  # scenario -> weight in the promotion gate, summing to 1
@@ -133,7 +134,7 @@ class Case(ABC):
             )
 
     @cached_property
-    def plant(self) -> Plant:
+    def plant(self) -> Simulator:
         """The nominal plant; raises PlantError where ``plant_class`` is abstract."""
         lacking = ", ".join(sorted(self.plant_class.__abstractmethods__))
         if lacking:
@@ -142,6 +143,11 @@ class Case(ABC):
                 "write that, or name another class as plant_class"
             )
         return self.plant_class()
+
+    @property
+    def equations(self) -> EquationPlant:
+        """The nominal plant in its equations; PlantError where it has none."""
+        return equations(self.plant, f"what was asked of case {self.name!r}")
 
     @property
     def regions(self) -> Mapping[str, tuple[float, float]]:

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import locked_up
 from pipeline.evaluation.metric import mean_of_draws, together
-from pipeline.plants.base import Array
+from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from pipeline.simulation.simulate import Trajectory, simulate_closed
 from serving.controller import Controller

@@ -9,9 +9,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from pipeline.errors import ParamsError
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
-from pipeline.simulation.simulate import measured, noise_draws, simulate_open
+from pipeline.simulation.simulate import noise_draws, simulate_open
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class Excitation(ABC):
         self.require("samples", 1)
 
     @abstractmethod
-    def run(self, plant: Plant, seed: int) -> Record:
+    def run(self, plant: Simulator, seed: int) -> Record:
         """The record of the experiment; the same for the same seed."""
 
     def require(self, name: str, least: float, most: float = np.inf) -> None:
@@ -57,7 +57,7 @@ class OpenLoop(Excitation):
         Whether levels are spread evenly over the range, or evenly over its logarithm: where an MV acts by
         its ratio (a flow by the time that it leaves), even levels hardly visit the low end.
     start : tuple of float
-        State at sample 0; empty: where the plant's experiments start (``Plant.start``).
+        State at sample 0; empty: where the plant's experiments start (``Simulator.start``).
     """
 
     low: float | None = None
@@ -69,14 +69,16 @@ class OpenLoop(Excitation):
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
         """The MVs on [0, 1], shape (samples, n_mv)."""
 
-    def run(self, plant: Plant, seed: int) -> Record:
+    def run(self, plant: Simulator, seed: int) -> Record:
         """The record of one run; the MVs and the noise come from ``seed``."""
         rng = np.random.default_rng(seed)
         mv = self.levels(plant, self.unit_sequence(len(plant.mv_signals), rng))
         x = simulate_open(plant, self.initial_state(plant), mv)[:-1]
-        return Record.of(plant, measured(plant, x) + noise_draws(plant, len(x), self.noise, rng), mv)
+        return Record.of(
+            plant.signals, plant.measured(x) + noise_draws(plant, len(x), self.noise, rng), mv, dv=plant.dv_nominal
+        )
 
-    def levels(self, plant: Plant, unit: Array) -> Array:
+    def levels(self, plant: Simulator, unit: Array) -> Array:
         """The MVs for values on [0, 1], shape (n, n_mv): over the range, of a discrete MV its values by equal shares.
 
         Raises ParamsError where ``low`` and ``high`` leave the signals' ranges, or leave a discrete MV no value.
@@ -96,7 +98,7 @@ class OpenLoop(Excitation):
                 mv[:, i] = allowed[np.minimum((unit[:, i] * len(allowed)).astype(np.int64), len(allowed) - 1)]
         return mv
 
-    def limits(self, plant: Plant) -> tuple[Array, Array]:
+    def limits(self, plant: Simulator) -> tuple[Array, Array]:
         """Lowest and highest MVs, shape (n_mv,); ParamsError where they leave the signals' ranges."""
         low = np.array([s.low if self.low is None else self.low for s in plant.mv_signals])
         high = np.array([s.high if self.high is None else self.high for s in plant.mv_signals])
@@ -113,6 +115,6 @@ class OpenLoop(Excitation):
                 )
         return low, high
 
-    def initial_state(self, plant: Plant) -> Array:
+    def initial_state(self, plant: Simulator) -> Array:
         """State at sample 0, shape (n_x,)."""
         return np.array(self.start) if self.start else plant.start[0]

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError
 from pipeline.excitation.base import OpenLoop
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
-from pipeline.simulation.simulate import measured, noise_draws, simulate_batch
+from pipeline.simulation.simulate import noise_draws, simulate_batch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +62,7 @@ class Batches(OpenLoop):
             self.require(name, 0, 1)
         self.require("binary", 0, 1 - self.constant)
 
-    def run(self, plant: Plant, seed: int) -> Record:
+    def run(self, plant: Simulator, seed: int) -> Record:
         """The record of all batches; levels, starts and noise come from ``seed``.
 
         Raises ParamsError for a spread that does not fit the plant's states.
@@ -70,8 +71,10 @@ class Batches(OpenLoop):
         mv = self.levels(plant, self.unit_sequence(len(plant.mv_signals), rng))
         moves = mv.reshape(self.batches, self.samples, -1)
         x = simulate_batch(plant, self.initial_states(plant, rng), moves)[:, :-1]
-        pv = measured(plant, x.reshape(len(mv), -1)) + noise_draws(plant, len(mv), self.noise, rng)
-        return Record.of(plant, pv, mv, run=np.repeat(np.arange(self.batches), self.samples))
+        pv = plant.measured(x.reshape(len(mv), -1)) + noise_draws(plant, len(mv), self.noise, rng)
+        return Record.of(
+            plant.signals, pv, mv, run=np.repeat(np.arange(self.batches), self.samples), dv=plant.dv_nominal
+        )
 
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
         """The MVs of all batches on [0, 1], one batch after the other, shape (batches * samples, n_mv)."""
@@ -90,15 +93,15 @@ class Batches(OpenLoop):
         after = np.arange(self.samples) - first
         return np.where(after < 0, 0, 1 + after // self.hold)
 
-    def initial_states(self, plant: Plant, rng: np.random.Generator) -> Array:
+    def initial_states(self, plant: Simulator, rng: np.random.Generator) -> Array:
         """State at the start of each batch, shape (batches, n_x)."""
-        states = plant.state_signals
-        spread = np.array(self.start_spread or np.zeros(len(states)))
-        if spread.shape != (len(states),) or not np.all(np.isfinite(spread) & (spread >= 0)):
-            names = ", ".join(s.name for s in states)
+        states = plant.state_signals if isinstance(plant, EquationPlant) else ()
+        spread = np.array(self.start_spread or np.zeros(plant.n_x))
+        if spread.shape != (plant.n_x,) or not np.all(np.isfinite(spread) & (spread >= 0)):
+            names = ", ".join(s.name for s in states) or str(plant.n_x)
             raise ParamsError(
                 f"excitation {self.kind!r}: start_spread is {list(self.start_spread)}; "
                 f"give one standard deviation >= 0 for each state of {plant.name!r}: {names}"
             )
-        x0 = self.initial_state(plant) + spread * rng.standard_normal((self.batches, len(states)))
-        return np.clip(x0, [s.low for s in states], [s.high for s in states])
+        x0 = self.initial_state(plant) + spread * rng.standard_normal((self.batches, plant.n_x))
+        return np.clip(x0, [s.low for s in states], [s.high for s in states]) if states else x0

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
 from pipeline.excitation.base import Excitation
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
-from pipeline.simulation.simulate import measured, noise_draws, simulate_batch
+from pipeline.simulation.simulate import noise_draws, simulate_batch
 from pipeline.tuning.rules import AllPole, PidSettings, imc_pid, robust_imc
 
 
@@ -107,7 +108,7 @@ class OperatingPoint(Excitation):
         for name in ("near_fraction", "end_fraction"):
             self.require(name, 0, 1)
 
-    def run(self, plant: Plant, seed: int) -> Record:
+    def run(self, plant: Simulator, seed: int) -> Record:
         """The record: closed-loop runs, each followed by the short runs from its states.
 
         Raises PlantError for a plant with more than one MV.
@@ -120,7 +121,7 @@ class OperatingPoint(Excitation):
         loops = [self.closed_loop(plant, pid, int(n), rng) for n in lengths]
         return self.with_moves(plant, loops, rng)
 
-    def set_points(self, plant: Plant) -> tuple[float, float]:
+    def set_points(self, plant: Simulator) -> tuple[float, float]:
         """Lowest and highest set point."""
         sp = plant.sp_signals[0]
         rim = 0.02 * (sp.high - sp.low)
@@ -133,16 +134,19 @@ class OperatingPoint(Excitation):
             )
         return low, high
 
-    def settings(self, plant: Plant) -> PidSettings:
+    def settings(self, plant: Simulator) -> PidSettings:
         """The PID that holds the plant at its set points."""
         if self.kc is not None:
             return PidSettings(self.kc, np.inf if self.ti_s is None else self.ti_s, self.td_s)
         cv = sum(self.set_points(plant)) / 2 if self.tune_cv is None else self.tune_cv
-        lin = plant.linearize(*plant.steady_state_at(cv))
+        known = equations(plant, f"excitation {self.kind!r} without its own kc and ti_s")
+        lin = known.linearize(*known.steady_state_at(cv))
         return robust_imc(lin, plant.period_s) if self.filter_s is None else imc_pid(AllPole.of(lin), self.filter_s)
 
-    def closed_loop(self, plant: Plant, pid: PidSettings, n: int, rng: np.random.Generator) -> Loop:
+    def closed_loop(self, plant: Simulator, pid: PidSettings, n: int, rng: np.random.Generator) -> Loop:
         """One run of n samples around random set points, from the steady state of a random one.
+
+        A plant without equations begins every run where it starts.
 
             v(k) = v(k-1) + Kc [ e(k) - e(k-1) + (h/Ti) e(k) - (Td/h) (y - 2 y1 + y2) ],  mv = v + dither
 
@@ -152,14 +156,15 @@ class OperatingPoint(Excitation):
         low, high, h = plant.mv_signals[0].low, plant.mv_signals[0].high, plant.period_s
         reach = 0.05 * (high - low) if self.dither is None else self.dither
         step, dv, p = plant.stepper(), plant.dv_nominal, plant.parameters()
-        state, steady_mv = plant.steady_state_at(float(rng.uniform(sp_low, sp_high)))
+        first = float(rng.uniform(sp_low, sp_high))
+        state, steady_mv = plant.steady_state_at(first) if isinstance(plant, EquationPlant) else plant.start
         noise = noise_draws(plant, n, self.noise, rng)
         x, pv, mv = np.empty((n, len(state))), np.empty((n, noise.shape[1])), np.empty((n, 1))
         v, past, left = float(steady_mv[0]), None, 0
         sp = dither = 0.0
         for k in range(n):
             x[k] = state
-            pv[k] = measured(plant, state) + noise[k]
+            pv[k] = plant.measure(state) + noise[k]
             if left == 0:
                 sp, left = (
                     float(rng.uniform(sp_low, sp_high)),
@@ -177,7 +182,7 @@ class OperatingPoint(Excitation):
             state = step(state, mv[k], dv, p)
         return Loop(x, pv, mv)
 
-    def with_moves(self, plant: Plant, loops: Sequence[Loop], rng: np.random.Generator) -> Record:
+    def with_moves(self, plant: Simulator, loops: Sequence[Loop], rng: np.random.Generator) -> Record:
         """The record of the loops and of held moves restarted from their states."""
         visited = np.concatenate([loop.x for loop in loops])
         used = np.concatenate([loop.mv for loop in loops])
@@ -189,7 +194,7 @@ class OperatingPoint(Excitation):
         # The last row shows where the last move led; its MV acts on nothing any more.
         move = np.hstack([move, move[:, -1:]])
         noise = noise_draws(plant, self.restarts * rows, self.noise, rng)
-        pv = (measured(plant, x).reshape(len(noise), -1) + noise).reshape(self.restarts, rows, -1)
+        pv = (plant.measured(x).reshape(len(noise), -1) + noise).reshape(self.restarts, rows, -1)
         ends = np.searchsorted(pick, np.cumsum([len(loop.x) for loop in loops]))
         pvs: list[Array] = []
         mvs: list[Array] = []
@@ -199,9 +204,15 @@ class OperatingPoint(Excitation):
             mvs += [loop.mv, move[start:end].reshape(-1, 1)]
             lengths += [np.array([len(loop.x)]), np.full(end - start, rows)]
         length = np.concatenate(lengths)
-        return Record.of(plant, np.concatenate(pvs), np.concatenate(mvs), run=np.repeat(np.arange(len(length)), length))
+        return Record.of(
+            plant.signals,
+            np.concatenate(pvs),
+            np.concatenate(mvs),
+            run=np.repeat(np.arange(len(length)), length),
+            dv=plant.dv_nominal,
+        )
 
-    def sequence(self, plant: Plant, used: Array, rng: np.random.Generator) -> Array:
+    def sequence(self, plant: Simulator, used: Array, rng: np.random.Generator) -> Array:
         """The MVs of each short run, shape (restarts, moves): over the whole range, the first maybe near ``used``."""
         signal = plant.mv_signals[0]
         shape = (len(used), self.moves)

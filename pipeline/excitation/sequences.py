@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError
 from pipeline.excitation.base import OpenLoop
-from pipeline.plants.base import Array
+from pipeline.plants.simulator import Array
 
 TAPS: dict[int, tuple[int, ...]] = {
     2: (2, 1),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.laws.base import ControlLaw, LawSignals
+from pipeline.laws.base import ControlLaw
 from pipeline.laws.fuzzy.fuzzy_feedforward import FuzzyFeedforward
 from pipeline.laws.fuzzy.fuzzy_feedforward_observer import FuzzyFeedforwardObserver
 from pipeline.laws.fuzzy.fuzzy_feedforward_pi import FuzzyFeedforwardPi
@@ -42,4 +42,4 @@ LAWS: dict[str, type[ControlLaw]] = {
     ForwardDob.name: ForwardDob,
 }
 
-__all__ = ["LAWS", "ControlLaw", "LawSignals"]
+__all__ = ["LAWS", "ControlLaw"]

@@ -10,9 +10,9 @@ from scipy.special import chdtri
 from torch import Tensor, nn
 
 from pipeline.errors import LawError
-from pipeline.laws.base import LawSignals
 from pipeline.laws.gain_update import PidForm, gain_update
 from pipeline.models.memory import Named, Slot, constant
+from pipeline.plants.signals import Signals
 
 Three = tuple[float, float, float]
 CONFIDENCE = 0.99  # of the update criterion: noise alone trips it in one sample of a hundred
@@ -85,7 +85,7 @@ class AdaptiveParams:
             raise ValueError(f"noise_variance is {self.noise_variance}; it must be above 0")
 
 
-def signed_unit(signals: LawSignals, plant_gain: str, model_slope: float) -> float:
+def signed_unit(signals: Signals, plant_gain: str, model_slope: float) -> float:
     """One unit of move [mv]: half the MV's range, in the direction that raises the controlled variable.
 
     ``model_slope`` is the model's dPV/dMV, which decides for ``auto``. Raises LawError where it is 0.
@@ -165,7 +165,7 @@ class AdaptiveGains(nn.Module):
     slope_min: Tensor  # (1,)
     by_unit: Tensor  # (1,) 1/unit
 
-    def __init__(self, params: AdaptiveParams, signals: LawSignals, unit: float, start: Three) -> None:
+    def __init__(self, params: AdaptiveParams, signals: Signals, unit: float, start: Three) -> None:
         super().__init__()
         self.filtered = params.momentum > 0
         self.window = 0 if params.window is None else params.window

@@ -13,26 +13,10 @@ from torch import Tensor, nn
 
 from pipeline.errors import LawError
 from pipeline.models.base import Model
-from pipeline.plants.base import Array, Plant
-from serving.manifest import Signal
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array, Simulator
 
 M = TypeVar("M", bound=Model)
-
-
-@dataclass(frozen=True, slots=True)
-class LawSignals:
-    """The signals of a law: set points, process variables, measured disturbances, MVs, and the period."""
-
-    period_s: float
-    sp: tuple[Signal, ...]
-    pv: tuple[Signal, ...]
-    dv: tuple[Signal, ...]
-    mv: tuple[Signal, ...]
-
-    @classmethod
-    def of(cls, plant: Plant) -> Self:
-        """The signals of a controller for ``plant``."""
-        return cls(plant.period_s, plant.sp_signals, plant.pv_signals, plant.dv_signals, plant.mv_signals)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +65,7 @@ def require_kind(models: Mapping[str, Model], cls: type[M], law: str) -> M:
     return model
 
 
-def require_single_loop(signals: LawSignals, law: str) -> None:
+def require_single_loop(signals: Signals, law: str) -> None:
     """Raise LawError unless there is one set point and one MV."""
     if len(signals.sp) != 1 or len(signals.mv) != 1:
         raise LawError(
@@ -111,7 +95,7 @@ class ControlLaw(nn.Module, ABC):
     high: Tensor  # (n_mv,)
     rate: Tensor | None  # (n_mv,) largest change a sample; None where unlimited
 
-    def __init__(self, signals: LawSignals, mv_rate: float | None = None) -> None:
+    def __init__(self, signals: Signals, mv_rate: float | None = None) -> None:
         super().__init__()
         self.signals = signals
         self.register_buffer("low", torch.tensor([s.low for s in signals.mv], dtype=torch.float64))
@@ -124,10 +108,11 @@ class ControlLaw(nn.Module, ABC):
 
     @classmethod
     @abstractmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with numbers from ``params`` and models by part name; raises LawError.
 
-        ``plant`` is for laws that are tuned in simulation; a law from data alone ignores it.
+        ``plant`` is for laws that are tuned in simulation; a law from data alone ignores it. A law that needs
+        a simulator, or its equations, and has none raises PlantError.
         """
 
     @abstractmethod
@@ -137,10 +122,10 @@ class ControlLaw(nn.Module, ABC):
         """One step."""
 
     @classmethod
-    def check(cls, params: Any, models: Mapping[str, Model], plant: Plant) -> None:
+    def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError where ``design`` would refuse the plant; without training, so ``models`` may lack parts."""
 
-    def analysis(self, plant: Plant) -> Analysis:
+    def analysis(self, plant: Simulator | None) -> Analysis:
         """What the law says of itself beside its closed loops over ``plant``; nothing, unless it has a theory."""
         return Analysis()
 

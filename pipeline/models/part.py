@@ -16,7 +16,8 @@ from pipeline.errors import ModelError
 from pipeline.metrics import per_region, r2, rmse
 from pipeline.models.base import Model
 from pipeline.models.training.regressors import Pairs, forward_pairs, inverse_pairs
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 
 if TYPE_CHECKING:
@@ -44,8 +45,14 @@ class Part(ABC):
     model: ClassVar[type[Model]]
 
     @abstractmethod
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
-        """The trained model; ``regions`` (ranges of the controlled variable) are for the figures only."""
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
+        """The trained model; ``regions`` (ranges of the controlled variable) are for the figures only.
+
+        ``plant`` is for parts that are made from equations, or compared with the plant itself; PlantError where one
+        needs it and has none. The others know the signals alone.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +70,7 @@ class StaticPart(Part):
     train_fraction: float = 0.7
     split: Literal["time", "random"] = "time"
 
-    def pairs(self, record: Record | None, plant: Plant) -> Pairs:
+    def pairs(self, record: Record | None, signals: Signals) -> Pairs:
         """All pairs of the record; raises ParamsError for an unknown target, ModelError without a record."""
         if record is None:
             raise ModelError(
@@ -71,24 +78,24 @@ class StaticPart(Part):
             )
         if self.task == "inverse":
             return inverse_pairs(record, self.horizon)
-        names = {s.name: i for i, s in enumerate(plant.pv_signals)}
+        names = {s.name: i for i, s in enumerate(signals.pv)}
         target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
         return forward_pairs(record, self.horizon, target)
 
-    def limits(self, plant: Plant) -> tuple[float, float] | None:
+    def limits(self, signals: Signals) -> tuple[float, float] | None:
         """Range of an inverse's output, the MV's; a forward model's is not limited."""
-        mv = plant.mv_signals[0]
+        mv = signals.mv[0]
         return (mv.low, mv.high) if self.task == "inverse" else None
 
-    def unit(self, plant: Plant) -> str:
+    def unit(self, signals: Signals) -> str:
         """Unit of the output."""
         if self.task == "inverse":
-            return plant.mv_signals[0].unit
-        return next((s.unit for s in plant.pv_signals if s.name == self.target), plant.pv_signals[0].unit)
+            return signals.mv[0].unit
+        return next((s.unit for s in signals.pv if s.name == self.target), signals.pv[0].unit)
 
-    def scored(self, model: Model, pairs: Pairs, plant: Plant, regions: Regions) -> dict[str, Any]:
+    def scored(self, model: Model, pairs: Pairs, signals: Signals, regions: Regions) -> dict[str, Any]:
         """RMSE and R2 over some pairs, overall and by the region of cv(k), predictions limited as in use."""
-        predicted = self.limited(predict(model, pairs.x), plant)
+        predicted = self.limited(predict(model, pairs.x), signals)
         cv = pairs.x[:, 0]
         counts = per_region(lambda a, _: float(len(a)), pairs.y, predicted, cv, regions)
         errors = per_region(rmse, pairs.y, predicted, cv, regions)
@@ -98,9 +105,9 @@ class StaticPart(Part):
             "regions": {name: {"rmse": errors[name], "n": int(counts[name])} for name in errors},
         }
 
-    def limited(self, predicted: Array, plant: Plant) -> Array:
+    def limited(self, predicted: Array, signals: Signals) -> Array:
         """Predictions within the output's range."""
-        limits = self.limits(plant)
+        limits = self.limits(signals)
         return predicted if limits is None else predicted.clip(*limits)
 
 

@@ -18,7 +18,7 @@ from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import together
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant, equations
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = dict[str, dict[str, dict[str, float]]]
@@ -46,7 +46,7 @@ def kinds(case: Case) -> tuple[str, ...]:
     observer for it would be one more controller, and no bound. So it is where samples follow
     one another quickly, and an NMPC without a filter is busy with the noise (``Effort.noisy``).
     """
-    noisy = case.plant.measures_states and case.effort.noisy
+    noisy = isinstance(case.plant, EquationPlant) and case.plant.measures_states and case.effort.noisy
     return ("nmpc", "offline", "nmpc_noise") if noisy else ("nmpc", "offline")
 
 
@@ -54,16 +54,16 @@ def problem(case: Case) -> dict[str, Any]:
     """What the bounds of a whole case depend on, beside the scenarios: stored, and compared with what is stored."""
     found = {key: getattr(case, key) for key in DEFAULTS} | {"limits": dict(case.limits), "effort": asdict(case.effort)}
     as_read: dict[str, Any] = json.loads(json.dumps(found))
-    return {"plant": plant_digest(case.plant), **as_read}
+    return {"plant": plant_digest(equations(case.plant, f"a bound of case {case.name!r}")), **as_read}
 
 
 def bounded(case: Case, scenarios: Sequence[Scenario]) -> bool:
     """Whether a test has bounds: not where it runs on a map from sample to sample, which no solver here plans over."""
     plants = (type(s.plant or case.plant) for s in scenarios)
-    return all(plant.transition is Plant.transition for plant in plants)
+    return all(issubclass(p, EquationPlant) and p.transition is EquationPlant.transition for p in plants)
 
 
-def plant_digest(plant: Plant) -> str:
+def plant_digest(plant: EquationPlant) -> str:
     """sha256 of the plant's equations, parameters and sampling; comments and layout do not count.
 
     An output of its own mostly calls other functions, so it counts by its values over the states'
@@ -83,7 +83,7 @@ def plant_digest(plant: Plant) -> str:
     return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
 
-def _probe(plant: Plant) -> list[str]:
+def _probe(plant: EquationPlant) -> list[str]:
     signals = (*plant.state_signals, *plant.mv_signals)
     low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
     found = []

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from serving.manifest import Signal
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ def scaling(signals: tuple[Signal, ...]) -> tuple[Array, Array]:
     return low, np.array([s.high for s in signals]) - low
 
 
-def collocation(plant: Plant, elements: int, degree: int) -> ca.Function:
+def collocation(plant: EquationPlant, elements: int, degree: int) -> ca.Function:
     """Defects of one period by Radau collocation: (x, z, u, p) -> (n_x * points,).
 
     States x (n_x,) at its start and z (n_x * points,) at its ``elements * degree`` points, and MVs
@@ -44,7 +44,7 @@ def collocation(plant: Plant, elements: int, degree: int) -> ca.Function:
     return ca.Function("collocation", [x, ca.vec(z), u, p], [ca.vertcat(*defects)])
 
 
-def trace(plant: Plant, elements: int, degree: int) -> ca.Function:
+def trace(plant: EquationPlant, elements: int, degree: int) -> ca.Function:
     """States at the collocation points of one period by RK4, in their units: (x, mv, p) -> (n_x, points)."""
     x = ca.SX.sym("x", len(plant.state_signals))
     mv = ca.SX.sym("mv", len(plant.mv_signals))

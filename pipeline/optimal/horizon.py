@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PlantError
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.optimal.collocation import collocation, scaling, trace
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class Horizon:
 
     def __init__(
         self,
-        plant: Plant,
+        plant: EquationPlant,
         n: int,
         *,
         metric: Metric = METRICS["mae"],
@@ -148,7 +148,7 @@ class Horizon:
     def _controlled(self) -> ca.Function:
         """Controlled variables in fractions of their ranges, from a scaled state."""
         x = ca.SX.sym("x", self._n_x)
-        pv = self.plant.measure(self._x_low + self._x_span * x)
+        pv = self.plant.measurement(self._x_low + self._x_span * x)
         return ca.Function("controlled", [x], [pv[: self._n_cv] / self._cv_span])
 
     def solve(self, x0: Array, sp: Array, p: Array, start: Plan) -> Plan:
@@ -187,7 +187,7 @@ class Horizon:
         n_z = self._n_x * self._points
         x = np.vstack([x0, self._x_low + self._x_span * values[n_z - self._n_x : n_z].T])
         mv = self._mv_low + self._mv_span * np.clip(values[n_z : n_z + self._n_mv].T, 0.0, 1.0)
-        cv = np.array(self.plant.measure(x[1:].T)).T[:, : self._n_cv]
+        cv = self.plant.measured(x[1:])[:, : self._n_cv]
         error = np.abs(sp - cv) / self._cv_span
         cost = float(np.sum(error**2 if self._squared else error))
         return Plan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), iterations, values, multipliers)
@@ -246,7 +246,7 @@ class Horizon:
                 trial[0] = self._mv_low[0] + fraction * self._mv_span[0]
                 for _ in range(reach):
                     x = step(x, trial, dv, p[k])
-                return float(sp[k, 0]) - float(np.array(self.plant.measure(x))[0, 0])
+                return float(sp[k, 0]) - float(self.plant.measure(x)[0])
 
             if k < len(given):
                 mv[:] = given[k]
@@ -256,7 +256,7 @@ class Horizon:
             x = passed[-1]
             values[:n_z, k] = ((passed - self._x_low) / self._x_span).ravel()
             values[n_z : n_z + self._n_mv, k] = (mv - self._mv_low) / self._mv_span
-            error = (sp[k] - np.array(self.plant.measure(x))[: self._n_cv, 0]) / self._cv_span
+            error = (sp[k] - self.plant.measure(x)[: self._n_cv]) / self._cv_span
             values[n_z + self._n_mv :, k] = error if self._squared else np.abs(error)
         return self._plan(np.asarray(x0), sp, values)
 

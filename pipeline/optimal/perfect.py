@@ -31,9 +31,9 @@ from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.optimal.horizon import Horizon, Plan
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import measured, noise_draws
+from pipeline.simulation.simulate import noise_draws
 
 Array = NDArray[np.float64]
 Score = Callable[[Scenario, Array, Array], dict[str, float]]
@@ -57,7 +57,7 @@ class PerfectNmpc:
     """
 
     def __init__(
-        self, plant: Plant, metric: Metric = MAE, effort: Effort = DEFAULT, limits: Limits | None = None
+        self, plant: EquationPlant, metric: Metric = MAE, effort: Effort = DEFAULT, limits: Limits | None = None
     ) -> None:
         self.plant, self._every = plant, effort.every
         self._reaches = effort.reaches
@@ -172,7 +172,7 @@ def run_nmpc(
 
 
 def run_offline(
-    plant: Plant,
+    plant: EquationPlant,
     scenario: Scenario,
     metric: Metric = MAE,
     recipe: bool = False,
@@ -214,8 +214,8 @@ def _course(scenario: Scenario, recipe: bool) -> Array:
     return scenario.sp if scenario.reference is None or not recipe else scenario.reference
 
 
-def _figures(plant: Plant, scenario: Scenario, x: Array, mv: Array, score: Score | None) -> dict[str, float]:
-    pv, actual = measured(plant, x), plant.actual(mv)
+def _figures(plant: EquationPlant, scenario: Scenario, x: Array, mv: Array, score: Score | None) -> dict[str, float]:
+    pv, actual = plant.measured(x), plant.actual(mv)
     if score is not None:
         return score(scenario, pv, actual)
     span = plant.sp_signals[0].high - plant.sp_signals[0].low

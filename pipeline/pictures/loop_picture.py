@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import mv_travel
-from pipeline.plants.base import Plant
+from pipeline.plants.simulator import Simulator
 from serving.manifest import Signal
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ class History:
     reason: list[str] = field(default_factory=list)
 
 
-def summary(plant: Plant, history: History, metric: Metric = METRICS["mae"]) -> str:
+def summary(plant: Simulator, history: History, metric: Metric = METRICS["mae"]) -> str:
     """The error of each controlled variable in the case's metric and at the end, MV travel, faults; one line each."""
     sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
     lines = []
@@ -58,7 +58,7 @@ def summary(plant: Plant, history: History, metric: Metric = METRICS["mae"]) -> 
     return "\n".join(lines)
 
 
-def write_csv(path: Path, plant: Plant, history: History) -> None:
+def write_csv(path: Path, plant: Simulator, history: History) -> None:
     """One row a sample, columns ``NAME [unit]``; PipelineError where the file cannot be written."""
     header = ["time_s", "mode"]
     header += [f"SP {s.name} [{s.unit}]" for s in plant.sp_signals]
@@ -77,7 +77,7 @@ def write_csv(path: Path, plant: Plant, history: History) -> None:
     _replace(path, write)
 
 
-def draw(path: Path, plant: Plant, history: History, title: str, marks: Mapping[float, str]) -> None:
+def draw(path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str]) -> None:
     """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-if TYPE_CHECKING:
-    from pipeline.plants.base import Plant
+from serving.manifest import Signal
 
 Array = NDArray[np.float64]
 
@@ -26,17 +26,18 @@ class SteadyStates:
     Each unknown is scaled by its signal's range, the derivative by range and period.
     """
 
-    def __init__(self, plant: Plant) -> None:
-        signals = (*plant.state_signals, *plant.mv_signals)
-        self.low = np.array([s.low for s in signals])
-        self.span = np.array([s.high - s.low for s in signals])
-        self.range = plant.sp_signals[0]
-        z, cv = ca.SX.sym("z", len(signals)), ca.SX.sym("cv")
+    def __init__(
+        self, rate: Callable[[Any, Any], Any], cv_of: Callable[[Any], Any], unknown: Sequence[Signal], cv_signal: Signal
+    ) -> None:
+        """``rate(x, mv)`` is dx/dt per period, ``cv_of(x)`` the CV; ``unknown``: the signals of x, then of the MV."""
+        self.low = np.array([s.low for s in unknown])
+        self.span = np.array([s.high - s.low for s in unknown])
+        self.range = cv_signal
+        z, cv = ca.SX.sym("z", len(unknown)), ca.SX.sym("cv")
         v = self.low + self.span * z
         x, mv = v[:-1], v[-1:]
-        rate = plant.rate(x, mv, plant.dv_nominal, plant.parameters()) * (plant.period_s / plant.time_unit_s)
-        miss = (plant.measure(x)[0] - cv) / (self.range.high - self.range.low)
-        balance = ca.vertcat(rate / self.span[:-1], miss)
+        miss = (cv_of(x) - cv) / (self.range.high - self.range.low)
+        balance = ca.vertcat(rate(x, mv) / self.span[:-1], miss)
         self.balance = ca.Function("balance", [z, cv], [balance, ca.densify(ca.jacobian(balance, z))])
 
     def at(self, cv: float, guess: tuple[Array, float] | None) -> tuple[Array, float] | None:

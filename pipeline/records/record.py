@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
 from pipeline.records.record_file import Table, column_name, read_table, write_table
 from serving.manifest import Signal
 
@@ -70,14 +71,18 @@ class Record:
 
     @classmethod
     def of(
-        cls, plant: Plant, pv: Array, mv: Array, *, run: NDArray[np.int64] | None = None, dv: Array | None = None
+        cls, signals: Signals, pv: Array, mv: Array, *, run: NDArray[np.int64] | None = None, dv: Array | None = None
     ) -> Self:
-        """The record of experiments on ``plant``, sampled at its period; one run unless ``run`` tells them apart."""
+        """The record of experiments, sampled at the signals' period; one run unless ``run`` tells them apart.
+
+        ``dv`` (n, n_dv), or (n_dv,) where they never changed; only needed where the plant has measured disturbances.
+        """
         n = len(pv)
         run = np.zeros(n, dtype=np.int64) if run is None else np.asarray(run, dtype=np.int64)
-        dv = np.tile(plant.dv_nominal, (n, 1)) if dv is None else dv
-        time_s = position_in_run(run).astype(np.float64) * plant.period_s
-        return cls(plant.period_s, plant.pv_signals, plant.mv_signals, plant.dv_signals, run, time_s, pv, mv, dv)
+        dv = np.zeros(0) if dv is None else dv
+        dv = np.tile(dv, (n, 1)) if dv.ndim == 1 else dv
+        time_s = position_in_run(run).astype(np.float64) * signals.period_s
+        return cls(signals.period_s, signals.pv, signals.mv, signals.dv, run, time_s, pv, mv, dv)
 
     @classmethod
     def joined(cls, records: Sequence[Record]) -> Self:

@@ -13,8 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Plant
-from pipeline.simulation.simulate import measured
+from pipeline.plants.simulator import Simulator
 from pipeline.simulation.timetable import Timetable
 from serving.guard import Sample
 
@@ -27,7 +26,7 @@ BARS = "▁▂▃▄▅▆▇█"
 class SimulatedPlant:
     """The plant as an endpoint: each write advances it by one period, each read measures it."""
 
-    def __init__(self, plant: Plant, run: Timetable) -> None:
+    def __init__(self, plant: Simulator, run: Timetable) -> None:
         self.plant, self.run = plant, run
         self._step = plant.stepper()
         self._parameters = plant.parameters()
@@ -38,7 +37,7 @@ class SimulatedPlant:
     @property
     def pv(self) -> Array:
         """True process variables, shape (n_pv,)."""
-        return np.asarray(measured(self.plant, self.x))
+        return self.plant.measure(self.x)
 
     def read(self) -> Sample:
         """Process variables with their noise, and the MV that was applied."""
@@ -54,7 +53,7 @@ class SimulatedPlant:
         if not np.isfinite(self.x).all():
             at_s = self.k * self.plant.period_s
             raise PlantError(
-                f"plant {self.plant.name!r} has left what its equations can compute at {at_s:g} s; "
+                f"plant {self.plant.name!r} has left what it can compute at {at_s:g} s; "
                 "give disturbances that it can physically meet"
             )
 
@@ -92,7 +91,7 @@ class View(Protocol):
         """Show one scan; ``mark`` says what happens in it."""
 
 
-def view_of(plant: Plant, title: str, duration_s: float, stream: IO[str]) -> View:
+def view_of(plant: Simulator, title: str, duration_s: float, stream: IO[str]) -> View:
     """A live view on a terminal, plain lines anywhere else."""
     if stream.isatty():
         return TerminalView(plant, title, duration_s, Console(file=stream))
@@ -102,7 +101,7 @@ def view_of(plant: Plant, title: str, duration_s: float, stream: IO[str]) -> Vie
 class PlainView:
     """A line where something happens, and twenty others on the way."""
 
-    def __init__(self, plant: Plant, duration_s: float, stream: IO[str]) -> None:
+    def __init__(self, plant: Simulator, duration_s: float, stream: IO[str]) -> None:
         self.plant, self.stream = plant, stream
         self.every_s, self.next_s = duration_s / 20, 0.0
         self.last: tuple[str, str, tuple[float, ...]] | None = None
@@ -130,7 +129,7 @@ class PlainView:
 class TerminalView:
     """Mode, values and the last minute of each signal, redrawn ten times a second."""
 
-    def __init__(self, plant: Plant, title: str, duration_s: float, console: Console) -> None:
+    def __init__(self, plant: Simulator, title: str, duration_s: float, console: Console) -> None:
         self.plant, self.title, self.duration_s = plant, title, duration_s
         self.recent: deque[Array] = deque(maxlen=max(2, round(WINDOW_S / plant.period_s)))
         self.events: deque[str] = deque(maxlen=4)
@@ -185,7 +184,7 @@ def sparkline(values: Array, low: float, high: float, width: int = WIDTH) -> str
     return "".join(BARS[i] for i in places)
 
 
-def _values(plant: Plant, pv: Array, command: Snapshot) -> str:
+def _values(plant: Simulator, pv: Array, command: Snapshot) -> str:
     parts = [f"SP {s.name} {v:.4g}" for s, v in zip(plant.sp_signals, command.sp, strict=True)]
     parts += [
         f"{s.name} {v:.5g}" + ("" if s.unit == "-" else f" {s.unit}")

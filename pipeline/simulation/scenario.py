@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.simulator import Simulator
 from pipeline.simulation import NOISE_SUFFIX as NOISE_SUFFIX
 
 Array = NDArray[np.float64]
@@ -36,7 +37,7 @@ class Scenario:
     hold: int = 0  # samples per set point; 0: it never moves, or follows a course of its own
     seed: int | None = None  # of a random sequence
     late_from: int = 0  # where above 0: the sample from which `sse_late` counts, once the set point is within reach
-    plant: Plant | None = None  # what the test runs on, where that is not the case's plant
+    plant: Simulator | None = None  # what the test runs on, where that is not the case's plant
     reference: Array | None = None  # (n, 1) what the CV should do, where that is not to be at its set point at once
 
     def __post_init__(self) -> None:
@@ -58,7 +59,7 @@ class Scenario:
         """Number of samples."""
         return len(self.sp)
 
-    def parameters(self, plant: Plant) -> Array:
+    def parameters(self, plant: Simulator) -> Array:
         """The plant's parameter vector over every period, shape (n, n_p).
 
         Raises PlantError where ``changes`` names a parameter that the plant does not have.
@@ -92,7 +93,7 @@ def random_levels(seed: int, count: int, low: float, high: float) -> list[float]
 
 
 def from_rest(
-    plant: Plant,
+    plant: Simulator,
     name: str,
     title: str,
     sp: Array,
@@ -107,13 +108,14 @@ def from_rest(
     where there is no such steady state.
     """
     changes = changes or {}
-    first = _same(plant.with_parameters({key: float(values[0]) for key, values in changes.items()}))
+    nominal = equations(plant, f"test {name!r}, which starts at a steady state,")
+    first = _same(nominal.with_parameters({key: float(values[0]) for key, values in changes.items()}))
     x0, mv0 = first.steady_state_at(float(sp[0, 0]))
     return Scenario(name, title, sp, x0, mv0, changes, hold, seed)
 
 
 @cache
-def _same(plant: Plant) -> Plant:
+def _same(plant: EquationPlant) -> EquationPlant:
     """The first plant with these parameters: it has its steady states already, which take longer than many a test."""
     return plant
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array, Simulator
 
 Step = Callable[[Array, Array, Array], tuple[ArrayLike, ArrayLike]]
 """One step of a controller: (sp (n_sp,), pv (n_pv,), mv_applied (n_mv,)) -> (mv, info); it may keep a state."""
@@ -53,21 +54,15 @@ class Trajectory:
     info: Array  # (n, n_info) what the controller told of its step
 
 
-def measured(plant: Plant, x: Array) -> Array:
-    """Process variables, shape (..., n_pv), of states of shape (..., n_x)."""
-    if plant.measures_states:
-        return x  # the state itself, and a call into CasADi for each sample would cost as much as its step
-    flat = x.reshape(-1, x.shape[-1])
-    return np.array(plant.measure(flat.T)).T.reshape(*x.shape[:-1], -1)
-
-
-def simulate_open(plant: Plant, x0: Array, mv: Array, parameters: Mapping[str, float | Array] | None = None) -> Array:
+def simulate_open(
+    plant: Simulator, x0: Array, mv: Array, parameters: Mapping[str, float | Array] | None = None
+) -> Array:
     """States under a sequence of MVs, shape (n + 1, n_x), the first of them ``x0``.
 
     Parameters
     ----------
-    plant : Plant
-        Integrated by its fixed-step RK4; measured disturbances stay nominal.
+    plant : Simulator
+        Measured disturbances stay nominal.
     x0 : array, shape (n_x,)
         State at sample 0.
     mv : array, shape (n, n_mv)
@@ -83,7 +78,7 @@ def simulate_open(plant: Plant, x0: Array, mv: Array, parameters: Mapping[str, f
     mv = _checked("mv", mv, (len(mv), len(plant.mv_signals)))
     rows = parameter_rows(plant, len(mv), parameters)
     step, dv = plant.stepper(), plant.dv_nominal
-    x = np.empty((len(mv) + 1, len(plant.state_signals)))
+    x = np.empty((len(mv) + 1, plant.n_x))
     x[0] = _checked("x0", x0, x[0].shape)
     for k in range(len(mv)):
         x[k + 1] = step(x[k], mv[k], dv, rows[k])
@@ -91,20 +86,18 @@ def simulate_open(plant: Plant, x0: Array, mv: Array, parameters: Mapping[str, f
     return x
 
 
-def simulate_batch(plant: Plant, x0: Array, mv: Array, parameters: Mapping[str, float] | None = None) -> Array:
+def simulate_batch(plant: Simulator, x0: Array, mv: Array, parameters: Mapping[str, float] | None = None) -> Array:
     """States of many short runs, shape (b, n + 1, n_x), from x0 (b, n_x) under mv (b, n, n_mv).
 
     Raises PlantError as ``simulate_open`` does.
     """
     b, n = mv.shape[:2]
     mv = _checked("mv", mv, (b, n, len(plant.mv_signals)))
-    x = np.empty((b, n + 1, len(plant.state_signals)))
+    x = np.empty((b, n + 1, plant.n_x))
     x[:, 0] = _checked("x0", x0, (b, x.shape[2]))
-    batch = plant.transition.map(b)
-    dv = np.tile(plant.dv_nominal[:, None], (1, b))
-    p = np.tile(plant.parameters(parameters)[:, None], (1, b))
+    advance = plant.many(b, parameters)
     for k in range(n):
-        x[:, k + 1] = np.array(batch(x[:, k].T, mv[:, k].T, dv, p)).T
+        x[:, k + 1] = advance(x[:, k], mv[:, k])
     broken = np.flatnonzero(~np.isfinite(x).all(axis=(1, 2)))
     if broken.size:
         _check_finite(plant, x[broken[0]])
@@ -112,14 +105,14 @@ def simulate_batch(plant: Plant, x0: Array, mv: Array, parameters: Mapping[str, 
 
 
 def simulate_closed(
-    plant: Plant, step: Step, test: LoopTest, *, noise: Sequence[float] | Array | None = None, seed: int = 0
+    plant: Simulator, step: Step, test: LoopTest, *, noise: Sequence[float] | Array | None = None, seed: int = 0
 ) -> Trajectory:
     """Close the loop of a controller over a plant.
 
     Parameters
     ----------
-    plant : Plant
-        Integrated by its fixed-step RK4; measured disturbances stay nominal.
+    plant : Simulator
+        Measured disturbances stay nominal.
     step : callable
         ``step(sp, pv, mv_applied) -> (mv, info)``; at sample 0 ``mv_applied`` is the test's ``mv0``.
     test : LoopTest
@@ -138,14 +131,14 @@ def simulate_closed(
     rows = parameter_rows(plant, n, test.changes)
     deviation = noise_draws(plant, n, noise, np.random.default_rng(seed))
     advance, dv = plant.stepper(), plant.dv_nominal
-    x, pv = np.empty((n, len(plant.state_signals))), np.empty((n, n_pv))
+    x, pv = np.empty((n, plant.n_x)), np.empty((n, n_pv))
     seen, mv = np.empty((n, n_pv)), np.empty((n, n_mv))
     info: list[Array] = []
     state = _checked("x0", test.x0, x.shape[1:])
     applied = _checked("mv0", test.mv0, (n_mv,))
     for k in range(n):
         x[k] = state
-        pv[k] = measured(plant, state)
+        pv[k] = plant.measure(state)
         seen[k] = pv[k] + deviation[k]
         move, told = step(test.sp[k], seen[k], applied)
         applied = _checked("the controller's MV", move, (n_mv,))
@@ -167,7 +160,7 @@ def simulate_closed(
     )
 
 
-def noise_draws(plant: Plant, n: int, noise: Sequence[float] | Array | None, rng: np.random.Generator) -> Array:
+def noise_draws(plant: Simulator, n: int, noise: Sequence[float] | Array | None, rng: np.random.Generator) -> Array:
     """Measurement noise, shape (n, n_pv), Gaussian with one standard deviation a PV; zeros where there is none.
 
     Raises PlantError unless there is one finite standard deviation >= 0 a PV.
@@ -183,7 +176,7 @@ def noise_draws(plant: Plant, n: int, noise: Sequence[float] | Array | None, rng
     return rng.standard_normal((n, len(names))) * std
 
 
-def parameter_rows(plant: Plant, n: int, changes: Mapping[str, float | Array] | None) -> Array:
+def parameter_rows(plant: Simulator, n: int, changes: Mapping[str, float | Array] | None) -> Array:
     """The plant's parameter vector over every period, shape (n, n_p), with changed ones by name.
 
     Raises PlantError for an unknown name or a shape other than () or (n,).
@@ -207,14 +200,15 @@ def _checked(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _check_finite(plant: Plant, x: Array) -> None:
+def _check_finite(plant: Simulator, x: Array) -> None:
     broken = np.flatnonzero(~np.isfinite(x).all(axis=-1))
     if broken.size:
         raise _not_finite(plant, int(broken[0]), x[broken[0]])
 
 
-def _not_finite(plant: Plant, sample: int, x: Array) -> PlantError:
+def _not_finite(plant: Simulator, sample: int, x: Array) -> PlantError:
+    steps = f", or its {plant.substeps} RK4 substeps are too few" if isinstance(plant, EquationPlant) else ""
     return PlantError(
         f"plant {plant.name!r}: the state at sample {sample} is {x}; "
-        f"start and MVs must be ones the plant can have, or its {plant.substeps} RK4 substeps are too few"
+        f"start and MVs must be ones the plant can have{steps}"
     )

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.config.params import nearest
 from pipeline.errors import ParamsError
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.simulator import Simulator
 from pipeline.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -42,7 +43,7 @@ class ManualSpan:
 class Timetable:
     """A run: the plant, set points, start, plant parameters, noise and manual spans, all by sample."""
 
-    plant: Plant
+    plant: Simulator
     sp: Array  # (n, n_sp)
     x0: Array  # (n_x,)
     mv0: Array  # (n_mv,)
@@ -83,7 +84,7 @@ def parse_manual(text: str) -> ManualSpan:
 
 
 def timetable(
-    plant: Plant,
+    plant: Simulator,
     test: Scenario | None = None,
     *,
     set_points: Sequence[Event] = (),
@@ -97,8 +98,8 @@ def timetable(
     """The run that was asked for; ParamsError or PlantError names what cannot be.
 
     Without set points those of ``test`` are taken. A run with set points of its own starts at the
-    steady state of ``start_cv``, or at that in the middle of the set point's range; a test that has
-    a plant of its own is run on that.
+    steady state of ``start_cv``, or at that in the middle of the set point's range; a plant without
+    equations starts at its ``start``. A test that has a plant of its own is run on that.
     """
     sp_signal = plant.sp_signals[0]
     if set_points and len(plant.sp_signals) > 1:
@@ -117,8 +118,7 @@ def timetable(
     changes: dict[str, Array] = {}
     marks: dict[float, str] = {}
     if set_points:
-        start = (sp_signal.low + sp_signal.high) / 2 if start_cv is None else start_cv
-        x0, mv0 = plant.steady_state_at(start)
+        x0, mv0, start = _rest(plant, start_cv)
         spans = [t for s in manual for t in (s.start_s, s.end_s) if math.isfinite(t)]
         last = max([*spans, *(e.time_s for e in (*set_points, *disturbances))])
         n = _samples(plant, duration_s, round(last / plant.period_s) + SETTLE_SAMPLES)
@@ -131,7 +131,7 @@ def timetable(
         chosen = test
         plant = plant if chosen.plant is None else chosen.plant
         n = _samples(plant, duration_s, chosen.samples)
-        x0, mv0 = (chosen.x0, chosen.mv0) if start_cv is None else plant.steady_state_at(start_cv)
+        x0, mv0 = (chosen.x0, chosen.mv0) if start_cv is None else _rest(plant, start_cv)[:2]
         sp = _stretched(chosen.sp, n)
         changes = {name: _stretched(values, n) for name, values in chosen.changes.items()}
         if changes:
@@ -142,7 +142,8 @@ def timetable(
                 f"plant {plant.name!r} has no parameter {event.name!r}{nearest(event.name, plant.parameter_names())}"
             )
         k = _sample(plant, event, n)
-        row = changes.setdefault(event.name, np.full(n, float(getattr(plant, event.name))))
+        nominal = plant.parameters()[plant.parameter_names().index(event.name)]
+        row = changes.setdefault(event.name, np.full(n, nominal))
         row[k:] = event.value
         unit = plant.parameter_units()[event.name]
         text = f"{event.name} = {event.value:g} {unit}".strip()
@@ -158,7 +159,17 @@ def timetable(
     return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks)
 
 
-def _check_manual(plant: Plant, span: ManualSpan) -> None:
+def _rest(plant: Simulator, start_cv: float | None) -> tuple[Array, Array, float]:
+    """(x0, mv0, set point) where a run starts: as ``timetable`` says; where a plant without equations starts."""
+    if start_cv is None and not isinstance(plant, EquationPlant):
+        x0, mv0 = plant.start
+        return x0, mv0, float(plant.measure(x0)[0])
+    sp = plant.sp_signals[0]
+    cv = (sp.low + sp.high) / 2 if start_cv is None else start_cv
+    return *equations(plant, "a start at a chosen controlled variable").steady_state_at(cv), cv
+
+
+def _check_manual(plant: Simulator, span: ManualSpan) -> None:
     """ParamsError unless the span has one value an MV, each in its range or among its allowed values."""
     if span.mv is None:
         return
@@ -186,7 +197,7 @@ def _number(text: str, whole: str, form: str) -> float:
     return value
 
 
-def _samples(plant: Plant, duration_s: float | None, default: int) -> int:
+def _samples(plant: Simulator, duration_s: float | None, default: int) -> int:
     n = default if duration_s is None else math.ceil(duration_s / plant.period_s - 1e-9)
     if not 1 <= n <= MAX_SAMPLES:
         raise ParamsError(
@@ -196,7 +207,7 @@ def _samples(plant: Plant, duration_s: float | None, default: int) -> int:
     return n
 
 
-def _sample(plant: Plant, event: Event, n: int) -> int:
+def _sample(plant: Simulator, event: Event, n: int) -> int:
     k = round(event.time_s / plant.period_s)
     if k >= n:
         raise ParamsError(f"time {event.time_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s")
@@ -208,7 +219,7 @@ def _stretched(values: Array, n: int) -> Array:
     return np.concatenate([values[:n], np.repeat(values[-1:], max(0, n - len(values)), axis=0)])
 
 
-def _noise(plant: Plant, deviations: Sequence[Event], n: int, seed: int) -> Array:
+def _noise(plant: Simulator, deviations: Sequence[Event], n: int, seed: int) -> Array:
     """Gaussian, shape (n, n_pv); each PV has a stream of its own, so that one's noise does not change another's."""
     names = [s.name for s in plant.pv_signals]
     noise = np.zeros((n, len(names)))

@@ -31,6 +31,7 @@ from pipeline.evaluation.case import Case
 from pipeline.evaluation.metric import mean_of_draws
 from pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
+from pipeline.plants.equations import equations
 from pipeline.simulation.scenario import Scenario
 
 NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
@@ -48,7 +49,7 @@ class Job:
 
 def _compute(case: Case, job: Job) -> tuple[Job, dict[str, dict[str, float]], float]:
     begun = time.perf_counter()
-    plant = (job.scenario.plant or case.plant).relaxed()
+    plant = equations(job.scenario.plant or case.plant, f"a bound of case {case.name!r}").relaxed()
     ahead, criterion = case.foreseen, case.criterion
     first = job.kinds[0]
     with threadpool_limits(1):

@@ -109,7 +109,11 @@ def _controller(name: str) -> None:
     if params.model not in models:
         raise ParamsError(f"{where}.model is {params.model!r}; {params.case} has the model sets {_listed(models)}")
     plant = CASES[params.case].plant
-    parts = {k: p.learn(None, plant, {}, 0).model for k, p in _parts(params).items() if isinstance(p, LinearizedPart)}
+    parts = {
+        k: p.learn(None, plant.signals, {}, 0, plant).model
+        for k, p in _parts(params).items()
+        if isinstance(p, LinearizedPart)
+    }
     for place, settings in read.items():
         try:
             law.check(settings, parts, plant)

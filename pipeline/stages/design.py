@@ -22,10 +22,9 @@ from pipeline.errors import LawError
 from pipeline.evaluation.trial import BASE
 from pipeline.export.gate import export
 from pipeline.files import read_json, write_json
-from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.laws import LAWS, ControlLaw
 from pipeline.models import load_model
-from pipeline.plants.base import Array, Plant
-from pipeline.simulation.simulate import measured
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder
 
 
@@ -54,14 +53,14 @@ def _export(
     params: ControllerParams,
     forms: Mapping[str, Any],
     models: Path,
-    plant: Plant,
+    plant: Simulator,
     provenance: Mapping[str, Any],
     data: Mapping[str, str],
     item: tuple[str, int],
 ) -> dict[str, Any]:
     form, seed = item
     parts = {p.stem: load_model(p) for p in sorted((models / f"seed{seed}").glob("*.npz"))}
-    law = LAWS[params.law].design(forms[form], parts, LawSignals.of(plant), plant).eval()
+    law = LAWS[params.law].design(forms[form], parts, plant.signals, plant).eval()
     path = controller_file(params.case, params.law, form, seed)
     origin = {**provenance, "data_seed": seed, "record_sha256": data.get(str(seed))}
     export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
@@ -69,7 +68,7 @@ def _export(
     return row | _analysed(law, plant, analysis_file(params.case, params.law, form, seed))
 
 
-def _analysed(law: ControlLaw, plant: Plant, path: Path) -> dict[str, Any]:
+def _analysed(law: ControlLaw, plant: Simulator, path: Path) -> dict[str, Any]:
     """What the law says of itself, its arrays in a file of their own; nothing of a law that has no analysis."""
     analysis = law.analysis(plant)
     if analysis.arrays:
@@ -79,7 +78,7 @@ def _analysed(law: ControlLaw, plant: Plant, path: Path) -> dict[str, Any]:
     return {"analysis": said} if any(said.values()) else {}
 
 
-def _closed_loop(plant: Plant) -> Callable[[Array], Array]:
+def _closed_loop(plant: Simulator) -> Callable[[Array], Array]:
     """The plant as the parity gate drives it: one period further with each MV."""
     state, _ = plant.start
     step, dv, p = plant.stepper(), plant.dv_nominal, plant.parameters()
@@ -87,7 +86,7 @@ def _closed_loop(plant: Plant) -> Callable[[Array], Array]:
     def drive(mv: Array) -> Array:
         nonlocal state
         state = step(state, mv, dv, p)
-        return measured(plant, state)
+        return plant.measure(state)
 
     return drive
 

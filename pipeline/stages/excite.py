@@ -14,7 +14,7 @@ from pipeline.engine.parallel import parallel_map
 from pipeline.evaluation.case import Case
 from pipeline.excitation import EXCITATIONS, Excitation
 from pipeline.files import write_json
-from pipeline.plants.base import Plant
+from pipeline.plants.simulator import Simulator
 from pipeline.stages.paths import record_folder
 
 
@@ -36,7 +36,7 @@ def excitations(case: Case) -> dict[str, type[Excitation]]:
     return {**EXCITATIONS, **beside(case, "excitations", "EXCITATIONS", {})}
 
 
-def _record(excitation: Excitation, plant: Plant, folder: Path, seed: int) -> tuple[str, dict[str, object]]:
+def _record(excitation: Excitation, plant: Simulator, folder: Path, seed: int) -> tuple[str, dict[str, object]]:
     record = excitation.run(plant, seed)
     record.write(folder / f"seed{seed}.parquet")
     where = plant.region(record.pv[:, 0])

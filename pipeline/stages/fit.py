@@ -83,7 +83,7 @@ def _learn(
 ) -> tuple[str | None, dict[str, Any], Mapping[str, Any] | None]:
     seed, name = item
     record = _record(data[seed], case)
-    learnt = parts[name].learn(record, case.plant, case.regions, seed)
+    learnt = parts[name].learn(record, case.plant.signals, case.regions, seed, case.plant)
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:
         learnt.sweep.save(folder / "sweep.json")
@@ -94,9 +94,12 @@ def _learn(
 @lru_cache(maxsize=1)
 def _record(path: Path | None, case: Case) -> Record | None:
     """The record of a file; the last one is kept, because a seed's parts follow each other."""
-    plant = case.plant
-    signals = {"pv": plant.pv_signals, "mv": plant.mv_signals, "dv": plant.dv_signals}
-    return None if path is None else Record.read(path, **signals, period_s=plant.period_s)
+    signals = case.plant.signals
+    return (
+        None
+        if path is None
+        else Record.read(path, pv=signals.pv, mv=signals.mv, dv=signals.dv, period_s=signals.period_s)
+    )
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

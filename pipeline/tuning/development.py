@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Simulator
 
 Array = NDArray[np.float64]
 
@@ -30,31 +31,39 @@ class DevelopmentLoops:
     They serve the choice of numbers and are never scored: the scored tests are those of the case.
     """
 
-    plant: Plant
+    plant: Simulator
     hold: int  # samples of each set point
     sp: Array  # (n, s) set point of every sequence at every sample
     x0: Array  # (s, n_x)
     mv0: Array  # (s, n_mv)
 
     @classmethod
-    def draw(cls, plant: Plant, seeds: tuple[int, ...], set_points: int, hold: int) -> Self:
+    def draw(cls, plant: Simulator, seeds: tuple[int, ...], set_points: int, hold: int) -> Self:
         """One sequence a seed: ``set_points`` uniform over what the plant can hold, ``hold`` samples each.
 
-        Raises PlantError where nothing was asked for, or the plant has no steady state in its MV's range.
+        A plant without equations starts every sequence where it starts, and its set points are uniform over
+        their signal's range. Raises PlantError where nothing was asked for, or the plant has no steady state
+        in its MV's range.
         """
         if not seeds or set_points < 1 or hold < 1:
             raise PlantError(
                 f"development loops need seeds, set points and a hold; got {seeds}, {set_points} and {hold}"
             )
-        cvs, _, mvs = plant.steady_curve
-        mv = plant.mv_signals[0]
-        held = cvs[(mvs >= mv.low) & (mvs <= mv.high)]
-        if not held.size:
-            raise PlantError(f"plant {plant.name!r} has no steady state with {mv.name} in [{mv.low}, {mv.high}]")
+        if isinstance(plant, EquationPlant):
+            cvs, _, mvs = plant.steady_curve
+            mv = plant.mv_signals[0]
+            held = cvs[(mvs >= mv.low) & (mvs <= mv.high)]
+            if not held.size:
+                raise PlantError(f"plant {plant.name!r} has no steady state with {mv.name} in [{mv.low}, {mv.high}]")
+        else:
+            held = np.array([plant.sp_signals[0].low, plant.sp_signals[0].high])
         inset = MARGIN * (held.max() - held.min())
         low, high = held.min() + inset, held.max() - inset
         levels = np.array([np.random.default_rng(s).uniform(low, high, set_points) for s in seeds])
-        starts = [plant.steady_state_at(float(first)) for first in levels[:, 0]]
+        if isinstance(plant, EquationPlant):
+            starts = [plant.steady_state_at(float(first)) for first in levels[:, 0]]
+        else:
+            starts = [plant.start] * len(levels)
         return cls(
             plant,
             hold,
@@ -74,21 +83,19 @@ class DevelopmentLoops:
         """
         n, s = self.sp.shape
         lanes = (candidates, s)
-        advance = self.plant.transition.map(candidates * s)
-        x = np.tile(self.x0.T, (1, candidates))
-        dv = np.tile(self.plant.dv_nominal[:, None], (1, candidates * s))
-        p = np.tile(self.plant.parameters()[:, None], (1, candidates * s))
+        advance = self.plant.many(candidates * s)
+        x = np.tile(self.x0, (candidates, 1))
         mv = torch.from_numpy(np.tile(self.mv0, (candidates, 1, 1)))
         state = torch.zeros(*lanes, n_state, dtype=torch.float64)
-        seen_dv = torch.from_numpy(dv.T.reshape(*lanes, -1).copy())
+        seen_dv = torch.from_numpy(np.tile(self.plant.dv_nominal, (*lanes, 1)))
         error = np.zeros(lanes)
         with torch.no_grad():
             for k in range(n):
-                pv = np.array(self.plant.measure(x)).T.reshape(*lanes, -1)
+                pv = self.plant.measured(x).reshape(*lanes, -1)
                 weight = k % self.hold if time_weighted else 1
                 error += weight * np.abs(self.sp[k] - pv[..., 0])
                 sp = torch.from_numpy(self.sp[k])[:, None].expand(*lanes, 1)
                 mv, state, _ = step(sp, torch.from_numpy(pv), seen_dv, mv, state)
-                x = np.array(advance(x, mv.reshape(candidates * s, -1).T.numpy(), dv, p))
+                x = advance(x, mv.reshape(candidates * s, -1).numpy())
         total = error.mean(axis=1) / n
         return np.where(np.isfinite(total), total, np.inf)

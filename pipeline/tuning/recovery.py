@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Simulator
 from pipeline.tuning.development import LawStep
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class Recovery:
 
 
 def recover(
-    plant: Plant,
+    plant: Simulator,
     law: LawStep,
     n_state: int,
     starts: Starts,
@@ -66,56 +66,50 @@ def recover(
     arrived, taken, end = np.zeros(n, dtype=bool), np.full(n, float(samples)), starts.x.copy()
     courses = np.full((watched, -(-samples // every), n_x), np.nan)
     at = np.arange(n)  # the loops that still run
-    x, sp, state = starts.x.T.copy(), torch.from_numpy(starts.sp), torch.zeros(n, n_state, dtype=torch.float64)
+    x, sp, state = starts.x.copy(), torch.from_numpy(starts.sp), torch.zeros(n, n_state, dtype=torch.float64)
     mv, inside = torch.from_numpy(starts.mv), np.zeros(n)
-    advance, dv, p = _batch(plant, n)
+    advance, dv = plant.many(n), torch.from_numpy(np.tile(plant.dv_nominal, (n, 1)))
     with torch.inference_mode():
         for k in range(samples):
             if k % every == 0:
-                courses[at[at < watched], k // every] = x.T[at < watched]
-            pv = np.array(plant.measure(x)).T
+                courses[at[at < watched], k // every] = x[at < watched]
+            pv = plant.measured(x)
             inside = np.where(np.abs(pv[:, 0] - sp[:, 0].numpy()) <= band, inside + 1, 0)
             if k % CHECK == 0:
                 done = inside >= holding
                 arrived[at[done]], taken[at[done]] = True, k + 1 - inside[done]
-                end[at[done]] = x.T[done]
+                end[at[done]] = x[done]
                 if done.any():
-                    stay = ~done & np.isfinite(x).all(axis=0)
-                    at, x, inside, pv = at[stay], x[:, stay], inside[stay], pv[stay]
-                    sp, state, mv = sp[stay], state[stay], mv[stay]
+                    stay = ~done & np.isfinite(x).all(axis=1)
+                    at, x, inside, pv = at[stay], x[stay], inside[stay], pv[stay]
+                    sp, state, mv, dv = sp[stay], state[stay], mv[stay], dv[stay]
                     if not len(at):
                         break
-                    advance, dv, p = _batch(plant, len(at))
-            seen_dv = torch.from_numpy(dv.T.copy())
-            mv, state, _ = law(sp, torch.from_numpy(pv), seen_dv, mv, state)
-            x = np.array(advance(x, mv.T.numpy(), dv, p))
-    end[at] = x.T
+                    advance = plant.many(len(at))
+            mv, state, _ = law(sp, torch.from_numpy(pv), dv, mv, state)
+            x = advance(x, mv.numpy())
+    end[at] = x
     return Recovery(arrived, taken, end, courses)
 
 
-def _batch(plant: Plant, n: int) -> tuple[Any, Array, Array]:
-    dv = np.tile(plant.dv_nominal[:, None], (1, n))
-    return plant.transition.map(n), dv, np.tile(plant.parameters()[:, None], (1, n))
-
-
-def other_rests(plant: Plant, samples: int = 1_500, moving: float = 1e-9) -> Array:
+def other_rests(plant: EquationPlant, samples: int = 1_500, moving: float = 1e-9) -> Array:
     """States (n, n_x) at which the plant rests, the MV at one of its ends, outside the range of its set point.
 
     Found from the corners of the states' ranges: a reactor that has gone out, or run away. Empty
     where the plant has none.
     """
     low, high = (np.array([getattr(s, end) for s in plant.state_signals]) for end in ("low", "high"))
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(len(low), -1)
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(len(low), -1).T
     sp, mv = plant.sp_signals[0], plant.mv_signals[0]
     found: list[Array] = []
-    advance, dv, p = _batch(plant, corners.shape[1])
+    advance = plant.many(len(corners))
     for end in (mv.low, mv.high):
         x, before = corners, corners
         for _ in range(samples):
-            before, x = x, np.array(advance(x, np.full((1, x.shape[1]), end), dv, p))
-        cv = np.array(plant.measure(x))[0]
-        still = np.isfinite(x).all(axis=0) & (np.abs(x - before).max(axis=0) <= moving * np.abs(x).max(axis=0))
-        for state in x.T[still & ~((cv >= sp.low) & (cv <= sp.high))]:
+            before, x = x, advance(x, np.full((len(x), 1), end))
+        cv = plant.measured(x)[:, 0]
+        still = np.isfinite(x).all(axis=1) & (np.abs(x - before).max(axis=1) <= moving * np.abs(x).max(axis=1))
+        for state in x[still & ~((cv >= sp.low) & (cv <= sp.high))]:
             if all(np.abs(state - known).max() > 1e-6 * np.abs(state).max() for known in found):
                 found.append(state)
     return np.array(found).reshape(-1, len(low))

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from pipeline.errors import LawError
-from pipeline.plants.base import Linearization
+from pipeline.plants.linearization import Linearization
 
 # Singular values of the Hankel matrix below this share of the largest are rounding.
 RANK = 1e-8

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import LawError
-from pipeline.plants.base import Linearization
+from pipeline.plants.linearization import Linearization
 from pipeline.tuning.reduction import LagWithDeadTime, minimal
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from scipy import linalg
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.tuning.development import LawStep
 
 Array = NDArray[np.float64]
@@ -41,13 +41,13 @@ class FrozenLoops:
     law: Array  # (g, n_mv + n_state, n_x + n_mv + n_state) what the law makes of z
 
     @classmethod
-    def of(cls, plant: Plant, law: LawStep, n_state: int, cvs: Array) -> Self:
+    def of(cls, plant: EquationPlant, law: LawStep, n_state: int, cvs: Array) -> Self:
         """The loops of a law with ``n_state`` states over ``plant``, at controlled variables ``cvs`` (g,).
 
         Raises PlantError where there is no such steady state, LawError for a law that does not rest there.
         """
         points = [plant.steady_state_at(float(cv)) for cv in cvs]
-        pv = torch.tensor(np.array([np.array(plant.measure(x)).ravel() for x, _ in points]))
+        pv = torch.tensor(np.array([plant.measure(x) for x, _ in points]))
         mv = torch.tensor(np.array([u for _, u in points]))
         sp = pv[:, : len(plant.sp_signals)]
         dv = torch.from_numpy(np.tile(plant.dv_nominal, (len(cvs), 1)))

@@ -18,7 +18,6 @@ from pipeline.engine.command import run_stage
 from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
-from pipeline.plants.base import Plant
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from pipeline.simulation.timetable import _scenario as first_scenario
 
@@ -211,7 +210,7 @@ class NoTests(PhNeutralizationCase):
         return {}
 
 
-class Unwritten(Plant):
+class Unwritten(EquationPlant):
     """A plant without equations."""
 
 

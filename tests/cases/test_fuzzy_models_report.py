@@ -41,7 +41,11 @@ def measured() -> dict[str, Any]:
     ways: Any = ("tied", "global", "local")
     parts: dict[str, Part] = {w: HybridFuzzyPart(identification=w, centres=(12, 20, 40, 60, 70)) for w in ways}
     parts["printed"] = PrintedFuzzyPart()
-    return {"parts": {name: {"median": part.learn(record, plant, {}, 0).metrics} for name, part in parts.items()}}
+    return {
+        "parts": {
+            name: {"median": part.learn(record, plant.signals, {}, 0, plant).metrics} for name, part in parts.items()
+        }
+    }
 
 
 def told(models: dict[str, Any]) -> Any:

@@ -19,7 +19,7 @@ N = 100
 
 @pytest.fixture(scope="module")
 def learnt() -> Learnt:
-    return IdentificationExamplePart().learn(None, ThiosulfateCstr(), {}, 0)
+    return IdentificationExamplePart().learn(None, ThiosulfateCstr().signals, {}, 0)
 
 
 @pytest.fixture(scope="module")

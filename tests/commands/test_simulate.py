@@ -17,9 +17,9 @@ from pipeline.__main__ import main
 from pipeline.cases import CASES
 from pipeline.errors import PlantError
 from pipeline.export.gate import export
-from pipeline.laws import LAWS, LawSignals
+from pipeline.laws import LAWS
 from pipeline.metrics import mae
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.live import SimulatedPlant, TerminalView, sparkline
 from pipeline.simulation.simulate import simulate_closed
 from serving import Command, Controller, Mode
@@ -29,11 +29,11 @@ pytest_plugins = ["small_laws"]
 
 
 @pytest.fixture(scope="session")
-def pid_file(plant: Plant, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pid_file(plant: EquationPlant, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cls = LAWS["pid"]
     params = cls.Params(tuning="imc", lambda_s=1.6, operating_cv=0.66613)
     path = tmp_path_factory.mktemp("controllers") / "pid.onnx"
-    export(cls.design(params, {}, LawSignals.of(plant), plant), path, case=CASE, provenance={})
+    export(cls.design(params, {}, plant.signals, plant), path, case=CASE, provenance={})
     return path
 
 
@@ -53,7 +53,7 @@ def column(rows: list[dict[str, str]], name: str) -> np.ndarray:
     return np.array([float(row[name]) for row in rows])
 
 
-def test_a_scenario_is_the_one_that_validation_runs(pid_file: Path, plant: Plant) -> None:
+def test_a_scenario_is_the_one_that_validation_runs(pid_file: Path, plant: EquationPlant) -> None:
     """The loop, its guards and modes add nothing: the same trajectory as the bare controller's."""
     rows = simulate(pid_file, "--scenario", "sp_b")
     (scenario,) = CASES[CASE].scenarios()["sp_b"]
@@ -71,7 +71,7 @@ def test_a_scenario_is_the_one_that_validation_runs(pid_file: Path, plant: Plant
 
 
 def test_set_points_disturbance_and_manual_happen_when_asked(
-    pid_file: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+    pid_file: Path, plant: EquationPlant, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = simulate(
         pid_file, "--from", "0.6", "--sp", "0.7@5", "--sp", "0.65@30", "--disturbance", "T_in=285@60",
@@ -201,7 +201,7 @@ def test_as_a_program(pid_file: Path) -> None:
     assert "simulate" in run().stdout
 
 
-def test_the_live_view_shows_mode_values_and_faults(plant: Plant) -> None:
+def test_the_live_view_shows_mode_values_and_faults(plant: EquationPlant) -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=120, height=30)
     with TerminalView(plant, "pid", 10.0, console) as view:
         for k in range(20):

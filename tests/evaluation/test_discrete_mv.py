@@ -12,7 +12,7 @@ import pytest
 from pipeline.__main__ import main
 from pipeline.cases import PLANTS
 from pipeline.export.gate import export
-from pipeline.laws import LAWS, LawSignals
+from pipeline.laws import LAWS
 from serving import Controller, ControlLoop, LoopError, Mode, Sample, SimulatedEndpoint, VirtualClock, default_guards
 from serving.bench import bench
 from serving.card import card
@@ -26,7 +26,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plant, law = PLANTS[CASE](), LAWS["fuzzy_feedforward_observer"]
     path = tmp_path_factory.mktemp("controllers") / "observer.onnx"
     parts = jacketed_batch_reactor_parts.parts(plant)
-    export(law.design(law.Params(), parts, LawSignals.of(plant), plant), path, case=CASE, provenance={})
+    export(law.design(law.Params(), parts, plant.signals, plant), path, case=CASE, provenance={})
     return path
 
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from pipeline.errors import ExportError
 from pipeline.export.controller_file import with_evidence
 from pipeline.export.gate import GATE_TOLERANCE, export, parity_gate
-from pipeline.laws import ControlLaw, LawSignals
+from pipeline.laws import ControlLaw
+from pipeline.plants.signals import Signals
 from serving import Controller, Signal
 from serving.digest import TRAILER_BYTES, file_digest
 
@@ -26,9 +27,9 @@ MakeFormula = Callable[..., ControlLaw]
 ONE = Signal("x", "-", -1e6, 1e6)
 
 
-def loop_signals(**changed: Any) -> LawSignals:
+def loop_signals(**changed: Any) -> Signals:
     values = {"period_s": 1.0, "sp": (ONE,), "pv": (ONE,), "dv": (), "mv": (ONE,), **changed}
-    return LawSignals(**values)
+    return Signals(**values)
 
 
 def test_every_law_becomes_a_controller_that_equals_it(law: ControlLaw, tmp_path: Path) -> None:

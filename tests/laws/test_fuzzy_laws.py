@@ -17,13 +17,13 @@ from torch import Tensor
 from pipeline.cases import CASES, PLANTS
 from pipeline.config.params import parse
 from pipeline.errors import LawError, ParamsError
-from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.laws import LAWS, ControlLaw
 from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
 
 CASE = CASES["jacketed_batch_reactor"]
 PLANT = CASE.plant
-SIGNALS = LawSignals.of(PLANT)
+SIGNALS = PLANT.signals
 PRINTED = jacketed_batch_reactor_parts.parts(PLANT)["printed"]
 assert isinstance(PRINTED, HybridFuzzy)
 RECIPE = CASE.scenarios()["same_model"][0].sp[:, 0]
@@ -238,7 +238,7 @@ def test_parts_signals_and_numbers_that_cannot_be_are_refused() -> None:
         cls.design(cls.Params(**needed, part="c"), two, SIGNALS, PLANT)
     other = PLANTS["thiosulfate_cstr"]()
     with pytest.raises(LawError, match=r"T_j \(continuous\)"):
-        cls.design(cls.Params(**needed), {"a": PRINTED}, LawSignals.of(other), other)
+        cls.design(cls.Params(**needed), {"a": PRINTED}, other.signals, other)
     with pytest.raises(ParamsError, match=r"core_gain is 1\.5"):
         parse(cls.Params, {**needed, "core_gain": 1.5}, "controllers.x")
     with pytest.raises(ParamsError, match="ti_s 0"):

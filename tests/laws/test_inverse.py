@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws import LawSignals
 from pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
 from pipeline.models import Model
 from pipeline.models.static.leverage_domain import LeverageDomain
+from pipeline.plants.signals import Signals
 
 DV = torch.zeros(0, dtype=torch.float64)
 A, B, MIDDLE = 0.8, -1e-3, 250.0  # y(k+1) = A y(k) + B (mv(k) - MIDDLE) + disturbance; the second PV takes no part
@@ -59,7 +59,7 @@ def run(law, disturbance: float, sp: float, n: int = 60) -> tuple[np.ndarray, np
     return np.array(ys), np.array(mvs)
 
 
-def design(cls, parts, signals: LawSignals, plant, **params: Any):
+def design(cls, parts, signals: Signals, plant, **params: Any):
     return cls.design(cls.Params(**params), parts, signals, plant)
 
 

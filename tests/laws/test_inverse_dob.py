@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws import LawSignals
 from pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob, ObserverLaw
 from pipeline.models.base import Model
 from pipeline.models.static.mlp import MLP
 from pipeline.models.static.pair import Layout, Pair, candidates
+from pipeline.plants.signals import Signals
 from serving.manifest import Signal
 
 PERIOD = 0.5
-SIGNALS = LawSignals(
+SIGNALS = Signals(
     PERIOD,
     sp=(Signal("y", "m", -10.0, 10.0),),
     pv=(Signal("y", "m", -10.0, 10.0), Signal("x", "m", -10.0, 10.0)),

@@ -17,9 +17,9 @@ from torch import Tensor
 from pipeline.config.params import parse
 from pipeline.errors import LawError
 from pipeline.export.gate import export
-from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.laws import LAWS, ControlLaw
 from pipeline.laws.reference.reference_law import ReferenceLaw
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from serving import Controller
 
 # A law is the same for all examples: nothing of it changes from one to the next.
@@ -65,10 +65,10 @@ def drawn(law: ControlLaw, rng: np.random.Generator, *batch: int, wide: float = 
     return Inputs(sp, pv, dv, mv)
 
 
-def at_rest(law: ControlLaw, plant: Plant, cv: float) -> Inputs:
+def at_rest(law: ControlLaw, plant: EquationPlant, cv: float) -> Inputs:
     """The plant at the steady state of ``cv``, the set point there too."""
     x, mv = plant.steady_state_at(cv)
-    pv = torch.from_numpy(np.array(plant.measure(x)).ravel())
+    pv = torch.from_numpy(plant.measure(x).copy())
     return Inputs(pv[: len(law.signals.sp)], pv, torch.from_numpy(plant.dv_nominal), torch.from_numpy(mv))
 
 
@@ -170,7 +170,7 @@ def test_state_zero_is_no_past(law: ControlLaw) -> None:
 
 
 @pytest.mark.parametrize("which", range(3))
-def test_start_on_set_point_keeps_the_actuator(law: ControlLaw, law_plant: Plant, which: int) -> None:
+def test_start_on_set_point_keeps_the_actuator(law: ControlLaw, law_plant: EquationPlant, which: int) -> None:
     if not law.incremental:
         pytest.skip("computes its MV afresh: on set point as accurate as its model")
     inputs = at_rest(law, law_plant, rest_points(law_plant)[which])
@@ -181,7 +181,7 @@ def test_start_on_set_point_keeps_the_actuator(law: ControlLaw, law_plant: Plant
         torch.testing.assert_close(out.mv, inputs.mv_applied, rtol=0, atol=1e-9 * span(law))
 
 
-def test_manual_to_auto_does_not_bump(law: ControlLaw, law_plant: Plant) -> None:
+def test_manual_to_auto_does_not_bump(law: ControlLaw, law_plant: EquationPlant) -> None:
     """In manual the law is stepped and not obeyed; what it does first in auto follows the error alone."""
     if not law.incremental:
         pytest.skip("computes its MV afresh: in auto it goes where its model says")
@@ -198,7 +198,7 @@ def test_manual_to_auto_does_not_bump(law: ControlLaw, law_plant: Plant) -> None
 @pytest.mark.parametrize("held", [3, 60])
 @pytest.mark.parametrize("away", [0.1, 0.9])
 def test_a_stuck_actuator_that_comes_free_on_set_point_does_not_kick(
-    law: ControlLaw, law_plant: Plant, away: float, held: int
+    law: ControlLaw, law_plant: EquationPlant, away: float, held: int
 ) -> None:
     """The plant rests under an MV that is stuck; the set point is elsewhere, and then put where the plant is.
 
@@ -236,7 +236,7 @@ def test_a_law_without_models_names_the_part_it_lacks_or_needs_none(
     name: str,
 ) -> None:
     cls, plant = LAWS[name], plant_of(name)
-    signals = LawSignals.of(plant)
+    signals = plant.signals
     try:
         law = cls.design(cls.Params(**QUICK[name]), {}, signals, plant).eval()
     except LawError as error:

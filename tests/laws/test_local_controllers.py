@@ -14,11 +14,11 @@ from pipeline.cases import CASES
 from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from pipeline.config.params import parse
 from pipeline.errors import LawError, ParamsError
-from pipeline.laws import LAWS, LawSignals
+from pipeline.laws import LAWS
 from pipeline.laws.local.auto_pid_network import one_knob
 from pipeline.laws.local.local_controllers import LocalControllers
 from pipeline.laws.local.local_stability import StabilityTest
-from pipeline.plants.base import Linearization
+from pipeline.plants.linearization import Linearization
 from pipeline.tuning.rules import PidSettings, sampled_loop
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
 
@@ -40,9 +40,7 @@ def plant() -> HensonSeborgCstr:
 
 def designed(name: str, **params) -> LocalControllers:
     cls, plant = LAWS[name], HensonSeborgCstr()
-    law = cls.design(
-        cls.Params(**required(name) | params), {"local_models": local_models(plant)}, LawSignals.of(plant), plant
-    )
+    law = cls.design(cls.Params(**required(name) | params), {"local_models": local_models(plant)}, plant.signals, plant)
     assert isinstance(law, LocalControllers)
     return law.eval()
 

@@ -13,7 +13,7 @@ from pipeline.config.params import parse
 from pipeline.errors import LawError, ParamsError
 from pipeline.excitation import EXCITATIONS
 from pipeline.laws import LAWS as ALL
-from pipeline.laws.base import ControlLaw, LawSignals
+from pipeline.laws.base import ControlLaw
 from pipeline.models.lagged.next_output import Ahead, GaussNewton, NextOutput
 from pipeline.models.lagged.nnarx import NNARX
 
@@ -57,7 +57,7 @@ def test_disturbance_of_the_ph_tank(model: NNARX, name: str) -> None:
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("params", [{}, {"slope_min": 0.3, "offset_filter": 0.6}], ids=str)
 def test_a_plant_of_negative_gain_is_the_mirror_image(model: NNARX, name: str, params: dict) -> None:
-    signals, test = LawSignals.of(PH.plant), scenario("set_point")
+    signals, test = PH.plant.signals, scenario("set_point")
     turn = mirrored(signals.mv[0])
     plain = closed(ph_law(model, name, **params), PH, test)
     other = designed(name, mirrored_in_mv(model, signals.mv[0]), PH.plant, **params)
@@ -101,7 +101,7 @@ def test_several_hidden_layers_and_other_lags() -> None:
 def test_what_it_cannot_use_is_said(model: NNARX) -> None:
     for name in LAWS:
         with pytest.raises(LawError, match=f"law '{name}' needs a part 'nnarx'.*the model set has no parts"):
-            ALL[name].design(ALL[name].Params(), {}, LawSignals.of(PH.plant), PH.plant)
+            ALL[name].design(ALL[name].Params(), {}, PH.plant.signals, PH.plant)
         with pytest.raises(LawError, match=f"law '{name}'.*delay 2"):
             ph_law(NNARX(2, 2, 1, 2), name, plant_gain="positive")
     with pytest.raises(LawError, match="slope over the MV is 0"):

@@ -13,11 +13,11 @@ from pipeline.cases.batch_reactor.plant import BatchReactor
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
 from pipeline.cases.ph_neutralization.plant import PhNeutralization
 from pipeline.errors import LawError
-from pipeline.laws import LawSignals
 from pipeline.laws.pid.pid import PID
 from pipeline.models import Model
 from pipeline.models.local.linearized import Linearized as LinearizedModel
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.signals import Signals
 from pipeline.simulation.simulate import simulate_closed
 from pipeline.tuning.rules import AllPole, PidSettings, imc_pid, sampled_loop
 
@@ -45,7 +45,7 @@ def stepper(law: PID):
 
 @given(st.integers(0, 1000), st.floats(0.0, 2.0), st.floats(0.0, 1.0))
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_equals_the_textbooks_position_form(signals: LawSignals, seed: int, filter_s: float, weight: float) -> None:
+def test_equals_the_textbooks_position_form(signals: Signals, seed: int, filter_s: float, weight: float) -> None:
     """Within its limits the velocity form is the position form with the sum of all errors."""
     rng = np.random.default_rng(seed)
     s = PidSettings(-5.0, 3.0, 0.8, filter_s, weight)
@@ -61,7 +61,7 @@ def test_equals_the_textbooks_position_form(signals: LawSignals, seed: int, filt
         assert mv.item() == pytest.approx(offset + s.kc * (weight * r[k] - y[k] + total - d), rel=1e-11)
 
 
-def test_small_signals_follow_the_sampled_loop(plant: Plant, signals: LawSignals) -> None:
+def test_small_signals_follow_the_sampled_loop(plant: EquationPlant, signals: Signals) -> None:
     """Near the unstable point the true loop is the linear one whose eigenvalues the tuning relies on."""
     x, mv = plant.steady_state_at(0.66613)
     lin = plant.linearize(x, mv)
@@ -79,7 +79,7 @@ def test_small_signals_follow_the_sampled_loop(plant: Plant, signals: LawSignals
         np.testing.assert_allclose(now - x, z[:2], rtol=1e-3, atol=1e-9)
 
 
-def test_an_actuator_that_stays_behind_leaves_no_wind_up(signals: LawSignals) -> None:
+def test_an_actuator_that_stays_behind_leaves_no_wind_up(signals: Signals) -> None:
     """Long at its limit with the error unchanged, the MV leaves the limit soon after the error turns."""
     law = PID(signals, PidSettings(-200.0, 2.0, 0.0, tracking_s=1.0))
     state, mv = torch.zeros(law.n_state, dtype=torch.float64), tensor(250.0)
@@ -91,7 +91,7 @@ def test_an_actuator_that_stays_behind_leaves_no_wind_up(signals: LawSignals) ->
     assert mv.item() < 490
 
 
-def test_a_moved_actuator_is_believed(signals: LawSignals) -> None:
+def test_a_moved_actuator_is_believed(signals: Signals) -> None:
     """Saturated, then put elsewhere by an operator: the next request starts from there."""
     law = PID(signals, PidSettings(-200.0, 2.0, 0.0))
     state, mv = torch.zeros(law.n_state, dtype=torch.float64), tensor(250.0)
@@ -102,7 +102,7 @@ def test_a_moved_actuator_is_believed(signals: LawSignals) -> None:
     assert moved.item() == pytest.approx(100.0 + first_move, abs=1e-9)
 
 
-def test_set_point_weight_zero_gives_no_kick(signals: LawSignals) -> None:
+def test_set_point_weight_zero_gives_no_kick(signals: Signals) -> None:
     law = PID(signals, PidSettings(-1000.0, 5.0, 1.0, set_point_weight=0.0))
     rest = (tensor(0.5, 300.0), DV)
     mv, state, _ = law(tensor(0.5), *rest, tensor(250.0), torch.zeros(law.n_state, dtype=torch.float64))
@@ -127,7 +127,7 @@ class Linearized(Model):
         return self._lin
 
 
-def test_part_linearized_comes_before_the_plant(plant: Plant, signals: LawSignals, parts) -> None:
+def test_part_linearized_comes_before_the_plant(plant: EquationPlant, signals: Signals, parts) -> None:
     middle = plant.linearize(*plant.steady_state_at(0.66613))
     params = PID.Params(tuning="imc", lambda_s=1.5, operating_cv=0.2)
     law = PID.design(params, {"linearized": Linearized(middle)}, signals, plant)
@@ -145,7 +145,7 @@ def test_part_linearized_comes_before_the_plant(plant: Plant, signals: LawSignal
         (PID.Params(tuning="magic"), "allowed are optimized, imc, simc, itae, manual"),  # type: ignore[arg-type]
     ],
 )
-def test_wrong_params_are_named(plant: Plant, signals: LawSignals, params: PID.Params, message: str) -> None:
+def test_wrong_params_are_named(plant: EquationPlant, signals: Signals, params: PID.Params, message: str) -> None:
     with pytest.raises(LawError, match=message):
         PID.design(params, {}, signals, plant)
 
@@ -153,7 +153,7 @@ def test_wrong_params_are_named(plant: Plant, signals: LawSignals, params: PID.P
 def test_a_plant_written_in_minutes_is_tuned_in_seconds() -> None:
     """gain u = tau dx/dt + x with tau = 3 min, measured in tenths: IMC of it is known, and so is a period of it."""
     lag = Lag()
-    law = PID.design(PID.Params(tuning="imc", lambda_s=60.0, operating_cv=0.0), {}, LawSignals.of(lag), lag)
+    law = PID.design(PID.Params(tuning="imc", lambda_s=60.0, operating_cv=0.0), {}, lag.signals, lag)
     assert law.settings.ti_s == pytest.approx(180.0)
     assert law.settings.kc == pytest.approx(180.0 / (20.0 * 60.0))
     decay = np.exp(-30.0 / 180.0)
@@ -161,7 +161,7 @@ def test_a_plant_written_in_minutes_is_tuned_in_seconds() -> None:
     np.testing.assert_allclose(part.one_period.numpy()[:, 0], [10 * decay, 20 * (1 - decay)], rtol=1e-12)
 
 
-def sse(law: PID, plant: Plant, test) -> float:
+def sse(law: PID, plant: EquationPlant, test) -> float:
     track = simulate_closed(plant, stepper(law), test)
     return float(np.sum((track.pv[:, 0] - track.sp[:, 0]) ** 2))
 
@@ -174,7 +174,7 @@ def test_itae_on_the_ph_tank() -> None:
 
     def figures(sampling: float) -> dict[str, float]:
         params = PID.Params(tuning="itae", operating_cv=8.0, sampling=sampling)
-        law = PID.design(params, {}, LawSignals.of(case.plant), case.plant)
+        law = PID.design(params, {}, case.plant.signals, case.plant)
         return {name: sse(law, case.plant, test) for name, test in tests.items()}
 
     whole, half = figures(1.0), figures(0.5)
@@ -188,14 +188,14 @@ def test_itae_on_the_ph_tank() -> None:
 def test_rules_hold_plants_with_hidden_states(plant_class, at: float, tuning: str, loop_test) -> None:
     """Three states, of which the MV and the controlled variable see one: a small step settles."""
     plant = plant_class()
-    law = PID.design(PID.Params(tuning=tuning, operating_cv=at, sampling=1.0), {}, LawSignals.of(plant), plant)
+    law = PID.design(PID.Params(tuning=tuning, operating_cv=at, sampling=1.0), {}, plant.signals, plant)
     span = plant.sp_signals[0].high - plant.sp_signals[0].low
     levels = np.full(60, at + 0.02 * span)
     track = simulate_closed(plant, stepper(law), loop_test(plant, levels, at))
     assert abs(track.pv[-1, 0] - levels[-1]) < 1e-4 * span
 
 
-def test_optimized_pid_holds_the_unstable_point(plant: Plant, signals: LawSignals, loop_test) -> None:
+def test_optimized_pid_holds_the_unstable_point(plant: EquationPlant, signals: Signals, loop_test) -> None:
     """Tuned on its own short sequences, it moves between all three branches and rejects what it does not measure."""
     params = PID.Params(operating_cv=0.66613, development_seeds=(5,), development_set_points=6, development_hold=50)
     law = PID.design(params, {}, signals, plant)
@@ -215,7 +215,7 @@ def test_plants_with_dead_time_and_zeros_are_tuned(tuning: str, back: float, loo
     """Five lags in series, also with an inverse response: the default tuning settles a step, and so does `itae`."""
     plant = Chain(back=back)
     params = PID.Params(tuning=tuning, development_seeds=(3,), development_set_points=4, development_hold=50)
-    law = PID.design(params, {}, LawSignals.of(plant), plant)
+    law = PID.design(params, {}, plant.signals, plant)
     levels = np.full(120, 0.5)
     track = simulate_closed(plant, stepper(law), loop_test(plant, levels, 0.0))
     assert np.abs(track.pv[-20:, 0] - 0.5).max() < 0.005
@@ -227,4 +227,4 @@ def test_plants_with_dead_time_and_zeros_are_tuned(tuning: str, back: float, loo
 def test_rules_that_do_not_hold_name_those_that_do(tuning: str) -> None:
     plant = Chain(back=0.1)
     with pytest.raises(LawError, match=r"no zero; .* choose tuning `optimized` or `itae`"):
-        PID.design(PID.Params(tuning=tuning), {}, LawSignals.of(plant), plant)
+        PID.design(PID.Params(tuning=tuning), {}, plant.signals, plant)

@@ -15,7 +15,6 @@ from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
 from pipeline.excitation.batches import Batches
 from pipeline.excitation.sequences import RandomSteps
-from pipeline.laws import LawSignals
 from pipeline.laws.base import ControlLaw
 from pipeline.laws.gain_update import gain_update
 from pipeline.laws.recursive.recursive_pid import RecursivePid
@@ -38,7 +37,7 @@ def record() -> Record:
 
 @pytest.fixture(scope="module")
 def arx(record: Record) -> Model:
-    return ArxPart().learn(record, PH.plant, {}, 0).model
+    return ArxPart().learn(record, PH.plant.signals, {}, 0).model
 
 
 def stepper(law: ControlLaw, through: Callable[[np.ndarray], np.ndarray] = lambda mv: mv):
@@ -64,7 +63,7 @@ def sse(track: Trajectory, start: int = 0) -> float:
 
 
 def designed(law: type[ControlLaw], arx: Model, case: Case = PH, **params) -> ControlLaw:
-    return law.design(law.Params(**required(law.name) | params), {"arx": arx}, LawSignals.of(case.plant), case.plant)
+    return law.design(law.Params(**required(law.name) | params), {"arx": arx}, case.plant.signals, case.plant)
 
 
 def scenario(name: str, case: Case = PH) -> Scenario:
@@ -153,7 +152,7 @@ def test_a_plant_of_negative_gain_is_the_mirror_image(record: Record, arx: Model
     def mirrored(value: np.ndarray) -> np.ndarray:
         return mv.low + mv.high - value
 
-    other = ArxPart().learn(replace(record, mv=mirrored(record.mv)), PH.plant, {}, 0).model
+    other = ArxPart().learn(replace(record, mv=mirrored(record.mv)), PH.plant.signals, {}, 0).model
     test = scenario("set_point")
     straight = closed(designed(law, arx, **params), PH, test)
     turned = closed(designed(law, other, **params), PH, test, through=mirrored)
@@ -190,7 +189,7 @@ def test_lags_that_were_not_measured_teach_nothing(arx: ARX) -> None:
 def test_follows_the_batch_profile() -> None:
     """Over noise of variance 1: no more than the 13,282 (29.9 from 200 s on) of an independent implementation."""
     part = ArxPart(n_y=1, n_u=1)
-    model = part.learn(Batches(batches=100, noise=(1.0,)).run(BATCH.plant, 0), BATCH.plant, {}, 0).model
+    model = part.learn(Batches(batches=100, noise=(1.0,)).run(BATCH.plant, 0), BATCH.plant.signals, {}, 0).model
     params = {"penalty": 100.0, "offset_filter": 0.3, "preview": "ramp"}
     law, test = designed(RecursivePid, model, BATCH, **params), scenario("trajectory", BATCH)
     tracks = [closed(law, BATCH, test, 1.0, seed) for seed in range(6)]
@@ -200,7 +199,7 @@ def test_follows_the_batch_profile() -> None:
 
 @pytest.mark.parametrize("law", [RecursivePid, SelfTuningPid])
 def test_what_it_cannot_use_is_said(arx: Model, parts, law) -> None:
-    signals = LawSignals.of(PH.plant)
+    signals = PH.plant.signals
     for models, message in (
         ({}, "needs a part 'arx'"),
         ({"arx": parts["nnarx"]}, "of kind nnarx"),

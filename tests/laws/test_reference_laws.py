@@ -14,7 +14,7 @@ from torch import Tensor
 from pipeline.cases import CASES
 from pipeline.cases.reversible_cstr.plant import ReversibleCstr
 from pipeline.errors import LawError
-from pipeline.laws import LAWS, ControlLaw, LawSignals
+from pipeline.laws import LAWS, ControlLaw
 from pipeline.laws.reference.model_reference import ModelReference
 from pipeline.laws.reference.model_reference_two_error import ModelReferenceTwoError
 from pipeline.laws.reference.pi_reference import PiReference
@@ -22,7 +22,8 @@ from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Trainin
 from pipeline.laws.reference.reference_networks import IncrementalNetwork, Trainable, TrainablePi, TwoErrorNetwork
 from pipeline.laws.reference.reference_training import follow, train
 from pipeline.models.state_space.state_space import StateSpace
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.signals import Signals
 from pipeline.simulation.simulate import Trajectory, simulate_closed
 from pipeline.tuning.reference_model import ReferenceModel
 from pipeline.tuning.rules import AllPole
@@ -32,23 +33,23 @@ TRAINING = Training(noise=0.002, restarts=1, iterations=20, lanes=27)
 
 
 @pytest.fixture(scope="module")
-def reactor() -> Plant:
+def reactor() -> EquationPlant:
     return CASE.plant
 
 
 @pytest.fixture(scope="module")
-def network(reactor: Plant) -> StateSpace:
+def network(reactor: EquationPlant) -> StateSpace:
     model = reversible_cstr_parts.parts(reactor)["state_space"]
     assert isinstance(model, StateSpace)
     return model
 
 
 @pytest.fixture(scope="module")
-def signals(reactor: Plant) -> LawSignals:
-    return LawSignals.of(reactor)
+def signals(reactor: EquationPlant) -> Signals:
+    return reactor.signals
 
 
-def policies(signals: LawSignals, order: int = 2) -> list[Trainable]:
+def policies(signals: Signals, order: int = 2) -> list[Trainable]:
     return [
         IncrementalNetwork(signals, order, -1.0, 5),
         TwoErrorNetwork(signals, order, -1.0, 5),
@@ -57,7 +58,7 @@ def policies(signals: LawSignals, order: int = 2) -> list[Trainable]:
 
 
 @pytest.fixture(scope="module")
-def trained(reactor: Plant, network: StateSpace, signals: LawSignals) -> dict[str, ControlLaw]:
+def trained(reactor: EquationPlant, network: StateSpace, signals: Signals) -> dict[str, ControlLaw]:
     """Each law, trained for about a second."""
     made = {}
     for cls in (ModelReference, ModelReferenceTwoError, PiReference):
@@ -67,7 +68,7 @@ def trained(reactor: Plant, network: StateSpace, signals: LawSignals) -> dict[st
 
 
 def run(
-    law: ControlLaw, name: str, noise: bool = False, plant: Plant | None = None
+    law: ControlLaw, name: str, noise: bool = False, plant: EquationPlant | None = None
 ) -> tuple[Trajectory, dict[str, float]]:
     """One of the case's tests through the torch module."""
     test = CASE.scenarios()[name][0]
@@ -86,7 +87,7 @@ def run(
 
 # ---------------------------------------------------------------- derivatives
 @pytest.mark.parametrize("which", range(3))
-def test_an_actions_derivatives_are_those_of_its_mv(signals: LawSignals, which: int) -> None:
+def test_an_actions_derivatives_are_those_of_its_mv(signals: Signals, which: int) -> None:
     policy = policies(signals)[which]
     rng = np.random.default_rng(1)
     theta = policy.drawn(rng)
@@ -106,7 +107,7 @@ def test_an_actions_derivatives_are_those_of_its_mv(signals: LawSignals, which: 
 
 
 @pytest.mark.parametrize("which", range(3))
-def test_sensitivities_through_time_are_the_gradient(network: StateSpace, signals: LawSignals, which: int) -> None:
+def test_sensitivities_through_time_are_the_gradient(network: StateSpace, signals: Signals, which: int) -> None:
     """J'r of the loops is minus half the gradient of their sum of squares; a wrong one still lowers it somewhat."""
     policy, plant, model = policies(signals)[which], PlantNetwork(network), ReferenceModel.optimal(2, 0.05)
     options = Training(noise=0.002, lanes=6, holds=2, hold=15)
@@ -122,7 +123,7 @@ def test_sensitivities_through_time_are_the_gradient(network: StateSpace, signal
     np.testing.assert_allclose(-2 * found, gradient, rtol=1e-4, atol=1e-6 * np.abs(gradient).max())
 
 
-def test_the_plant_networks_jacobian_and_rest(network: StateSpace, reactor: Plant) -> None:
+def test_the_plant_networks_jacobian_and_rest(network: StateSpace, reactor: EquationPlant) -> None:
     plant = PlantNetwork(network)
     x, u = np.array([[0.45, 415.0], [0.55, 395.0]]), np.array([[1.7], [0.6]])
     after, jac = plant.step(x, u)
@@ -141,7 +142,7 @@ def test_the_plant_networks_jacobian_and_rest(network: StateSpace, reactor: Plan
 
 
 @pytest.mark.parametrize("name", ["model_reference", "model_reference_two_error", "pi_reference"])
-def test_the_law_acts_as_what_was_trained(trained: dict[str, ControlLaw], name: str, signals: LawSignals) -> None:
+def test_the_law_acts_as_what_was_trained(trained: dict[str, ControlLaw], name: str, signals: Signals) -> None:
     """The law's stage and the training's arithmetic are two texts of one controller."""
     law = trained[name]
     rng = np.random.default_rng(2)
@@ -166,7 +167,7 @@ def test_the_law_acts_as_what_was_trained(trained: dict[str, ControlLaw], name: 
 
 
 # ---------------------------------------------------------------- theory
-def test_no_weights_give_the_incremental_network_another_root(signals: LawSignals) -> None:
+def test_no_weights_give_the_incremental_network_another_root(signals: Signals) -> None:
     """At rest its move is zero for zero error alone, trained or not, even with weights far from any training."""
     rng = np.random.default_rng(7)
     for sign in (-1.0, 1.0):
@@ -183,7 +184,7 @@ def test_no_weights_give_the_incremental_network_another_root(signals: LawSignal
             np.testing.assert_allclose(network.act(theta, none).mv, u, atol=1e-13)
 
 
-def test_no_weights_free_the_two_error_network_of_offset(signals: LawSignals, reactor: Plant) -> None:
+def test_no_weights_free_the_two_error_network_of_offset(signals: Signals, reactor: EquationPlant) -> None:
     """Without errors it has one MV, but two set points have two steady ones."""
     network = TwoErrorNetwork(signals, 2, -1.0, 4)
     rng = np.random.default_rng(8)
@@ -195,7 +196,7 @@ def test_no_weights_free_the_two_error_network_of_offset(signals: LawSignals, re
     assert np.ptp([reactor.steady_state_at(level)[1][0] for level in levels]) > 2
 
 
-def test_a_pi_on_the_reference_is_a_pi(signals: LawSignals) -> None:
+def test_a_pi_on_the_reference_is_a_pi(signals: Signals) -> None:
     law = PiReference(signals, ReferenceModel.optimal(2, 0.05), -40.0, 8.0)
     state = torch.tensor([1.0, 0.45, 0.0, 0.004, 2.0], dtype=torch.float64)
     values = [torch.tensor(v, dtype=torch.float64) for v in ([0.46], [0.44, 410.0], [], [2.0])]
@@ -242,7 +243,7 @@ def test_two_errors_leave_an_offset_and_an_integral_none(trained: dict[str, Cont
     assert pi["tracking"] <= 0.0015
 
 
-def test_unseen_drift_is_brought_back(trained: dict[str, ControlLaw], reactor: Plant) -> None:
+def test_unseen_drift_is_brought_back(trained: dict[str, ControlLaw], reactor: EquationPlant) -> None:
     """Slower reactions, a hotter feed and more heat loss at once, all twelve levels, and noise on top."""
     assert isinstance(reactor, ReversibleCstr)
     drifted = replace(reactor, k1=0.85 * reactor.k1, k2=0.85 * reactor.k2, T_in=440.0, h=2.6e-3)
@@ -251,7 +252,7 @@ def test_unseen_drift_is_brought_back(trained: dict[str, ControlLaw], reactor: P
     assert run(law, "levels", noise=True, plant=drifted)[1]["tracking"] <= 0.006
 
 
-def test_the_printed_pid_and_its_sign(reactor: Plant, signals: LawSignals) -> None:
+def test_the_printed_pid_and_its_sign(reactor: EquationPlant, signals: Signals) -> None:
     """Independent figures: IAE 53.5, ITAE 2582, RMS 0.0090; with the printed sign the valve stays at an end."""
     params = {"tuning": "manual", "ti_s": 7.875, "td_s": 2.5397}
     cls = LAWS["pid"]
@@ -265,7 +266,7 @@ def test_the_printed_pid_and_its_sign(reactor: Plant, signals: LawSignals) -> No
 
 
 # ---------------------------------------------------------------- what cannot be
-def test_clear_errors(network: StateSpace, signals: LawSignals, reactor: Plant) -> None:
+def test_clear_errors(network: StateSpace, signals: Signals, reactor: EquationPlant) -> None:
     with pytest.raises(LawError, match="part 'state_space'"):
         ModelReference.design(ModelReference.Params(wn=0.05), {}, signals, reactor)
     with pytest.raises(LawError, match="needs kc and ti_s"):
@@ -284,7 +285,7 @@ def test_clear_errors(network: StateSpace, signals: LawSignals, reactor: Plant) 
         Loops.drawn(PlantNetwork(network), away, Training(), np.random.default_rng(0))
 
 
-def test_a_training_repeats(network: StateSpace, signals: LawSignals) -> None:
+def test_a_training_repeats(network: StateSpace, signals: Signals) -> None:
     options = Training(noise=0.002, lanes=6, holds=1, hold=20, iterations=3, hidden=3)
     policy, model = IncrementalNetwork(signals, 2, -1.0, 3), ReferenceModel.optimal(2, 0.05)
     first, again = (train(policy, network, model, options) for _ in range(2))
@@ -295,7 +296,7 @@ def test_a_training_repeats(network: StateSpace, signals: LawSignals) -> None:
     assert not np.array_equal(first.theta, other.theta)
 
 
-def test_a_plant_with_a_zero_is_tuned_by_its_lag(reactor: Plant) -> None:
+def test_a_plant_with_a_zero_is_tuned_by_its_lag(reactor: EquationPlant) -> None:
     lin = reactor.linearize(*reactor.steady_state_at(0.46))
     near = AllPole.near(lin)
     gain = -float((lin.c @ np.linalg.solve(lin.a, lin.b))[0, 0])

@@ -9,7 +9,6 @@ from shipped import required
 
 from pipeline.cases import CASES
 from pipeline.excitation.sequences import RandomSteps
-from pipeline.laws import LawSignals
 from pipeline.laws.base import ControlLaw
 from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
 from pipeline.models import Model
@@ -19,14 +18,14 @@ from pipeline.simulation.simulate import simulate_closed
 
 DV = torch.zeros(0, dtype=torch.float64)
 PH = CASES["ph_neutralization"]
-SIGNALS = LawSignals.of(PH.plant)
+SIGNALS = PH.plant.signals
 NUMBERS = required("self_tuning_pid")
 HALF = 100.0  # ml/min, one unit of move
 
 
 @pytest.fixture(scope="module")
 def arx() -> Model:
-    return ArxPart().learn(RandomSteps(samples=2000, hold=3).run(PH.plant, 0), PH.plant, {}, 0).model
+    return ArxPart().learn(RandomSteps(samples=2000, hold=3).run(PH.plant, 0), PH.plant.signals, {}, 0).model
 
 
 def tensor(*values: float) -> torch.Tensor:

@@ -23,12 +23,12 @@ def linear_record(noise: float = 0.0, samples: int = 800) -> Record:
     y = np.full(len(u), 0.5)
     for k in range(1, len(u) - 1):
         y[k + 1] = 0.1 + 1.2 * y[k] - 0.4 * y[k - 1] + 0.002 * u[k] - 0.0005 * u[k - 1] + noise * rng.normal()
-    return Record.of(ThiosulfateCstr(), np.column_stack([y, 300 + y]), u[:, None])
+    return Record.of(ThiosulfateCstr().signals, np.column_stack([y, 300 + y]), u[:, None])
 
 
 def test_exact_data_give_the_exact_coefficients(tmp_path: Path) -> None:
     record = linear_record()
-    learnt = ArxPart().learn(record, ThiosulfateCstr(), {}, 0)
+    learnt = ArxPart().learn(record, ThiosulfateCstr().signals, {}, 0)
     model = learnt.model
     assert isinstance(model, ARX)
     np.testing.assert_allclose(model.weight.numpy(), [1.2, -0.4, 0.002, -0.0005], rtol=1e-9)
@@ -56,16 +56,16 @@ def test_noisy_data_leave_a_residual_orthogonal_to_the_regressors() -> None:
 
 def test_part_is_known_by_its_kind_and_learns_another_target() -> None:
     assert MODELS["arx"] is ArxPart
-    model = ArxPart(target="T").learn(linear_record(), ThiosulfateCstr(), {}, 0).model
+    model = ArxPart(target="T").learn(linear_record(), ThiosulfateCstr().signals, {}, 0).model
     assert isinstance(model, ARX)
     assert model.bias.item() == pytest.approx(0.1 + 300 * 0.2, rel=1e-6)
     with pytest.raises(ParamsError, match="process variable"):
-        ArxPart(target="pressure").learn(linear_record(), ThiosulfateCstr(), {}, 0)
+        ArxPart(target="pressure").learn(linear_record(), ThiosulfateCstr().signals, {}, 0)
 
 
 def test_what_the_data_do_not_determine_is_said() -> None:
     with pytest.raises(ModelError, match="learns from a record"):
-        ArxPart().learn(None, ThiosulfateCstr(), {}, 0)
+        ArxPart().learn(None, ThiosulfateCstr().signals, {}, 0)
     with pytest.raises(ModelError, match="n_u=0"):
         ARX(2, 0)
     with pytest.raises(ModelError, match="7 regressor columns"):

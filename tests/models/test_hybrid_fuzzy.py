@@ -192,7 +192,7 @@ def test_only_the_tied_model_keeps_the_ties_and_has_no_gap(how: How, reactor_rec
     shared = model.consequents[:, [0, 1, 3]]
     tied = torch.equal(shared[0], shared[1])
     assert tied == (how == "tied")
-    assert (gap(model, JacketedBatchReactor())["gap"] < 1e-12) == tied
+    assert (gap(model, JacketedBatchReactor().signals)["gap"] < 1e-12) == tied
 
 
 def test_least_squares_can_only_lose_by_ties_and_by_separate_rules(reactor_record: Record) -> None:
@@ -231,16 +231,16 @@ def test_one_step_errors_are_those_of_an_independent_implementation(reactor_reco
     # A fifth is left for the draw of the pulses.
     expected = {"local": 0.18, "global": 0.070, "tied": 0.076}
     plant = JacketedBatchReactor()
-    found = {how: part(how).learn(reactor_record, plant, {}, 0).metrics for how in HOWS}
+    found = {how: part(how).learn(reactor_record, plant.signals, {}, 0, plant).metrics for how in HOWS}
     assert {how: metrics["rmse"] for how, metrics in found.items()} == pytest.approx(expected, rel=0.2)
-    printed = PrintedFuzzyPart().learn(reactor_record, plant, {}, 0).metrics
+    printed = PrintedFuzzyPart().learn(reactor_record, plant.signals, {}, 0, plant).metrics
     # The printed model has drifted off after an hour of free run.
     assert printed["free_run_rmse"] > 4 * found["tied"]["free_run_rmse"]
 
 
 def test_the_tied_models_parameters_are_those_of_the_physics(reactor_record: Record) -> None:
     plant = JacketedBatchReactor()
-    found = part("tied").learn(reactor_record, plant, {}, 0).metrics
+    found = part("tied").learn(reactor_record, plant.signals, {}, 0, plant).metrics
     for centre in (20, 40, 60):
         for name, tolerance in (("a1", 0.01), ("a2", 0.006)):
             key = f"{name}_hot_{centre}"
@@ -256,7 +256,7 @@ def test_the_tied_models_parameters_are_those_of_the_physics(reactor_record: Rec
 def test_measurement_noise_hardly_moves_the_tied_parameters() -> None:
     plant = JacketedBatchReactor()
     noisy = JacketPulses(samples=12_000, noise=(0.05, 0.1)).run(plant, 0)
-    found = part("tied").learn(noisy, plant, {}, 0).metrics
+    found = part("tied").learn(noisy, plant.signals, {}, 0, plant).metrics
     for key in ("a1_hot_20", "a1_hot_40", "a1_hot_60"):
         assert found["parameters"][key] == pytest.approx(found["physics"][key], abs=0.01)
     for key in ("b_hot_20", "b_hot_40", "b_cold_40", "b_cold_60"):
@@ -277,20 +277,20 @@ def test_physics_of_the_linear_part_are_the_matrix_exponential() -> None:
 
 def test_the_printed_gap_is_what_was_found_independently() -> None:
     # "Up to 1.4 degC a step" within core temperatures that the test's profile reaches.
-    found = gap(printed_model(), FuzzyBatchReactor())
+    found = gap(printed_model(), FuzzyBatchReactor().signals)
     assert found["gap"] == pytest.approx(1.4, abs=0.1)
 
 
 def test_only_the_printed_model_needs_no_record(reactor_record: Record) -> None:
     plant = JacketedBatchReactor()
-    assert "gap" in PrintedFuzzyPart().learn(None, plant, {}, 0).metrics
+    assert "gap" in PrintedFuzzyPart().learn(None, plant.signals, {}, 0, plant).metrics
     with pytest.raises(ModelError, match="learns from a record; point `data:`"):
-        part("tied").learn(None, plant, {}, 0)
+        part("tied").learn(None, plant.signals, {}, 0, plant)
     assert MODELS["hybrid_fuzzy"] is HybridFuzzyPart
-    odd = Record.of(plant, reactor_record.pv[:50], np.full((50, 2), 1.5))
+    odd = Record.of(plant.signals, reactor_record.pv[:50], np.full((50, 2), 1.5))
     with pytest.raises(ModelError, match=r"mode is 1\.5 somewhere; it must be 1 \(hot\) or 2 \(cold\)"):
         Transitions.of(odd)
-    always = Record.of(plant, reactor_record.pv[:50], np.column_stack([reactor_record.mv[:50, 0], np.ones(50)]))
+    always = Record.of(plant.signals, reactor_record.pv[:50], np.column_stack([reactor_record.mv[:50, 0], np.ones(50)]))
     with pytest.raises(ModelError, match=r"mode is never 2 \(cold\); record pulses of both modes"):
         Transitions.of(always)
     with pytest.raises(ModelError, match="give two or more, ascending"):

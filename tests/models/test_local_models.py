@@ -44,7 +44,7 @@ def model(plant) -> LocalModels:
 @pytest.fixture(scope="module")
 def learnt(plant):
     part = LocalModelsPart(points=POINTS, mv_low=50.0, mv_high=110.0, mv_step=10.0, sizes=(3, 5))
-    return part.learn(None, plant, {}, 0)
+    return part.learn(None, plant.signals, {}, 0, plant)
 
 
 def test_operating_points_and_widths(model):

@@ -16,7 +16,7 @@ from pipeline.errors import ModelError
 from pipeline.models import MODELS, load_model
 from pipeline.models.local.linearized import Linearized
 from pipeline.models.static.mlp import MLP
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 
 
 def data(n: int = 200, n_in: int = 3, n_out: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +142,7 @@ def test_wrong_arguments_are_one_clear_line(make, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_linearized_keeps_the_steady_state_and_the_plant_s_slope(plant: Plant, tmp_path: Path) -> None:
+def test_linearized_keeps_the_steady_state_and_the_plant_s_slope(plant: EquationPlant, tmp_path: Path) -> None:
     model = Linearized.at_set_point(plant, 0.66612814)
     x0 = torch.cat([model.x, model.mv])
     torch.testing.assert_close(model(x0), model.pv, rtol=1e-12, atol=1e-12)

@@ -119,7 +119,7 @@ def linear_record(plant: ThiosulfateCstr, runs: tuple[int, ...] = (800,), order:
             last = y[k - 1] if k and run[k - 1] == run[k] else 0.0
             y[k + 1] = (0.8 * y[k] if order == 1 else 1.5 * y[k] - 0.7 * last) + 0.2 * u[k] / 500
             y[k + 1] += noise * rng.normal()
-    return Record.of(plant, np.column_stack([y, 300 + y]), u[:, None], run=run)
+    return Record.of(plant.signals, np.column_stack([y, 300 + y]), u[:, None], run=run)
 
 
 @pytest.mark.parametrize("runs", [(800,), (40,) * 20])
@@ -127,7 +127,7 @@ def test_part_learns_from_a_record_one_step_and_free_run(runs: tuple[int, ...]) 
     """A linear first-order plant is learnt to rounding of the noise-free data, and runs free as well."""
     plant = ThiosulfateCstr()
     part = NnarxPart(n_y=1, n_u=1, hidden=(4,), steps=5, trainer={"kind": "lm", "iterations": 60})
-    learnt = part.learn(linear_record(plant, runs), plant, {}, 0)
+    learnt = part.learn(linear_record(plant, runs), plant.signals, {}, 0)
     assert learnt.metrics["fit_percent"] > 99
     assert learnt.metrics["free_run_rmse"] < 0.01
     assert learnt.metrics["n_train"] == 560
@@ -140,7 +140,7 @@ def test_search_takes_the_lags_that_the_plant_has() -> None:
     plant = ThiosulfateCstr()
     search = [{"n_y": 1}, {"n_y": 2}, {"n_y": 3, "hidden": [6]}]
     options = {"n_u": 1, "hidden": [3], "trainer": {"kind": "lm", "iterations": 80}, "search": search}
-    learnt = parse(NnarxPart, options, "nnarx").learn(linear_record(plant, order=2, noise=0.01), plant, {}, 0)
+    learnt = parse(NnarxPart, options, "nnarx").learn(linear_record(plant, order=2, noise=0.01), plant.signals, {}, 0)
     rows = learnt.metrics["candidates"]
     assert [r["chosen"] for r in rows] == [False, True, False]
     assert isinstance(learnt.model, NNARX)

@@ -15,19 +15,19 @@ from pipeline.models.lagged.nnarx_part import NnarxPart
 from pipeline.models.part import predict
 from pipeline.models.training.objectives import Windows
 from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.records.record import Record
 
 SEEDS = (0, 1, 2)
 
 
 @pytest.fixture(scope="module")
-def tank() -> Plant:
+def tank() -> EquationPlant:
     return PLANTS["ph_neutralization_15s"]()
 
 
 @pytest.fixture(scope="module")
-def unseen(tank: Plant) -> Windows:
+def unseen(tank: EquationPlant) -> Windows:
     """Free runs over 30 samples of an experiment without noise that no network has seen."""
     return Windows.of(EXCITATIONS["random_steps"](samples=800, hold=8).run(tank, 99), 2, 2, 30)
 
@@ -46,13 +46,13 @@ def one_step(learnt: Learnt, record: Record) -> float:
 
 @pytest.mark.parametrize(("noise", "ahead", "free"), [((), 0.002, 0.0045), ((0.05,), 0.06, 0.021)])
 def test_training_on_free_runs_makes_free_runs_better(
-    tank: Plant, unseen: Windows, noise: tuple[float, ...], ahead: float, free: float
+    tank: EquationPlant, unseen: Windows, noise: tuple[float, ...], ahead: float, free: float
 ) -> None:
     """Reference, 2,000 points every 15 s: one step .0012; free run .0044 -> .0033, with noise .0190 -> .0117."""
     rows = []
     for seed in SEEDS:
         record = EXCITATIONS["random_steps"](samples=2_000, hold=4, noise=noise).run(tank, seed)
-        plain, multi = (NnarxPart(steps=steps).learn(record, tank, {}, seed) for steps in (1, 10))
+        plain, multi = (NnarxPart(steps=steps).learn(record, tank.signals, {}, seed) for steps in (1, 10))
         rows.append((plain.metrics["rmse"], free_run(plain, unseen), free_run(multi, unseen)))
     one, before, after = np.median(rows, axis=0)
     assert one < ahead
@@ -74,7 +74,7 @@ def test_a_batch_is_learnt_from_start_ups_with_mixed_levels() -> None:
         EXCITATIONS["random_steps"](samples=2_000),
         EXCITATIONS["batches"](samples=50, batches=40, hold=1),
     )
-    binary, mixed, startups = (one_step(part.learn(e.run(reactor, 0), reactor, {}, 0), unseen) for e in records)
+    binary, mixed, startups = (one_step(part.learn(e.run(reactor, 0), reactor.signals, {}, 0), unseen) for e in records)
     assert startups < 0.13
     assert mixed > 2 * startups
     assert binary > 1.0

@@ -134,7 +134,7 @@ def test_windows_that_do_not_match_are_refused() -> None:
 
 def test_part_needs_a_record_and_steps() -> None:
     with pytest.raises(ModelError, match="learns from a record"):
-        StateSpacePart().learn(None, ReversibleCstr(), {}, 0)
+        StateSpacePart().learn(None, ReversibleCstr().signals, {}, 0)
     with pytest.raises(ValueError, match="steps is 0"):
         StateSpacePart(steps=0)
 
@@ -146,7 +146,7 @@ def reactor_record() -> Record:
 
 def test_the_reactor_is_learnt_to_within_a_percent_of_a_long_free_run(reactor_record: Record) -> None:
     part = StateSpacePart(hidden=(10,), steps=30, long_run=400, trainer={"kind": "lm", "iterations": 40, "rows": 1500})
-    learnt = part.learn(reactor_record, ReversibleCstr(), {"all": (-np.inf, np.inf)}, 0)
+    learnt = part.learn(reactor_record, ReversibleCstr().signals, {"all": (-np.inf, np.inf)}, 0)
     figures = learnt.metrics["state_space"]
     assert set(figures) == {"one_step_trained", "free_run_trained"}
     for name in ("C_B", "T"):
@@ -158,7 +158,7 @@ def test_training_on_free_runs_mends_what_one_step_hides(reactor_record: Record)
     part = NnarxPart(
         hidden=(10,), steps=50, long_run=400, compared=0, trainer={"kind": "lm", "iterations": 40, "rows": 1500}
     )
-    learnt = part.learn(reactor_record, ReversibleCstr(), {}, 0)
+    learnt = part.learn(reactor_record, ReversibleCstr().signals, {}, 0)
     first, then = (learnt.metrics["nnarx"][name]["C_B"] for name in ("one_step_trained", "free_run_trained"))
     assert first["one_step_rmse"] < 1e-3 * np.ptp(reactor_record.pv[:, 0])  # accurate, one step ahead
     assert first["free_run_rmse"] > 10 * first["one_step_rmse"]  # and far off, running free

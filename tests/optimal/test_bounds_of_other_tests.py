@@ -23,7 +23,7 @@ from pipeline.evaluation.metric import METRICS
 from pipeline.optimal.bounds import load_bounds, plant_digest
 from pipeline.optimal.horizon import Horizon
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.simulation.simulate import simulate_closed, simulate_open
 from pipeline.stages import bounds as oracle
@@ -134,7 +134,7 @@ def test_a_discrete_mv_without_relaxation_is_refused(vessel: JacketedBatchReacto
     with pytest.raises(PlantError, match="no horizon for the discrete MV 'mode' of plant 'jacketed_batch_reactor'"):
         Horizon(vessel, 5)
     with pytest.raises(PlantError, match=r"has the discrete MV 'mode' and no relaxed\(\) without it"):
-        Plant.relaxed(vessel)
+        EquationPlant.relaxed(vessel)
     plain = HensonSeborgCstr()
     assert plain.relaxed() is plain
 
@@ -212,7 +212,7 @@ class Vessels(Case):
 
     name: ClassVar[str] = "vessels"
     title: ClassVar[str] = "Vessels"
-    plant_class: ClassVar[type[Plant]] = JacketedBatchReactor
+    plant_class: ClassVar[type[EquationPlant]] = JacketedBatchReactor
     development_seeds: ClassVar[tuple[int, ...]] = (11,)
     noise: ClassVar[Mapping[str, float]] = {"T": 0.05, "T_w": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"own": 1.0}
@@ -261,7 +261,7 @@ def test_the_yardstick_of_tracking_is_what_noisy_samples_tell_apart(followed: Sc
     class Tracked(Vessels):
         name: ClassVar[str] = "tracked"
         metric: ClassVar[str] = "tracking"
-        plant_class: ClassVar[type[Plant]] = ReversibleCstr
+        plant_class: ClassVar[type[EquationPlant]] = ReversibleCstr
         noise: ClassVar[Mapping[str, float]] = {"C_B": 0.002, "T": 0.1}
 
         def scenarios(self) -> dict[str, tuple[Scenario, ...]]:

@@ -18,7 +18,7 @@ from pipeline.evaluation.metric import METRICS
 from pipeline.metrics import mae
 from pipeline.optimal.horizon import Horizon
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline, search
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_closed
 from pipeline.stages import bounds as oracle
@@ -35,7 +35,7 @@ def nmpc(case: Case) -> PerfectNmpc:
 
 
 @pytest.fixture(scope="module")
-def tank() -> Plant:
+def tank() -> EquationPlant:
     return CASES["ph_neutralization"].plant
 
 
@@ -120,13 +120,13 @@ def test_an_ignition_is_found_at_its_best_sample(case: Case) -> None:
 
 
 @pytest.mark.parametrize(("start", "end"), [(7.0, 9.0), (9.2, 6.6)])
-def test_the_plan_for_squared_errors_is_that_of_single_shooting(tank: Plant, start: float, end: float) -> None:
+def test_the_plan_for_squared_errors_is_that_of_single_shooting(tank: EquationPlant, start: float, end: float) -> None:
     # Another way to the same optimum: moves alone, through the integrator, by a bounded least-squares solver.
     n, x0 = 6, tank.steady_state_at(start)[0]
     x, moves, errors = ca.DM(x0), ca.SX.sym("moves", n), []
     for k in range(n):
         x = tank.transition(x, moves[k], tank.dv_nominal, tank.parameters())
-        errors.append(end - tank.measure(x))
+        errors.append(end - tank.measurement(x))
     error = ca.Function("error", [moves], [ca.vertcat(*errors)])
     slope = ca.Function("slope", [moves], [ca.jacobian(ca.vertcat(*errors), moves)])
     starts = np.random.default_rng(0).uniform(860, 1040, (8, n))
@@ -141,7 +141,7 @@ def test_the_plan_for_squared_errors_is_that_of_single_shooting(tank: Plant, sta
     assert plan.cost * span**2 == pytest.approx(2 * min(f.cost for f in found), rel=1e-4)
 
 
-def test_an_unforeseen_disturbance_costs_the_nmpc_one_sample(tank: Plant) -> None:
+def test_an_unforeseen_disturbance_costs_the_nmpc_one_sample(tank: EquationPlant) -> None:
     x0, mv0 = tank.steady_state_at(8.0)
     q1 = np.repeat([tank.parameters()[tank.parameter_names().index("q1")], 1010.0], 6)
     scenario = Scenario("acid", "", np.full((12, 1), 8.0), x0, mv0, {"q1": q1})
@@ -174,7 +174,7 @@ def test_a_recipe_is_followed_as_closely_as_can_be(batch: Case, period_s: float,
     assert aware["sse_late"] < 1e-3 < 1 < blind["sse_late"]
 
 
-def test_each_set_point_is_planned_by_itself_unless_it_is_a_recipe(tank: Plant) -> None:
+def test_each_set_point_is_planned_by_itself_unless_it_is_a_recipe(tank: EquationPlant) -> None:
     # Equal neighbours are one set point, of whatever length: its plan ends at rest. A recipe's plan starts early.
     x0, mv0 = tank.steady_state_at(7.0)
     test = Scenario("steps", "", np.repeat([7.0, 7.0, 9.0], 5)[:, None], x0, mv0, {}, 5)
@@ -183,14 +183,14 @@ def test_each_set_point_is_planned_by_itself_unless_it_is_a_recipe(tank: Plant) 
     assert course["sse"] < steps["sse"]
 
 
-def test_a_metric_without_a_floor_is_refused(tank: Plant) -> None:
+def test_a_metric_without_a_floor_is_refused(tank: EquationPlant) -> None:
     with pytest.raises(
         PlantError, match="no horizon for the metric 'masse', which has no floor; it may be mae, sse, tracking"
     ):
         Horizon(tank, 5, metric=METRICS["masse"])
 
 
-def test_noise_on_what_is_no_state_is_refused(tank: Plant) -> None:
+def test_noise_on_what_is_no_state_is_refused(tank: EquationPlant) -> None:
     x0, mv0 = tank.steady_state_at(7.0)
     scenario = Scenario("rest", "", np.full((3, 1), 7.0), x0, mv0)
     with pytest.raises(PlantError, match="measures other things than its states; its NMPC cannot be given noise"):

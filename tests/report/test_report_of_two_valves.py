@@ -24,7 +24,7 @@ from pipeline.evaluation.metric import Metric
 from pipeline.evaluation.validation import Validation
 from pipeline.evaluation.verdicts import PLAIN, CasePicture, requirement
 from pipeline.pictures.loop_pictures import overview_picture
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.report.figures import draw_all
 from pipeline.report.page import headline, write_report
 from pipeline.report.verdict_words import statement
@@ -46,7 +46,7 @@ class TwoValves(Case):
     held_out_seeds: tuple[int, ...] = (9001,)
     name: ClassVar[str] = "two_valves"
     title: ClassVar[str] = "A reactor with two valves"
-    plant_class: ClassVar[type[Plant]] = JacketedBatchReactor
+    plant_class: ClassVar[type[EquationPlant]] = JacketedBatchReactor
     development_seeds: ClassVar[tuple[int, ...]] = (1,)
     noise: ClassVar[Mapping[str, float]] = {"T": 0.05, "T_w": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"levels": 1.0}

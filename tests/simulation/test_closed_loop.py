@@ -9,7 +9,7 @@ from made_up_plant import Lag
 from pipeline.cases import PLANTS
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import PlantError
-from pipeline.simulation.simulate import measured, simulate_batch, simulate_closed, simulate_open
+from pipeline.simulation.simulate import simulate_batch, simulate_closed, simulate_open
 
 
 @dataclass(frozen=True)
@@ -122,10 +122,10 @@ def test_noise_is_seeded_and_not_in_the_true_pv(cstr):
 
 
 def test_measured_follows_the_plants_output(cstr):
-    assert np.array_equal(measured(cstr, np.ones((2, 3, 2))), np.ones((2, 3, 2)))
+    assert np.array_equal(cstr.measured(np.ones((2, 3, 2))), np.ones((2, 3, 2)))
     x = np.arange(6.0).reshape(2, 3, 1)
-    assert np.array_equal(measured(Lag(), x), 10 * x)
-    assert measured(Lag(), np.array([2.0])).tolist() == [20.0]
+    assert np.array_equal(Lag().measured(x), 10 * x)
+    assert Lag().measured(np.array([2.0])).tolist() == [20.0]
 
 
 def test_a_state_that_is_lost_names_its_sample(cstr, middle):

@@ -11,7 +11,6 @@ import yaml
 
 from pipeline.cases import CASES
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.plants.base import Plant
 from pipeline.stages import check
 
 ROOT = Path(__file__).parents[2]
@@ -74,7 +73,7 @@ def test_every_mistake_is_told_and_the_exit_says_so(params: dict[str, Any], caps
     assert [line.partition(":")[0] for line in lines] == ["check", "check"]
 
 
-class Unwritten(Plant):
+class Unwritten(EquationPlant):
     """A plant without equations."""
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from pipeline.errors import LawError, PlantError
-from pipeline.laws.base import LawSignals
 from pipeline.laws.pid.pid import PID
 from pipeline.tuning.recovery import Starts, other_rests, recover
 from pipeline.tuning.rules import PidSettings, sampled_loop
@@ -33,7 +32,7 @@ def settings() -> PidSettings:
 
 @pytest.fixture(scope="module")
 def pid(plant, settings) -> PID:
-    return PID(LawSignals.of(plant), settings)
+    return PID(plant.signals, settings)
 
 
 def eigenvalues(matrix: np.ndarray) -> np.ndarray:
@@ -66,7 +65,7 @@ def test_gain_margin_is_where_the_loop_becomes_unstable(plant, pid):
 
 
 def test_gain_margin_of_an_unstable_loop_is_none(plant, settings):
-    hard = PID(LawSignals.of(plant), PidSettings(1e6, settings.ti_s))
+    hard = PID(plant.signals, PidSettings(1e6, settings.ti_s))
     assert FrozenLoops.of(plant, hard, hard.n_state, np.array([0.1])).gain_margin() == 0.0
 
 
@@ -80,7 +79,7 @@ def test_a_law_that_does_not_rest_has_no_frozen_loop(plant):
 
 def test_a_pid_tells_of_its_loops_where_it_is_asked_to(plant, settings):
     asked = {"tuning": "manual", "kc": settings.kc, "ti_s": settings.ti_s, "td_s": settings.td_s, "filter_s": 1.32}
-    signals = LawSignals.of(plant)
+    signals = plant.signals
     told = PID.design(PID.Params(**asked, examined_cv=(0.015, 0.13)), {}, signals, plant).analysis(plant)
     assert told.figures["frozen_radius"] == pytest.approx(told.arrays["frozen_radius"].max())
     assert 3 < told.figures["gain_margin"] < 4

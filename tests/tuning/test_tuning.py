@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import LawError, PlantError
-from pipeline.plants.base import Linearization, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.linearization import Linearization
 from pipeline.tuning.development import DevelopmentLoops
 from pipeline.tuning.reduction import LagWithDeadTime, minimal
 from pipeline.tuning.rules import (
@@ -41,7 +42,7 @@ def first_order(gain: float, tau: float) -> Linearization:
 
 
 @pytest.fixture(scope="module")
-def middle(plant: Plant) -> Linearization:
+def middle(plant: EquationPlant) -> Linearization:
     return plant.linearize(*plant.steady_state_at(MIDDLE))
 
 
@@ -142,7 +143,7 @@ def test_imc_of_one_pole_is_a_pi(pole: float) -> None:
     assert closed_loop_poles(process, settings_).real.max() < 0
 
 
-def test_imc_stabilizes_the_sampled_cstr(middle: Linearization, plant: Plant) -> None:
+def test_imc_stabilizes_the_sampled_cstr(middle: Linearization, plant: EquationPlant) -> None:
     """Continuous IMC is always stable; sampled at 0.5 s, too short a filter is not."""
     process = AllPole.of(middle)
 
@@ -231,7 +232,7 @@ def test_optimized_imc_finds_the_cheapest(middle: Linearization) -> None:
         optimized_imc(process, 0.5, lambda rows: np.full(len(rows), np.inf), base)
 
 
-def test_development_loops_start_at_rest(plant: Plant) -> None:
+def test_development_loops_start_at_rest(plant: EquationPlant) -> None:
     loops = DevelopmentLoops.draw(plant, (1, 2), 3, 5)
     assert loops.sp.shape == (15, 2)
     assert (np.diff(loops.sp.reshape(3, 5, 2), axis=1) == 0).all()
@@ -244,7 +245,7 @@ def test_development_loops_start_at_rest(plant: Plant) -> None:
     assert still.error(hold, 0, candidates=2).max() < 1e-6
 
 
-def test_time_weighted_errors_count_what_comes_late(plant: Plant) -> None:
+def test_time_weighted_errors_count_what_comes_late(plant: EquationPlant) -> None:
     """An MV that never moves: the error stays as it is over each hold, but for the plant's own motion."""
     loops = DevelopmentLoops.draw(plant, (3,), 2, 6)
 
@@ -257,7 +258,7 @@ def test_time_weighted_errors_count_what_comes_late(plant: Plant) -> None:
     assert weighted == pytest.approx(step / 2 * 2.5, rel=1e-3)  # mean of 0..5 over the hold with an error
 
 
-def test_development_loops_must_be_asked_for(plant: Plant) -> None:
+def test_development_loops_must_be_asked_for(plant: EquationPlant) -> None:
     with pytest.raises(PlantError, match="need seeds"):
         DevelopmentLoops.draw(plant, (), 3, 5)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.cases.batch_reactor.plant import BatchReactor
 from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, PaperTable, Requirement
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario
 
 END_S, LATE_S = 1000.0, 200.0  # full heating from 25 deg C meets the profile after 171 s
@@ -53,7 +53,7 @@ class BatchReactorCase(Case):
     )
     noise_draws: ClassVar[int] = 10
     development_noise: ClassVar[bool] = True
-    plant_class: ClassVar[type[Plant]] = BatchReactor
+    plant_class: ClassVar[type[EquationPlant]] = BatchReactor
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
     noise: ClassVar[Mapping[str, float]] = {"T": 1.0}
     gate: ClassVar[Mapping[str, float]] = {"trajectory": 0.4, "held_out": 0.4, "fouling": 0.2}

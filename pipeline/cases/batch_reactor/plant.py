@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array
 from serving.manifest import Signal
 
 KELVIN = 273.15
@@ -18,7 +19,7 @@ GRID = 400  # points of the steady curve
 
 
 @dataclass(frozen=True)
-class BatchReactor(Plant):
+class BatchReactor(EquationPlant):
     """Consecutive reactions of second and first order, heated and cooled by one split-range signal.
 
         dCA/dt = -k1 CA^2,     dCB/dt = k1 CA^2 - k2 CB

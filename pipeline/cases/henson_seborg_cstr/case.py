@@ -13,7 +13,8 @@ from pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTabl
 from pipeline.evaluation.closed_loop import overshoots
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import Metric
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
 
 HOLD = 500  # samples: 10 min
@@ -93,7 +94,7 @@ class HensonSeborgCstrCase(Case):
 
     name: ClassVar[str] = "henson_seborg_cstr"
     title: ClassVar[str] = "Exothermic CSTR under coolant flow"
-    plant_class: ClassVar[type[Plant]] = HensonSeborgCstr
+    plant_class: ClassVar[type[EquationPlant]] = HensonSeborgCstr
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
     noise: ClassVar[Mapping[str, float]] = {"C": 2e-4, "T": 0.2}
     seen: ClassVar[str] = (

@@ -22,7 +22,8 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.timing import faster_than_nmpc, step_within
 from pipeline.evaluation.verdicts import CasePicture, Check, Claim, Claims, Verdict, plain_reason
 from pipeline.pictures.words import number
-from pipeline.plants.base import Linearization, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.linearization import Linearization
 
 SET = "local_models"
 SMALL = 0.10  # of a step: an overshoot that deserves the name
@@ -99,16 +100,16 @@ def _five(evidence: Evidence) -> Verdict:
 
 
 def _hopf(evidence: Evidence) -> Verdict:
-    at = hopf_point(evidence.case.plant)
+    at = hopf_point(evidence.case.equations)
     measured = f"the eigenvalues cross the imaginary axis at C = {at[0]:.5f} mol/l, q_c = {at[1]:.2f} l/min"
     holds = all(abs(ours - printed) <= NEAR * printed for ours, printed in zip(at, PRINTED_HOPF, strict=True))
-    plant = evidence.case.plant
+    plant = evidence.case.equations
     stable = plant.linearize(*plant.steady_state_at(PRINTED_HOPF[0])).eigenvalues[0].real < 0
     because = f"within {100 * NEAR:g} %; the printed point is {'still a stable' if stable else 'an unstable'} one"
     return Verdict("", "", measured, holds, because)
 
 
-def hopf_point(plant: Plant) -> tuple[float, float]:
+def hopf_point(plant: EquationPlant) -> tuple[float, float]:
     """(C, q_c) where the ignited branch loses its stability; raises ValueError where it does not."""
     sp = plant.sp_signals[0]
 
@@ -119,7 +120,7 @@ def hopf_point(plant: Plant) -> tuple[float, float]:
     return cv, float(plant.steady_state_at(cv)[1][0])
 
 
-def rekindling_flow(plant: Plant) -> float:
+def rekindling_flow(plant: EquationPlant) -> float:
     """The coolant flow [l/min] below which the reactor cannot stay gone out: the least steady flow of that branch.
 
     At temperature T the concentration is steady at C = 1/(1 + (V/q) K0 exp(-(E/R)/T)) C_f; what coolant
@@ -170,7 +171,7 @@ def _ahead(evidence: Evidence) -> Verdict:
 
 def _ziegler_nichols(evidence: Evidence) -> Verdict:
     """Whether proportional feedback has an ultimate gain on the local models, and what the sampling makes of it."""
-    plant = evidence.case.plant
+    plant = evidence.case.equations
     part = (evidence.models.get(SET, {}).get("parts") or {}).get(SET) or {}
     points = ((part.get("median") or {}).get("operating_points") or {}).values()
     lins = [plant.linearize(*plant.steady_state_at(float(p["C"]))) for p in points]
@@ -255,7 +256,7 @@ def _gone_out(evidence: Evidence) -> Verdict:
     known = {law: v for law, v in found.items() if v is not None}
     if len(known) < len(found):
         return Verdict(what, limit, "not measured", None)
-    plant, mv = evidence.case.plant, evidence.case.plant_class.mv_signals[0]
+    plant, mv = evidence.case.equations, evidence.case.plant_class.mv_signals[0]
     because = (
         f"there the law asks for the least {mv.name}, {mv.low:g} {mv.unit}; to take fire again by itself the reactor "
         f"needs less than {rekindling_flow(plant):.1f} {mv.unit}"

@@ -40,7 +40,7 @@ def free_run_picture(model_set: str) -> Draw:
         arrays = _predictions(evidence, model_set)
         if not {"time_s", "mv", "actual", "predicted"} <= set(arrays):
             return None
-        plant = evidence.case.plant_class
+        plant = evidence.case.equations
         states, n = plant.state_signals, arrays["actual"].shape[1]
         canvas = Canvas(figsize=(SIZE[0], 1.0 + 1.7 * (n + 1)), layout="constrained")
         panels = list(canvas.subplots(n + 1, 1, sharex=True))
@@ -68,7 +68,7 @@ def phase_picture(evidence: Evidence) -> Canvas | None:
         return None
     canvas = Canvas(figsize=(SIZE[0], 5.4), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(1, len(found), sharex=True, sharey=True)))
-    cvs, xs, _ = evidence.case.plant.steady_curve
+    cvs, xs, _ = evidence.case.equations.steady_curve
     for axes, (law, arrays) in zip(panels, found, strict=True):
         good = arrays["arrived"] > 0
         start = arrays["start"]
@@ -188,7 +188,7 @@ def _colour(evidence: Evidence, curves: Sequence[tuple[Curve, str]], i: int) -> 
 
 
 def _label(evidence: Evidence, state: int) -> str:
-    signal = evidence.case.plant_class.state_signals[state]
+    signal = evidence.case.equations.state_signals[state]
     return axis_label(symbol(signal.name), signal.unit)
 
 

@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from serving.manifest import Signal
 
 
 @dataclass(frozen=True)
-class HensonSeborgCstr(Plant):
+class HensonSeborgCstr(EquationPlant):
     """One irreversible exothermic reaction, cooled by a coil.
 
         dC/dt = (q/V) (C_f - C) - K0 C exp(-(E/R)/T)

@@ -14,7 +14,7 @@ from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import Metric
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario, random_levels, stepwise
 
 RECIPE = ((0, 62.0), (800, 26.0), (1600, 35.0))  # first sample, core temperature [deg C]
@@ -61,7 +61,7 @@ class JacketedBatchReactorCase(Case):
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {"T_w": (20.0, 70.0)}
     # Periods of 10 s, of which the core's time constant is 300.
     effort: ClassVar[Effort] = Effort(40, 1, 1, 2, (1, 3), tail=60, every=10, noisy=False)
-    plant_class: ClassVar[type[Plant]] = JacketedBatchReactor
+    plant_class: ClassVar[type[EquationPlant]] = JacketedBatchReactor
     further_plants = (FuzzyBatchReactor,)
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     noise: ClassVar[Mapping[str, float]] = {"T": 0.05, "T_w": 0.1}
@@ -170,7 +170,7 @@ class JacketedBatchReactorCase(Case):
         name: str,
         title: str,
         changes: Mapping[str, Array] | None = None,
-        plant: Plant | None = None,
+        plant: EquationPlant | None = None,
         seed: int | None = None,
     ) -> Scenario:
         x0, mv0 = self.plant.start

@@ -11,7 +11,8 @@ import casadi as ca
 import numpy as np
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array
 from serving.manifest import Signal
 
 HOT, COLD = 1.0, 2.0  # the values of the mode
@@ -26,7 +27,7 @@ def _of(value: float, unit: str = "-") -> Any:
 
 
 @dataclass(frozen=True)
-class FuzzyBatchReactor(Plant):
+class FuzzyBatchReactor(EquationPlant):
     """Core and jacket of a batch reactor, sampled every 10 s, by rules on the jacket's temperature.
 
         T(k+1)   = core_jacket T_w(k) + core_core T(k)

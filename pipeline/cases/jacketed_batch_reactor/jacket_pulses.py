@@ -9,9 +9,9 @@ import numpy as np
 
 from pipeline.errors import PlantError
 from pipeline.excitation.base import Excitation
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
-from pipeline.simulation.simulate import measured, noise_draws
+from pipeline.simulation.simulate import noise_draws
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class JacketPulses(Excitation):
         self.require("opening", 0)
         self.require("shut", 0, 1)
 
-    def run(self, plant: Plant, seed: int) -> Record:
+    def run(self, plant: Simulator, seed: int) -> Record:
         """The record of one run from the plant's start; the modes answer to the jacket as it is measured.
 
         Raises PlantError for a plant without a throttle, a mode of two values and a second process variable.
@@ -76,7 +76,7 @@ class JacketPulses(Excitation):
         mode = k_m = 0.0
         target_left = pulse_left = 0
         for k in range(self.samples):
-            pv[k] = measured(plant, state) + noise[k]
+            pv[k] = plant.measure(state) + noise[k]
             if target_left == 0:
                 target = float(rng.uniform(self.target_low, self.target_high))
                 target_left = int(rng.integers(self.hold_low, self.hold_high + 1))
@@ -88,9 +88,9 @@ class JacketPulses(Excitation):
             target_left, pulse_left = target_left - 1, pulse_left - 1
             mv[k] = k_m, mode
             state = step(state, mv[k], dv, p)
-        return Record.of(plant, pv, mv)
+        return Record.of(plant.signals, pv, mv, dv=plant.dv_nominal)
 
-    def _valves(self, plant: Plant) -> tuple[Array, tuple[float, float]]:
+    def _valves(self, plant: Simulator) -> tuple[Array, tuple[float, float]]:
         """Ends of the throttle's range, shape (2,), and the mode's two values."""
         mvs = plant.mv_signals
         modes = mvs[1].values if len(mvs) == 2 else None

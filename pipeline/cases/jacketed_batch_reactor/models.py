@@ -10,7 +10,8 @@ from pipeline.models.base import Model
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
 from pipeline.models.fuzzy.hybrid_fuzzy_part import coefficients, figures, gap
 from pipeline.models.part import Learnt, Part, Regions
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 
 
@@ -26,12 +27,14 @@ class PrintedFuzzyPart(Part):
     train_fraction: float = 0.7
     free_run: int = 360
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """The printed model; without a record only what its coefficients say."""
         model = printed_model()
         if record is None:
-            return Learnt(model, {**gap(model, plant), **coefficients(model, plant)})
-        return Learnt(model, figures(model, plant, record, self.train_fraction, self.free_run))
+            return Learnt(model, {**gap(model, signals), **coefficients(model, plant)})
+        return Learnt(model, figures(model, signals, plant, record, self.train_fraction, self.free_run))
 
 
 def printed_model() -> HybridFuzzy:

@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 
 from pipeline.errors import PlantError
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array
 from serving.manifest import Signal
 
 HOT, COLD = 1.0, 2.0  # the values of the mode
@@ -19,7 +20,7 @@ LEAK = 1e-3  # of full flow that a shut valve of SignedFlow lets through, at mos
 
 
 @dataclass(frozen=True)
-class JacketedBatchReactor(Plant):
+class JacketedBatchReactor(EquationPlant):
     """Core and jacket of a batch reactor; one throttled flow of hot or of cold water feeds the jacket.
 
         dT/dt   = a_c (T_w - T)

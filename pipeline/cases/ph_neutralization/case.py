@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.cases.ph_neutralization.plant import PhNeutralization
 from pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
 
 HOLD_S = 1500.0
@@ -47,7 +47,7 @@ class PhNeutralizationCase(Case):
         "No number was chosen on held_out."
     )
     unforeseen: ClassVar[bool] = True
-    plant_class: ClassVar[type[Plant]] = PhNeutralization
+    plant_class: ClassVar[type[EquationPlant]] = PhNeutralization
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
     noise: ClassVar[Mapping[str, float]] = {"pH": 0.02}
     gate: ClassVar[Mapping[str, float]] = {

@@ -8,7 +8,7 @@ from typing import ClassVar
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
 from pipeline.cases.ph_neutralization.plant import PhNeutralization15s
 from pipeline.evaluation.case import Figure, PaperTable, Requirement
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class PhNeutralization15sCase(PhNeutralizationCase):
 
     name: ClassVar[str] = "ph_neutralization_15s"
     title: ClassVar[str] = "pH neutralization, sampled every 15 s"
-    plant_class: ClassVar[type[Plant]] = PhNeutralization15s
+    plant_class: ClassVar[type[EquationPlant]] = PhNeutralization15s
     tables: ClassVar[tuple[PaperTable, ...]] = ()
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = (

@@ -17,7 +17,8 @@ from pipeline.models.part import Learnt, Part, Regions
 from pipeline.models.training.network_parts import trainer_of
 from pipeline.models.training.objectives import Samples
 from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 from serving.manifest import Signal
 
@@ -73,7 +74,9 @@ class IdentificationExamplePart(Part):
     train_fraction: float = 0.7
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm", "iterations": 300})
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """Train and compare; the model and the curves are those of the network with the median error on the sine."""
         seeds = [seed * self.networks + i for i in range(self.networks)]
         models = [self._network(s) for s in seeds]

@@ -152,7 +152,7 @@ def _unstable(evidence: Evidence) -> Verdict:
 
 def _buffer_flow(evidence: Evidence) -> Verdict:
     """How far the printed disturbance would move pH, as one of the buffer's flow and as one of the acid's."""
-    plant = evidence.case.plant
+    plant = evidence.case.equations
     _, mv = plant.steady_state_at(8.0)
     moved = {}
     for name in ("q2", "q1"):
@@ -160,7 +160,7 @@ def _buffer_flow(evidence: Evidence) -> Verdict:
         for flow in PRINTED:
             changed = plant.with_parameters({name: flow})
             (state,) = changed.steady_states(float(mv[0]))
-            ends.append(float(np.ravel(np.asarray(changed.measure(state)))[0]))
+            ends.append(float(changed.measure(state)[0]))
         moved[name] = abs(ends[1] - ends[0])
     measured = (
         f"{PRINTED[0]:g} to {PRINTED[1]:g} ml/min, base flow held: pH moves by {moved['q2']:.2g} as buffer flow, "
@@ -189,7 +189,7 @@ def _at_bounds(evidence: Evidence) -> Verdict:
 
 # ---------------------------------------------------------------- the plant itself
 def _flows(evidence: Evidence) -> Verdict:
-    plant = evidence.case.plant
+    plant = evidence.case.equations
     found = {ph: float(plant.steady_state_at(ph)[1][0]) for ph in FLOWS}
     limit = ", ".join(f"{flow:g}" for flow in FLOWS.values()) + f" within {FLOW_ERROR:g} ml/min"
     shown = ", ".join(f"{flow:.1f}" for flow in found.values())

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from serving.manifest import Signal
 
 PH_RANGE = (0.0, 14.0)
@@ -17,7 +17,7 @@ PER_MINUTE = 1.0 / 60.0  # ml/min in ml/s
 
 
 @dataclass(frozen=True)
-class PhNeutralization(Plant):
+class PhNeutralization(EquationPlant):
     """Acid, buffer and base streams meet in a tank; the base stream's flow controls the pH.
 
         A dh/dt    = q1 + q2 + q3 - Cv sqrt(h)

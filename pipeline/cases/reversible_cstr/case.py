@@ -13,7 +13,7 @@ from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, Pa
 from pipeline.evaluation.closed_loop import itae
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import Metric
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
 from pipeline.tuning.reference_model import ReferenceModel
 
@@ -74,7 +74,7 @@ class ReversibleCstrCase(Case):
     baseline: ClassVar[str] = "pi_reference"  # the printed PID follows no reference model: to beat it is easy
     # Periods of 2 s beside a reference model of some 50 s.
     effort: ClassVar[Effort] = Effort(40, 1, 1, 3, (1, 3), every=10, noisy=False)
-    plant_class: ClassVar[type[Plant]] = ReversibleCstr
+    plant_class: ClassVar[type[EquationPlant]] = ReversibleCstr
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     # A good thermometer beside the analyser; no law here reads the temperature.
     noise: ClassVar[Mapping[str, float]] = {"C_B": 0.002, "T": 0.2}

@@ -55,7 +55,7 @@ def reason(row: PaperFigure, ours: float, evidence: Evidence) -> str:
 
 # ---------------------------------------------------------------- the plant
 def _conversion(evidence: Evidence) -> Verdict:
-    plant = evidence.case.plant
+    plant = evidence.case.equations
     assert isinstance(plant, ReversibleCstr)
     mv, (cvs, xs, mvs) = plant.mv_signals[0], plant.steady_curve
     inside = (mvs >= mv.low) & (mvs <= mv.high)
@@ -71,7 +71,7 @@ def _conversion(evidence: Evidence) -> Verdict:
 
 
 def _temperature(evidence: Evidence) -> Verdict:
-    plant = evidence.case.plant
+    plant = evidence.case.equations
     assert isinstance(plant, ReversibleCstr)
     _, xs, mvs = plant.steady_curve
     inside = (mvs >= plant.mv_signals[0].low) & (mvs <= plant.mv_signals[0].high)
@@ -105,7 +105,7 @@ def _sign(evidence: Evidence) -> Verdict:
         f"{number(offset[0])} mol/l; with -3.15 up to {number(settled[0], 2)}"
     )
     holds = share < SATURATED and offset[0] <= settled[0]
-    cvs, _, mvs = evidence.case.plant.steady_curve
+    cvs, _, mvs = evidence.case.equations.steady_curve
     gains = np.gradient(cvs, mvs)[(mvs >= mv.low) & (mvs <= mv.high)]
     because = f"the plant's gain lies between {gains.min():.2f} and {gains.max():.2f} mol/l per {mv.unit}"
     return Verdict("", "", measured, holds, because)

@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from serving.manifest import Signal
 
 R = 8.314  # J/(mol K)
 
 
 @dataclass(frozen=True)
-class ReversibleCstr(Plant):
+class ReversibleCstr(EquationPlant):
     """A <-> B in a jacketed tank of constant volume.
 
         dC_B/dt = -(F/V) C_B + r,   r = k1 exp(-E1/(R T)) (C_t - C_B) - k2 exp(-E2/(R T)) C_B

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, PaperTable, Requirement
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario, held, random_levels
 
 TJ = 250.0  # [K] of the three steady states
@@ -57,7 +57,7 @@ class ThiosulfateCstrCase(Case):
         "No number was chosen on held_out."
     )
     title: ClassVar[str] = "Thiosulfate CSTR"
-    plant_class: ClassVar[type[Plant]] = ThiosulfateCstr
+    plant_class: ClassVar[type[EquationPlant]] = ThiosulfateCstr
     test_words: ClassVar[Mapping[str, str]] = {"sp_a": "SP-A", "sp_b": "SP-B"}
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13)
     noise: ClassVar[Mapping[str, float]] = {"C_A": 5e-4, "T": 0.1}
@@ -155,7 +155,7 @@ class ThiosulfateCstrCase(Case):
 
     @cached_property
     def _steady(self) -> dict[str, Array]:
-        return dict(zip(("hot", "middle", "cold"), self.plant.steady_states(TJ), strict=True))
+        return dict(zip(("hot", "middle", "cold"), self.equations.steady_states(TJ), strict=True))
 
     def _tracking(
         self, name: str, title: str, start: str, levels: list[float], hold: int, seed: int | None = None

@@ -15,7 +15,7 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import parse_setting
 from pipeline.evaluation.timing import faster_than_nmpc, step_within
 from pipeline.evaluation.verdicts import Claim, Claims, Verdict, plain_reason
-from pipeline.plants.base import Linearization
+from pipeline.plants.linearization import Linearization
 
 TJ = 250.0  # K
 # (C_A [mol/l], T [K]) at Tj = 250 K
@@ -184,7 +184,7 @@ def _no_offset(evidence: Evidence) -> Verdict:
 
 # ---------------------------------------------------------------- the plant itself
 def _steady_states(evidence: Evidence) -> Verdict:
-    found = evidence.case.plant.steady_states(TJ)
+    found = evidence.case.equations.steady_states(TJ)
     expected = np.array(STEADY)
     what, limit = f"steady states at Tj = {TJ:g} K", "three, within 1e-4 of their range"
     if len(found) != len(expected):
@@ -194,7 +194,7 @@ def _steady_states(evidence: Evidence) -> Verdict:
 
 
 def _turning_points(evidence: Evidence) -> Verdict:
-    found = np.array([[*x, mv] for x, mv in evidence.case.plant.turning_points()])
+    found = np.array([[*x, mv] for x, mv in evidence.case.equations.turning_points()])
     expected = np.array(TURNING)
     what, limit = "turning points", "two, as far as they are printed (1e-4, 0.05 K, 0.05 K)"
     if found.shape != expected.shape:
@@ -219,7 +219,7 @@ def _zero(evidence: Evidence) -> Verdict:
 
 
 def _middle(evidence: Evidence) -> Linearization:
-    plant = evidence.case.plant
+    plant = evidence.case.equations
     return plant.linearize(*plant.steady_state_at(STEADY[1][0]))
 
 

@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import EquationPlant
 from serving.manifest import Signal
 
 
 @dataclass(frozen=True)
-class ThiosulfateCstr(Plant):
+class ThiosulfateCstr(EquationPlant):
     """Oxidation of sodium thiosulfate by hydrogen peroxide in a cooled stirred tank.
 
         dCA/dt = F/V (CA_in - CA) - 2 k0 exp(-E/RT) CA^2

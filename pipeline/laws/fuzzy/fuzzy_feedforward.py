@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import LawSignals
 from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, require_numbers
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from pipeline.plants.signals import Signals
 
 
 class FuzzyFeedforward(FuzzyLaw):
@@ -47,7 +47,7 @@ class FuzzyFeedforward(FuzzyLaw):
         def __post_init__(self) -> None:
             require_numbers(self)
 
-    def __init__(self, signals: LawSignals, model: HybridFuzzy, params: Params) -> None:
+    def __init__(self, signals: Signals, model: HybridFuzzy, params: Params) -> None:
         super().__init__(signals, model, params)
         self.n_state = 6  # started, T(k), both modes' T_w(k) at k_M = 0, and what k_M = 1 adds to each
         self.info = ("adjusted_reference", "wanted_jacket", "reached_jacket", "mode")

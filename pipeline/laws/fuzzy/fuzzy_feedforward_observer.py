@@ -8,9 +8,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import LawSignals
 from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, require_numbers, require_shares
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
+from pipeline.plants.signals import Signals
 
 
 class FuzzyFeedforwardObserver(FuzzyLaw):
@@ -79,7 +79,7 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
     core_gain: Tensor  # (1,)
     approach: Tensor  # (1,)
 
-    def __init__(self, signals: LawSignals, model: HybridFuzzy, params: Params) -> None:
+    def __init__(self, signals: Signals, model: HybridFuzzy, params: Params) -> None:
         super().__init__(signals, model, params)
         numbers = {
             "correct": [params.k_core, params.k_jacket],

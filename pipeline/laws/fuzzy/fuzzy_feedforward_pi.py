@@ -9,9 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import LawSignals
 from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, require_numbers, require_shares
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from pipeline.plants.signals import Signals
 
 
 class FuzzyFeedforwardPi(FuzzyLaw):
@@ -71,7 +71,7 @@ class FuzzyFeedforwardPi(FuzzyLaw):
     approach: Tensor  # (1,)
     k_jacket: Tensor  # (1,)
 
-    def __init__(self, signals: LawSignals, model: HybridFuzzy, params: Params) -> None:
+    def __init__(self, signals: Signals, model: HybridFuzzy, params: Params) -> None:
         super().__init__(signals, model, params)
         numbers = {
             "kc": params.kc,

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, LawSignals
+from pipeline.laws.base import ControlLaw
 from pipeline.models.base import Model
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 TIE = 1e-9  # [degC] what two modes may differ by through rounding alone
 
@@ -56,7 +57,7 @@ class FuzzyLaw(ControlLaw):
     mode_middle: Tensor  # (1,) between the modes' values
     mode_half: Tensor  # (1,) half of their distance
 
-    def __init__(self, signals: LawSignals, model: HybridFuzzy, params: Any) -> None:
+    def __init__(self, signals: Signals, model: HybridFuzzy, params: Any) -> None:
         super().__init__(signals, params.mv_rate)
         _require_signals(signals, self.name)
         _require_inverse(model, self.name)
@@ -73,7 +74,7 @@ class FuzzyLaw(ControlLaw):
             self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over the part that ``params.part`` names, or the set's only hybrid fuzzy model; raises LawError."""
         return cls(signals, _chosen(models, params.part, cls.name), params)
 
@@ -150,7 +151,7 @@ def _chosen(models: Mapping[str, Model], part: str | None, law: str) -> HybridFu
     return fuzzy[part]
 
 
-def _require_signals(signals: LawSignals, law: str) -> None:
+def _require_signals(signals: Signals, law: str) -> None:
     discrete = [s.values for s in signals.mv]
     if (len(signals.sp), len(signals.pv), len(signals.mv)) != (1, 2, 2) or discrete[0] or len(discrete[1] or ()) != 2:
         raise LawError(

@@ -10,15 +10,16 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, LawSignals, require_part, require_single_loop
+from pipeline.laws.base import ControlLaw, require_part, require_single_loop
 from pipeline.models.base import Model
 from pipeline.models.static.leverage_domain import Interval, LeverageDomain
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 REQUEST_INFO = ("sp_requested", "sp_min", "sp_max", "leverage", "in_domain")
 
 
-def _parts(models: Mapping[str, Model], signals: LawSignals, law: str) -> tuple[Model, LeverageDomain]:
+def _parts(models: Mapping[str, Model], signals: Signals, law: str) -> tuple[Model, LeverageDomain]:
     """Parts ``inverse`` and ``domain`` of a model set over the inputs [pv, set point]; raises LawError."""
     require_single_loop(signals, law)
     n_in = len(signals.pv) + 1
@@ -64,14 +65,14 @@ class INC(ControlLaw):
 
         mv_rate: float | None = None
 
-    def __init__(self, signals: LawSignals, inverse: Model, mv_rate: float | None = None) -> None:
+    def __init__(self, signals: Signals, inverse: Model, mv_rate: float | None = None) -> None:
         super().__init__(signals, mv_rate)
         self.inverse = inverse
         self.n_state = 0
         self.info = ("mv_requested",)
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over part ``inverse``; raises LawError where it is missing or of another shape."""
         n_in = len(signals.pv) + len(signals.sp)
         return cls(signals, require_part(models, "inverse", cls.name, n_in, len(signals.mv)), params.mv_rate)
@@ -112,7 +113,7 @@ class INCAD(ControlLaw):
 
     def __init__(
         self,
-        signals: LawSignals,
+        signals: Signals,
         inverse: Model,
         domain: LeverageDomain,
         r: float = 1.5,
@@ -125,7 +126,7 @@ class INCAD(ControlLaw):
         self.info = (*REQUEST_INFO, "mv_requested")
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over parts ``inverse`` and ``domain``; raises LawError."""
         return cls(signals, *_parts(models, signals, cls.name), params.r, params.mv_rate)
 
@@ -175,7 +176,7 @@ class INCADEC(ControlLaw):
 
     def __init__(
         self,
-        signals: LawSignals,
+        signals: Signals,
         inverse: Model,
         domain: LeverageDomain,
         r: float = 5.5,
@@ -194,7 +195,7 @@ class INCADEC(ControlLaw):
         self.info = (*REQUEST_INFO, "error_correction", "mv_requested")
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over parts ``inverse`` and ``domain``; raises LawError."""
         parts = _parts(models, signals, cls.name)
         return cls(signals, *parts, params.r, params.correction, params.mv_rate)

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, LawSignals, require_part, require_single_loop
+from pipeline.laws.base import ControlLaw, require_part, require_single_loop
 from pipeline.models.base import Model
 from pipeline.models.static.pair import Layout, Pair, candidates
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 # Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
 FOLLOWED = 1e-3
@@ -24,7 +25,7 @@ def _column(value: float) -> Tensor:
     return torch.tensor([value], dtype=torch.float64)
 
 
-def _rising(forward: Model, signals: LawSignals) -> bool:
+def _rising(forward: Model, signals: Signals) -> bool:
     """Whether more MV means more of the controlled variable, over states all over the PVs' ranges."""
     rng = torch.Generator().manual_seed(0)
     low, high = (torch.tensor([getattr(s, end) for s in signals.pv], dtype=torch.float64) for end in ("low", "high"))
@@ -81,7 +82,7 @@ class ObserverLaw(ControlLaw):
     band: Tensor
     least: Tensor  # (1,) share of the set point's range below which a reach is nothing but the models' errors
 
-    def __init__(self, signals: LawSignals, forward: Model, observer: Model, params: Params, sections: int = 1) -> None:
+    def __init__(self, signals: Signals, forward: Model, observer: Model, params: Params, sections: int = 1) -> None:
         super().__init__(signals, params.mv_rate)
         names = [s.name for s in signals.pv]
         if params.observed is not None and params.observed not in names:
@@ -168,13 +169,13 @@ class InverseDob(ObserverLaw):
     title: ClassVar[str] = "RBF inverse over several periods, disturbance observer, integral"
 
     def __init__(
-        self, signals: LawSignals, inverse: Model, forward: Model, observer: Model, params: ObserverLaw.Params
+        self, signals: Signals, inverse: Model, forward: Model, observer: Model, params: ObserverLaw.Params
     ) -> None:
         super().__init__(signals, forward, observer, params)
         self.inverse = inverse
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over parts ``inverse``, ``forward`` and ``observer``; raises LawError."""
         require_single_loop(signals, cls.name)
         n = len(signals.pv) + 1
@@ -206,7 +207,7 @@ class ForwardDob(ObserverLaw):
     chord: Tensor  # (1,) [mv] width of one part of a part
     flat: Tensor  # (1,) [cv] a rise below which a chord has no slope
 
-    def __init__(self, signals: LawSignals, model: Model, observer: Model, params: ObserverLaw.Params) -> None:
+    def __init__(self, signals: Signals, model: Model, observer: Model, params: ObserverLaw.Params) -> None:
         super().__init__(signals, model, observer, params, sections=self.SECTIONS)
         self.model = model
         self.register_buffer("part", self.span / self.SECTIONS)
@@ -215,7 +216,7 @@ class ForwardDob(ObserverLaw):
         self.register_buffer("flat", _column(1e-12))
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over parts ``forward`` and ``observer``; raises LawError."""
         require_single_loop(signals, cls.name)
         n = len(signals.pv) + 1

@@ -9,12 +9,13 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import LawSignals, require_kind
+from pipeline.laws.base import require_kind
 from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
 from pipeline.models.base import Model
 from pipeline.models.lagged.next_output import GaussNewton
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 
 class GaussNewtonPid(NnarxPid):
@@ -45,12 +46,12 @@ class GaussNewtonPid(NnarxPid):
             if self.relinearize < 1:
                 raise ValueError(f"relinearize is {self.relinearize}; give 1 or more linearizations a sample")
 
-    def __init__(self, signals: LawSignals, model: NNARX, params: Params) -> None:
+    def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         super().__init__(signals, model, params, told=("linearization_error",), bounded=True)
         self.search = GaussNewton(self.model, params.relinearize, params.penalty, params.slope_min)
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over part ``nnarx``; raises LawError."""
         return cls(signals, require_kind(models, NNARX, cls.name), params)
 

@@ -10,13 +10,14 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import LawSignals, require_kind
+from pipeline.laws.base import require_kind
 from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
 from pipeline.models.base import Model
 from pipeline.models.lagged.next_output import Ahead
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.memory import Named, Slot, constant
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 DOUBLINGS = 12
 
@@ -70,7 +71,7 @@ class LinearizedPid(NnarxPid):
     eps_low: Tensor  # (1,)
     none: Tensor  # (1,) larger than any penalty
 
-    def __init__(self, signals: LawSignals, model: NNARX, params: Params) -> None:
+    def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         start = torch.tensor([params.penalty_start], dtype=torch.float64)
         more = {"penalty": Slot(1, constant(start))} if params.adaptive else {}
         told = ("linearization_error", *more)
@@ -88,7 +89,7 @@ class LinearizedPid(NnarxPid):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over part ``nnarx``; raises LawError."""
         return cls(signals, require_kind(models, NNARX, cls.name), params)
 

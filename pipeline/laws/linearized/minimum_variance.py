@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.adaptive import signed_unit, target, target_slots
-from pipeline.laws.base import ControlLaw, LawSignals, require_kind, require_single_loop
+from pipeline.laws.base import ControlLaw, require_kind, require_single_loop
 from pipeline.laws.linearized.nnarx_law import central_model, next_output, room
 from pipeline.models.base import Model
 from pipeline.models.lagged.next_output import GaussNewton
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.memory import Memory, Stage
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 
 class MinimumVariance(ControlLaw):
@@ -62,7 +63,7 @@ class MinimumVariance(ControlLaw):
 
     unit: Tensor  # (1,) [mv]
 
-    def __init__(self, signals: LawSignals, model: NNARX, params: Params) -> None:
+    def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
         require_single_loop(signals, self.name)
         unit = signed_unit(signals, params.plant_gain, float(central_model(model).b[0]))
@@ -84,7 +85,7 @@ class MinimumVariance(ControlLaw):
         self.info = ("b1", "offset", "mv_requested")
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over part ``nnarx``; raises LawError."""
         return cls(signals, require_kind(models, NNARX, cls.name), params)
 

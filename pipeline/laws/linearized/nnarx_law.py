@@ -16,11 +16,12 @@ from pipeline.laws.adaptive import (
     target,
     target_slots,
 )
-from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.base import ControlLaw, require_single_loop
 from pipeline.models.lagged.instantaneous import Arx, arx
 from pipeline.models.lagged.next_output import Ahead, NextOutput
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.memory import Memory, Named, Slot, Stage
+from pipeline.plants.signals import Signals
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ class NnarxPid(ControlLaw):
 
     def __init__(
         self,
-        signals: LawSignals,
+        signals: Signals,
         model: NNARX,
         params: NnarxParams,
         *,

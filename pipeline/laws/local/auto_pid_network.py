@@ -9,11 +9,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from pipeline.errors import LawError
-from pipeline.laws.base import LawSignals, require_kind
+from pipeline.laws.base import require_kind
 from pipeline.laws.local.local_controllers import BlendedParams, LocalControllers, LocalPid
 from pipeline.models.base import Model
 from pipeline.models.local.local_models import LocalModels
-from pipeline.plants.base import Linearization, Plant
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.tuning.rules import AllPole
 
 DAMPING = 2.6  # of the triple of closed-loop poles: s^3 + 2.6 wc s^2 + 2.6 wc^2 s + wc^3
@@ -81,11 +83,11 @@ class AutoPidNetwork(LocalControllers):
                 raise ValueError(f"wc is {self.wc}; give the wanted speed in rad/min, above 0")
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over the part ``local_models``; raises LawError."""
         local = require_kind(models, LocalModels, cls.name)
         pids = [one_knob(_of_first_pv(lin), params.wc / 60.0) for lin in local.linearizations()]
-        return cls.blended(params, signals, local, pids, plant)
+        return cls.blended(params, signals, local, pids)
 
 
 def _of_first_pv(lin: Linearization) -> Linearization:

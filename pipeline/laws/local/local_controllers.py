@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.base import Analysis, ControlLaw, require_single_loop
 from pipeline.laws.local.local_stability import StabilityTest, stability_analysis
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.local.local_models import LocalModels
-from pipeline.plants.base import Plant
+from pipeline.plants.equations import equations
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 Blending = Literal["gains", "outputs", "velocity"]
 
@@ -81,7 +83,7 @@ class LocalControllers(ControlLaw):
 
     def __init__(
         self,
-        signals: LawSignals,
+        signals: Signals,
         models: LocalModels,
         pids: Sequence[LocalPid],
         *,
@@ -115,15 +117,13 @@ class LocalControllers(ControlLaw):
         self.info = ("kc", "tau_i_s", "tau_d_s", "mv_requested")
 
     @classmethod
-    def blended(
-        cls, params: BlendedParams, signals: LawSignals, models: LocalModels, pids: Sequence[LocalPid], plant: Plant
-    ) -> Self:
+    def blended(cls, params: BlendedParams, signals: Signals, models: LocalModels, pids: Sequence[LocalPid]) -> Self:
         """The law with these local controllers, the rest as ``params`` says; raises LawError."""
-        states, given = len(plant.state_signals), len(params.stability.box(plant)[0])
-        if params.stability.starts and given != states:
+        given = models.n_x if params.stability.low is None else len(params.stability.low)
+        if params.stability.starts and given != models.n_x:
             raise LawError(
-                f"law {cls.name!r}: stability.low and stability.high have {given} numbers; plant {plant.name!r} has "
-                f"{states} states, give one of each for every state"
+                f"law {cls.name!r}: stability.low and stability.high have {given} numbers; the plant has "
+                f"{models.n_x} states, give one of each for every state"
             )
         return cls(
             signals,
@@ -171,6 +171,8 @@ class LocalControllers(ControlLaw):
         info = torch.cat([kp, kp / ki * self.period, kd / kp * self.period, requested], dim=-1)
         return mv, torch.cat([torch.ones_like(y), kept, beside, y, slope, mv, mv_applied, sp], dim=-1), info
 
-    def analysis(self, plant: Plant) -> Analysis:
+    def analysis(self, plant: Simulator | None) -> Analysis:
         """The stability of the loop along the operating points and from many starts, as ``stability`` asks for it."""
-        return stability_analysis(self, plant, self.points, self.stability)
+        return stability_analysis(
+            self, equations(plant, f"the analysis of law {self.name!r}"), self.points, self.stability
+        )

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
-from pipeline.laws.base import LawSignals, require_kind
+from pipeline.laws.base import require_kind
 from pipeline.laws.local.local_controllers import BlendedParams, LocalControllers, LocalPid
 from pipeline.models.base import Model
 from pipeline.models.local.local_models import LocalModels
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 
 class LocalPidNetwork(LocalControllers):
@@ -45,8 +46,8 @@ class LocalPidNetwork(LocalControllers):
                 raise ValueError(f"td_s is {list(self.td_s)}; each must be 0 s or above, 0 for a PI")
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over the part ``local_models``; raises LawError."""
         local = require_kind(models, LocalModels, cls.name)
         settings = zip(params.kc, params.ti_s, params.td_s, strict=True)
-        return cls.blended(params, signals, local, [LocalPid(k, k / ti, k * td) for k, ti, td in settings], plant)
+        return cls.blended(params, signals, local, [LocalPid(k, k / ti, k * td) for k, ti, td in settings])

@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.laws.base import Analysis, ControlLaw
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array
 from pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
 from pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
 
@@ -53,13 +54,13 @@ class StabilityTest:
                 "below its high, or neither"
             )
 
-    def box(self, plant: Plant) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def box(self, plant: EquationPlant) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Least and largest states at which a loop starts, each (n_x,), in the plant's units."""
         low, high = zip(*((s.low, s.high) for s in plant.state_signals), strict=True)
         return self.low or low, self.high or high
 
 
-def stability_analysis(law: ControlLaw, plant: Plant, points: Sequence[float], test: StabilityTest) -> Analysis:
+def stability_analysis(law: ControlLaw, plant: EquationPlant, points: Sequence[float], test: StabilityTest) -> Analysis:
     """Frozen loops, Lyapunov functions of neighbouring points, and recoveries from many starts.
 
     ``points`` are the operating points [CV] that the law is blended over.
@@ -102,7 +103,7 @@ def _lyapunov_note(edges: Array, found: Array) -> str:
 
 
 def _recoveries(
-    law: ControlLaw, plant: Plant, edges: Array, test: StabilityTest
+    law: ControlLaw, plant: EquationPlant, edges: Array, test: StabilityTest
 ) -> tuple[dict[str, float], dict[str, Array], list[str]]:
     rng, sp, mv = np.random.default_rng(test.seed), plant.sp_signals[0], plant.mv_signals[0]
     n, (low, high) = test.starts, test.box(plant)
@@ -119,7 +120,7 @@ def _recoveries(
 
     ended = run(starts, test.watched)
     minutes = plant.period_s / 60.0
-    out = np.array(plant.measure(ended.end.T))[0] > sp.high + 0.5 * (sp.high - sp.low)
+    out = plant.measured(ended.end)[:, 0] > sp.high + 0.5 * (sp.high - sp.low)
     figures = {
         "starts": float(n),
         "recovered": float(ended.arrived.sum()),
@@ -143,7 +144,7 @@ def _recoveries(
     arrays["other_rest_courses"] = back.courses
     # Several of them may lead to one: a reactor that has gone out rests elsewhere under another MV.
     kept: list[Array] = []
-    cv = np.array(plant.measure(back.end.T))[0]
+    cv = plant.measured(back.end)[:, 0]
     # What swings within the range does not arrive either, and yet came back.
     for state in back.end[~back.arrived & ((cv < sp.low) | (cv > sp.high))]:
         if all(np.abs(state / known - 1).max() > SAME for known in kept):

@@ -11,15 +11,19 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.base import Analysis, ControlLaw, require_single_loop
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.base import Model
-from pipeline.plants.base import Array, Linearization, Plant
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning import rules as tuning
 from pipeline.tuning.development import DevelopmentLoops
 from pipeline.tuning.reduction import LagWithDeadTime
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
+from pipeline.tuning.start_lag import start_lag
 
 EXAMINED = 40  # linear closed loops over a range of the CV
 
@@ -104,7 +108,7 @@ class PID(ControlLaw):
     examined_cv: tuple[float, float] | None = None
 
     def __init__(
-        self, signals: LawSignals, settings: PidSettings | Sequence[PidSettings], mv_rate: float | None = None
+        self, signals: Signals, settings: PidSettings | Sequence[PidSettings], mv_rate: float | None = None
     ) -> None:
         super().__init__(signals, mv_rate)
         require_single_loop(signals, self.name)
@@ -131,23 +135,23 @@ class PID(ControlLaw):
         self.info = ("mv_requested",)
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The PID tuned as ``params`` says, on part ``linearized`` or on the plant; raises LawError."""
         law = cls._tuned(params, models, signals, plant)
         law.examined_cv = params.examined_cv
         return law
 
     @classmethod
-    def check(cls, params: Any, models: Mapping[str, Model], plant: Plant) -> None:
+    def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
-        require_single_loop(LawSignals.of(plant), cls.name)
+        require_single_loop(plant.signals, cls.name)
         if params.tuning == "optimized":
             AllPole.near(_linearization(params, models, plant))
         else:
-            cls._tuned(params, models, LawSignals.of(plant), plant)
+            cls._tuned(params, models, plant.signals, plant)
 
     @classmethod
-    def _tuned(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def _tuned(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         require_single_loop(signals, cls.name)
         p = params
         weight = 1.0 if p.set_point_weight is None else p.set_point_weight
@@ -166,6 +170,8 @@ class PID(ControlLaw):
         elif p.tuning == "imc":
             settings = tuning.robust_imc(lin, signals.period_s)
         elif p.tuning == "optimized":
+            if plant is None:
+                raise LawError("PID tuning `optimized` needs a simulator; take manual, imc, simc or itae")
             loops = DevelopmentLoops.draw(plant, p.development_seeds, p.development_set_points, p.development_hold)
             free = p.set_point_weight is None
 
@@ -200,23 +206,30 @@ class PID(ControlLaw):
         mv = self.limited(requested, mv_applied)
         return mv, torch.cat([torch.ones_like(p), p, y, d, requested, mv, mv_applied], dim=-1), requested
 
-    def analysis(self, plant: Plant) -> Analysis:
+    def analysis(self, plant: Simulator | None) -> Analysis:
         """Stability and gain margin of the linear closed loops over ``examined_cv``; nothing where that is None."""
         if self.examined_cv is None:
             return Analysis()
-        loops = FrozenLoops.of(plant, self, self.n_state, np.linspace(*self.examined_cv, EXAMINED))
+        known = equations(plant, "law 'pid' with `examined_cv`")
+        loops = FrozenLoops.of(known, self, self.n_state, np.linspace(*self.examined_cv, EXAMINED))
         radius = spectral_radius(loops.matrices())
         figures = {"frozen_radius": float(radius.max()), "gain_margin": loops.gain_margin()}
         return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius})
 
 
-def _linearization(params: Any, models: Mapping[str, Model], plant: Plant) -> Linearization:
-    """Of the part ``linearized`` where the model set has one, else of the plant at ``operating_cv``."""
+def _linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:
+    """Of the part ``linearized`` where the model set has one, else of the plant at ``operating_cv``.
+
+    A plant without equations counts as one or two lags, those near its start.
+    """
     if "linearized" in models:
         part = models["linearized"]
         if not isinstance(part, HoldsLinearization):
             raise LawError(f"law 'pid' needs a part 'linearized' that is a linearization; got one of kind {part.kind}")
         return part.linearization()
-    sp = plant.sp_signals[0]
+    if plant is not None and params.operating_cv is None and not isinstance(plant, EquationPlant):
+        return start_lag(plant)
+    known = equations(plant, f"PID tuning {params.tuning!r} without a part `linearized`")
+    sp = known.sp_signals[0]
     cv = 0.5 * (sp.low + sp.high) if params.operating_cv is None else params.operating_cv
-    return plant.linearize(*plant.steady_state_at(cv))
+    return known.linearize(*known.steady_state_at(cv))

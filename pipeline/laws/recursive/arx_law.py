@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from pipeline.errors import LawError, ModelError
-from pipeline.laws.base import LawSignals, require_kind
+from pipeline.laws.base import require_kind
 from pipeline.models.base import Model
 from pipeline.models.lagged.arx import ARX
 from pipeline.models.lagged.recursive import RecursiveLeastSquares
 from pipeline.models.lagged.recursive_arx import RecursiveArx
+from pipeline.plants.signals import Signals
 
 
 def require_arx(models: Mapping[str, Model], law: str) -> ARX:
@@ -25,7 +26,7 @@ def require_arx(models: Mapping[str, Model], law: str) -> ARX:
 
 def estimator(
     law: str,
-    signals: LawSignals,
+    signals: Signals,
     model: ARX,
     unit: float,
     *,

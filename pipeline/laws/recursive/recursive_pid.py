@@ -17,12 +17,13 @@ from pipeline.laws.adaptive import (
     target,
     target_slots,
 )
-from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.base import ControlLaw, require_single_loop
 from pipeline.laws.recursive.arx_law import estimator, require_arx
 from pipeline.models.base import Model
 from pipeline.models.lagged.arx import ARX
 from pipeline.models.memory import Memory, Named, Slot, Stage, constant
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 
 class RecursivePid(ControlLaw):
@@ -62,7 +63,7 @@ class RecursivePid(ControlLaw):
     penalty: Tensor  # (1,)
     alpha: Tensor  # (1,) [pv]
 
-    def __init__(self, signals: LawSignals, model: ARX, params: Params) -> None:
+    def __init__(self, signals: Signals, model: ARX, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
         require_single_loop(signals, self.name)
         b = float(model.weight[model.n_y])
@@ -99,7 +100,7 @@ class RecursivePid(ControlLaw):
         self.info = (*AdaptiveGains.info, "offset")
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with part ``arx`` as its first estimate; raises LawError."""
         return cls(signals, require_arx(models, cls.name), params)
 

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.adaptive import signed_unit
-from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.base import ControlLaw, require_single_loop
 from pipeline.laws.gain_update import PidForm
 from pipeline.laws.recursive.arx_law import estimator, require_arx
 from pipeline.models.base import Model
 from pipeline.models.lagged.arx import ARX
 from pipeline.models.memory import Memory, Slot, Stage, constant
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 TERMS = 3  # of F: more would be no PID
 
@@ -96,7 +97,7 @@ class SelfTuningPid(ControlLaw):
     hi: Tensor  # (3,)
     by_unit: Tensor  # (1,) 1/unit
 
-    def __init__(self, signals: LawSignals, model: ARX, params: Params) -> None:
+    def __init__(self, signals: Signals, model: ARX, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
         require_single_loop(signals, self.name)
         unit = signed_unit(signals, params.plant_gain, float(model.weight[model.n_y]))
@@ -138,7 +139,7 @@ class SelfTuningPid(ControlLaw):
         self.info = ("kc", "tau_i_s", "tau_d_s", "b1", "updated")
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with part ``arx`` as its first estimate; raises LawError."""
         return cls(signals, require_arx(models, cls.name), params)
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import Analysis, LawSignals, require_kind, require_single_loop
+from pipeline.laws.base import Analysis, require_kind, require_single_loop
 from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from pipeline.laws.reference.reference_loops import Training
 from pipeline.laws.reference.reference_networks import BEFORE, COURSE, IncrementalNetwork, R, U, Y
@@ -18,7 +18,8 @@ from pipeline.laws.reference.reference_training import Trained, gain_sign, story
 from pipeline.models.base import Model
 from pipeline.models.memory import Named
 from pipeline.models.state_space.state_space import StateSpace
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning.reference_model import ReferenceModel
 
 POINTS = 21  # of MV and CV each, at which the roots are looked for
@@ -50,7 +51,7 @@ class ModelReference(ReferenceLaw):
 
     def __init__(
         self,
-        signals: LawSignals,
+        signals: Signals,
         model: ReferenceModel,
         network: IncrementalNetwork,
         trained: Trained,
@@ -69,7 +70,7 @@ class ModelReference(ReferenceLaw):
         self.register_buffer("readout", torch.cat([out, -out])[:, None].contiguous())
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law trained through part ``state_space``; raises LawError without it."""
         require_single_loop(signals, cls.name)
         network = require_kind(models, StateSpace, cls.name)
@@ -86,7 +87,7 @@ class ModelReference(ReferenceLaw):
         move = torch.tanh(done["units"]) @ self.readout
         return self.stepped(x, done, self.limited(mv_applied + done["reach"] * move, mv_applied))
 
-    def analysis(self, plant: Plant) -> Analysis:
+    def analysis(self, plant: Simulator | None) -> Analysis:
         """How the training went, and whether the move has another root than zero error anywhere in the law's domain."""
         gains = self.resting_gains()
         wrong = int(np.sum(gains * self.network.sign <= 0))

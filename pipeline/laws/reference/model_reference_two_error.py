@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import Analysis, LawSignals, require_kind, require_single_loop
+from pipeline.laws.base import Analysis, require_kind, require_single_loop
 from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from pipeline.laws.reference.reference_loops import Training
 from pipeline.laws.reference.reference_networks import TwoErrorNetwork
@@ -17,7 +17,8 @@ from pipeline.laws.reference.reference_training import Trained, gain_sign, story
 from pipeline.models.base import Model
 from pipeline.models.memory import Named
 from pipeline.models.state_space.state_space import StateSpace
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.tuning.reference_model import ReferenceModel
 
 
@@ -44,7 +45,7 @@ class ModelReferenceTwoError(ReferenceLaw):
 
     def __init__(
         self,
-        signals: LawSignals,
+        signals: Signals,
         model: ReferenceModel,
         network: TwoErrorNetwork,
         trained: Trained,
@@ -64,7 +65,7 @@ class ModelReferenceTwoError(ReferenceLaw):
         self.register_buffer("level", self.low + span * level)
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law trained through part ``state_space``; raises LawError without it."""
         require_single_loop(signals, cls.name)
         network = require_kind(models, StateSpace, cls.name)
@@ -81,7 +82,7 @@ class ModelReferenceTwoError(ReferenceLaw):
         mv = torch.tanh(done["units"]) @ self.readout + self.level
         return self.stepped(x, done, self.limited(mv, mv_applied))
 
-    def analysis(self, plant: Plant) -> Analysis:
+    def analysis(self, plant: Simulator | None) -> Analysis:
         """How the training went, and the one set point that the law can hold without offset."""
         told = story(self.trained, self.signals)
         at_rest = float(self.level + torch.tanh(self._at_zero()) @ self.readout)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, LawSignals, require_kind, require_single_loop
+from pipeline.laws.base import Analysis, require_kind, require_single_loop
 from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from pipeline.laws.reference.reference_loops import Training
 from pipeline.laws.reference.reference_networks import TrainablePi
@@ -17,7 +17,8 @@ from pipeline.laws.reference.reference_training import Trained, gain_sign, story
 from pipeline.models.base import Model
 from pipeline.models.memory import Named
 from pipeline.models.state_space.state_space import StateSpace
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.tuning.reference_model import ReferenceModel
 
 
@@ -43,7 +44,7 @@ class PiReference(ReferenceLaw):
 
     def __init__(
         self,
-        signals: LawSignals,
+        signals: Signals,
         model: ReferenceModel,
         kc: float,
         ti_s: float,
@@ -63,7 +64,7 @@ class PiReference(ReferenceLaw):
         self.stage = self.prepared(formulas)
 
     @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: LawSignals, plant: Plant) -> Self:
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with the numbers of ``params``, or trained through part ``state_space``; raises LawError."""
         require_single_loop(signals, cls.name)
         reference = params.model(cls.name)
@@ -84,7 +85,7 @@ class PiReference(ReferenceLaw):
         done = self.stage(x)
         return self.stepped(x, done, self.limited(done["asked_for"], mv_applied))
 
-    def analysis(self, plant: Plant) -> Analysis:
+    def analysis(self, plant: Simulator | None) -> Analysis:
         """The two numbers, and how their training went."""
         own = {"kc": self.kc, "ti_s": self.ti_s}
         if self.trained is None:

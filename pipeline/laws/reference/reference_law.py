@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, LawSignals, require_single_loop
+from pipeline.laws.base import ControlLaw, require_single_loop
 from pipeline.models.memory import Named, Stage
+from pipeline.plants.signals import Signals
 from pipeline.tuning.reference_model import ReferenceModel
 
 FOLLOWED = 0.01  # of the MV's range: an applied MV this close to the last request is the request
@@ -50,7 +51,7 @@ class ReferenceLaw(ControlLaw):
     info_names: ClassVar[tuple[str, ...]] = ("reference",)
     followed: Tensor  # (1,) [mv]
 
-    def __init__(self, signals: LawSignals, model: ReferenceModel, mv_rate: float | None = None) -> None:
+    def __init__(self, signals: Signals, model: ReferenceModel, mv_rate: float | None = None) -> None:
         super().__init__(signals, mv_rate)
         require_single_loop(signals, self.name)
         self.model = model

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import LawError
-from pipeline.laws.base import LawSignals
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.models.static.mlp import scaled_layers
+from pipeline.plants.signals import Signals
 
 Array = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ class Loops:
     load: Array  # (n, B, n_x) added to the state a period
 
     @classmethod
-    def drawn(cls, plant: PlantNetwork, signals: LawSignals, options: Training, rng: np.random.Generator) -> Self:
+    def drawn(cls, plant: PlantNetwork, signals: Signals, options: Training, rng: np.random.Generator) -> Self:
         """Loops as ``options`` says, at set points that the plant's network can hold.
 
         Raises LawError where it can hold none.

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.laws.base import LawSignals
 from pipeline.models.memory import Named, Stage
+from pipeline.plants.signals import Signals
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class Action(NamedTuple):
 class Trainable(ABC):
     """A controller with weights theta (P,). ``sign`` is that of the plant's gain, dy/du."""
 
-    signals: LawSignals
+    signals: Signals
     order: int
     sign: float
 

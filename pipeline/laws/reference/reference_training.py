@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, LawSignals
+from pipeline.laws.base import Analysis
 from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
 from pipeline.laws.reference.reference_networks import Trainable
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.models.training.jacobian import input_jacobian
+from pipeline.plants.signals import Signals
 from pipeline.tuning.reference_model import ReferenceModel
 
 Array = NDArray[np.float64]
@@ -173,14 +174,14 @@ def _finite(cost: float) -> float:
     return cost if np.isfinite(cost) else np.inf
 
 
-def gain_sign(model: StateSpace, signals: LawSignals) -> float:
+def gain_sign(model: StateSpace, signals: Signals) -> float:
     """Sign of dy(k+1)/du(k) in the middle of all ranges: +1 or -1."""
     middle = torch.tensor([[(s.low + s.high) / 2 for s in (*signals.pv, *signals.mv)]], dtype=torch.float64)
     slope = float(input_jacobian(model.net, middle)[0, 0, model.n_pv])
     return 1.0 if slope > 0 else -1.0
 
 
-def story(trained: Trained, signals: LawSignals) -> Analysis:
+def story(trained: Trained, signals: Signals) -> Analysis:
     """How a training went, for people and pictures."""
     training, validation = trained.history[trained.best]
     unit = signals.sp[0].unit

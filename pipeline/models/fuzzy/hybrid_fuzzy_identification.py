@@ -12,7 +12,7 @@ from scipy import linalg
 
 from pipeline.errors import ModelError
 from pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
-from pipeline.plants.base import Array
+from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 
 How = Literal["tied", "global", "local"]

@@ -15,7 +15,8 @@ from pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
 from pipeline.models.fuzzy.hybrid_fuzzy_identification import MODES, Transitions, identify
 from pipeline.models.part import Learnt, Part, Regions, predict
 from pipeline.models.training.time_split import split_in_time
-from pipeline.plants.base import Array, Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
 
 Identification = Literal["tied", "global", "local"]
@@ -41,22 +42,26 @@ class HybridFuzzyPart(Part):
         if self.free_run < 1:
             raise ValueError(f"free_run is {self.free_run}; it must be at least 1")
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """The model; its figures are over the last part of the record, which no identification saw."""
         if record is None:
             raise ModelError("a hybrid fuzzy model learns from a record; point `data:` of its set at one")
         train, _ = split_in_time(record, self.train_fraction)
         model = identify(Transitions.of(train), self.centres, self.identification)
-        return Learnt(model, figures(model, plant, record, self.train_fraction, self.free_run))
+        return Learnt(model, figures(model, signals, plant, record, self.train_fraction, self.free_run))
 
 
-def figures(model: HybridFuzzy, plant: Plant, record: Record, train_fraction: float, free_run: int) -> dict[str, Any]:
+def figures(
+    model: HybridFuzzy, signals: Signals, plant: Simulator | None, record: Record, train_fraction: float, free_run: int
+) -> dict[str, Any]:
     """What is reported of a model: errors over the record's last part, gap and coefficients."""
     train, validation = split_in_time(record, train_fraction)
     return {
         **_scored(model, validation, free_run),
         "n_train": len(Transitions.of(train).row),
-        **gap(model, plant),
+        **gap(model, signals),
         **coefficients(model, plant),
     }
 
@@ -89,7 +94,7 @@ def _free(model: HybridFuzzy, record: Record, samples: int) -> tuple[Array, Arra
     return run.numpy(), record.pv[window + 1]
 
 
-def gap(model: HybridFuzzy, plant: Plant) -> dict[str, float]:
+def gap(model: HybridFuzzy, signals: Signals) -> dict[str, float]:
     """Jacket temperatures a step ahead that lie between the modes' ranges, and those that lie in both [degC].
 
     With the throttle shut, mode hot leads to base_1 and can only be hotter, mode cold to base_2 and can
@@ -97,7 +102,7 @@ def gap(model: HybridFuzzy, plant: Plant) -> dict[str, float]:
     figures are the widest over jacket temperatures from the second to the last centre and core
     temperatures over the set points' range.
     """
-    sp = plant.sp_signals[0]
+    sp = signals.sp[0]
     low, high = float(model.centres[1]), float(model.centres[-1])
     t, t_w = np.meshgrid(np.arange(sp.low, sp.high + GRID_DEGC, GRID_DEGC), np.arange(low, high + GRID_DEGC, GRID_DEGC))
     with torch.no_grad():
@@ -106,33 +111,37 @@ def gap(model: HybridFuzzy, plant: Plant) -> dict[str, float]:
     return {"gap": max(0.0, float(between.max())), "overlap": max(0.0, float(-between.min()))}
 
 
-def coefficients(model: HybridFuzzy, plant: Plant) -> dict[str, dict[str, float]]:
-    """The model's coefficients by name (``b_hot_40``), and what the plant itself does over one period.
+def coefficients(model: HybridFuzzy, plant: Simulator | None) -> dict[str, dict[str, float]]:
+    """The model's coefficients by name (``b_hot_40``), and what the plant itself, if there is one, does over a period.
 
     ``physics`` is the plant's own line at the centres, with T = T_w there: slopes in T_w and T with the throttle
     shut; b the chord from shut to a quarter open, the pulses' mean opening (it bends: an open throttle gains less).
     """
     at = model.centres.tolist()
-    theta, truth = model.consequents.tolist(), np.stack([_plant_line(plant, c) for c in at], axis=-1)
+    theta = model.consequents.tolist()
     found: dict[str, dict[str, float]] = {"parameters": {"core_jacket": float(model.core[0])}, "physics": {}}
-    dv, p = plant.dv_nominal, plant.parameters()
-    moved = [float(plant.transition([0.0, v], [0.0, 1.0], dv, p)[0]) for v in (20.0, 21.0)]
-    found["physics"]["core_jacket"] = moved[1] - moved[0]
+    truth = None
+    if plant is not None:
+        truth = np.stack([_plant_line(plant, c) for c in at], axis=-1)
+        dv, p = plant.dv_nominal, plant.parameters()
+        moved = [float(plant.step(np.array([0.0, v]), np.array([0.0, 1.0]), dv, p)[0]) for v in (20.0, 21.0)]
+        found["physics"]["core_jacket"] = moved[1] - moved[0]
     for q, mode in enumerate(MODES.values()):
         for i, name in enumerate(COEFFICIENTS):
             for j, centre in enumerate(at):
                 key = f"{name}_{mode}_{centre:g}"
                 found["parameters"][key] = theta[q][i][j]
-                found["physics"][key] = float(truth[q, i, j])
+                if truth is not None:
+                    found["physics"][key] = float(truth[q, i, j])
     return found
 
 
-def _plant_line(plant: Plant, at: float, opening: float = 0.25, step: float = 0.5) -> Array:
-    """a1, a2, b, r of both modes around T = T_w = ``at``, shape (2, 4), from the plant's transition."""
+def _plant_line(plant: Simulator, at: float, opening: float = 0.25, step: float = 0.5) -> Array:
+    """a1, a2, b, r of both modes around T = T_w = ``at``, shape (2, 4), from the plant's steps."""
     dv, p = plant.dv_nominal, plant.parameters()
 
     def jacket(t: float, t_w: float, k_m: float, mode: float) -> float:
-        return float(plant.transition([t, t_w], [k_m, mode], dv, p)[1])
+        return float(plant.step(np.array([t, t_w]), np.array([k_m, mode]), dv, p)[1])
 
     rows = []
     for q in MODES:

@@ -15,7 +15,8 @@ from pipeline.metrics import fit_percent, r2, rmse
 from pipeline.models.lagged.lagged import Array, LaggedModel
 from pipeline.models.part import Learnt, Part, Regions, predict
 from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 
 
@@ -88,11 +89,13 @@ class ArxPart(Part):
     steps: int = 10
     train_fraction: float = 0.7
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """Fit; the figures are of one step and of a free run, over the rows that did not train."""
         if record is None:
             raise ModelError("a part of kind 'arx' learns from a record; point `data:` of its set at one")
-        names = {s.name: i for i, s in enumerate(plant.pv_signals)}
+        names = {s.name: i for i, s in enumerate(signals.pv)}
         target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
         pairs = nnarx_pairs(record, self.n_y, self.n_u, target, self.delay)
         train, validation = pairs.split(self.train_fraction, "time", seed)

@@ -22,7 +22,8 @@ from pipeline.models.training.network_parts import going_on, story, trainer_of
 from pipeline.models.training.objectives import Samples, Windows
 from pipeline.models.training.regressors import nnarx_pairs
 from pipeline.models.training.time_split import longest_run, split_in_time
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 
 
@@ -68,7 +69,9 @@ class NnarxPart(Part):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least:g}")
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """Train each size with early stopping on the last part of the record; the figures are of the one that stays.
 
         They are of one step (by the region of the target, too) and of a free run. Validation data stop the
@@ -76,7 +79,7 @@ class NnarxPart(Part):
         """
         if record is None:
             raise ModelError("a part of kind 'nnarx' learns from a record; point `data:` of its set at one")
-        names = {s.name: i for i, s in enumerate(plant.pv_signals)}
+        names = {s.name: i for i, s in enumerate(signals.pv)}
         target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
         halves = split_in_time(record, self.train_fraction)
         sizes = [self._sized(size) for size in self.search or (Size(),)]
@@ -95,9 +98,9 @@ class NnarxPart(Part):
         if self.search:
             metrics["candidates"] = [c.row(i == best) for i, (*_, c) in enumerate(trials)]
         if runs:
-            metrics["nnarx"] = {name: run.figures([plant.pv_signals[target].name]) for name, run in runs.items()}
+            metrics["nnarx"] = {name: run.figures([signals.pv[target].name]) for name, run in runs.items()}
         if not self.compared:
-            return Learnt(model, metrics, predictions=curves(runs, plant.period_s) if runs else None)
+            return Learnt(model, metrics, predictions=curves(runs, signals.period_s) if runs else None)
         shown = compare_one_step(
             model, longest_run(halves[1], self.compared), target=target, forgetting=self.forgetting
         )

@@ -12,7 +12,10 @@ from torch import Tensor
 from pipeline.errors import ModelError
 from pipeline.models.base import Model
 from pipeline.models.part import Learnt, Part, Regions
-from pipeline.plants.base import Array, Linearization, Plant
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
 
 
@@ -88,11 +91,10 @@ class Linearized(Model):
         return model
 
     @classmethod
-    def at_set_point(cls, plant: Plant, cv: float) -> Self:
+    def at_set_point(cls, plant: EquationPlant, cv: float) -> Self:
         """The model at the steady state with controlled variable ``cv``; raises PlantError where there is none."""
         x, mv = plant.steady_state_at(cv)
-        pv = np.array(plant.measure(x), float).ravel()
-        return cls.of(plant.linearize(x, mv), plant.period_s, pv=pv)
+        return cls.of(plant.linearize(x, mv), plant.period_s, pv=plant.measure(x))
 
     def linearization(self) -> Linearization:
         """The continuous model, per second."""
@@ -110,14 +112,17 @@ class LinearizedPart(Part):
     model: ClassVar[type[Model]] = Linearized
     at: float
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """The linearization; needs no data."""
-        x, mv = plant.steady_state_at(self.at)
-        lin = plant.linearize(x, mv)
-        zeros = lin.sampled_zeros(plant.period_s)
+        known = equations(plant, "a part of kind 'linearized'")
+        x, mv = known.steady_state_at(self.at)
+        lin = known.linearize(x, mv)
+        zeros = lin.sampled_zeros(signals.period_s)
         metrics = {
             "eigenvalues": [[float(v.real), float(v.imag)] for v in lin.eigenvalues],
             "sampled_zeros": [[float(v.real), float(v.imag)] for v in zeros],
             "mv": [float(v) for v in mv],
         }
-        return Learnt(Linearized.at_set_point(plant, self.at), metrics)
+        return Learnt(Linearized.at_set_point(known, self.at), metrics)

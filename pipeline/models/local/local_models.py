@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from pipeline.errors import ModelError
 from pipeline.models.base import Model
-from pipeline.plants.base import Array, Linearization, Plant
+from pipeline.plants.equations import EquationPlant
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.simulator import Array
 
 
 class Validity(nn.Module):
@@ -117,7 +119,7 @@ class LocalModels(Model):
         return model.eval()
 
     @classmethod
-    def at_set_points(cls, plant: Plant, cvs: list[float], overlap: float) -> Self:
+    def at_set_points(cls, plant: EquationPlant, cvs: list[float], overlap: float) -> Self:
         """The network of the plant's own equations, linearized at the steady states with these controlled variables.
 
         ``overlap`` times the mean distance to the neighbours is the width of each validity function.

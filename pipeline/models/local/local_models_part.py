@@ -15,7 +15,10 @@ from pipeline.metrics import fit_percent
 from pipeline.models.base import Model
 from pipeline.models.local.local_models import LocalModels
 from pipeline.models.part import Learnt, Part, Regions
-from pipeline.plants.base import Array, Linearization, Plant
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
 from pipeline.simulation.simulate import simulate_open
 
@@ -58,21 +61,24 @@ class LocalModelsPart(Part):
                 "every size must be at least 2, and there must be a random step"
             )
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """The network and its free runs; ``seed`` draws the random course."""
-        model = LocalModels.at_set_points(plant, [operating_cv(plant, p) for p in self.points], self.overlap)
-        courses = {name: (mv, _plant_run(plant, mv)) for name, mv in self._courses(seed).items()}
+        known = equations(plant, "a part of kind 'local_models'")
+        model = LocalModels.at_set_points(known, [operating_cv(known, p) for p in self.points], self.overlap)
+        courses = {name: (mv, _plant_run(known, mv)) for name, mv in self._courses(seed).items()}
         runs = {name: free_run(model, x[0], mv) for name, (mv, x) in courses.items()}
         metrics: dict[str, Any] = {
-            "operating_points": {str(i): _point(plant, p) for i, p in enumerate(model.linearizations(), start=1)},
+            "operating_points": {str(i): _point(known, p) for i, p in enumerate(model.linearizations(), start=1)},
             "widths": [float(v) for v in model.width],
-            **{name: _figures(plant, x, runs[name]) for name, (_, x) in courses.items()},
-            "steady_error": self._steady_error(model, plant),
+            **{name: _figures(known, x, runs[name]) for name, (_, x) in courses.items()},
+            "steady_error": self._steady_error(model, known),
         }
         mv, x = courses["staircase"]
         if self.sizes:
-            metrics["sizes"] = {str(n): self._of_size(plant, n, x, mv) for n in self.sizes}
-        time_s = np.arange(len(mv), dtype=np.float64) * plant.period_s
+            metrics["sizes"] = {str(n): self._of_size(known, n, x, mv) for n in self.sizes}
+        time_s = np.arange(len(mv), dtype=np.float64) * signals.period_s
         curves = {"time_s": time_s, "mv": mv, "actual": x, "predicted": runs["staircase"]}
         return Learnt(model, metrics, predictions=curves)
 
@@ -86,7 +92,7 @@ class LocalModelsPart(Part):
             "random": np.repeat(levels, self.hold // 2)[:, None],
         }
 
-    def _steady_error(self, model: LocalModels, plant: Plant) -> float:
+    def _steady_error(self, model: LocalModels, plant: EquationPlant) -> float:
         """The relative error of the network's steady controlled variable that is largest in size, its sign kept."""
         mvs = np.linspace(self.mv_low, self.mv_high, STEADY_POINTS)
         starts = np.array([_rest(plant, float(mv)) for mv in mvs])
@@ -97,14 +103,14 @@ class LocalModelsPart(Part):
         error = x[:, 0].numpy() / starts[:, 0] - 1
         return float(error[np.argmax(np.abs(error))])
 
-    def _of_size(self, plant: Plant, n: int, x: Array, mv: Array) -> float:
+    def _of_size(self, plant: EquationPlant, n: int, x: Array, mv: Array) -> float:
         """Staircase fit [%] of the controlled variable with ``n`` models at equal distances of the MV."""
         cvs = [float(_rest(plant, float(v))[0]) for v in np.linspace(self.mv_low, self.mv_high, n)]
         model = LocalModels.at_set_points(plant, cvs, self.overlap)
         return fit_percent(x[:, 0], free_run(model, x[0], mv)[:, 0])
 
 
-def operating_cv(plant: Plant, point: Mapping[str, float]) -> float:
+def operating_cv(plant: EquationPlant, point: Mapping[str, float]) -> float:
     """The controlled variable of the steady state at which one signal, a state or the MV, has a given value.
 
     Raises ModelError unless the point names one signal, and that value is met once over the set point's range.
@@ -142,20 +148,20 @@ def free_run(model: LocalModels, x0: Array, mv: Array) -> Array:
     return found.numpy()
 
 
-def _rest(plant: Plant, mv: float) -> Array:
+def _rest(plant: EquationPlant, mv: float) -> Array:
     return plant.steady_state_at(operating_cv(plant, {plant.mv_signals[0].name: mv}))[0]
 
 
-def _plant_run(plant: Plant, mv: Array) -> Array:
+def _plant_run(plant: EquationPlant, mv: Array) -> Array:
     return simulate_open(plant, _rest(plant, float(mv[0, 0])), mv)[:-1]
 
 
-def _figures(plant: Plant, actual: Array, predicted: Array) -> dict[str, float]:
+def _figures(plant: EquationPlant, actual: Array, predicted: Array) -> dict[str, float]:
     """Fit [%] of each state, and the largest error of the controlled variable."""
     fits = {f"fit_{s.name}": fit_percent(actual[:, i], predicted[:, i]) for i, s in enumerate(plant.state_signals)}
     return {**fits, "largest_error": float(np.abs(actual[:, 0] - predicted[:, 0]).max())}
 
 
-def _point(plant: Plant, point: Linearization) -> dict[str, float]:
+def _point(plant: EquationPlant, point: Linearization) -> dict[str, float]:
     names = [s.name for s in (*plant.state_signals, *plant.mv_signals)]
     return dict(zip(names, map(float, (*point.x, *point.mv)), strict=True))

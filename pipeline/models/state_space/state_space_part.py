@@ -19,7 +19,8 @@ from pipeline.models.training.long_run import TRAINED, LongRun
 from pipeline.models.training.network_parts import going_on, story, trainer_of
 from pipeline.models.training.objectives import Samples
 from pipeline.models.training.time_split import split_in_time
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 
 
@@ -47,7 +48,9 @@ class StateSpacePart(Part):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """Train with early stopping on the last part of the record, which the figures are of.
 
         ``state_space`` of the metrics holds, of each PV, the one-step RMSE and the fit of a long free run,
@@ -66,7 +69,7 @@ class StateSpacePart(Part):
             history = going_on(trainer, self.free_run_iterations).fit(model.net, before, after, seed=seed)
             runs[TRAINED[1]] = self._run(model, validation)
         model.eval()
-        names = [s.name for s in plant.pv_signals]
+        names = [s.name for s in signals.pv]
         figures = {trained: run.figures(names) for trained, run in runs.items()}
         cv, predicted = y_held[:, 0], predict(model, x_held)[:, 0]
         by_region = per_region(rmse, cv, predicted, x_held[:, 0], regions)

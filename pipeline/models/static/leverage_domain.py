@@ -13,7 +13,8 @@ from torch import Tensor
 from pipeline.models.applicability import Leverage
 from pipeline.models.base import Model
 from pipeline.models.part import Learnt, Regions, StaticPart, predict
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 
 
@@ -111,9 +112,11 @@ class DomainPart(StaticPart):
     model: ClassVar[type[Model]] = LeverageDomain
     task: Literal["inverse", "forward"] = "inverse"
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """The domain of the training pairs' inputs."""
-        train, validation = self.pairs(record, plant).split(self.train_fraction, self.split, seed)
+        train, validation = self.pairs(record, signals).split(self.train_fraction, self.split, seed)
         domain = LeverageDomain.fit(train.x)
         inside = predict(domain, validation.x) <= domain.threshold.numpy()
         return Learnt(domain, {"threshold": float(domain.threshold), "inside": float(inside.mean())})

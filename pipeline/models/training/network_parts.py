@@ -14,7 +14,8 @@ from pipeline.models.part import Array, Learnt, Regions, StaticPart
 from pipeline.models.static.mlp import MLP
 from pipeline.models.training.fit import TRAINERS, FitHistory, Trainer
 from pipeline.models.training.objectives import Samples
-from pipeline.plants.base import Plant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 
 
@@ -55,21 +56,23 @@ class MlpPart(StaticPart):
     train_fraction: float = 0.85
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
-    def learn(self, record: Record | None, plant: Plant, regions: Regions, seed: int) -> Learnt:
+    def learn(
+        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
+    ) -> Learnt:
         """Train with early stopping on the validation pairs."""
-        pairs = self.pairs(record, plant)
+        pairs = self.pairs(record, signals)
         train, validation = pairs.split(self.train_fraction, self.split, seed)
-        residual = (self._column(plant),) if self.residual and self.task == "forward" else ()
+        residual = (self._column(signals),) if self.residual and self.task == "forward" else ()
         net = MLP.scaled_to(train.x, train.y, hidden=self.hidden, residual=residual)
         weights = [self._weights(p.x[:, 0], regions) for p in (train, validation)]
         sets = [Samples(p.x, p.y, w) for p, w in zip((train, validation), weights, strict=True)]
         history = trainer_of(self.trainer).fit(net, sets[0], sets[1], seed=seed)
-        metrics = self.scored(net.eval(), validation, plant, regions)
+        metrics = self.scored(net.eval(), validation, signals, regions)
         metrics |= {"n_train": len(train), **story(net, history)}
         return Learnt(net, metrics)
 
-    def _column(self, plant: Plant) -> int:
-        names = [s.name for s in plant.pv_signals]
+    def _column(self, signals: Signals) -> int:
+        names = [s.name for s in signals.pv]
         return names.index(self.target) if self.target is not None else 0
 
     def _weights(self, cv: Array, regions: Regions) -> Array | None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError, RecordError
-from pipeline.plants.base import Array
+from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 
 HELD = 1e-9  # of an MV's span: what still counts as the same value

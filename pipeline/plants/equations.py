@@ -1,9 +1,9 @@
-"""What every plant is: named parameters, signals, and one text of its derivative."""
+"""A plant in equations: from one text of its derivative, all that a simulator gives, and what only equations give."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -11,21 +11,17 @@ from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
 from pipeline.errors import PlantError
 from pipeline.plants.linearization import Linearization
+from pipeline.plants.simulator import Advance, AdvanceMany, Array, Simulator
 from pipeline.plants.steady import SteadyStates
 from serving.manifest import Signal
 
-Array = NDArray[np.float64]
-
-__all__ = ["Array", "Linearization", "Plant"]
-
 
 @dataclass(frozen=True)
-class Plant(ABC):
+class EquationPlant(Simulator):
     """A continuous-time plant in CasADi, sampled with its MV held over each period.
 
     A subclass is a frozen dataclass whose fields are its parameters (each with
@@ -35,14 +31,7 @@ class Plant(ABC):
     controller does not measure. Measured disturbances are ``dv``.
     """
 
-    name: ClassVar[str]
-    title: ClassVar[str]
     state_signals: ClassVar[tuple[Signal, ...]]
-    pv_signals: ClassVar[tuple[Signal, ...]]  # controlled variables first
-    sp_signals: ClassVar[tuple[Signal, ...]]
-    mv_signals: ClassVar[tuple[Signal, ...]]
-    dv_signals: ClassVar[tuple[Signal, ...]] = ()
-    period_s: ClassVar[float]
     substeps: ClassVar[int]  # of RK4 a period
     time_unit_s: ClassVar[float] = 1.0  # the unit of time in which ``derivative`` is written
 
@@ -57,12 +46,12 @@ class Plant(ABC):
     @property
     def measures_states(self) -> bool:
         """Whether the process variables are the states."""
-        return type(self).output is Plant.output
+        return type(self).output is EquationPlant.output
 
     @property
-    def dv_nominal(self) -> Array:
-        """Nominal measured disturbances, shape (n_dv,)."""
-        return np.zeros(len(self.dv_signals))
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.state_signals)
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -73,7 +62,7 @@ class Plant(ABC):
         return np.asarray(xs[nearest]), np.array([mvs[nearest]])
 
     # ------------------------------------------------------------------ discrete MVs
-    def relaxed(self) -> Plant:
+    def relaxed(self) -> EquationPlant:
         """A plant of the same states and parameters whose MVs are all continuous, for solvers that know no others.
 
         This plant itself unless it has a discrete MV: it then gives one that can do whatever it can, so that
@@ -89,29 +78,6 @@ class Plant(ABC):
         return mv
 
     # ------------------------------------------------------------------ parameters
-    @classmethod
-    def parameter_names(cls) -> tuple[str, ...]:
-        """Names of the plant's parameters, in the order of the parameter vector."""
-        return tuple(f.name for f in fields(cls))
-
-    @classmethod
-    def parameter_units(cls) -> dict[str, str]:
-        """Unit of each parameter."""
-        return {f.name: str(f.metadata.get("unit", "")) for f in fields(cls)}
-
-    def parameters(self, changed: Mapping[str, float] | None = None) -> Array:
-        """The parameter vector, shape (n_p,), with some of them changed by name.
-
-        Raises PlantError for a name that the plant does not have.
-        """
-        names = self.parameter_names()
-        values = {n: float(getattr(self, n)) for n in names}
-        for key, value in (changed or {}).items():
-            if key not in values:
-                raise PlantError(f"plant {self.name!r} has no parameter {key!r}; it has {', '.join(names)}")
-            values[key] = float(value)
-        return np.array([values[n] for n in names])
-
     def with_parameters(self, changed: Mapping[str, float]) -> Self:
         """A plant with other parameters: a different plant, or one that drifted."""
         self.parameters(changed)
@@ -136,7 +102,7 @@ class Plant(ABC):
         return ca.Function("rate", [x, mv, dv, p], [ca.densify(dx)])
 
     @cached_property
-    def measure(self) -> ca.Function:
+    def measurement(self) -> ca.Function:
         """CasADi function x -> pv."""
         x = self._symbols[0]
         return ca.Function("measure", [x], [ca.densify(ca.vertcat(self.output(x)))])
@@ -170,7 +136,34 @@ class Plant(ABC):
         x0, m0, d0, p0 = (ca.MX.sym(n, s.numel()) for n, s in zip("xmdp", (x, mv, dv, p), strict=True))
         return ca.Function("exact_transition", [x0, m0, d0, p0], [solver(x0=x0, p=ca.vertcat(m0, d0, p0))["xf"]])
 
-    def stepper(self) -> Callable[[Array, Array, Array, Array], Array]:
+    # ------------------------------------------------------------------ what a closed loop needs
+    def step(self, x: Array, mv: Array, dv: Array, p: Array) -> Array:
+        """The state one period later, by ``transition``; shapes as in Simulator."""
+        return np.array(self.transition(x, mv, dv, p))[:, 0]
+
+    def measure(self, x: Array) -> Array:
+        """The process variables (n_pv,) of a state (n_x,)."""
+        return self.measured(x)
+
+    def measured(self, x: Array) -> Array:
+        """Process variables, shape (..., n_pv), of states of shape (..., n_x)."""
+        if self.measures_states:
+            return x  # the state itself, and a call into CasADi for each sample would cost as much as its step
+        flat = x.reshape(-1, x.shape[-1])
+        return np.array(self.measurement(flat.T)).T.reshape(*x.shape[:-1], -1)
+
+    def many(self, n: int, parameters: Mapping[str, float] | None = None) -> AdvanceMany:
+        """``step`` of ``n`` runs side by side through one CasADi map; as in Simulator."""
+        batch = self.transition.map(n)
+        dv = np.tile(self.dv_nominal[:, None], (1, n))
+        p = np.tile(self.parameters(parameters)[:, None], (1, n))
+
+        def advance(x: Array, mv: Array) -> Array:
+            return np.array(batch(x.T, mv.T, dv, p)).T
+
+        return advance
+
+    def stepper(self) -> Advance:
         """``step(x, mv, dv, p) -> x`` through CasADi's buffers, which skip its argument conversion."""
         buffer: Any  # casadi's type stubs have other signatures than its buffers
         evaluate: Any
@@ -194,7 +187,13 @@ class Plant(ABC):
     # ------------------------------------------------------------------ steady states
     @cached_property
     def _steady(self) -> SteadyStates:
-        return SteadyStates(self)
+        scale = self.period_s / self.time_unit_s
+        return SteadyStates(
+            lambda x, mv: self.rate(x, mv, self.dv_nominal, self.parameters()) * scale,
+            lambda x: self.measurement(x)[0],
+            (*self.state_signals, *self.mv_signals),
+            self.sp_signals[0],
+        )
 
     @cached_property
     def steady_curve(self) -> tuple[Array, Array, Array]:
@@ -265,16 +264,6 @@ class Plant(ABC):
         ranges = pairwise(edges)
         return dict(zip(names.get(n, tuple(f"region {i + 1}" for i in range(n))), ranges, strict=True))
 
-    @property
-    def region_names(self) -> tuple[str, ...]:
-        """Names of the operating regions, smallest CV first."""
-        return tuple(self.regions)
-
-    def region(self, cv: Array) -> NDArray[np.int64]:
-        """Index into ``region_names`` of each controlled variable, same shape as ``cv``."""
-        bounds = [low for low, _ in self.regions.values()][1:]
-        return np.asarray(np.searchsorted(bounds, np.asarray(cv, dtype=np.float64), side="right"), dtype=np.int64)
-
     def linearize(self, x: Array, mv: Array) -> Linearization:
         """Linearization at a steady state (x, mv), per second."""
         x, mv = np.asarray(x, dtype=np.float64), np.asarray(mv, dtype=np.float64)
@@ -290,3 +279,14 @@ class Plant(ABC):
     def __getstate__(self) -> dict[str, Any]:
         # The cached CasADi functions are rebuilt in the process that unpickles the plant.
         return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+def equations(plant: Simulator | None, why: str) -> EquationPlant:
+    """``plant``, where it is one in equations; PlantError says ``why`` it must be, and what to do, where it is not."""
+    if isinstance(plant, EquationPlant):
+        return plant
+    what = "there is no plant" if plant is None else f"plant {plant.name!r} has none"
+    raise PlantError(
+        f"{why} needs a plant's equations, and {what}: write it as an EquationPlant with its `derivative`, "
+        "or choose what needs none"
+    )

@@ -1,0 +1,132 @@
+"""What a closed loop needs of a plant: signals, where it starts, one step, and what is measured."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PlantError
+from pipeline.plants.signals import Signals
+from serving.manifest import Signal
+
+Array = NDArray[np.float64]
+
+Advance = Callable[[Array, Array, Array, Array], Array]
+"""``advance(x (n_x,), mv (n_mv,), dv (n_dv,), p (n_p,)) -> x (n_x,)`` one period later."""
+
+AdvanceMany = Callable[[Array, Array], Array]
+"""``advance(x (n, n_x), mv (n, n_mv)) -> x (n, n_x)`` one period later."""
+
+
+class Simulator(ABC):
+    """A plant that can be simulated, one sampling period at a time, with its MV held.
+
+    A subclass states its signals and writes ``start``, ``step`` and ``measure``; nothing else is needed to simulate
+    it, to excite it, and to design, try and validate controllers for it. Parameters that may change during a run,
+    unseen by the controller, are the numeric fields of a subclass that is a dataclass (each with
+    ``metadata={"unit": ...}``); any other subclass has none.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    pv_signals: ClassVar[tuple[Signal, ...]]  # controlled variables first
+    sp_signals: ClassVar[tuple[Signal, ...]]
+    mv_signals: ClassVar[tuple[Signal, ...]]
+    dv_signals: ClassVar[tuple[Signal, ...]] = ()
+    period_s: ClassVar[float]
+
+    @property
+    @abstractmethod
+    def start(self) -> tuple[Array, Array]:
+        """(x (n_x,), mv (n_mv,)) where an experiment starts. The tuning rules need a start at rest."""
+
+    @abstractmethod
+    def step(self, x: Array, mv: Array, dv: Array, p: Array) -> Array:
+        """The state (n_x,) one period after ``x`` (n_x,), under mv (n_mv,), dv (n_dv,) and the parameters p (n_p,).
+
+        It keeps nothing of its own from step to step: all that the plant remembers stands in ``x``.
+        """
+
+    @abstractmethod
+    def measure(self, x: Array) -> Array:
+        """The process variables (n_pv,) of a state (n_x,)."""
+
+    @property
+    def signals(self) -> Signals:
+        """The signals of a controller for this plant."""
+        return Signals(self.period_s, self.sp_signals, self.pv_signals, self.dv_signals, self.mv_signals)
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.start[0])
+
+    @property
+    def dv_nominal(self) -> Array:
+        """Nominal measured disturbances, shape (n_dv,)."""
+        return np.zeros(len(self.dv_signals))
+
+    # ------------------------------------------------------------------ parameters
+    @classmethod
+    def parameter_names(cls) -> tuple[str, ...]:
+        """Names of the plant's parameters, in the order of the parameter vector."""
+        return tuple(f.name for f in fields(cls)) if is_dataclass(cls) else ()
+
+    @classmethod
+    def parameter_units(cls) -> dict[str, str]:
+        """Unit of each parameter."""
+        return {f.name: str(f.metadata.get("unit", "")) for f in fields(cls)} if is_dataclass(cls) else {}
+
+    def parameters(self, changed: Mapping[str, float] | None = None) -> Array:
+        """The parameter vector, shape (n_p,), with some of them changed by name.
+
+        Raises PlantError for a name that the plant does not have.
+        """
+        names = self.parameter_names()
+        values = {n: float(getattr(self, n)) for n in names}
+        for key, value in (changed or {}).items():
+            if key not in values:
+                has = f"it has {', '.join(names)}" if names else "it has none"
+                raise PlantError(f"plant {self.name!r} has no parameter {key!r}; {has}")
+            values[key] = float(value)
+        return np.array([values[n] for n in names])
+
+    # ------------------------------------------------------------------ faster forms of step and measure
+    def stepper(self) -> Advance:
+        """``step`` for a loop over many samples."""
+        return self.step
+
+    def many(self, n: int, parameters: Mapping[str, float] | None = None) -> AdvanceMany:
+        """``step`` of ``n`` runs side by side, measured disturbances nominal, some parameters changed by name."""
+        dv, p = self.dv_nominal, self.parameters(parameters)
+
+        def advance(x: Array, mv: Array) -> Array:
+            return np.array([self.step(a, b, dv, p) for a, b in zip(x, mv, strict=True)], dtype=np.float64)
+
+        return advance
+
+    def measured(self, x: Array) -> Array:
+        """Process variables, shape (..., n_pv), of states of shape (..., n_x)."""
+        flat = x.reshape(-1, x.shape[-1])
+        return np.array([self.measure(row) for row in flat], dtype=np.float64).reshape(*x.shape[:-1], -1)
+
+    # ------------------------------------------------------------------ operating regions
+    @property
+    def regions(self) -> dict[str, tuple[float, float]]:
+        """Operating regions by name: the range [low, high) of the CV in each, smallest CV first."""
+        return {"all": (-np.inf, np.inf)}
+
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """Names of the operating regions, smallest CV first."""
+        return tuple(self.regions)
+
+    def region(self, cv: Array) -> NDArray[np.int64]:
+        """Index into ``region_names`` of each controlled variable, same shape as ``cv``."""
+        bounds = [low for low, _ in self.regions.values()][1:]
+        return np.asarray(np.searchsorted(bounds, np.asarray(cv, dtype=np.float64), side="right"), dtype=np.int64)
