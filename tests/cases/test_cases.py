@@ -18,6 +18,7 @@ from pipeline.engine.command import run_stage
 from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
+from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from pipeline.simulation.timetable import _scenario as first_scenario
 
