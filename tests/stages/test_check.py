@@ -11,6 +11,7 @@ import yaml
 
 from pipeline.cases import CASES
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from pipeline.plants.equations import EquationPlant
 from pipeline.stages import check
 
 ROOT = Path(__file__).parents[2]
