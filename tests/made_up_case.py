@@ -228,6 +228,7 @@ def write_validation(
     errors = {name: bound * quality for name, bound in mini.bound.items()}
     variants, adaptive = mini.variants.get(law, ()), law in mini.adaptive
     metrics: dict[str, Any] = {
+        "name": law,
         "law": law,
         "title": law.upper(),
         "seeds": list(SEEDS),

@@ -205,12 +205,16 @@ class ModelParams:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ControllerParams:
-    """``controllers.<name>``: a law, its models, its numbers; ``variants`` are evaluated beside it.
+    """``controllers.<case>-<name>``: a law, its models, its numbers; ``variants`` are evaluated beside it.
+
+    ``name`` is the controller's own: of its file, its DVC target and its registered model. Two of one law may
+    stand in one case.
 
     ``as_printed`` marks the reproduction of a paper's law: it alone is shipped although it locked up in a test.
     """
 
     case: str
+    name: str
     law: str
     model: str
     settings: Mapping[str, Any]
@@ -219,8 +223,14 @@ class ControllerParams:
 
     @classmethod
     def read(cls, name: str) -> ControllerParams:
-        """The section of one controller."""
-        return _with_rest(cls, read_section("controllers", name), "settings", f"controllers.{name}")
+        """The section of one controller; ParamsError where its name is not that of the section."""
+        section, where = read_section("controllers", name), f"controllers.{name}"
+        wanted = name.removeprefix(f"{section.get('case')}-")
+        if section.get("name") != wanted:
+            raise ParamsError(
+                f"{where}.name is {section.get('name')!r}; the section is called CASE-NAME, so give `name: {wanted}`"
+            )
+        return _with_rest(cls, section, "settings", where)
 
 
 def _with_rest(cls: type[T], section: Mapping[str, Any], rest: str, where: str) -> T:

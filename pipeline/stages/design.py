@@ -40,7 +40,7 @@ def design(name: str) -> None:
     if not seeds:
         raise LawError(f"{where}: {models} holds no models; run the fit stage of that model set first")
     data = read_json(models / "metrics.json").get("data", {})
-    folder = design_folder(params.case, params.law)
+    folder = design_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
     provenance = {"params_sha256": digest(forms), "commit": _commit(), "versions": _versions()}
     work = [(form, seed) for form in forms for seed in seeds]
@@ -61,11 +61,11 @@ def _export(
     form, seed = item
     parts = {p.stem: load_model(p) for p in sorted((models / f"seed{seed}").glob("*.npz"))}
     law = LAWS[params.law].design(forms[form], parts, plant.signals, plant).eval()
-    path = controller_file(params.case, params.law, form, seed)
+    path = controller_file(params.case, params.name, form, seed)
     origin = {**provenance, "data_seed": seed, "record_sha256": data.get(str(seed))}
     export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
     row = {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
-    return row | _analysed(law, plant, analysis_file(params.case, params.law, form, seed))
+    return row | _analysed(law, plant, analysis_file(params.case, params.name, form, seed))
 
 
 def _analysed(law: ControlLaw, plant: Simulator, path: Path) -> dict[str, Any]:

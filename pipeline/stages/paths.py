@@ -20,33 +20,33 @@ def model_folder(case: str, model: str) -> Path:
     return WORK / case / "models" / model
 
 
-def design_folder(case: str, law: str) -> Path:
+def design_folder(case: str, name: str) -> Path:
     """Folder of a controller's files before validation, one folder a form inside."""
-    return WORK / case / "controllers" / law
+    return WORK / case / "controllers" / name
 
 
-def controller_file(case: str, law: str, form: str, seed: int) -> Path:
+def controller_file(case: str, name: str, form: str, seed: int) -> Path:
     """The exported file of one form (``base`` or a variant's name) and data seed."""
-    return design_folder(case, law) / re.sub(r"[^\w.=]+", "_", form) / f"seed{seed}.onnx"
+    return design_folder(case, name) / re.sub(r"[^\w.=]+", "_", form) / f"seed{seed}.onnx"
 
 
-def analysis_file(case: str, law: str, form: str, seed: int) -> Path:
+def analysis_file(case: str, name: str, form: str, seed: int) -> Path:
     """The arrays of a form's analysis, beside its exported file; there only where the law has some."""
-    return controller_file(case, law, form, seed).with_suffix(".analysis.npz")
+    return controller_file(case, name, form, seed).with_suffix(".analysis.npz")
 
 
-def validation_folder(case: str, law: str) -> Path:
+def validation_folder(case: str, name: str) -> Path:
     """Folder of a controller's validation."""
-    return WORK / case / "validation" / law
+    return WORK / case / "validation" / name
 
 
-def step_time_file(case: str, law: str) -> Path:
+def step_time_file(case: str, name: str) -> Path:
     """The time of one step of a shipped controller [us], as validate measured it: {"p50": ..., "p99": ...}.
 
     An output of validate that is no dependency of any stage: a rerun gives other microseconds,
     and these must not mark the report as changed. The report shows what it finds here.
     """
-    return TIMING / case / f"{law}-step.json"
+    return TIMING / case / f"{name}-step.json"
 
 
 def receipt_file(case: str) -> Path:

@@ -26,7 +26,7 @@ def report(name: str) -> None:
     bounds, missing = stored_bounds(case) if bounds_path(case).exists() else ({}, [])
     for line in missing or ([] if bounds else [f"no bounds yet; `loopwright bounds {name}` computes them"]):
         print(f"report {name}: {line}", file=sys.stderr)
-    laws, models = entries("controllers", name, "law"), entries("models", name, "model")
+    laws, models = entries("controllers", name, "name"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
     evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data, TIMING / name)
     for path in write_report(

@@ -43,28 +43,29 @@ def validate(name: str) -> None:
     case = choose(CASES, params.case, "case", f"controllers.{name}").with_held_out(choices.held_out_seeds)
     case.tests()  # before hours of closed loops: raises where there are none
     seeds = sorted(
-        int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.law) / BASE).glob("*.onnx")
+        int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.name) / BASE).glob("*.onnx")
     )
     if not seeds:
         raise LawError(f"controllers.{name} has no exported files; run its design stage first")
     forms = (BASE, *params.variants)
-    work = [(form, seed, controller_file(params.case, params.law, form, seed)) for form in forms for seed in seeds]
+    work = [(form, seed, controller_file(params.case, params.name, form, seed)) for form in forms for seed in seeds]
     trials = parallel_map(partial(try_file, case, choices.noise_seed), work, f"validate {name}")
     base = [t for t in trials if t.form == BASE]
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))
-    source = controller_file(params.case, params.law, BASE, shipped.seed)
+    source = controller_file(params.case, params.name, BASE, shipped.seed)
     locked_up = _locked_up(base)
     if locked_up and not params.as_printed:
         raise LawError(
             f"controllers.{name} locked up on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
             "numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
         )
-    folder = validation_folder(params.case, params.law)
+    folder = validation_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
-    designed = read_json(design_folder(params.case, params.law) / "metrics.json")
+    designed = read_json(design_folder(params.case, params.name) / "metrics.json")
     analysis = {r["form"]: r["analysis"] for r in designed["controllers"] if _is_told(r, shipped.seed)}
     metrics = {
+        "name": params.name,
         "law": params.law,
         "title": designed["title"],
         **_summary(params, base, trials, shipped),
@@ -75,7 +76,7 @@ def validate(name: str) -> None:
     }
     write_json(folder / "metrics.json", metrics)
     took = step_us(Controller(source), next(iter(shipped.curves.values())))
-    write_json(step_time_file(params.case, params.law), took)
+    write_json(step_time_file(params.case, params.name), took)
     print(f"validate {name}: one step takes {took['p50']:.0f} us (median)", file=sys.stderr)
     curves = {f"{s}/{t.form}/{t.seed}": c for t in trials if t.seed == shipped.seed for s, c in t.curves.items()}
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
@@ -86,7 +87,7 @@ def validate(name: str) -> None:
         evidence["analysis"] = analysis[BASE]["figures"]
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
-    with_evidence(source, ARTIFACTS / params.case / f"{params.law}.onnx", evidence)
+    with_evidence(source, ARTIFACTS / params.case / f"{params.name}.onnx", evidence)
 
 
 def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:
@@ -103,7 +104,7 @@ def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:
     """Put the arrays of every form's analysis into one file, as <form>/<name>."""
     arrays: dict[str, Any] = {}
     for form in (BASE, *params.variants):
-        source = analysis_file(params.case, params.law, form, seed)
+        source = analysis_file(params.case, params.name, form, seed)
         if source.exists():
             with np.load(source, allow_pickle=False) as file:
                 arrays |= {f"{form}/{name}": file[name] for name in file.files}

@@ -78,7 +78,7 @@ def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str,
         errors[f"{metric}/{test}"] = rows[test]["median"].get(metric)
     step = tree.get("step_us")
     shown = {
-        **of_gate(str(tree.get("law")), validation),
+        **of_gate(str(tree.get("name")), validation),
         "lock_ups": tree.get("lock_ups"),
         "step_us": step.get("p50") if isinstance(step, Mapping) else step,
         "data_seeds": len(tree.get("seeds") or ()),

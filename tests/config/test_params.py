@@ -120,7 +120,7 @@ def test_the_shipped_file_is_read_whole(monkeypatch: pytest.MonkeyPatch) -> None
         for settings in ({}, *controller.variants.values()):
             parse(LAWS[controller.law].Params, {**controller.settings, **settings}, name)
         assert (controller.case, controller.model) in models
-        assert name == f"{controller.case}-{controller.law}"
+        assert name == f"{controller.case}-{controller.name}"
     assert set(tree["cases"]) == set(CASES)
 
 

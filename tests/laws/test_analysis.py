@@ -17,7 +17,9 @@ from pipeline.stages.paths import analysis_file
 from pipeline.stages.validate import _keep_analysis
 
 PLANT = PLANTS["batch_reactor"]()
-PARAMS = ControllerParams("batch_reactor", "pid", "linearized", {"r": 1.0}, {"r=2": {"r": 2.0}, "r=3": {"r": 3.0}})
+PARAMS = ControllerParams(
+    "batch_reactor", "pid", "pid", "linearized", {"r": 1.0}, {"r=2": {"r": 2.0}, "r=3": {"r": 3.0}}
+)
 
 
 class Told:

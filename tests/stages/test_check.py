@@ -49,6 +49,7 @@ def test_the_repositorys_own_has_none(params: dict[str, Any], capsys: pytest.Cap
         (("models", "batch_reactor-nnarx", "parts", "arx", "kind"), "arxx", "did you mean 'arx'"),
         (("models", "thiosulfate_cstr-three_periods", "parts", "forward", "trainer", "kind"), "ml", "trainer"),
         (("controllers", "batch_reactor-pid", "law"), "pit", "did you mean 'pid'"),
+        (("controllers", "batch_reactor-pid", "name"), "fast", "so give `name: pid`"),
         (("controllers", "batch_reactor-pid", "model"), "linear", "has the model sets"),
         (("controllers", "batch_reactor-pid", "case"), "batch", "known: batch_reactor"),
         (("controllers", "batch_reactor-pid", "tunings"), "imc", "unknown key 'tunings'"),

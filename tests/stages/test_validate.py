@@ -59,7 +59,7 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
         (designed / "metrics.json").write_text(json.dumps({"title": "PID", "controllers": []}))
         tree = {
             "cases": {CASE: {"held_out_seeds": [9001], "noise_seed": 0}},
-            "controllers": {f"{CASE}-{LAW}": {"case": CASE, "law": LAW, "model": "linearized", **section}},
+            "controllers": {f"{CASE}-{LAW}": {"case": CASE, "name": LAW, "law": LAW, "model": "linearized", **section}},
         }
         (tmp_path / "params.yaml").write_text(yaml.safe_dump(tree))
 
