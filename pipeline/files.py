@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import json
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,17 @@ from pipeline.errors import PipelineError
 
 @contextlib.contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
-    """A file beside ``path`` to write into; it takes the place of ``path`` unless an exception was raised."""
+    """A file beside ``path``, of the same suffix, to write into.
+
+    It takes the place of ``path`` unless an exception was raised; whatever happens, none is left behind.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".draft")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+    os.close(handle)
+    draft = Path(name)
     try:
         yield draft
+        draft.chmod(0o644)
         os.replace(draft, path)
     finally:
         draft.unlink(missing_ok=True)

@@ -7,16 +7,14 @@ that takes longer than many a closed loop.
 from __future__ import annotations
 
 import json
-import os
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import onnx
 
+from pipeline.files import draft_of, write_text
 from serving.controller import Controller
 from serving.digest import TRAILER_BYTES, file_digest, seal
 from serving.manifest import MANIFEST_KEY, Manifest
@@ -34,7 +32,6 @@ def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any])
     with draft_of(dst) as draft:
         draft.write_bytes(assembled(model.SerializeToString(), manifest))
         Controller(draft)
-        os.replace(draft, dst)
     write_sidecar(dst, manifest)
     return manifest
 
@@ -48,19 +45,4 @@ def assembled(model: bytes, manifest: Manifest) -> bytes:
 def write_sidecar(path: Path, manifest: Manifest) -> None:
     """``<law>.json``: the manifest again and the file's SHA-256, for hosts that cannot read ONNX metadata."""
     text = json.dumps({**json.loads(manifest.to_json()), "sha256": file_digest(path.read_bytes())}, indent=2)
-    with draft_of(path.with_suffix(".json")) as draft:
-        draft.write_text(text + "\n", encoding="utf-8")
-        os.replace(draft, path.with_suffix(".json"))
-
-
-@contextmanager
-def draft_of(path: Path) -> Iterator[Path]:
-    """A file beside ``path`` to write and rename; whatever fails, none is left behind."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    os.chmod(name, 0o644)
-    try:
-        yield Path(name)
-    finally:
-        Path(name).unlink(missing_ok=True)
+    write_text(path.with_suffix(".json"), text + "\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -12,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.errors import ExportError
-from pipeline.export.controller_file import assembled, draft_of, write_sidecar
+from pipeline.export.controller_file import assembled, write_sidecar
 from pipeline.export.graph import law_graph
+from pipeline.files import draft_of
 from pipeline.laws.base import ControlLaw
 from serving.controller import Controller
 from serving.errors import LoopwrightError
@@ -91,7 +91,6 @@ def export(
         except LoopwrightError as error:
             raise ExportError(f"law {law.name!r} does not make a controller: {_after_path(error, draft)}") from error
         parity_gate(law, controller, drive=drive)
-        os.replace(draft, path)
     write_sidecar(path, manifest)
     return manifest
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.errors import ModelError
+from pipeline.files import draft_of
 
 
 class Model(nn.Module, ABC):
@@ -34,13 +34,11 @@ class Model(nn.Module, ABC):
         """Prediction, shape (..., n_out), for inputs of shape (..., n_in)."""
 
     def save(self, path: Path) -> None:
-        """Write the model as one .npz; a temporary file is renamed, so no half-written model stays."""
+        """Write the model as one .npz, whole or not at all."""
         header = json.dumps({"kind": self.kind, "config": self.config()})
         arrays = {k: v.detach().cpu().numpy() for k, v in self.state_dict().items()}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_suffix(".draft.npz")
-        np.savez(draft, __model__=np.array(header), **arrays)
-        os.replace(draft, path)
+        with draft_of(path) as draft:
+            np.savez(draft, __model__=np.array(header), **arrays)
 
     @classmethod
     def from_arrays(cls, config: dict[str, Any], arrays: dict[str, np.ndarray[Any, Any]]) -> Self:

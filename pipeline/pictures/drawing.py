@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFo
 
 from pipeline.evaluation.law_evidence import Array
 from pipeline.evaluation.metric import NO_UNIT
+from pipeline.files import write_bytes
 
 BASELINE_COLOUR = "#7f7f7f"
 PALETTE = ("#d55e00", "#0072b2", "#cc79a7", "#009e73", "#56b4e9", "#e69f00", "#8c564b", "#332288")
@@ -173,9 +173,7 @@ def clear_legend(axes: Axes, **options: Any) -> Legend:
 
 
 def save(canvas: Canvas, path: Path) -> None:
-    """Write the PNG by renaming a draft; without date and version inside, so that equal data give equal files."""
+    """Write the PNG whole or not at all; without date and version inside, so that equal data give equal files."""
     buffer = io.BytesIO()
     canvas.savefig(buffer, format="png", dpi=100, facecolor="white", metadata={"Software": None})
-    draft = path.with_suffix(".draft")
-    draft.write_bytes(buffer.getvalue())
-    os.replace(draft, path)
+    write_bytes(path, buffer.getvalue())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.metric import METRICS, Metric
+from pipeline.files import draft_of
 from pipeline.metrics import mv_travel
 from pipeline.plants.simulator import Simulator
 from serving.manifest import Signal
@@ -129,18 +128,9 @@ def _label(signal: Signal) -> str:
 
 
 def _replace(path: Path, write: Callable[[Path], None]) -> None:
-    """Write a draft beside ``path`` and rename it."""
-    draft = None
+    """Write a file whole or not at all; PipelineError where it cannot be written."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        os.close(handle)
-        draft = Path(name)
-        write(draft)
-        draft.chmod(0o644)
-        os.replace(draft, path)
+        with draft_of(path) as draft:
+            write(draft)
     except (OSError, ValueError) as error:
         raise PipelineError(f"{path} cannot be written: {' '.join(str(error).split())}") from error
-    finally:
-        if draft is not None:
-            draft.unlink(missing_ok=True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from pipeline.files import draft_of
 
 if TYPE_CHECKING:
     from pipeline.models.static.sweep import SweepResult
@@ -39,7 +40,5 @@ def draw(result: SweepResult, path: Path) -> None:
     for axes in (error, size):
         axes.axvline(best.partitions, color="C3", lw=0.8, ls=":")
         axes.grid(alpha=0.3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(path.name + ".draft")
-    figure.savefig(draft, dpi=120, format=path.suffix.lstrip(".") or "png")
-    os.replace(draft, path)
+    with draft_of(path) as draft:
+        figure.savefig(draft, dpi=120, format=path.suffix.lstrip(".") or "png")

@@ -6,7 +6,6 @@ import csv
 import difflib
 import json
 import math
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
+from pipeline.files import draft_of
 from serving.manifest import Signal
 
 METADATA_KEY = b"loopwright.record"
@@ -120,13 +120,11 @@ def read_table(path: Path) -> Table:
 
 
 def write_table(path: Path, columns: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any]) -> None:
-    """Write columns by the suffix of ``path``: a draft is renamed, so a reader sees the old file or the new one."""
+    """Write columns by the suffix of ``path``, whole or not at all."""
     suffix = path.suffix.lower()
     if suffix not in {".parquet", ".csv"}:
         raise _unknown_format(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f"{path.name}.{os.getpid()}.draft")
-    try:
+    with draft_of(path) as draft:
         if suffix == ".csv":
             import pandas as pd  # here, because stages read Parquet and importing pandas takes long
 
@@ -134,9 +132,6 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]], metadata: Mappi
         else:
             table = pa.table(dict(columns)).replace_schema_metadata({METADATA_KEY: json.dumps(metadata).encode()})
             pq.write_table(table, draft)
-        os.replace(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _unknown_format(path: Path) -> RecordError:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from pipeline.files import write_text
 from pipeline.pictures.numbers import figure, headline, kilobytes, multiple, times
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
@@ -38,11 +38,9 @@ def render(name: str, content: Mapping[str, Any]) -> str:
 
 
 def write_pages(out: Path, files: Mapping[str, str]) -> list[Path]:
-    """Write files by renaming drafts, so that no half-written one is ever read; returns their paths."""
+    """Write files, each whole or not at all; returns their paths."""
     for name, body in files.items():
-        draft = out / f"{name}.draft"
-        draft.write_text(body, encoding="utf-8")
-        os.replace(draft, out / name)
+        write_text(out / name, body)
     return [out / name for name in files]
 
 

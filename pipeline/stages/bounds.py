@@ -16,7 +16,6 @@ measurement noise, and stores them in ``pipeline/cases/<case>.bounds.json``, fro
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.metric import mean_of_draws
+from pipeline.files import write_text
 from pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from pipeline.plants.equations import equations
@@ -112,9 +112,7 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
         entry = stored["figures"].setdefault(job.scenario.name, {}).setdefault(job.scenario.digest(), {})
         for kind, found in figures.items():
             entry[kind] = {key: float(f"{value:.6g}") for key, value in found.items()}
-        draft = path.with_suffix(".draft")
-        draft.write_text(json.dumps(stored, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(draft, path)
+        write_text(path, json.dumps(stored, indent=1, sort_keys=True, allow_nan=False) + "\n")
         for kind in figures:
             which, figure = f"{job.scenario.name} {job.index} {kind}", entry[kind][case.metric]
             yield f"[{done}/{len(work)}] {which}: {case.metric} {figure:.6g} ({seconds:.0f} s){_remark(entry[kind])}"

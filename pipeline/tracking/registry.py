@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from mlflow.types import Schema, TensorSpec
 
 from pipeline.errors import TrackingError
 from pipeline.evaluation.validation import Validation
+from pipeline.files import write_bytes
 from pipeline.tracking import card
 from pipeline.tracking.gate import Gate
 
@@ -304,8 +304,6 @@ def _download(client: MlflowClient, version: ModelVersion, file: str, draft: str
 
 
 def _place(source: Path, target: Path) -> Path:
-    """Copy by renaming a draft, so that a loop which reloads the file never sees half of it."""
-    draft = target.with_name(target.name + ".draft")
-    draft.write_bytes(source.read_bytes())
-    os.replace(draft, target)
+    """Copy a file; a loop that reloads it never sees half of it."""
+    write_bytes(target, source.read_bytes())
     return target

@@ -261,7 +261,7 @@ def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
     del stored["figures"]["ua"]
     partial = tmp_path / "partial.json"
     partial.write_text(json.dumps(stored))
-    for module in ("pipeline.bounds", "pipeline.stages.report"):
+    for module in ("pipeline.optimal.bounds", "pipeline.stages.report"):
         monkeypatch.setattr(f"{module}.bounds_path", lambda case: partial)
     laws = {f"{CASE}-{law}": {"case": CASE, "law": law, "model": "one_step"} for law in LAWS}
     case = {"held_out_seeds": list(CASES[CASE].held_out_seeds)}

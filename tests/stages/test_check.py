@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from pipeline.__main__ import main
 from pipeline.cases import CASES
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
 from pipeline.plants.equations import EquationPlant
@@ -34,7 +35,7 @@ def checked(tree: dict[str, Any]) -> list[str]:
 
 def test_the_repositorys_own_has_none(params: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     assert checked(params) == []
-    assert check.main() == 0
+    assert main(["check"]) == 0
     assert f"{len(params['controllers'])} controllers" in capsys.readouterr().out
 
 
@@ -70,7 +71,7 @@ def test_every_mistake_is_told_and_the_exit_says_so(params: dict[str, Any], caps
     params["records"]["ph_neutralization-aprbs"]["kind"] = "aprb"
     params["controllers"]["batch_reactor-pid"]["law"] = "pit"
     assert len(checked(params)) == 2
-    assert check.main() == 2
+    assert main(["check"]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert [line.partition(":")[0] for line in lines] == ["check", "check"]
 
@@ -114,7 +115,7 @@ def test_bounds_that_are_missing_are_a_note_and_no_mistake(
 ) -> None:
     params["cases"]["thiosulfate_cstr"]["held_out_seeds"] = [90_001]
     assert checked(params) == []
-    assert check.main() == 0
+    assert main(["check"]) == 0
     said = capsys.readouterr().err.splitlines()
     assert said
     for line in said:

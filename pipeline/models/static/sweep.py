@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.engine.parallel import progress_bar
 from pipeline.errors import ModelError
+from pipeline.files import write_json
 from pipeline.metrics import per_region, r2, rmse
 from pipeline.models.static.fuzzy_means import check_parameters, grid_points, scaling, select_centres, to_grid
 from pipeline.models.static.least_squares import solve_iterative
@@ -62,10 +62,7 @@ class SweepResult:
 
     def save(self, path: Path) -> None:
         """Write the result as JSON."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(path.name + ".draft")
-        draft.write_text(json.dumps(self.to_dict(), indent=1) + "\n", encoding="utf-8")
-        os.replace(draft, path)
+        write_json(path, self.to_dict())
 
     @classmethod
     def load(cls, path: Path) -> Self:
