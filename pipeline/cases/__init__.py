@@ -41,6 +41,8 @@ def beside(case: Case, module: str, name: str, default: Any) -> Any:
     ``default`` where there is no such module.
     """
     package, _, own = type(case).__module__.rpartition(".")
+    if "case" not in own:
+        return default
     path = f"{package}.{own.replace('case', module, 1)}".lstrip(".")
     return default if importlib.util.find_spec(path) is None else getattr(importlib.import_module(path), name)
 

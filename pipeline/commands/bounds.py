@@ -19,7 +19,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute the bounds, a line for each figure."""
     case = choose(CASES, options.case, "case", "bounds")
-    tests = case.scenarios()
+    tests = case.tests()
     for name in options.scenario or ():
         choose(tests, name, "scenario", f"case {case.name!r}")
     for line in compute(case, options.scenario or list(tests), options.jobs):

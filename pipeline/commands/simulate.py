@@ -57,9 +57,9 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def _test_of(case: Case | None, name: str | None) -> Scenario | None:
     """The first sequence of the case's test ``name``, or of its first test; None where the plant has no case."""
-    tests = {} if case is None else case.scenarios()
-    if case is None or not tests:
+    if case is None:
         return None
+    tests = case.tests()
     return choose(tests, next(iter(tests)) if name is None else name, "scenario", f"case {case.name!r}")[0]
 
 

@@ -70,7 +70,7 @@ def itae(sp: ArrayLike, pv: ArrayLike, hold: int, period_s: float) -> float:
     return float(np.sum(period_s**2 * (k % hold if hold else k) * error))
 
 
-def steadyerrors(sp: ArrayLike, pv: ArrayLike, hold: int, last: int = LAST) -> Array:
+def steady_errors(sp: ArrayLike, pv: ArrayLike, hold: int, last: int = LAST) -> Array:
     """Steady-state error of each hold, shape (holds,): |mean of its last ``last`` errors|.
 
     The mean comes before the absolute value, so that measurement noise averages out instead of
@@ -82,12 +82,12 @@ def steadyerrors(sp: ArrayLike, pv: ArrayLike, hold: int, last: int = LAST) -> A
 
 def masse(sp: ArrayLike, pv: ArrayLike, hold: int) -> float:
     """Mean absolute steady-state error over the holds (MASSE of the paper's Table 4)."""
-    return float(np.mean(steadyerrors(sp, pv, hold)))
+    return float(np.mean(steady_errors(sp, pv, hold)))
 
 
 def max_asse(sp: ArrayLike, pv: ArrayLike, hold: int) -> float:
     """Largest absolute steady-state error over the holds (MaxASSE of the paper's Table 4)."""
-    return float(np.max(steadyerrors(sp, pv, hold)))
+    return float(np.max(steady_errors(sp, pv, hold)))
 
 
 def overshoots(sp: ArrayLike, pv: ArrayLike, hold: int, span: float = 1.0) -> Array:

@@ -119,6 +119,7 @@ METRICS: dict[str, Metric] = {
         Metric("mv_travel", "MV travel", "travel of the MVs"),
         # Of the bounds alone.
         Metric("failures", "failures", "plans that were not solved", together="sum"),
+        Metric("from_nmpc", "taken from the NMPC", "plans for which the NMPC's figures stand", together="sum"),
         Metric("step_ms_p50", "step, median", "median time of a step", "ms"),
         Metric("step_ms_p99", "step, 99 %", "time that one step in a hundred exceeds", "ms", "max"),
     )
@@ -134,12 +135,17 @@ def together(sequences: Iterable[Figures], known: Mapping[str, Metric] = METRICS
     is no known metric: nobody could say how to put it together.
     """
     rows = list(sequences)
-    for name in rows[0]:
+    names = dict.fromkeys(name for row in rows for name in row)
+    for name in names:
         if name not in known:
             raise ParamsError(
                 f"the figure {name!r} is scored, but is no metric; add Metric({name!r}, ...) to the case's own_metrics"
             )
-    return {name: float(REDUCE[known[name].together](row[name] for row in rows)) for name in rows[0]}
+    # What is counted may be missing where nothing was: ``from_nmpc``.
+    return {
+        name: float(REDUCE[how](row.get(name, 0.0) if how == "sum" else row[name] for row in rows))
+        for name, how in ((name, known[name].together) for name in names)
+    }
 
 
 def mean_of_draws(draws: Iterable[Figures]) -> Figures:

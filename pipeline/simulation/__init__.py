@@ -4,4 +4,4 @@ How good a loop is stands in ``evaluation``.
 """
 
 NOISE_SUFFIX = "_noise"
-"""A scenario's name with measurement noise is its name with this at the end: ``sp_a_noise``."""
+"""A scenario's name with measurement noise is its name with this at the end: ``held_out_noise``."""

@@ -76,11 +76,11 @@ def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str,
     for test in sorted(scenarios, key=lambda name: -max(weights.get(name, 0), weights.get(name + NOISE_SUFFIX, 0))):
         rows = noisy if test + NOISE_SUFFIX in weights and test not in weights else scenarios
         errors[f"{metric}/{test}"] = rows[test]["median"].get(metric)
-    step = tree.get("step_us")
+    own = validation.laws.get(str(tree.get("name"))) if validation else None
     shown = {
         **of_gate(str(tree.get("name")), validation),
         "lock_ups": tree.get("lock_ups"),
-        "step_us": step.get("p50") if isinstance(step, Mapping) else step,
+        "step_us": own.step_us if own else None,
         "data_seeds": len(tree.get("seeds") or ()),
     }
     return shown | errors

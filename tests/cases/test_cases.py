@@ -14,13 +14,13 @@ import yaml
 
 from pipeline.cases import CASES
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from pipeline.commands.simulate import _test_of as first_scenario
 from pipeline.engine.command import run_stage
 from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
-from pipeline.simulation.timetable import _scenario as first_scenario
 
 DISTURBANCES = {"tin", "ua", "ua_gradual"}
 

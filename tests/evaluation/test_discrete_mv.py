@@ -8,6 +8,7 @@ from pathlib import Path
 import jacketed_batch_reactor_parts
 import numpy as np
 import pytest
+from shipped import required
 
 from pipeline.__main__ import main
 from pipeline.cases import PLANTS
@@ -26,7 +27,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plant, law = PLANTS[CASE](), LAWS["fuzzy_feedforward_observer"]
     path = tmp_path_factory.mktemp("controllers") / "observer.onnx"
     parts = jacketed_batch_reactor_parts.parts(plant)
-    export(law.design(law.Params(), parts, plant.signals, plant), path, case=CASE, provenance={})
+    export(law.design(law.Params(**required(law.name)), parts, plant.signals, plant), path, case=CASE, provenance={})
     return path
 
 

@@ -22,7 +22,7 @@ from pipeline.models.static.rbf import BASES, RBF, design_matrix
 
 CHECKS = """
 from sklearn.utils.estimator_checks import check_estimator
-from pipeline.models.fuzzy_means import FuzzyMeansRBF
+from pipeline.models.static.fuzzy_means import FuzzyMeansRBF
 for estimator in (FuzzyMeansRBF(), FuzzyMeansRBF(5, basis="gaussian", ridge=1e-6)):
     results = check_estimator(estimator, on_skip="warn", on_fail="raise")
     assert len(results) > 40 and all(r["status"] == "passed" for r in results), results

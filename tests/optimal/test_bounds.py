@@ -140,7 +140,7 @@ def test_figures_of_another_plant_are_refused(stored: Path, tmp_path: Path) -> N
 def test_a_file_that_holds_no_bounds_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "none.json"
     path.write_text(text)
-    with pytest.raises(LawError, match=r"holds no bounds of case 'thiosulfate_cstr'; run `python -m"):
+    with pytest.raises(LawError, match=r"holds no bounds of case 'thiosulfate_cstr'; run `loopwright bounds"):
         load_bounds(TinyCase(), path)
 
 
@@ -244,7 +244,7 @@ def test_figures_for_another_aim_are_refused_and_computed_anew(
     tank: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str, other: Any
 ) -> None:
     monkeypatch.setattr(TinyTank, key, other)
-    with pytest.raises(LawError, match=rf"computed for the {key} .*, and the case has .*; run `python -m"):
+    with pytest.raises(LawError, match=rf"computed for the {key} .*, and the case has .*; run `loopwright bounds"):
         load_bounds(TinyTank(), tank)
     path = tmp_path / "again.json"
     path.write_text(tank.read_text())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from pipeline.__main__ import main
 from pipeline.cases import CASES
 from pipeline.cases.batch_reactor.plant import BatchReactor
 from pipeline.errors import PlantError
@@ -21,7 +22,6 @@ from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline, search
 from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_closed
-from pipeline.stages import bounds as oracle
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +198,5 @@ def test_noise_on_what_is_no_state_is_refused(tank: EquationPlant) -> None:
 
 
 def test_an_unknown_scenario_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        oracle.main(["thiosulfate_cstr", "--scenario", "sp_c"])
-    assert "has no scenario 'sp_c'; it has sp_a, sp_b" in capsys.readouterr().err
+    assert main(["bounds", "thiosulfate_cstr", "--scenario", "sp_c"]) == 2
+    assert "unknown scenario 'sp_c'; did you mean 'sp_b'?" in capsys.readouterr().err

@@ -271,7 +271,7 @@ def test_simulated_endpoint_steps_the_plant_at_each_write() -> None:
 
 
 # ---------------------------------------------------------------------- the range, whatever comes
-SHIPPED = sorted((Path(__file__).parent.parent / "artifacts").glob("*/*.onnx"))
+SHIPPED = sorted((Path(__file__).parents[2] / "artifacts").glob("*/*.onnx"))
 
 
 @functools.cache

@@ -84,7 +84,7 @@ def root(tmp_path, monkeypatch, empty_store) -> Path:
 
 
 def test_a_registered_model_asks_for_what_the_package_asks_for() -> None:
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     assert sorted(REQUIREMENTS) == sorted(project["dependencies"])
 
 
