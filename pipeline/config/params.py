@@ -57,8 +57,8 @@ def _tree(path: Path) -> dict[str, Any]:
 
 def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
     """What the section ``kind`` lists for ``case``: the values of ``field`` of its entries, in their order."""
-    tree = _tree(path)
-    return tuple(str(e[field]) for e in (tree.get(kind) or {}).values() if e.get("case") == case)
+    own = {name: e for name, e in (_tree(path).get(kind) or {}).items() if e.get("case") == case}
+    return tuple(str(_entry(e, field, f"{path}: {kind}.{name}")) for name, e in own.items())
 
 
 def _entry(tree: Mapping[str, Any], key: str, where: str) -> Any:
@@ -225,8 +225,8 @@ class ControllerParams:
     def read(cls, name: str) -> ControllerParams:
         """The section of one controller; ParamsError where its name is not that of the section."""
         section, where = read_section("controllers", name), f"controllers.{name}"
-        wanted = name.removeprefix(f"{section.get('case')}-")
-        if section.get("name") != wanted:
+        case, dash, wanted = name.partition("-")
+        if dash and case == section.get("case") and section.get("name") != wanted:
             raise ParamsError(
                 f"{where}.name is {section.get('name')!r}; the section is called CASE-NAME, so give `name: {wanted}`"
             )

@@ -47,7 +47,7 @@ def parse_setting(name: str) -> dict[str, Any]:
 
 
 def lock_up_text(locked_up: Mapping[str, Mapping[str, int]]) -> str:
-    """Tests with the data seeds that locked up in them: ``set_point (seeds 0, 3), held_out (seed 1)``."""
+    """Tests with the data seeds that locked up in them: ``held_out (seeds 0, 3), step (seed 1)``."""
     return ", ".join(
         f"{test} (seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)})" for test, seeds in locked_up.items()
     )

@@ -19,6 +19,7 @@ from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import LawError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.metric import METRICS
 from pipeline.optimal.bounds import (
     DEFAULTS,
     bounded,
@@ -111,7 +112,7 @@ def test_an_optimum_is_no_worse_than_the_nmpc_and_says_that_it_did_not_converge(
     monkeypatch.setattr(Horizon, "solve", gives_up)
     lines = list(oracle.compute(case, ["held_out"], path=path))
     bounds = load_bounds(case, path)["held_out"]
-    alone = run_offline(case.plant, case.scenarios()["held_out"][0], "mae", False, case.effort)
+    alone = run_offline(case.plant, case.scenarios()["held_out"][0], METRICS["mae"], False, case.effort)
     assert alone["mae"] > 1.1 * bounds["nmpc"]["mae"]
     assert bounds["offline"]["mae"] <= bounds["nmpc"]["mae"]
     assert bounds["offline"]["failures"] == 1

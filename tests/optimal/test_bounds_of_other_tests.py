@@ -19,7 +19,7 @@ from pipeline.errors import PlantError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.metric import METRICS
+from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.optimal.bounds import load_bounds, plant_digest
 from pipeline.optimal.horizon import Horizon
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
@@ -213,6 +213,7 @@ class Vessels(Case):
     name: ClassVar[str] = "vessels"
     title: ClassVar[str] = "Vessels"
     plant_class: ClassVar[type[EquationPlant]] = JacketedBatchReactor
+    own_metrics: ClassVar[tuple[Metric, ...]] = (Metric("hot_samples", "hot samples"),)
     development_seeds: ClassVar[tuple[int, ...]] = (11,)
     noise: ClassVar[Mapping[str, float]] = {"T": 0.05, "T_w": 0.1}
     gate: ClassVar[Mapping[str, float]] = {"own": 1.0}

@@ -82,6 +82,7 @@ class Unwritten(EquationPlant):
 
 def test_an_abstract_plant_is_told_before_the_run(params: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     class Case(PhNeutralizationCase):
+        __module__ = PhNeutralizationCase.__module__  # whose folder it shares
         plant_class = Unwritten
 
     monkeypatch.setitem(CASES, "ph_neutralization", Case())
@@ -92,6 +93,8 @@ def test_an_abstract_plant_is_told_before_the_run(params: dict[str, Any], monkey
 
 def test_a_case_without_tests_is_told_before_the_run(params: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     class Case(PhNeutralizationCase):
+        __module__ = PhNeutralizationCase.__module__  # whose folder it shares
+
         def scenarios(self) -> Any:
             return {}
 

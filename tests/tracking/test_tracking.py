@@ -347,7 +347,11 @@ def test_a_run_shows_the_figures_that_matter_and_keeps_all(root):
         run = runs_of(client)[f"validate@{CASE}-inverse_dob"]
         shown = run.data.metrics
         assert len(shown) <= 12
-        assert (shown["data_seeds"], shown["lock_ups"], shown["step_us"]) == (len(made_up.SEEDS), 0, 25.0)
+        assert (shown["data_seeds"], shown["lock_ups"], shown["step_us"]) == (
+            len(made_up.SEEDS),
+            0,
+            evidence["laws"]["inverse_dob"]["step_us"],
+        )
         assert shown["ratio_to_bound"] == SCORES["inverse_dob"]
         rows = dict(json.loads(Path(client.download_artifacts(run.info.run_id, "figures.json")).read_text())["data"])
         stored = made_up.spread(0.064 * made_up.QUALITY["inverse_dob"])
