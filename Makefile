@@ -11,7 +11,7 @@ export DO_NOT_TRACK := 1
 PORT ?= 5000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check registry bench clean
+.PHONY: help setup run test check coverage registry bench clean
 
 help: ## list the targets
 	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -27,13 +27,17 @@ run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, 
 
 test: check ## formatting, lint, types, import rules, tests
 	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
-	python -m pytest
+	python -m pytest -n logical --dist loadfile
 
 check: $(STAMP) ## the static part of make test
 	ruff format --check .
 	ruff check .
 	mypy
 	lint-imports
+
+coverage: $(STAMP) ## branch coverage of the tests, by file
+	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
+	python -m pytest -n logical --dist loadfile --cov=serving --cov=pipeline --cov-branch --cov-report=term:skip-covered
 
 registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes first what the store lacks
 	loopwright registry publish

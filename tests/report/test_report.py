@@ -263,7 +263,7 @@ def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
     partial.write_text(json.dumps(stored))
     for module in ("pipeline.optimal.bounds", "pipeline.stages.report"):
         monkeypatch.setattr(f"{module}.bounds_path", lambda case: partial)
-    laws = {f"{CASE}-{law}": {"case": CASE, "law": law, "model": "one_step"} for law in LAWS}
+    laws = {f"{CASE}-{law}": {"case": CASE, "name": law, "law": law, "model": "one_step"} for law in LAWS}
     case = {"held_out_seeds": list(CASES[CASE].held_out_seeds)}
     models = {f"{CASE}-one_step": {"case": CASE, "model": "one_step", "data": "work", "parts": {}}}
     params = {"cases": {CASE: case}, "records": {}, "models": models, "controllers": laws}
