@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from pipeline.report.results import show_results
 from pipeline.stages.check import mistakes
 
 ARTIFACTS = Path("artifacts")
+MANY = 25  # stages that a person does not read line by line
 KINDS = {"records": "excite", "models": "fit", "controllers": "validate"}  # a section of params.yaml -> its stage
 
 
@@ -103,12 +105,15 @@ def reasons(entry: Mapping[str, object] | str) -> list[str]:
 
 
 def plan(changed: Mapping[str, list[str]]) -> list[str]:
-    """What runs and why, a line a stage."""
+    """What runs and why, a line a stage; of many stages, a line for each kind."""
     if not changed:
         return ["nothing has changed; everything is up to date"]
+    head = f"{len(changed)} stages have changed; they run, and after them what depends on them:"
+    if len(changed) > MANY:
+        kinds = Counter(stage.partition("@")[0] for stage in changed)
+        return [head, *(f"  {kind:10} {count:3}" for kind, count in kinds.items())]
     width = max(map(len, changed))
-    rows = [f"  {stage:{width}}  {'; '.join(why)}" for stage, why in changed.items()]
-    return [f"{len(changed)} stages have changed; they run, and after them what depends on them:", *rows]
+    return [head, *(f"  {stage:{width}}  {'; '.join(why)}" for stage, why in changed.items())]
 
 
 def _dvc(*arguments: str) -> str:

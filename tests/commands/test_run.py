@@ -1,0 +1,40 @@
+"""What ``loopwright run`` says beforehand: which stages run, and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.commands.run import plan, reasons, stages_of
+from pipeline.errors import ParamsError
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_name_asks_for_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    assert stages_of("batch_reactor") == ["report@batch_reactor"]
+    assert stages_of("batch_reactor-pid") == ["validate@batch_reactor-pid"]
+    assert stages_of("batch_reactor-nnarx") == ["fit@batch_reactor-nnarx"]
+    assert stages_of("batch_reactor-batches") == ["excite@batch_reactor-batches"]
+    with pytest.raises(ParamsError, match="no case, controller, model or record 'batch_reacto'; did you mean"):
+        stages_of("batch_reacto")
+
+
+def test_reasons_are_words_for_what_dvc_says() -> None:
+    told = [
+        {"changed deps": {"params.yaml": {"controllers.x.kc": "modified"}, "work/a": "deleted"}},
+        "changed command",
+    ]
+    said = [reason for entry in told for reason in reasons(entry)]
+    assert said == ["controllers.x.kc is modified", "work/a is deleted", "changed command"]
+
+
+def test_the_plan_names_every_stage_or_counts_many() -> None:
+    assert plan({}) == ["nothing has changed; everything is up to date"]
+    few = plan({"fit@a": ["models.a is modified"]})
+    assert few[0].startswith("1 stages have changed")
+    assert "fit@a  models.a is modified" in few[1]
+    many = plan({f"{kind}@{i}": ["new"] for kind in ("fit", "design") for i in range(20)})
+    assert [line.split() for line in many[1:]] == [["fit", "20"], ["design", "20"]]
