@@ -73,4 +73,4 @@ def test_no_stage_depends_on_a_duration() -> None:
             assert not Path(dependency).is_relative_to(TIMING), dependency
             assert not TIMING.is_relative_to(dependency), dependency
     (receipt,) = [out for out in stages["validate"]["do"]["outs"] if str(out).startswith(TIMING.as_posix())]
-    assert receipt == step_time_file("${item.case}", "${item.law}").as_posix()
+    assert receipt == step_time_file("${item.case}", "${item.name}").as_posix()
