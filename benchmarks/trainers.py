@@ -156,8 +156,7 @@ def example(seconds: float, seeds: int) -> None:
 def ph(seconds: float, seeds: int) -> None:
     from pipeline.cases import PLANTS
     from pipeline.excitation import EXCITATIONS
-    from pipeline.models.training.regressors import nnarx_pairs
-    from pipeline.models.training.time_split import split_in_time
+    from pipeline.models.training.regressors import nnarx_pairs, split_in_time
 
     plant = PLANTS["ph_neutralization_15s"]()
     record, other = (EXCITATIONS["random_steps"](samples=2_000, hold=8).run(plant, seed) for seed in (0, 1))

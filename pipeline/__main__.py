@@ -8,8 +8,8 @@ import sys
 from collections.abc import Sequence
 
 from pipeline.commands import COMMANDS, Parser
-from pipeline.config.params import nearest
-from serving.errors import LoopwrightError
+from pipeline.engine.command import FAILURES, reason
+from pipeline.errors import nearest
 
 EXAMPLES = """examples:
   loopwright run                                   the whole pipeline
@@ -24,25 +24,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command: 0 if it went well, 2 after one line on standard error where it could not."""
     # No telemetry, whichever library a command loads.
     os.environ.update(MLFLOW_DISABLE_TELEMETRY="true", DVC_NO_ANALYTICS="1", DO_NOT_TRACK="1")
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    name = given[0] if given else "--help"
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    name = words[0] if words else "--help"
     if name in {"-h", "--help"}:
-        print(_help())
+        try:
+            print(_help(), flush=True)
+        except BrokenPipeError:  # `| head`: nobody reads on
+            sys.stderr.close()
         return 0
     if name not in COMMANDS:
         print(f"loopwright: unknown command {name!r}{nearest(name, COMMANDS)}", file=sys.stderr)
         return 2
-    command = importlib.import_module(f"pipeline.commands.{name}")
+    try:
+        command = importlib.import_module(f"pipeline.commands.{name}")
+    except ModuleNotFoundError as error:  # installed for embedding alone
+        print(f"loopwright {name}: {error.name} is not installed; pip install '.[pipeline]' brings it", file=sys.stderr)
+        return 2
     parser = Parser(prog=f"loopwright {name}", description=COMMANDS[name])
     command.options(parser)
-    options = parser.parse_args(given[1:])
+    options = parser.parse_args(words[1:])
     try:
         status: int | None = command.run(options)
-    except (LoopwrightError, OSError) as error:
-        if isinstance(error, BrokenPipeError):  # `| head`: the reader has seen enough
+    except FAILURES as error:
+        if isinstance(error, BrokenPipeError):  # `| head`: nobody reads on
             sys.stderr.close()
             return 0
-        print(f"loopwright {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"loopwright {name}: {reason(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -53,7 +60,7 @@ def _help() -> str:
     width = max(map(len, COMMANDS))
     rows = [f"  {name:{width}}  {words}" for name, words in COMMANDS.items()]
     head = ("usage: loopwright COMMAND [...]", "", "Neural process controllers from plant data.", "", "commands:")
-    return "\n".join([*head, *rows, "", EXAMPLES, "", "`loopwright COMMAND --help` tells what a command takes."])
+    return "\n".join([*head, *rows, "", EXAMPLES, "", "`loopwright COMMAND --help` lists what a command takes."])
 
 
 if __name__ == "__main__":

@@ -59,6 +59,11 @@ def read_json(path: Path) -> Any:
         raise PipelineError(f"{path} cannot be read ({error}); run the stages before this one: dvc repro") from None
 
 
+def digest(content: Any) -> str:
+    """sha256 of JSON-ready content, however its keys are ordered; what JSON does not know counts as its text."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+
+
 def sha256(path: Path) -> str:
     """Digest of a file's content, as 64 hexadecimal digits."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -18,7 +18,7 @@ def errors(sp: ArrayLike, pv: ArrayLike) -> Array:
     return r - y
 
 
-# ---------------------------------------------------------------------- the whole test
+# ---------------------------------------------------------------------- closed loops
 def mae(sp: ArrayLike, pv: ArrayLike) -> float:
     """Mean absolute error, MAE = (1/Kt) sum_k |r(k) - y(k)|, in the CV's unit.
 
@@ -40,9 +40,6 @@ def ise(sp: ArrayLike, pv: ArrayLike, period_s: float) -> float:
 def mv_travel(mv: ArrayLike) -> float:
     """Actuator travel, sum_k sum_i |u_i(k) - u_i(k-1)| for MVs of shape (n,) or (n, n_mv)."""
     return float(np.sum(np.abs(np.diff(np.asarray(mv, dtype=np.float64), axis=0))))
-
-
-# ---------------------------------------------------------------------- hold by hold
 
 
 # ---------------------------------------------------------------------- models

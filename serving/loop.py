@@ -30,7 +30,7 @@ WARM_LEAD_S = 4e-4  # within the clock's spin, so that the processor does not sl
 
 
 class Mode(StrEnum):
-    """Who decides on the MV: the operator, the law, or nobody (it stays where it is)."""
+    """The source of the MV: MANUAL the operator, AUTO the law, HOLD the last applied MV."""
 
     MANUAL = "MANUAL"
     AUTO = "AUTO"
@@ -39,23 +39,23 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What one scan decided. ``reason`` is empty unless something was wrong."""
+    """The result of one scan. ``reason`` names a fault; it is empty without one."""
 
     scan: int
     mode: Mode
     sp: Array  # shape: (n_sp,)
     mv: Array  # shape: (n_mv,), to be written
-    law_mv: Array | None  # what the law asked for, also in MANUAL; None where it was not or could not be stepped
+    law_mv: Array | None  # the law's MV, also in MANUAL; None if the law was not stepped or its step failed
     info: Array | None  # shape: (n_info,)
     reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """How a run went: scans done, periods skipped because the machine was late, scans with a fault.
+    """Counts of a run: scans, periods missed because the machine was late, scans with a fault.
 
-    An exception of ``observe``, ``until`` or the warm-up moves no MV and is no fault. ``errors``
-    counts these exceptions; ``first_errors`` names the first one of each.
+    An exception in ``observe``, ``until`` or the warm-up does not affect the MV and is no fault.
+    ``errors`` counts these exceptions; ``first_errors`` has the first one of each.
     """
 
     scans: int
@@ -69,36 +69,35 @@ class RunReport:
 class ControlLoop:
     """One controller on one plant.
 
-    AUTO: the law's MV is commanded. MANUAL: the operator's; the law is still stepped with the
-    applied MV and its output ignored, so the transfer to AUTO does not bump. HOLD: the MV stays
-    at its last applied value; a fault in AUTO leads there by itself, with the reason in the
-    command, and ``recover_after`` good samples lead back. A law that had a gap starts cold
-    (state = 0).
+    AUTO commands the law's MV. MANUAL commands the operator's MV; the law is still stepped with
+    the applied MV, so the transfer to AUTO is bumpless. HOLD keeps the last applied MV. A fault in
+    AUTO changes the mode to HOLD, and the command names the reason; ``recover_after`` good samples
+    change it back. After a gap the law starts cold (state = 0).
 
-    Every commanded MV lies in its range, in every mode and with any guards (a discrete MV has one
-    of its values). A read-back outside the range by more than ``guard.READ_BACK_MARGIN`` times the
-    range is a fault. One within this margin is clipped to the range, for the law and for HOLD.
+    Every commanded MV lies in its range, in every mode and with any guards; a discrete MV has one
+    of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
+    it is clipped to the range, for the law and for HOLD. A larger excess is a fault.
 
     Parameters
     ----------
     controller
         The law.
     endpoint
-        The plant's side; only ``run`` needs it.
+        Reads and writes the plant; only ``run`` needs it.
     sp
         Set points (n_sp,).
     mv
-        The MV that the plant has now (n_mv,): what HOLD and MANUAL start from.
+        The MV that the plant has now (n_mv,): the start value of HOLD and MANUAL.
     mode
         Mode at the start.
     guards
-        Reasons not to act; ``default_guards`` unless given.
+        Checks that can refuse a sample; ``default_guards`` unless given.
     recover_after
-        Good samples after which a fault's HOLD returns to AUTO; None: an operator must.
+        Good samples after which HOLD returns to AUTO after a fault; None: only the operator returns it.
     clock
         Time for ``run``; the machine's unless given.
     warm_lead_s
-        How long before each deadline the controller is warmed [s]; 0: none.
+        Lead time of the warm-up before each deadline [s]; 0: no warm-up.
     max_gap
         Missed periods in a row after which the law starts cold.
 
@@ -136,7 +135,7 @@ class ControlLoop:
         self._mv = _within(mv, manifest.mv, "MV")
         self._ranges = [(s.low, s.high, s.values) for s in manifest.mv]
         self._mode = mode
-        self._fault = ""  # why the loop itself went to HOLD; empty while it did not
+        self._fault = ""  # the fault that changed the mode to HOLD; empty without one
         self._good = 0
         self._scan = 0
         self._state = controller.cold_state()
@@ -160,11 +159,11 @@ class ControlLoop:
 
     @property
     def fault(self) -> str:
-        """Why the loop went to HOLD by itself; empty if it did not."""
+        """The fault that changed the mode to HOLD; empty without one."""
         return self._fault
 
     def set_mode(self, mode: Mode) -> None:
-        """Change the mode by hand; effective at the next scan."""
+        """Set the mode; it takes effect at the next scan."""
         self._mode, self._fault, self._good = mode, "", 0
 
     def set_sp(self, sp: ArrayLike) -> None:
@@ -172,14 +171,14 @@ class ControlLoop:
         self._sp = _within(sp, self.controller.manifest.sp, "set point")
 
     def set_mv(self, mv: ArrayLike) -> None:
-        """Change the MV by hand (n_mv,); LoopError outside its range or when the law decides."""
+        """Set the MV (n_mv,) in MANUAL; LoopError outside its range or in another mode."""
         if self._mode is not Mode.MANUAL:
             raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self._mode}")
         self._mv = _within(mv, self.controller.manifest.mv, "MV")
 
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
-        """Decide on the MV of the next period. No I/O, no clock; never an exception for what a sample holds."""
+        """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         reason = self._refusal(sample)
         if reason:
             return self.miss(reason)
@@ -188,8 +187,8 @@ class ControlLoop:
             applied = self._read_back(sample)
             step = self.controller.step(sp=self._sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
             if self._past.maxlen:
-                self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may use its array again
-        except Exception as error:  # whatever it is, the plant needs an MV
+                self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
+        except Exception as error:  # the plant needs an MV after any error
             if self._mode is Mode.AUTO:
                 self._mv = applied
             return self.miss(_text(error))
@@ -203,7 +202,7 @@ class ControlLoop:
         return self._command(step.mv, step.info, self._fault)
 
     def miss(self, reason: str) -> Command:
-        """The command for a scan without a usable sample: the MV stays, the law starts cold afterwards."""
+        """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         reason = reason or "a fault without a reason"
         self._state = self.controller.cold_state()
         self._past.clear()
@@ -220,15 +219,15 @@ class ControlLoop:
                 reason = guard.check(sample, self._past)
                 if reason:
                     return str(reason)
-            except Exception as error:  # a guard that fails has not cleared the sample
+            except Exception as error:  # a guard that fails refuses the sample
                 return f"{type(guard).__name__} failed: {_text(error)}"
         return None
 
     def _read_back(self, sample: Sample) -> Array:
-        """The applied MV (n_mv,), each value one that may be commanded; the last command if there is no read-back.
+        """The applied MV (n_mv,) within its range; the last command if there is no read-back.
 
-        Raises ContractError for a wrong shape and SampleError for an implausible value: HOLD makes
-        the read-back a command, so this check does not depend on the guards.
+        Raises ContractError for a wrong shape and SampleError for an implausible value. HOLD
+        commands the read-back, so this check does not depend on the guards.
         """
         if sample.mv_applied is None:
             return self._mv
@@ -258,29 +257,29 @@ class ControlLoop:
         before: Callable[[int], None] | None = None,
         observe: Callable[[Sample | None, Command], None] | None = None,
     ) -> RunReport:
-        """Scan once a period until ``n`` periods have passed or ``until`` says so.
+        """Scan once a period for ``n`` periods, or until ``until`` returns True.
 
-        Deadlines are t0 + k period, so lateness never becomes drift; a period that has wholly
-        passed is skipped and counted. ``before(k)`` is called ahead of the scan on grid place k (a
-        schedule of set points), ``observe`` after it.
+        Deadlines are t0 + k period, so lateness does not add up to drift. A period that has passed
+        completely is skipped and counted. ``before(k)`` is called before the scan at grid place k
+        (for a schedule of set points), ``observe`` after it.
 
-        No exception but KeyboardInterrupt, SystemExit and their like ends the run: the plant needs
-        an MV at every period. What raises decides what follows.
+        Only KeyboardInterrupt, SystemExit and similar exceptions end the run, because the plant
+        needs an MV at every period. The effect of another exception depends on its source.
 
-        - ``endpoint``: a fault. The loop holds and tries again.
+        - ``endpoint``: a fault. The loop goes to HOLD and tries again.
         - ``before``: a fault, because the set points may be wrong. The held MV is written.
         - ``clock``: a fault, because the law's period is not known. The held MV is written, and the
           machine's clock measures the next period.
         - ``observe``, ``until``, the warm-up: no fault, because the MV is already written or does
-          not depend on them. The run goes on; an ``until`` that raises has not said yes. The
-          exceptions are counted and named in the report, and the first of each is logged at once.
+          not depend on them. The run continues; an ``until`` that raises counts as False. The
+          report counts and names these exceptions, and the first of each is logged at once.
 
         Raises
         ------
         LoopError
             There is no endpoint.
         Exception
-            What the clock raises when it is first read: nothing has been commanded yet.
+            The clock failed at its first reading; no MV was commanded yet.
         """
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")
@@ -321,7 +320,7 @@ class ControlLoop:
         return RunReport(scans, missed, faults, latest, failures.count, tuple(failures.first.values()))
 
     def _wait(self, deadline: float, failures: _Failures) -> float:
-        """Sleep until ``deadline`` [s], warm the controller just before it, and give the lateness [s]."""
+        """Warm the controller, sleep until ``deadline`` [s], and return the lateness [s]."""
         if self.warm_lead_s:
             self.clock.sleep_until(deadline - self.warm_lead_s)
             failures.call("warm", self.controller.warm)
@@ -332,7 +331,7 @@ class ControlLoop:
         return max(0.0, late)
 
     def _exchange(self, endpoint: Endpoint, reason: str) -> tuple[Sample | None, Command]:
-        """Read, scan, write; ``reason`` (unless empty) or an endpoint that fails gives a held command."""
+        """Read, scan, write; a ``reason`` or a failing endpoint gives a command that holds the MV."""
         sample, last = None, self._mv
         try:
             sample = endpoint.read()
@@ -344,34 +343,34 @@ class ControlLoop:
             endpoint.write(command.mv)
         except Exception as error:
             if self._mode is Mode.AUTO:
-                self._mv = last  # what was decided never arrived
+                self._mv = last  # the new MV never reached the plant
             self._scan -= 1
             command = self.miss(f"the endpoint cannot be written: {_named(error)}")
         return sample if isinstance(sample, Sample) else None, command
 
 
 class _Failures:
-    """Exceptions that move no MV: how many, and the text of the first one by the name of what raised."""
+    """Exceptions that do not affect the MV: their number, and by source the text of the first one."""
 
     def __init__(self) -> None:
         self.count = 0
         self.first: dict[str, str] = {}
 
     def call(self, name: str, act: Callable[..., T], *arguments: object) -> T | None:
-        """``act(*arguments)``; None, counted and named, if it raises."""
+        """``act(*arguments)``; an exception is counted and named, and gives None."""
         try:
             return act(*arguments)
         except Exception as error:
             self.count += 1
             if name not in self.first:
                 self.first[name] = f"{name} failed: {_named(error)}"
-                with suppress(Exception):  # a log handler of the host's may be what is broken
+                with suppress(Exception):  # the host's log handler may fail too
                     _log.error(self.first[name])
             return None
 
 
 def _text(error: Exception) -> str:
-    """The first line of the error's text; its type where it has none."""
+    """The first line of the error's text; its type if the text is empty."""
     name = type(error).__name__
     try:
         return (str(error).strip().splitlines() or [name])[0]

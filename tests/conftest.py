@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -26,6 +25,7 @@ from pipeline.models.training.fit import LevenbergMarquardt
 from pipeline.models.training.objectives import Samples
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.signals import Signals
+from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_batch
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
@@ -33,12 +33,13 @@ QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
 QUICK["pid"] |= {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613}
 for _name in ("model_reference", "model_reference_two_error", "pi_reference"):
     QUICK[_name] |= reversible_cstr_parts.QUICK
+ADAPTIVE = {"adaptive": True, "penalty_start": 20.0, "penalty_low": 0.1, "eps_high": 0.2, "eps_low": 0.05}
 # Forms of a law that its defaults do not reach, under the contract too.
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "incadec": [{"correction": "back_calculation"}],
     "linearized_pid": [
-        {"adaptive": True},
-        {"adaptive": True, "momentum": 0.4, "window": 5, "noise_variance": 1e-4, "offset_filter": 0.3, "trust": 0.6},
+        ADAPTIVE,
+        {**ADAPTIVE, "momentum": 0.4, "window": 5, "noise_variance": 1e-4, "offset_filter": 0.3, "trust": 0.6},
         {"preview": "ramp", "trust": 0.5},
         {"momentum": 0.4, "window": 2, "noise_variance": 1e-4},
     ],
@@ -65,6 +66,11 @@ AT_REST: dict[str, tuple[float, float, float]] = {"thiosulfate_cstr": (0.1, 0.66
 HORIZON = 3
 
 LawFactory = Callable[..., ControlLaw]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The file that takes longest comes first: with several workers nobody waits for it alone at the end."""
+    items.sort(key=lambda item: item.path.name != "test_pipeline.py")
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -184,23 +190,13 @@ def law_plant(law: ControlLaw) -> EquationPlant:
     return plant_of(law.name)
 
 
-@dataclass(frozen=True)
-class LoopTest:
-    """A closed-loop test as ``simulate_closed`` reads it."""
-
-    sp: np.ndarray
-    x0: np.ndarray
-    mv0: np.ndarray
-    changes: dict[str, np.ndarray]
-
-
 @pytest.fixture(scope="session")
-def loop_test() -> Callable[..., LoopTest]:
+def loop_test() -> Callable[..., Scenario]:
     """``loop_test(plant, levels (n,), start, NAME=value)``: from the steady state at ``start``, parameters changed."""
 
-    def make(plant: EquationPlant, levels: np.ndarray, start: float, **changed: float) -> LoopTest:
+    def make(plant: EquationPlant, levels: np.ndarray, start: float, **changed: float) -> Scenario:
         x0, mv0 = plant.steady_state_at(start)
         changes = {name: np.full(len(levels), value) for name, value in changed.items()}
-        return LoopTest(levels[:, None], x0, mv0, changes)
+        return Scenario("made", "made", levels[:, None], x0, mv0, changes)
 
     return make

@@ -19,12 +19,16 @@ import yaml
 from onnx import TensorProto, helper
 
 from pipeline.cases import CASES, beside
+from pipeline.cases.batch_reactor.case import CALMED
+from pipeline.cases.batch_reactor.case import PLAIN as WITHOUT
+from pipeline.evaluation import law_evidence
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.validation import SCHEMA, Validation
-from pipeline.evaluation.verdicts import PLAIN, Claims, judge
+from pipeline.evaluation.verdicts import PLAIN, Claims
 from pipeline.report.for_programs import validation
 from pipeline.report.page import write_report
+from pipeline.report.verdicts import judge
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 SEEDS = (0, 1, 2)
@@ -39,7 +43,7 @@ class Miniature:
     quality: Mapping[str, float]  # of each law: its error as a multiple of the bound's
     bound: Mapping[str, float]  # of each test, in the case's metric
     setting: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    variants: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)  # law -> name -> setting
     offline: Mapping[str, float] = field(default_factory=dict)
     adaptive: tuple[str, ...] = ()  # laws with ``GAINS`` in their info
 
@@ -58,12 +62,16 @@ class Miniature:
         return {name: scenarios[0] for name, scenarios in self.of.scenarios().items()}
 
 
+BACK = {"correction": "back_calculation"}
 THIOSULFATE = Miniature(
     "thiosulfate_cstr",
     {"inc": 2.7, "incad": 1.8, "incadec": 3.9, "pid": 1.35, "inverse_dob": 1.12, "forward_dob": 1.16},
     {"sp_a": 0.064, "sp_b": 0.0073, "tin": 0.0002, "ua": 0.0004, "ua_gradual": 0.0001, "held_out": 0.036},
     {"incad": {"r": 1.5}, "incadec": {"r": 5.5, "correction": "as_printed"}},
-    {"incad": ("r=2.5", "r=3.5", "r=4.5", "r=10"), "incadec": ("r=10", "r=5.5, back", "r=10, back")},
+    {
+        "incad": {f"r={r:g}": {"r": r} for r in (2.5, 3.5, 4.5, 10)},
+        "incadec": {"r=10": {"r": 10}, "r=5.5, back": BACK, "r=10, back": {"r": 10, **BACK}},
+    },
     {"sp_a": 0.0635, "sp_b": 0.0072},
 )
 PH = Miniature(
@@ -72,9 +80,9 @@ PH = Miniature(
     {"set_point": 6.04, "disturbance": 0.144, "held_out": 8.0, "buffer": 7.0, "base": 0.01},
     {"linearized_pid": {"penalty": 1.0}, "recursive_pid": {"penalty": 1.0}, "pid": {"tuning": "optimized"}},
     {
-        "linearized_pid": ("penalty=20", "adaptive"),
-        "recursive_pid": ("penalty=5",),
-        "pid": ("tuning=itae, sampling=1",),
+        "linearized_pid": {"penalty=20": {"penalty": 20.0}, "adaptive": {"adaptive": True}},
+        "recursive_pid": {"penalty=5": {"penalty": 5.0}},
+        "pid": {"tuning=itae, sampling=1": {"tuning": "itae", "sampling": 1.0}},
     },
     adaptive=("linearized_pid", "gauss_newton_pid", "recursive_pid"),
 )
@@ -83,7 +91,7 @@ BATCH = Miniature(
     {"linearized_pid": 1.004, "gauss_newton_pid": 1.001, "recursive_pid": 1.002, "pid": 1.01},
     {"trajectory": 13_252.0, "fouling": 14_181.0, "held_out": 8000.0},
     {},
-    {"linearized_pid": ("calmed", "without_recipe")},
+    {"linearized_pid": {"calmed": CALMED.setting, "without_recipe": WITHOUT.setting}},
     adaptive=("linearized_pid", "recursive_pid"),
 )
 CASE, QUALITY = THIOSULFATE.case, THIOSULFATE.quality
@@ -226,24 +234,24 @@ def write_validation(
     case, metric = mini.of, mini.of.metric
     tests = mini.tests
     errors = {name: bound * quality for name, bound in mini.bound.items()}
-    variants, adaptive = mini.variants.get(law, ()), law in mini.adaptive
+    variants, info = mini.variants.get(law, {}), list(GAINS) if law in mini.adaptive else []
+    shipped = {name: spread(error, metric) for name, error in errors.items()}
+    noisy = {name + NOISE_SUFFIX: spread(error * 1.1 + 1e-4, metric) for name, error in errors.items()}
+    forms = {"base": {"setting": mini.setting.get(law, {}), "info": info, "tests": shipped | noisy}}
+    for i, (name, setting) in enumerate(variants.items()):
+        worse = {test: spread(error * (1.2 + 0.1 * i), metric) for test, error in errors.items()}
+        forms[name] = {"setting": setting, "info": info, "tests": worse}
     metrics: dict[str, Any] = {
+        "schema": law_evidence.SCHEMA,
         "name": law,
-        "law": law,
         "title": law.upper(),
+        "metric": metric,
         "seeds": list(SEEDS),
         "shipped_seed": 0,
         "lock_ups": lock_ups,
         "locked_up": {"sp_a": {"0": lock_ups}} if lock_ups else {},
         "as_printed": bool(lock_ups),
-        "setting": mini.setting.get(law, {}),
-        "info": list(GAINS) if adaptive else [],
-        "scenarios": {name: spread(error, metric) for name, error in errors.items()},
-        "noise": {name: spread(error * 1.1 + 1e-4, metric) for name, error in errors.items()},
-        "variants": {
-            v: {name: spread(error * (1.2 + 0.1 * i), metric) for name, error in errors.items()}
-            for i, v in enumerate(variants)
-        },
+        "forms": forms,
     }
     write_json(folder / "metrics.json", metrics)
     write_json(root / "timing" / mini.case / f"{law}-step.json", {"p50": 25.0, "p99": 60.0})
@@ -252,7 +260,7 @@ def write_validation(
     arrays = {}
     for i, variant in enumerate(("base", *variants)):
         for name, scenario in loops.items():
-            for key, values in trajectory(case, scenario, quality * (1 + 0.3 * i), adaptive).items():
+            for key, values in trajectory(case, scenario, quality * (1 + 0.3 * i), bool(info)).items():
                 arrays[f"{name}/{variant}/0/{key}"] = values
     np.savez_compressed(folder / "trajectories.npz", **arrays)
     write_controller(root / "artifacts" / mini.case / f"{law}.onnx", law, gain, mini)
@@ -338,9 +346,11 @@ def claims_of(case: str) -> Claims:
     return claims
 
 
-def report(evidence: Evidence, models: Path, out: Path) -> None:
+def report(evidence: Evidence, out: Path) -> None:
     """The report with what is known of the case, as its stage writes it."""
-    write_report(evidence, claims_of(evidence.case.name), models, out)
+    name = evidence.case.name
+    pictures = beside(CASES[name], "pictures", "PICTURES", ()) if name in CASES else ()
+    write_report(evidence, claims_of(name), pictures, out)
 
 
 def for_programs(evidence: Evidence) -> Validation:

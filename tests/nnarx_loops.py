@@ -14,6 +14,7 @@ from pipeline.excitation import Excitation
 from pipeline.laws import LAWS, ControlLaw
 from pipeline.models import MODELS, Model
 from pipeline.models.lagged.nnarx import NNARX
+from pipeline.models.part import Source
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.signals import Signals
 from pipeline.simulation.scenario import Scenario
@@ -26,7 +27,7 @@ DV = torch.zeros(0, dtype=torch.float64)
 def trained(plant: EquationPlant, excitation: Excitation, lags: int, seed: int = 0) -> NNARX:
     """An NNARX as params.yaml asks for it, without the figures that its report shows."""
     part = MODELS["nnarx"](n_y=lags, n_u=lags, hidden=(10,), steps=10, compared=0)
-    model = part.learn(excitation.run(plant, seed), plant.signals, {}, seed).model
+    model = part.learn(Source(excitation.run(plant, seed), plant.signals, seed=seed)).model
     assert isinstance(model, NNARX)
     return model
 

@@ -24,7 +24,9 @@ def required(law: str) -> dict[str, Any]:
     }
     if not names:
         return {}
-    name = next(n for n in sections("controllers", PARAMS) if n.endswith(f"-{law}"))
-    section = read_section("controllers", name, PARAMS)
+    every = {n: read_section("controllers", n, PARAMS) for n in sections("controllers", PARAMS)}
+    name = next((n for n, section in every.items() if section["law"] == law and names <= set(section)), None)
+    assert name, f"law {law!r} needs {sorted(names)}, and no controller of params.yaml gives them; add a section"
+    section = every[name]
     found = parse(cls, {key: section[key] for key in names}, name)
     return {key: getattr(found, key) for key in names}

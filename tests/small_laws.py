@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from pipeline.export.controller_file import with_evidence
 from pipeline.export.gate import export
 from pipeline.laws import ControlLaw
 from pipeline.plants.signals import Signals
@@ -70,7 +71,8 @@ def pi_law(make_formula: Callable[..., ControlLaw]) -> ControlLaw:
 @pytest.fixture(scope="session")
 def pi_file(pi_law: ControlLaw, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("controller") / "pi.onnx"
-    export(pi_law, path, case="tank", provenance={"git": "0123abc"}, evidence={"step": {"mae": 0.25, "ise": 0.5}})
+    export(pi_law, path, case="tank", provenance={"git": "0123abc"})
+    with_evidence(path, path, {"step": {"mae": 0.25, "ise": 0.5}})
     return path
 
 

@@ -29,3 +29,4 @@ fi
 say "installing into $venv (a few minutes the first time)"
 # Python compiles on first use what is used, a third of the files: pip would compile all of them, one by one.
 "$venv/bin/python" -m pip install --quiet --no-compile -c constraints.txt "$torch" -e '.[pipeline,dev]'
+say "ready; \`source $venv/bin/activate\` brings the command loopwright"

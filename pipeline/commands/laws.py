@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from pipeline.commands.parameters import show
-from pipeline.config.params import choose
+from pipeline.commands.parameters import list_or_show
 from pipeline.laws import LAWS
 
 
@@ -16,10 +15,4 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the list or one law."""
-    if options.name is None:
-        for name, law in LAWS.items():
-            print(f"{name:28} {law.title}")
-        return
-    law = choose(LAWS, options.name, "law", "laws")
-    print(f"{law.name}: {law.title}\n")
-    show(law.Params)
+    list_or_show({name: (law.title, law.Params) for name, law in LAWS.items()}, options.name, "law", "laws")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from pipeline.commands.parameters import first_sentence, show
-from pipeline.config.params import choose
+from pipeline.commands.parameters import first_sentence, list_or_show
 from pipeline.models import MODELS
 
 
@@ -16,10 +15,5 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the list or one kind."""
-    if options.name is None:
-        for kind, part in MODELS.items():
-            print(f"{kind:28} {first_sentence(part)}")
-        return
-    part = choose(MODELS, options.name, "kind of model", "models")
-    print(f"{options.name}: {first_sentence(part)}\n")
-    show(part)
+    kinds = {kind: (first_sentence(part), part) for kind, part in MODELS.items()}
+    list_or_show(kinds, options.name, "kind of model", "models")

@@ -7,9 +7,23 @@ import inspect
 import re
 import textwrap
 import typing
+from collections.abc import Mapping
 from typing import Any
 
+from pipeline.config.params import choose
+
 WIDTH = 110
+
+
+def list_or_show(table: Mapping[str, tuple[str, type[Any]]], name: str | None, what: str, command: str) -> None:
+    """Print each entry of the table, name -> (title, parameters), in a line; or the one that is named, in full."""
+    if name is None:
+        for entry, (title, _) in table.items():
+            print(f"{entry:28} {title}")
+        return
+    title, params = choose(table, name, what, command)
+    print(f"{name}: {title}\n")
+    show(params)
 
 
 def show(params: type[Any]) -> None:
@@ -18,8 +32,9 @@ def show(params: type[Any]) -> None:
     if not rows:
         print("no parameters")
         return
-    columns = [max(len(row[i]) for row in (*rows, ("parameter", "type", "default"))) for i in range(2)]
-    for row in (("parameter", "type", "default"), *rows):
+    rows.insert(0, ("parameter", "type", "default"))
+    columns = [max(len(row[i]) for row in rows) for i in range(2)]
+    for row in rows:
         print(f"{row[0]:{columns[0]}}  {row[1]:{columns[1]}}  {row[2]}")
     for text in texts(params):
         print()
@@ -35,12 +50,9 @@ def show(params: type[Any]) -> None:
 
 def texts(params: type[Any]) -> list[str]:
     """The docstrings that describe the parameters, those of the class itself first."""
-    found = []
-    for cls in params.__mro__:
-        own = cls.__dict__.get("__doc__")
-        if cls is not object and dataclasses.is_dataclass(cls) and own and not own.startswith(f"{cls.__name__}("):
-            found.append(inspect.cleandoc(own))
-    return found
+    own = {cls: cls.__dict__.get("__doc__") or "" for cls in params.__mro__ if dataclasses.is_dataclass(cls)}
+    # A dataclass without words of its own has its signature there.
+    return [inspect.cleandoc(text) for cls, text in own.items() if text and not text.startswith(f"{cls.__name__}(")]
 
 
 def first_sentence(cls: type[Any]) -> str:

@@ -6,6 +6,7 @@ import argparse
 import os
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import quote
 
@@ -17,10 +18,6 @@ from pipeline.tracking.store import store, store_uri
 HOST = "127.0.0.1"
 CHAMPIONS = "tags.standing LIKE 'champion%'"
 """MLflow's search for the registered models that are champion of their case."""
-
-
-def _publish(args: argparse.Namespace) -> None:
-    publish(Path.cwd())
 
 
 def _list(args: argparse.Namespace) -> None:
@@ -69,26 +66,24 @@ def _serve(args: argparse.Namespace) -> None:
 def options(parser: argparse.ArgumentParser) -> None:
     """What the command takes: a command of its own and what that one takes."""
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=type(parser))
-    one = commands.add_parser("publish", help="write the cached results that the store lacks")
-    one.set_defaults(action=_publish)
-    one = commands.add_parser(
-        "list", help="controllers, versions, gate scores and aliases; the champion of each case first"
-    )
-    one.set_defaults(action=_list)
-    one = commands.add_parser("promote", help="make a version the champion of its case, or move another alias")
+
+    def command(name: str, action: Callable[[argparse.Namespace], object], words: str) -> argparse.ArgumentParser:
+        one = commands.add_parser(name, help=words)
+        one.set_defaults(action=action)
+        return one
+
+    command("publish", lambda _: publish(Path.cwd()), "write the cached results that the store lacks")
+    command("list", _list, "controllers, versions, gate scores and aliases; the champion of each case first")
+    one = command("promote", _promote, "make a version the champion of its case, or move another alias")
     one.add_argument("name", help="registered controller: CASE-LAW")
     one.add_argument("version", help="its version, a number")
     one.add_argument("--alias", default=CHAMPION, help="default: %(default)s")
-    one.set_defaults(action=_promote)
-    one = commands.add_parser("fetch", help="write a controller and its manifest into a folder")
-    one.add_argument(
-        "controller", help="CASE (its champion), CASE-LAW (its best version), CASE-LAW@ALIAS or CASE-LAW/VERSION"
-    )
+    one = command("fetch", _fetch, "write a controller and its manifest into a folder")
+    names = "CASE (its champion), CASE-LAW (its best version), CASE-LAW@ALIAS or CASE-LAW/VERSION"
+    one.add_argument("controller", help=names)
     one.add_argument("folder", type=Path)
-    one.set_defaults(action=_fetch)
-    one = commands.add_parser("serve", help="open MLflow's UI on this machine only, its job execution off")
+    one = command("serve", _serve, "open MLflow's UI on this machine only, its job execution off")
     one.add_argument("--port", type=int, default=5000, help="default: %(default)s")
-    one.set_defaults(action=_serve)
 
 
 def run(options: argparse.Namespace) -> None:

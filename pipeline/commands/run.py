@@ -12,9 +12,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from pipeline.config.params import nearest, sections
+from pipeline.config.params import sections
 from pipeline.engine.lifeline import end_with_parent
-from pipeline.errors import ParamsError, PipelineError
+from pipeline.errors import ParamsError, PipelineError, nearest
 from pipeline.report.results import show_results
 from pipeline.stages.check import mistakes
 
@@ -35,20 +35,21 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check params.yaml, say what runs, run it, and show the results."""
     targets = [stage for name in options.targets for stage in stages_of(name)]
-    found = mistakes()
-    if found:
-        raise ParamsError(f"{found[0]}; params.yaml has {len(found)} mistakes, `loopwright check` lists them")
+    wrong = mistakes()
+    if wrong:
+        rest = f"; params.yaml has {len(wrong)} mistakes, `loopwright check` lists them" if wrong[1:] else ""
+        raise ParamsError(f"{wrong[0]}{rest}")
     # The list of files that each stage runs comes first: what has changed shows only after it.
     _dvc("repro", "--quiet", "code")
     changed = status(targets)
     print("\n".join(plan(changed)), flush=True)
     if options.dry:
         return 0
-    code = 0
-    if changed:
-        code = repro(*(["--keep-going"] if options.keep_going else []), *targets)
+    code = repro(*(["--keep-going"] if options.keep_going else []), *targets) if changed else 0
     if code == 0:
         show_results(ARTIFACTS)
+        if targets and not any(t.startswith("report") for t in targets):
+            print("the table is of the last report; `loopwright run CASE` makes the report of these results")
     return code
 
 
@@ -66,7 +67,7 @@ def repro(*arguments: str) -> int:
             try:
                 return process.wait()
             except KeyboardInterrupt:
-                continue  # the terminal has told all of them; wait until they have ended
+                continue  # the terminal has interrupted all of them; wait until they have ended
 
 
 def stages_of(name: str) -> list[str]:
@@ -87,21 +88,19 @@ def status(targets: Iterable[str]) -> Mapping[str, list[str]]:
     """Stage -> why it runs, of the stages whose own files or parameters have changed (``dvc status``)."""
     upstream = [] if not targets else ["--with-deps"]
     tree = json.loads(_dvc("status", "--json", *upstream, *targets) or "{}")
-    return {stage: [reason for entry in found for reason in reasons(entry)] for stage, found in tree.items()}
+    return {stage: [reason for entry in entries for reason in reasons(entry)] for stage, entries in tree.items()}
 
 
 def reasons(entry: Mapping[str, object] | str) -> list[str]:
     """What DVC says of a stage, in words: ``{"changed deps": {"params.yaml": {"x.y": "modified"}}}``."""
     if isinstance(entry, str):  # "changed command", "always changed"
         return [entry]
-    found = []
+    lines = []
     for items in entry.values():
         for name, how in items.items() if isinstance(items, Mapping) else ():
-            if isinstance(how, Mapping):  # parameters of a file
-                found += [f"{key} is {verb}" for key, verb in how.items()]
-            else:
-                found.append(f"{name} is {how}")
-    return found
+            verbs = how if isinstance(how, Mapping) else {name: how}  # parameters of a file have one each
+            lines += [f"{key} is {verb}" for key, verb in verbs.items()]
+    return lines
 
 
 def plan(changed: Mapping[str, list[str]]) -> list[str]:

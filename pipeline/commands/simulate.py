@@ -11,9 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
+import numpy as np
+
 from pipeline.cases import CASES, PLANTS
-from pipeline.config.params import choose, nearest
-from pipeline.errors import ParamsError
+from pipeline.config.params import choose
+from pipeline.errors import ParamsError, nearest
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.metric import METRICS
 from pipeline.pictures.loop_picture import History, draw, summary, write_csv
@@ -23,7 +25,7 @@ from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
 from serving.clock import MonotonicClock, VirtualClock
 from serving.controller import Controller
-from serving.endpoint import Array, Endpoint
+from serving.endpoint import Array
 from serving.guard import Sample
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest
@@ -37,19 +39,18 @@ def options(parser: argparse.ArgumentParser) -> None:
     """What the command takes."""
     event = partial(_argument, partial(parse_event, named=False))
     named = partial(_argument, partial(parse_event, named=True))
+    positive = partial(_number, above=0)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
     add("--sp", metavar="VALUE[@S]", type=event, action="append", default=[], help="set point from time S on")
     add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
-    add(
-        "--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this controlled variable"
-    )
+    add("--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this CV")
     add("--disturbance", metavar="NAME=VALUE[@S]", type=named, action="append", default=[], help="plant parameter")
     add("--noise", metavar="PV=STD", type=named, action="append", default=[], help="measurement noise")
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
-    add("--duration", metavar="S", type=_positive, help="length of the run")
-    add("--speed", metavar="X", type=_positive, help="times real time, 1 is real time (default: as fast as possible)")
+    add("--duration", metavar="S", type=positive, help="length of the run")
+    add("--speed", metavar="X", type=positive, help="times real time, 1 is real time (default: as fast as possible)")
     add("--seed", metavar="N", type=_seed, default=0, help="of the noise (0)")
     add("--picture", metavar="FILE", type=Path, help="where the picture goes (<law>-simulation.png)")
     add("--csv", metavar="FILE", type=Path, help="write every sample there")
@@ -96,10 +97,25 @@ def close_loop(
     controller: Controller, plant: Simulator, course: Timetable, *, title: str, speed: float | None = None
 ) -> History:
     """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible."""
-    endpoint, history = SimulatedPlant(plant, course), History()
+    simulated, history = SimulatedPlant(plant, course), History()
+    # The loop outlives whatever raises, as a plant needs it to; a simulation that raised is over.
+    failed: list[Exception] = []
+
+    def ending(act: Callable[P, T]) -> Callable[P, T]:
+        """``act`` that also keeps its exceptions."""
+
+        def call(*arguments: P.args, **options: P.kwargs) -> T:
+            try:
+                return act(*arguments, **options)
+            except Exception as error:
+                failed.append(error)
+                raise
+
+        return call
+
     loop = ControlLoop(
         controller,
-        endpoint,
+        _Endpoint(ending(simulated.read), ending(simulated.write)),
         sp=course.sp[0],
         mv=course.mv0,
         mode=Mode.AUTO,
@@ -112,8 +128,8 @@ def close_loop(
 
     def before(k: int) -> None:
         # A period that a slow machine missed passed in the plant too, with the MV held.
-        while endpoint.k < k:
-            endpoint.write(endpoint.mv)
+        while simulated.k < k:
+            simulated.write(simulated.mv)
         loop.set_sp(course.sp[k])
         span = course.manual_at(k * period)
         if span is not None and loop.mode is not Mode.MANUAL:
@@ -122,10 +138,10 @@ def close_loop(
                 loop.set_mv(span.mv)
         elif span is None and loop.mode is Mode.MANUAL:
             loop.set_mode(Mode.AUTO)
-        history.pv.append(endpoint.pv)
+        history.pv.append(simulated.pv)
 
     def observe(sample: Sample | None, command: Command) -> None:
-        k = endpoint.k - 1
+        k = simulated.k - 1
         assert sample is not None  # a simulated plant can always be read
         history.time_s.append(k * period)
         history.mode.append(command.mode.value)
@@ -133,43 +149,20 @@ def close_loop(
         history.measured.append(sample.pv)
         history.mv.append(command.mv)
         history.reason.append(command.reason)
-        view.show(k * period, sample.pv, command, marks.get(k))
+        values = np.concatenate([command.sp, sample.pv, command.mv])
+        show(k * period, command.mode.value, values, command.reason, marks.get(k))
 
-    # The loop outlives whatever raises, as a plant needs it to; a simulation that raised is over.
-    failed: list[Exception] = []
-    loop.endpoint = _Ending(endpoint, failed)
-    with view_of(plant, title, n * period, sys.stdout) as view:
-        loop.run(n, before=_ending(before, failed), observe=_ending(observe, failed), until=lambda _: len(failed) > 0)
+    with view_of(plant, title, n * period, sys.stdout) as show:
+        loop.run(n, before=ending(before), observe=ending(observe), until=lambda _: len(failed) > 0)
     if failed:
         raise failed[0]
     return history
 
 
 @dataclass(frozen=True)
-class _Ending:
-    """An endpoint whose exceptions are kept in ``failed``."""
-
-    endpoint: Endpoint
-    failed: list[Exception]
-
-    def read(self) -> Sample:
-        return _ending(self.endpoint.read, self.failed)()
-
-    def write(self, mv: Array) -> None:
-        _ending(self.endpoint.write, self.failed)(mv)
-
-
-def _ending(act: Callable[P, T], failed: list[Exception]) -> Callable[P, T]:
-    """``act`` that also keeps its exceptions in ``failed``."""
-
-    def call(*arguments: P.args, **options: P.kwargs) -> T:
-        try:
-            return act(*arguments, **options)
-        except Exception as error:
-            failed.append(error)
-            raise
-
-    return call
+class _Endpoint:
+    read: Callable[[], Sample]
+    write: Callable[[Array], None]
 
 
 def _plant_of(manifest: Manifest) -> tuple[Simulator, Case | None]:
@@ -201,13 +194,15 @@ def _argument(parse: Callable[[str], object], text: str) -> object:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _number(text: str) -> float:
+def _number(text: str, above: float = -math.inf) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+    if not value > above:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above {above:g}")
     return value
 
 
@@ -215,10 +210,3 @@ def _seed(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is no seed; give a whole number of at least 0")
     return int(text)
-
-
-def _positive(text: str) -> float:
-    value = _number(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
-    return value

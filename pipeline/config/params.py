@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
-import hashlib
-import json
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
-from pipeline.errors import ParamsError
+from pipeline.errors import ParamsError, nearest
 
 T = TypeVar("T")
 PARAMS_FILE = Path("params.yaml")
@@ -39,17 +36,17 @@ def sections(kind: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=4)
 def _parsed(text: str) -> Any:
-    """YAML's reader is slow, and whoever checks every section asks for the same text again and again."""
-    return yaml.safe_load(text)
+    """Whoever checks every section asks for the same text again and again."""
+    return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
 
 
 def _tree(path: Path) -> dict[str, Any]:
     try:
-        tree = _parsed(path.read_text())
+        tree = _parsed(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ParamsError(f"{path} is not here; run from the repository's root") from None
-    except yaml.YAMLError as error:
-        raise ParamsError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ParamsError(f"{path} is not YAML in UTF-8: {' '.join(str(error).split())}") from None
     if not isinstance(tree, dict):
         raise ParamsError(f"{path} holds no mapping; it needs the sections cases, records, models, controllers")
     return tree
@@ -65,14 +62,6 @@ def _entry(tree: Mapping[str, Any], key: str, where: str) -> Any:
     if not isinstance(tree, dict) or key not in tree:
         raise ParamsError(f"{where} has no {key!r}{nearest(key, tree if isinstance(tree, dict) else ())}")
     return tree[key]
-
-
-def nearest(word: object, known: Iterable[str]) -> str:
-    """The end of an error message: the nearest known word, or all of them."""
-    names = sorted(str(k) for k in known)
-    close = difflib.get_close_matches(str(word), names, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ";"
-    return f"{hint} known: {', '.join(names) or 'none'}"
 
 
 def choose(table: Mapping[str, T], word: object, what: str, where: str) -> T:
@@ -150,11 +139,6 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
         raise ParamsError(f"{where} is {value!r}; it must be of type {hint.__name__}")
     return value
-
-
-def digest(values: Any) -> str:
-    """sha256 of a section, however its keys are ordered."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
 
 # ---------------------------------------------------------------- the sections

@@ -1,4 +1,4 @@
-"""How good a law is: cases, metrics, trials of exported files, evidence and verdicts.
+"""Evaluation of laws: cases, metrics, trials of exported files, evidence and verdicts.
 
-Nothing here draws or makes pages.
+Drawing and pages are elsewhere.
 """

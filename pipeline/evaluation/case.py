@@ -1,4 +1,4 @@
-"""What a case is: a plant, the tests that its controllers must pass, and the paper's figures."""
+"""Cases: a plant, the tests of its controllers, and the paper's figures."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from pipeline.plants.simulator import Simulator
 from pipeline.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
+Setting = Mapping[str, float | str]
+"""The parameters in which a variant differs from the shipped law."""
 
 
 @dataclass(frozen=True, slots=True)
 class PaperFigure:
-    """One number of the paper's tables, and the same one from an independent implementation.
+    """One number of the paper's tables.
 
-    Of a model, ``law`` names its set, ``scenario`` is empty and ``metric`` a path of the set's figures.
-    Without a scenario a law's name stands for what its analysis says, where no set is called so.
-    Where the paper prints no figure (``printed`` false), ``paper`` is the independent implementation's.
-    ``within`` is how near ours must be, in the figure's unit, where a quarter would let anything pass:
-    half a unit of the last printed digit, for what follows from equations alone.
+    For a model, ``law`` names its set, ``scenario`` is empty and ``metric`` is a path in the set's figures.
+    ``within`` is a tolerance in the figure's unit, for figures that follow from equations alone: half a
+    unit of the last printed digit. The general tolerance of a quarter is too wide for them.
     """
 
     label: str
@@ -39,9 +39,7 @@ class PaperFigure:
     scenario: str
     metric: str
     paper: float
-    setting: Mapping[str, float | str] = field(default_factory=dict)  # of the law, such as r
-    independent: float | None = None
-    printed: bool = True
+    setting: Setting = field(default_factory=dict)  # of the law, such as r
     within: float | None = None
 
 
@@ -59,13 +57,7 @@ class Curve:
     """One controller in a figure."""
 
     law: str
-    setting: Mapping[str, float | str] = field(default_factory=dict)
-
-    @property
-    def label(self) -> str:
-        """The paper's way to write it: INCAD (r=2.5)."""
-        inside = ", ".join(f"{k}={v}" if isinstance(v, str) else f"{k}={v:g}" for k, v in self.setting.items())
-        return self.law.upper() + (f" ({inside})" if inside else "")
+    setting: Setting = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +68,13 @@ class Figure:
     title: str
     curves: tuple[Curve, ...]
     scenario: str | None = None  # of ``Case.scenarios`` or ``Case.unscored``
-    info: tuple[str, ...] = ()  # entries of the controllers' info to show in place of the loop, a panel each
+    info: tuple[str, ...] = ()  # entries of the controllers' info, a panel each, instead of the loop
     model: str | None = None  # the model set whose predictions it shows
 
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What a law must show: low <= metric <= high, or high times a bound's figure of the same scenario."""
+    """A requirement: low <= metric <= high; with ``times``, high is a factor of that bound's figure."""
 
     law: str | None  # None: the case's best controller
     scenario: str
@@ -90,47 +82,47 @@ class Requirement:
     high: float
     low: float = 0.0
     times: str | None = None  # "nmpc" or "offline"
-    setting: Mapping[str, float | str] = field(default_factory=dict)
+    setting: Setting = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Case(ABC):
-    """A plant with its tests. ``held_out_seeds`` may be changed (params.yaml); the rest is what the case is."""
+    """A plant with its tests. params.yaml sets ``held_out_seeds``; the case fixes the rest."""
 
     held_out_seeds: tuple[int, ...]
 
     name: ClassVar[str]
     title: ClassVar[str]
     plant_class: ClassVar[type[Simulator]]
-    further_plants: ClassVar[tuple[type[Simulator], ...]] = ()  # that some of its tests run on
+    further_plants: ClassVar[tuple[type[Simulator], ...]] = ()  # for some of its tests
     development_seeds: ClassVar[tuple[int, ...]]  # for tuning and selection, never scored
     noise: ClassVar[Mapping[str, float]]  # PV -> standard deviation of its measurement noise
     gate: ClassVar[Mapping[str, float]]  # scenario -> weight in the promotion gate, summing to 1
     tables: ClassVar[tuple[PaperTable, ...]] = ()
     figures: ClassVar[tuple[Figure, ...]] = ()
     requirements: ClassVar[tuple[Requirement, ...]] = ()
-    metric: ClassVar[str] = "mae"  # the figure that laws are compared by, one with a floor: mae, sse, tracking
-    # Figures that `score` adds, or that a law's analysis has, and other words for a common one. The report shows
-    # them of every test.
+    metric: ClassVar[str] = "mae"  # compares the laws; it has a floor: mae, sse, tracking
+    # Metrics that `score` or a law's analysis adds, and new words for common metrics. The report shows them for
+    # every test.
     own_metrics: ClassVar[tuple[Metric, ...]] = ()
-    # A test -> its words inside a sentence, where they are not its name's.
+    # Test -> its words in a sentence, if they differ from its name.
     test_words: ClassVar[Mapping[str, str]] = {}
-    recipe: ClassVar[bool] = False  # the course of the set point is known beforehand; the bounds may use that
-    unforeseen: ClassVar[bool] = False  # the bounds' NMPC learns of a changed parameter one sample late
-    seen: ClassVar[str] = ""  # in words for the report: which scored figures were looked at while numbers were chosen
+    recipe: ClassVar[bool] = False  # the set-point profile is known in advance; the bounds may use it
+    unforeseen: ClassVar[bool] = False  # the bounds' NMPC sees a parameter change one sample late
+    disclosure: ClassVar[str] = ""  # for the report: the scored figures that influenced settings
     baseline: ClassVar[str] = "pid"  # the law that a champion must beat, and that reports compare with
-    data_seeds: ClassVar[int] = 5  # that the best law must come from; 1 where nothing is learnt from data
-    effort: ClassVar[Effort] = Effort()  # how far and how finely the bounds are searched
-    limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> the range that its laws and bounds keep it in
-    noise_draws: ClassVar[int] = 1  # closed loops with noise are run this many times, and their figures averaged
-    development_noise: ClassVar[bool] = False  # the plant is never measured without noise: nor is it for development
+    data_seeds: ClassVar[int] = 5  # required of the best law; 1 if no model is trained on data
+    effort: ClassVar[Effort] = Effort()  # horizon and resolution of the bounds' search
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
+    noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
+    development_noise: ClassVar[bool] = False  # development runs have measurement noise too
 
     def __post_init__(self) -> None:
         both = sorted(set(self.held_out_seeds) & set(self.development_seeds))
         if both or not self.held_out_seeds or len(set(self.held_out_seeds)) < len(self.held_out_seeds):
             raise ParamsError(
                 f"cases.{self.name}.held_out_seeds: {list(self.held_out_seeds)}; give one or more different seeds, "
-                f"none of {list(self.development_seeds)}, which serve the development"
+                f"none of the development seeds {list(self.development_seeds)}"
             )
 
     @cached_property
@@ -140,7 +132,7 @@ class Case(ABC):
         if lacking:
             raise PlantError(
                 f"case {self.name!r}: its plant class {self.plant_class.__name__} is abstract, as it lacks {lacking}; "
-                "write that, or name another class as plant_class"
+                "implement that, or give another plant_class"
             )
         return self.plant_class()
 
@@ -151,7 +143,7 @@ class Case(ABC):
 
     @property
     def regions(self) -> Mapping[str, tuple[float, float]]:
-        """Operating regions, name -> [low, high) of the CV; the plant's own unless the case has better names."""
+        """Operating regions, name -> [low, high) of the CV; by default the plant's regions."""
         return self.plant.regions
 
     @property
@@ -160,16 +152,16 @@ class Case(ABC):
         return np.array([self.noise[s.name] for s in self.plant_class.pv_signals])
 
     def tests(self) -> dict[str, tuple[Scenario, ...]]:
-        """``scenarios``; raises ParamsError where there are none, or one of them has no sequence."""
-        found = self.scenarios()
-        if not found:
+        """``scenarios``; ParamsError if there are none, or if one of them has no sequence."""
+        scenarios = self.scenarios()
+        if not scenarios:
             raise ParamsError(f"case {self.name!r} has no tests: its scenarios() is empty; return at least one")
-        for name, sequences in found.items():
+        for name, sequences in scenarios.items():
             if not sequences:
                 raise ParamsError(
                     f"case {self.name!r}: its test {name!r} has no sequence; give it at least one Scenario"
                 )
-        return found
+        return scenarios
 
     @cached_property
     def metrics(self) -> Mapping[str, Metric]:
@@ -183,7 +175,7 @@ class Case(ABC):
 
     @property
     def foreseen(self) -> bool:
-        """Whether the bounds may use the whole course that the CV should take: of a recipe, or of a reference."""
+        """Whether the bounds may use the future set points: of a recipe, or of a reference model."""
         return self.recipe or self.criterion.reference
 
     @property
@@ -192,7 +184,7 @@ class Case(ABC):
         return self.plant_class.sp_signals[0].unit
 
     def label(self, metric: str) -> str:
-        """Words for a figure at the head of a table, with its unit; of a path into a model set's, before the dot."""
+        """Words and unit of a metric for a table head; for a path into a model set, of the part before the dot."""
         first = metric.partition(".")[0]
         known = self.metrics.get(metric) or self.metrics.get(first)
         return first.replace("_", " ") if known is None else known.label(self.cv_unit)
@@ -202,30 +194,30 @@ class Case(ABC):
         return replace(self, held_out_seeds=seeds)
 
     def score(self, test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
-        """Figures of one closed loop, of the process variables without noise: pv (n, n_pv), mv (n, n_mv).
+        """Figures of one closed loop from the noise-free process variables pv (n, n_pv) and mv (n, n_mv).
 
-        A case that is judged by more than ``closed_loop_metrics`` adds to them.
+        A case with more figures than ``closed_loop_metrics`` adds its own.
         """
         sp = self.plant.sp_signals[0]
-        found = closed_loop_metrics(test.sp, pv, mv, test.hold, self.plant.period_s, sp.high - sp.low, test.late_from)
+        figures = closed_loop_metrics(test.sp, pv, mv, test.hold, self.plant.period_s, sp.high - sp.low, test.late_from)
         if test.reference is not None:
-            found["tracking"] = rmse(test.reference, pv[:, : test.reference.shape[1]])
-        return found
+            figures["tracking"] = rmse(test.reference, pv[:, : test.reference.shape[1]])
+        return figures
 
     @abstractmethod
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """The tests by name, each as its scenarios.
 
-        A test of several random sequences has one scenario for each sequence, and its figures are
-        put ``together``; the other tests have one scenario.
+        A test of several random sequences has one scenario for each sequence; ``together`` combines
+        their figures. The other tests have one scenario.
         """
 
     def unscored(self) -> Mapping[str, Scenario]:
-        """Further tests by name, whose curves are kept and whose figures are not: what a picture shows."""
+        """Further tests by name, for pictures only: their curves are stored, their figures are not."""
         return {}
 
     def variants_run(self, tests: tuple[Scenario, ...]) -> bool:
-        """Whether a law's variants run these tests of one name; by default those of one sequence, as papers have."""
+        """Whether a law's variants run this test; by default if it has one sequence, as in papers."""
         return len(tests) == 1
 
     @abstractmethod

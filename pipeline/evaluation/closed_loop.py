@@ -1,15 +1,13 @@
-"""How good a closed loop is, in numbers.
+"""Figures of a closed loop.
 
-A test is a sequence of holds: the set point stays for ``hold`` samples, then moves. ``hold = 0``
-means that it never moves, so the whole test is one hold. At sample k the process variable is
-measured, the error r(k) - y(k) is counted, and only then the move acts: set point and process
-variable of the same sample belong together. All arrays are float64; the functions of one loop
-take shape ``(n,)``, ``closed_loop_metrics`` also ``(n, loops)``.
+A test is a sequence of holds: the set point stays for ``hold`` samples and then moves. ``hold = 0``
+means that it never moves; the whole test is then one hold. The error of sample k is r(k) - y(k), and
+the MV of sample k acts after it. All arrays are float64. The functions of one loop take shape
+``(n,)``; ``closed_loop_metrics`` also takes ``(n, loops)``.
 
-A set point may also move within a hold, as the recipe of a batch does. Every figure is one of the
-errors alone, so it keeps its meaning: a step is then the error at the hold's first sample, its
-overshoot how far the process variable runs past the moving set point, and its settling when it
-has caught up with it.
+A set point may also move within a hold, as in a batch recipe. The figures depend on the errors alone,
+so they keep their meaning. The step is then the error at the first sample of the hold, the overshoot
+is the distance beyond the moving set point, and the loop settles when it reaches the set point.
 """
 
 from __future__ import annotations
@@ -17,28 +15,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.metrics import errors, ise, mae, mv_travel, sse
+from pipeline.evaluation.metric import METRICS
+from pipeline.metrics import errors, ise, mv_travel
 
 Array = NDArray[np.float64]
 
-LAST = 5
-"""Samples at the end of a hold whose mean error is the steady-state error."""
-
-
-SMALLEST_STEP = 0.02
-"""Fraction of the CV's range below which a move of the set point is no step to overshoot."""
-
-
-STEP_BAND = 0.02
-"""Settled: within this fraction of the step ..."""
-
-
-RANGE_BAND = 0.002
-"""... or within this fraction of the CV's range, whichever is wider (a disturbance test has no step)."""
-
-
-FAR = 0.02
-"""Fraction of the CV's range beyond which a saturated loop has not arrived."""
+LAST = 5  # samples at the end of a hold whose mean error is the steady-state error
+SMALLEST_STEP = 0.02  # of the CV's range: a smaller move of the set point has no overshoot
+STEP_BAND = 0.02  # settled: within this fraction of the step ...
+RANGE_BAND = 0.002  # ... or of the CV's range, whichever is wider (a disturbance test has no step)
+FAR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
 
 
 def holds(n: int, hold: int) -> list[slice]:
@@ -50,9 +36,9 @@ def holds(n: int, hold: int) -> list[slice]:
 
 
 def sse_late(sp: ArrayLike, pv: ArrayLike, late_from: int) -> float:
-    """Sum of squared errors from sample ``late_from`` on, once the start that no controller can hasten is over.
+    """Sum of squared errors from sample ``late_from`` on, after the start that no controller can speed up.
 
-    Raises ValueError where the test has no such sample: a sum over nothing would look perfect.
+    Raises ValueError if the test has no such sample, because an empty sum would look perfect.
     """
     error = errors(sp, pv)
     if not 0 <= late_from < error.size:
@@ -73,8 +59,8 @@ def itae(sp: ArrayLike, pv: ArrayLike, hold: int, period_s: float) -> float:
 def steady_errors(sp: ArrayLike, pv: ArrayLike, hold: int, last: int = LAST) -> Array:
     """Steady-state error of each hold, shape (holds,): |mean of its last ``last`` errors|.
 
-    The mean comes before the absolute value, so that measurement noise averages out instead of
-    adding up. A loop that rings around its set point therefore shows in MAE, not here.
+    The mean comes before the absolute value, so measurement noise averages out. An oscillation around
+    the set point averages out too; it shows in the MAE.
     """
     error = errors(sp, pv)
     return np.array([abs(float(np.mean(error[part][-last:]))) for part in holds(error.size, hold)])
@@ -95,51 +81,37 @@ def overshoots(sp: ArrayLike, pv: ArrayLike, hold: int, span: float = 1.0) -> Ar
 
         max(0, max_k s (y(k) - r)) / |r - y(0)|,   s = sign(r - y(0))
 
-    over the hold, with y(0) the process variable when the set point moved: the step that the loop
-    sees, also after a hold whose set point was not reached. Steps smaller than ``SMALLEST_STEP``
-    of ``span`` (the CV's range) are left out: any fraction of nearly nothing is large.
+    over the hold. y(0) is the process variable when the set point moves, so the definition also
+    holds after a hold whose set point was not reached. Steps smaller than ``SMALLEST_STEP`` of
+    ``span`` (the CV's range) do not count, because their fractions are very large.
     """
-    r, error = np.asarray(sp, dtype=np.float64), errors(sp, pv)
-    found = []
-    for part in holds(r.size, hold):
-        step = error[part][0]
-        if abs(step) >= SMALLEST_STEP * span:
-            beyond = -np.sign(step) * error[part]
-            found.append(max(0.0, float(np.max(beyond))) / abs(step))
-    return np.array(found)
+    error = errors(sp, pv)
+    steps = [part for part in holds(error.size, hold) if abs(error[part][0]) >= SMALLEST_STEP * span]
+    return np.array([max(0.0, np.max(-np.sign(e[0]) * e)) / abs(e[0]) for e in (error[part] for part in steps)])
 
 
 def settling_samples(sp: ArrayLike, pv: ArrayLike, hold: int, span: float = 1.0) -> Array:
-    """Samples until the error of each hold enters its band for good, shape (holds,).
+    """Samples until the error of each hold stays in its band, shape (holds,).
 
     The band is the wider of ``STEP_BAND`` of the step and ``RANGE_BAND`` of ``span``. A hold that
     does not settle counts with its whole length.
     """
     error = errors(sp, pv)
-    found = []
+    settled = []
     for part in holds(error.size, hold):
         e = np.abs(error[part])
         outside = np.nonzero(e > max(STEP_BAND * e[0], RANGE_BAND * span))[0]
-        found.append(float(outside[-1] + 1) if outside.size else 0.0)
-    return np.array(found)
+        settled.append(float(outside[-1] + 1) if outside.size else 0.0)
+    return np.array(settled)
 
 
-def locked_up(
-    sp: ArrayLike,
-    pv: ArrayLike,
-    mv: ArrayLike,
-    hold: int,
-    *,
-    low: float,
-    high: float,
-    span: float,
-) -> bool:
-    """Whether the loop is stuck in some hold: saturated, far from its set point, and not moving on.
+def locked_up(sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, *, low: float, high: float, span: float) -> bool:
+    """Whether the loop locks up in some hold: it stays saturated and far from its set point.
 
-    That is, for the whole second half of a hold the MV sits at one end of [low, high] while
-    |r - y| is more than ``FAR`` of ``span``, the CV's range. A slow plant, or a batch that heats up,
-    may rightly saturate for long, but it arrives within half a hold (of a recipe: half the batch)
-    or gets closer than that; an inverse model asked beyond its data sits there for ever. Shapes (n,).
+    In the whole second half of such a hold the MV is at one end of [low, high], and |r - y| is more
+    than ``FAR`` of ``span``, the CV's range. A slow plant or the heating of a batch may saturate for a
+    long time, but the error is smaller after half a hold (half a batch for a recipe). An inverse model
+    outside its applicability domain can stay saturated for ever. Shapes (n,).
     """
     e = np.abs(errors(sp, pv))
     u = np.asarray(mv, dtype=np.float64).reshape(e.shape)
@@ -153,13 +125,7 @@ def locked_up(
 
 
 def closed_loop_metrics(
-    sp: ArrayLike,
-    pv: ArrayLike,
-    mv: ArrayLike,
-    hold: int,
-    period_s: float,
-    span: float = 1.0,
-    late_from: int = 0,
+    sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, period_s: float, span: float = 1.0, late_from: int = 0
 ) -> dict[str, float]:
     """The figures of one closed-loop test, ready for JSON.
 
@@ -177,17 +143,17 @@ def closed_loop_metrics(
     period_s
         Sampling period [s].
     span
-        The CV's range, for what counts as a step and as settled.
+        The CV's range; it scales the smallest step and the settling band.
     late_from
         Sample from which ``sse_late`` counts; 0: there is no such figure.
 
     Returns
     -------
     dict
-        ``mae`` [CV], ``sse`` [CV^2], ``ise`` [CV^2 s], ``masse`` and ``max_asse`` [CV],
-        ``overshoot`` (mean over the steps, fraction of the step; 0 without steps), ``settling``
-        [s] (median over the holds), ``mv_travel`` [MV], and ``sse_late`` [CV^2] where asked for.
-        Several loops: the mean over them, the largest ``max_asse``.
+        Every metric with ``of``, among them ``mae`` [CV] and ``sse`` [CV^2]; ``ise`` [CV^2 s],
+        ``masse`` and ``max_asse`` [CV], ``overshoot`` (mean over the steps, fraction of the step;
+        0 without steps), ``settling`` [s] (median over the holds), ``mv_travel`` [MV], and
+        ``sse_late`` [CV^2] where asked for. Several loops: the mean, the largest ``max_asse``.
 
     Raises
     ------
@@ -195,33 +161,24 @@ def closed_loop_metrics(
         For shapes that do not match, values that are not finite, or a ``late_from`` beyond the test.
 
     """
-    r = np.asarray(sp, dtype=np.float64)
-    y = np.asarray(pv, dtype=np.float64)
-    u = np.asarray(mv, dtype=np.float64)
+    r, y, u = (np.asarray(values, dtype=np.float64) for values in (sp, pv, mv))
     r = r.reshape(len(r), -1)
     y = y.reshape(len(y), -1)[:, : r.shape[1]]
     for name, values in (("sp", r), ("pv", y), ("mv", u)):
         if len(values) != len(r) or not np.all(np.isfinite(values)):
             raise ValueError(f"{name} has {len(values)} samples, or some not finite; give {len(r)} finite ones")
-    loops = []
-    for a, b in zip(r.T, y.T, strict=True):
-        over = overshoots(a, b, hold, span)
-        loops.append(
-            (
-                mae(a, b),
-                sse(a, b),
-                ise(a, b, period_s),
-                masse(a, b, hold),
-                max_asse(a, b, hold),
-                float(np.mean(over)) if over.size else 0.0,
-                period_s * float(np.median(settling_samples(a, b, hold, span))),
-            )
-        )
-    table = np.array(loops)
-    names = ("mae", "sse", "ise", "masse", "max_asse", "overshoot", "settling")
-    found = dict(zip(names, map(float, table.mean(axis=0)), strict=True))
-    found["max_asse"] = float(table[:, names.index("max_asse")].max())
-    found["mv_travel"] = mv_travel(u)
+    pairs = list(zip(r.T, y.T, strict=True))
+    over = [overshoots(a, b, hold, span) for a, b in pairs]
+    loops = {
+        **{m.name: [m.of(a, b) for a, b in pairs] for m in METRICS.values() if m.of},
+        "ise": [ise(a, b, period_s) for a, b in pairs],
+        "masse": [masse(a, b, hold) for a, b in pairs],
+        "max_asse": [max_asse(a, b, hold) for a, b in pairs],
+        "overshoot": [float(np.mean(steps)) if steps.size else 0.0 for steps in over],
+        "settling": [period_s * float(np.median(settling_samples(a, b, hold, span))) for a, b in pairs],
+    }
+    figures = {name: float(np.max(v) if name == "max_asse" else np.mean(v)) for name, v in loops.items()}
+    figures["mv_travel"] = mv_travel(u)
     if late_from:
-        found["sse_late"] = float(np.mean([sse_late(a, b, late_from) for a, b in zip(r.T, y.T, strict=True)]))
-    return found
+        figures["sse_late"] = float(np.mean([sse_late(a, b, late_from) for a, b in pairs]))
+    return figures

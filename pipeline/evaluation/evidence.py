@@ -1,4 +1,4 @@
-"""All closed-loop figures of a case in one place, and how to ask for one."""
+"""All closed-loop figures of a case in one place."""
 
 from __future__ import annotations
 
@@ -9,27 +9,41 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
+from pipeline.errors import PipelineError
 from pipeline.evaluation.case import Case, Curve
-from pipeline.evaluation.law_evidence import LawEvidence, Loop, ReportError, read_metrics
+from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.model_evidence import model_figure
+from pipeline.evaluation.typed_json import ReportError, read_mapping
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]
 
 
+class NotMeasuredError(PipelineError):
+    """A figure that a check or a picture needs was not measured."""
+
+    def __init__(self, words: str = "not measured") -> None:
+        super().__init__(words)
+
+
 @dataclass(frozen=True)
 class Evidence:
-    """The case, its bounds, and what the stages measured of its laws and models.
+    """The case, its bounds, and the measured figures of its laws and models.
 
-    Where no metric is named, a figure is in the case's own, ``Case.metric``.
+    Without a named metric, a figure is in the case's metric, ``Case.metric``. ``model_folder`` = work/<case>/models
+    holds the predictions of the model sets. ``own_data``: models are trained on a user's data, not on the case's
+    experiments.
     """
 
     case: Case
     bounds: Bounds
     laws: Mapping[str, LawEvidence]
     models: Mapping[str, Mapping[str, Any]]
-    own_data: bool = False  # models were learnt from a person's data, not from the case's experiments
+    model_folder: Path = Path()
+    own_data: bool = False
 
     @classmethod
     def load(
@@ -37,47 +51,36 @@ class Evidence:
         case: Case,
         bounds: Bounds,
         work: Path,
+        timing: Path,
         laws: Collection[str] | None = None,
         models_of: Collection[str] | None = None,
         own_data: bool = False,
-        timing: Path | None = None,
     ) -> Self:
-        """What lies under ``work`` = work/<case>, of the named laws and model sets in their order (None: all).
+        """The results in ``work`` = work/<case> for the named laws and model sets in their order (None: all).
 
         ``timing`` = timing/<case> holds the times of a step; a law without a file there was not timed.
 
-        A law or set that params.yaml no longer lists leaves its folder behind; it is no evidence any more.
-        Raises ReportError where no law was validated.
+        The names leave out old folders of laws and sets that params.yaml no longer lists.
+        Raises ReportError if no law was validated.
         """
         validation, models = work / "validation", work / "models"
-        names = sorted(p.parent.name for p in validation.glob("*/metrics.json"))
-        if laws is not None:
-            names = [n for n in laws if n in names]
+        validated = sorted(p.parent.name for p in validation.glob("*/metrics.json"))
+        names = validated if laws is None else [n for n in laws if n in validated]
         if not names:
             raise ReportError(f"{validation} holds no law's metrics.json; run `dvc repro`")
-        return cls(
-            case,
-            bounds,
-            {
-                n: LawEvidence(
-                    n,
-                    read_metrics(validation / n / "metrics.json"),
-                    validation / n / "trajectories.npz",
-                    {} if timing is None else _step_time(timing / f"{n}-step.json"),
-                )
-                for n in names
-            },
-            {
-                p.parent.name: read_metrics(p)
-                for p in sorted(models.glob("*/metrics.json"))
-                if models_of is None or p.parent.name in models_of
-            },
-            own_data,
-        )
+        evidence = {}
+        for name in names:
+            folder, took = validation / name, timing / f"{name}-step.json"
+            metrics = LawMetrics.read(folder / "metrics.json")
+            step_us = read_mapping(took).get("p50") if took.exists() else None
+            evidence[name] = LawEvidence(metrics, folder / "trajectories.npz", step_us)
+        sets = {p.parent.name: p for p in sorted(models.glob("*/metrics.json"))}
+        model_sets = {n: read_mapping(p) for n, p in sets.items() if models_of is None or n in models_of}
+        return cls(case, bounds, evidence, model_sets, models, own_data)
 
     @cached_property
     def tests(self) -> Mapping[str, tuple[Scenario, ...]]:
-        """The case's tests; it makes them anew each time it is asked, steady states and all."""
+        """The case's tests, cached: each call of ``scenarios`` computes the steady states again."""
         return self.case.scenarios()
 
     @cached_property
@@ -95,12 +98,9 @@ class Evidence:
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:
-        """Every metric that validate gave of some law, in its order."""
-        found: dict[str, None] = {}
-        for law in self.laws.values():
-            for block in law.metrics["scenarios"].values():
-                found.update(dict.fromkeys(block["median"]))
-        return tuple(found)
+        """All metrics of the validated laws, in their order."""
+        tests = (test for law in self.laws.values() for test in law.metrics.forms[BASE].tests.values())
+        return tuple(dict.fromkeys(name for test in tests for name in test.median))
 
     @property
     def main_test(self) -> str:
@@ -108,7 +108,7 @@ class Evidence:
         return max(self.case.gate, key=lambda name: self.case.gate[name])
 
     def late_from(self, scenario: str) -> int:
-        """The sample from which the test, with noise or without, is scored a second time; 0: it is not."""
+        """The first sample of the late figures, with noise or without; 0: the test has none."""
         tests = self.tests.get(scenario.removesuffix(NOISE_SUFFIX), ())
         return tests[0].late_from if tests else 0
 
@@ -131,20 +131,31 @@ class Evidence:
     ) -> float | None:
         """One figure over the data seeds (median, min or max); None where it was not measured.
 
-        Without a scenario ``law`` names a model set and ``metric`` a path of its figures, or a law
-        and a figure of its analysis, which is one and has no range.
+        Without a scenario, ``law`` names a model set and ``metric`` a path in its figures, or ``law``
+        names a law and ``metric`` a figure of its analysis, which has a median only.
         """
-        metric = metric or self.case.metric
-        if not scenario and law in self.laws and law not in self.models:
-            said = (self.laws[law].analysis(setting or {}).get("figures") or {}).get(metric)
-            return None if said is None or how != "median" else float(said)
-        if not scenario:
+        metric, form = metric or self.case.metric, self.form(Curve(law, setting or {}))
+        if not scenario and (law not in self.laws or law in self.models):
             return model_figure(self.models.get(law, {}), metric, how)
-        if law not in self.laws:
+        if form is None:
             return None
-        block = self.laws[law].block(scenario, setting or {})
-        value = ((block or {}).get(how) or {}).get(metric)
-        return None if value is None else float(value)
+        if not scenario:
+            return form.analysis.figures.get(metric) if form.analysis is not None and how == "median" else None
+        rows: Mapping[str, float] = getattr(form.tests[scenario], how) if scenario in form.tests else {}
+        return rows.get(metric)
+
+    def measured(self, curve: Curve | str, scenario: str, metric: str | None = None) -> float:
+        """The median ``figure`` of a form of a law, or of a model set; raises NotMeasuredError without one."""
+        curve = Curve(curve) if isinstance(curve, str) else curve
+        value = self.figure(curve.law, scenario, metric, curve.setting)
+        if value is None:
+            raise NotMeasuredError
+        return value
+
+    def form(self, curve: Curve) -> Form | None:
+        """The form of a law behind a curve of a figure; None where it was not validated."""
+        law = self.laws.get(curve.law)
+        return None if law is None else law.form(curve.setting)
 
     def bound(self, scenario: str, metric: str | None = None, kind: str = "nmpc") -> float | None:
         """A bound's figure; None where none was computed."""
@@ -158,7 +169,7 @@ class Evidence:
 
     @cached_property
     def floors(self) -> dict[str, float]:
-        """Of each scenario the error that noise would hide, in the case's metric."""
+        """For each scenario the error that noise can hide, in the case's metric."""
         floor = self.case.criterion.floor
         if floor is None:
             raise ReportError(f"case {self.case.name!r} is compared by {self.case.metric!r}, a metric without a floor")
@@ -175,35 +186,56 @@ class Evidence:
         return None if own is None or bound is None else ratio_to_bound(own, bound, self.floor(scenario))
 
     def gate_ratio(self, law: str, scenario: str) -> float | None:
-        """Error over the NMPC's, both at least ``floor``: 1 is the bound, or an error that noise would hide."""
+        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide."""
         own, bound = self.figure(law, scenario), self.bound(scenario)
         return None if own is None or bound is None else gate_ratio(own, bound, self.floor(scenario))
 
     def score(self, law: str) -> float | None:
         """Gate score: weighted mean of ``gate_ratio`` over the gate's scenarios; lower is better, 1 the bound."""
-        ratios = {s: self.gate_ratio(law, s) for s in self.case.gate}
-        known = {s: r for s, r in ratios.items() if r is not None}
-        if not known or len(known) < len(ratios):
+        gate = self.case.gate
+        ratios = {s: r for s in gate if (r := self.gate_ratio(law, s)) is not None}
+        if not ratios or len(ratios) < len(gate):
             return None
-        return sum(self.case.gate[s] * r for s, r in known.items()) / sum(self.case.gate.values())
+        return sum(gate[s] * r for s, r in ratios.items()) / sum(gate.values())
 
     @cached_property
     def best(self) -> str | None:
-        """The law with the lowest error over the development sequences, no scored test asked.
+        """The law with the lowest error on the development sequences; no scored test is used.
 
-        A law that locked up on one of them is out. Where no development was measured: by the gate score.
+        A law that locked up on one of them is left out. Without development figures the gate score decides.
         """
         errors = {n: law.development for n, law in self.laws.items()}
         if all(error is None for error in errors.values()):
             errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
-        known = {n: e for n, e in errors.items() if e is not None}
-        return min(known, key=lambda n: known[n], default=None)
+        scores = {n: e for n, e in errors.items() if e is not None}
+        return min(scores, key=lambda n: scores[n], default=None)
 
     def loop(self, curve: Curve, scenario: str) -> Loop | None:
         """The trajectory behind a curve of a figure; None where none was stored."""
         law = self.laws.get(curve.law)
         return None if law is None else law.loop(scenario, curve.setting)
 
+    def info(self, curve: Curve, scenario: str, *names: str) -> tuple[Loop, dict[str, Array]]:
+        """The trajectory behind a curve, and these columns of the controller's info, (n,) each; or NotMeasuredError."""
+        loop, form = self.loop(curve, scenario), self.form(curve)
+        if loop is None or form is None or "info" not in loop or not set(names) <= set(form.info):
+            raise NotMeasuredError
+        return loop, {name: loop["info"][:, form.info.index(name)] for name in names}
 
-def _step_time(path: Path) -> dict[str, float]:
-    return {key: float(value) for key, value in read_metrics(path).items()} if path.exists() else {}
+    def analysis_arrays(self, curve: Curve) -> Loop:
+        """Arrays of a form's analysis by name; empty where none were kept."""
+        law = self.laws.get(curve.law)
+        return {} if law is None else law.analysis_arrays(curve.setting)
+
+    def part(self, model_set: str, part: str) -> Mapping[str, Any]:
+        """The figures of one part of a model set, medians over the data seeds; empty where there are none."""
+        figures = (self.models.get(model_set, {}).get("parts") or {}).get(part) or {}
+        return figures.get("median") or {}
+
+    def predictions(self, model_set: str) -> Loop:
+        """Arrays that the fit of a model set stored with its figures; empty if there are none."""
+        path = self.model_folder / model_set / "predictions.npz"
+        if not path.exists():
+            return {}
+        with np.load(path, allow_pickle=False) as file:
+            return {key: np.asarray(file[key], float) for key in file.files}

@@ -1,8 +1,7 @@
-"""What validate measured of one law, and how to ask for one figure or one loop of it."""
+"""The validation results of one law: its metrics.json, its figures and its loops."""
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,38 +11,87 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PipelineError
-from pipeline.simulation import NOISE_SUFFIX
+from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
+from pipeline.files import write_text
 
 Array = NDArray[np.float64]
 Loop = dict[str, Array]
+Row = Mapping[str, int | float]  # figures by metric
+
+SCHEMA = 1
+"""Schema of metrics.json. It changes with the meaning of an entry; a new entry with a default does not change it."""
+BASE = "base"
+"""The form of a law that is shipped; the others are its variants."""
 
 
-class ReportError(PipelineError):
-    """The stages left nothing that a report could be made of."""
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """Results of one form of a law that need no closed-loop test."""
+
+    figures: Row = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
-def read_metrics(path: Path) -> dict[str, Any]:
-    """The mapping in a metrics.json; ReportError where there is none."""
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ReportError(f"{path} cannot be read ({error}); run `dvc repro`, which makes it again") from error
-    if not isinstance(tree, dict):
-        raise ReportError(f"{path} holds no mapping; run `dvc repro`, which makes it again")
-    return tree
+@dataclass(frozen=True, slots=True)
+class OverSeeds:
+    """Figures of one test over the data seeds."""
+
+    median: Row
+    min: Row
+    max: Row
+    per_seed: Mapping[str, Row]
 
 
-def parse_setting(name: str) -> dict[str, Any]:
-    """What a variant's name says: ``"r=10, correction=back_calculation"`` as a mapping."""
-    found: dict[str, Any] = {}
-    for item in name.split(","):
-        key, _, text = item.strip().partition("=")
-        try:
-            found[key] = float(text)
-        except ValueError:
-            found[key] = text or True
-    return found
+@dataclass(frozen=True, slots=True)
+class Form:
+    """One form of a law: the shipped one, or a variant.
+
+    ``setting`` holds the numbers, words and switches that params.yaml gives this form itself, ``info`` the names
+    of the trajectories' columns, ``tests`` the figures by test, those with noise under names of their own.
+    """
+
+    setting: Mapping[str, Any]
+    info: tuple[str, ...]
+    tests: Mapping[str, OverSeeds]
+    analysis: Analysis | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LawMetrics:
+    """metrics.json of one law, ``controllers.<case>-<name>``; this class alone writes and reads it.
+
+    ``development``: data seed -> mean error over the development sequences, in the case's ``metric``;
+    ``locked_up``: test -> data seed -> closed loops that got stuck, of those where any did; ``as_printed``: a
+    reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
+    ``forms``: the shipped one, BASE, and the variants by their names in params.yaml.
+    """
+
+    name: str
+    title: str
+    metric: str
+    seeds: tuple[int, ...]
+    shipped_seed: int
+    forms: Mapping[str, Form]
+    lock_ups: int = 0
+    development_lock_ups: int = 0
+    development: Mapping[str, float] = field(default_factory=dict)
+    locked_up: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    as_printed: bool = False
+    sequences: Mapping[str, Mapping[str, Row]] = field(default_factory=dict)
+
+    def write(self, path: Path) -> None:
+        """Write the file; ValueError for NaN and infinity."""
+        write_text(path, to_json(self, SCHEMA))
+
+    @classmethod
+    def read(cls, path: Path) -> LawMetrics:
+        """The file's content; ReportError names what is wrong with it and the remedy."""
+        return cls.of(read_mapping(path), str(path))
+
+    @classmethod
+    def of(cls, tree: Mapping[str, Any], where: str = "metrics.json") -> LawMetrics:
+        """The mapping in such a file; ReportError names what is wrong with it and the remedy."""
+        return parsed(cls, tree, where, SCHEMA)
 
 
 def lock_up_text(locked_up: Mapping[str, Mapping[str, int]]) -> str:
@@ -55,43 +103,26 @@ def lock_up_text(locked_up: Mapping[str, Mapping[str, int]]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LawEvidence:
-    """What validate measured of one law: metrics.json, the time of a step and, when asked for, trajectories.npz."""
+    """The validation results of one law: metrics.json, the median time of a step, and the loops on demand."""
 
-    law: str
-    metrics: Mapping[str, Any]
+    metrics: LawMetrics
     trajectories: Path
-    step_time: Mapping[str, float] = field(default_factory=dict)  # [us] p50, p99; empty: not timed
+    step_us: float | None = None  # None: not timed
 
     @property
     def title(self) -> str:
         """The law in words."""
-        return str(self.metrics.get("title") or self.law)
+        return self.metrics.title
 
     @property
     def seeds(self) -> int:
         """Number of data seeds: each trained its own networks."""
-        return len(self.metrics["seeds"])
+        return len(self.metrics.seeds)
 
     @property
-    def lock_ups(self) -> int | None:
+    def lock_ups(self) -> int:
         """Closed loops that got stuck, over all seeds and scenarios."""
-        found = self.metrics.get("lock_ups")
-        return None if found is None else int(found)
-
-    @property
-    def locked_up(self) -> Mapping[str, Mapping[str, int]]:
-        """Test -> data seed -> closed loops that got stuck; tests and seeds without one are left out."""
-        return self.metrics.get("locked_up") or {}
-
-    @property
-    def as_printed(self) -> bool:
-        """Whether the law is a reproduction of a paper's, shipped although it locked up."""
-        return bool(self.metrics.get("as_printed"))
-
-    def info(self, setting: Mapping[str, Any]) -> tuple[str, ...]:
-        """Names of the controller's info with this setting, in the order of the trajectories' columns."""
-        own = self.metrics.get("info") or ()
-        return tuple((self.metrics.get("variant_info") or {}).get(self.variant_of(setting), own))
+        return self.metrics.lock_ups
 
     @property
     def development(self) -> float | None:
@@ -99,69 +130,42 @@ class LawEvidence:
 
         None with a lock-up there, or where nothing was measured.
         """
-        found = self.metrics.get("development") or {}
-        if not found or self.metrics.get("development_lock_ups"):
-            return None
-        return statistics.median(float(v) for v in found.values())
+        errors = self.metrics.development.values()
+        return None if not errors or self.metrics.development_lock_ups else statistics.median(errors)
+
+    def form_of(self, setting: Mapping[str, Any]) -> str | None:
+        """Name of the form whose numbers, words and switches are the shipped ones but for ``setting``; BASE first."""
+        shipped = self.metrics.forms[BASE].setting
+        forms = {name: {**shipped, **form.setting} for name, form in self.metrics.forms.items()}
+        return next((name for name, own in forms.items() if own == {**shipped, **setting}), None)
+
+    def form(self, setting: Mapping[str, Any]) -> Form | None:
+        """The form with this setting; None where it was not validated."""
+        name = self.form_of(setting)
+        return None if name is None else self.metrics.forms[name]
 
     @property
-    def step_us(self) -> float | None:
-        """Median time of a step [us]."""
-        return self.step_time.get("p50")
-
-    def variant_of(self, setting: Mapping[str, Any]) -> str | None:
-        """Name of the variant with exactly this setting beside the shipped one; "" is the shipped law itself."""
-        shipped = {k: float(v) if isinstance(v, int) else v for k, v in (self.metrics.get("setting") or {}).items()}
-        wanted = {**shipped, **setting}
-        for name in ("", *(self.metrics.get("variants") or {})):
-            if wanted == {**shipped, **(parse_setting(name) if name else {})}:
-                return name
-        return None
-
-    def block(self, scenario: str, setting: Mapping[str, Any]) -> Mapping[str, Any] | None:
-        """Median, min, max and per_seed of one scenario; None where it was not run."""
-        name = self.variant_of(setting)
-        if name is None:
-            return None
-        tree = (self.metrics.get("variants") or {})[name] if name else self.metrics["scenarios"]
-        if not name and scenario not in tree and scenario.endswith(NOISE_SUFFIX):
-            tree, scenario = self.metrics.get("noise") or {}, scenario.removesuffix(NOISE_SUFFIX)
-        found: Mapping[str, Any] | None = tree.get(scenario)
-        return found
-
-    @property
-    def analyses(self) -> Mapping[str, Mapping[str, Any]]:
-        """Every form's analysis (``figures`` and ``notes``) by its variant's name; "" is the shipped law's."""
-        return {"" if form == "base" else form: said for form, said in (self.metrics.get("analysis") or {}).items()}
-
-    def analysis(self, setting: Mapping[str, Any]) -> Mapping[str, Any]:
-        """``figures`` and ``notes`` of the law's analysis with this setting; empty where it has none."""
-        name = self.variant_of(setting)
-        return {} if name is None else self.analyses.get(name, {})
+    def analyses(self) -> dict[str, Analysis]:
+        """The analysis of every form that has one, by the form's name."""
+        return {name: form.analysis for name, form in self.metrics.forms.items() if form.analysis is not None}
 
     def analysis_arrays(self, setting: Mapping[str, Any]) -> Loop:
         """Arrays of the analysis by name; empty where none were kept."""
-        path, name = self.trajectories.with_name("analysis.npz"), self.variant_of(setting)
-        if name is None or not path.exists():
-            return {}
-        start = f"{name or 'base'}/"
-        with np.load(path, allow_pickle=False) as file:
-            return {k.removeprefix(start): np.asarray(file[k], float) for k in file.files if k.startswith(start)}
+        start = f"{self.form_of(setting)}/"
+        return _under(start, self.trajectories.with_name("analysis.npz"))
 
     def loop(self, scenario: str, setting: Mapping[str, Any]) -> Loop | None:
         """Trajectory of the shipped data seed, arrays (n, ...) by field; None where none was stored.
 
         Of a test of several sequences, or of several draws of the noise, it is the first.
         """
-        name = self.variant_of(setting)
-        if name is None or not self.trajectories.exists():
-            return None
-        with np.load(self.trajectories, allow_pickle=False) as file:
-            start = f"{scenario}/{name or 'base'}/"
-            keys = [k for k in file.files if k.startswith(start)]
-            seeds = sorted({k[len(start) :].partition("/")[0] for k in keys})
-            if not seeds:
-                return None
-            shipped = str(self.metrics.get("shipped_seed"))
-            seed = shipped if shipped in seeds else seeds[0]
-            return {k.rpartition("/")[2]: np.asarray(file[k], float) for k in keys if k.startswith(f"{start}{seed}/")}
+        start = f"{scenario}/{self.form_of(setting)}/{self.metrics.shipped_seed}/"
+        return _under(start, self.trajectories) or None
+
+
+def _under(start: str, path: Path) -> Loop:
+    """Arrays of an .npz whose names begin so, by the rest of the name; empty where there is no such file."""
+    if not path.exists():
+        return {}
+    with np.load(path, allow_pickle=False) as file:
+        return {k.removeprefix(start): np.asarray(file[k], float) for k in file.files if k.startswith(start)}

@@ -1,4 +1,4 @@
-"""What a figure of a closed loop is: its name, unit and words, and how the figures of several loops make one."""
+"""Metrics of closed loops: name, unit, words, and the rule that combines the figures of several loops."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ REDUCE: Mapping[How, Callable[[Iterable[float]], float]] = {
     "sum": sum,
 }
 NO_UNIT = frozenset({"", "-", "1"})
-"""How a signal says that it is a plain number."""
+"""Units of a signal that is a plain number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Floor:
-    """The error that measurement noise would hide in a test: a loop below it is as good as perfect.
+    """The error that measurement noise can hide in a test; a smaller error counts as perfect.
 
-    ``error`` gives it from the noise's standard deviation [CV] and the test's samples; ``text`` says the
-    same, with ``{noise}`` for the deviation.
+    ``error`` computes it from the noise's standard deviation [CV] and the number of samples. ``text``
+    describes it, with ``{noise}`` for the deviation.
     """
 
     error: Callable[[float, float], float]
@@ -40,11 +40,11 @@ class Floor:
 class Metric:
     """A figure of a closed loop.
 
-    ``unit`` holds ``{cv}`` where the controlled variable's unit stands. ``together`` is how the figures of
-    several sequences make one: the worst of them stays the worst for a figure that is itself a worst case.
-    A case may be compared by a metric that has a ``floor``; the bounds then minimize its errors, ``squared``
-    or absolute, from the ``reference`` or from the set point. ``of`` gives the figure from the set points
-    and the controlled variable alone, each (n,), where that is enough.
+    ``unit`` has ``{cv}`` in place of the controlled variable's unit. ``together`` combines the figures of
+    several sequences; for a worst-case figure it is the worst of them. A metric with a ``floor`` can compare
+    the laws of a case. The bounds then minimize its errors, ``squared`` or absolute, from the ``reference`` or
+    from the set point. ``of`` computes the figure from the set points and the controlled variable, each (n,),
+    if they are sufficient.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Metric:
     def unit_of(self, cv: str) -> str:
         """The unit where the controlled variable has the unit ``cv``; empty for a plain number."""
         cv = cv.replace("deg", "°")
-        if cv in NO_UNIT:  # an error without a unit leaves only what stands beside it
+        if cv in NO_UNIT:  # only the rest of the unit remains
             return self.unit.replace("{cv}²", "").replace("{cv}", "").strip()
         return self.unit.replace("{cv}²", f"({cv})²" if {" ", "/"} & set(cv) else f"{cv}²").replace("{cv}", cv)
 
@@ -78,22 +78,15 @@ def _sum_of_squares(noise: float, samples: float) -> float:
     return noise**2 * samples
 
 
-def _tells_apart(noise: float, samples: float) -> float:
-    """An error whose square is the deviation of the mean square of so many noisy samples.
-
-    A loop that can stay on its reference throughout is well within the noise.
-    """
+def _detectable(noise: float, samples: float) -> float:
+    """An error whose square is the standard deviation of the mean square of the noisy samples."""
     return float(noise * (2 / samples) ** 0.25)
 
 
 _ABSOLUTE = Floor(_deviation, "{noise} (the measurement noise)")
-_SUM = Floor(
-    _sum_of_squares,
-    "what the measurement noise alone adds up to ({noise:g} squared times the samples)",
-)
+_SUM = Floor(_sum_of_squares, "the SSE of the measurement noise alone ({noise:g} squared times the samples)")
 _MEAN_SQUARE = Floor(
-    _tells_apart,
-    "what the test's samples tell apart from their noise ({noise:g} times (2/samples)^(1/4))",
+    _detectable, "the smallest error that the samples can show in their noise ({noise:g} times (2/samples)^(1/4))"
 )
 
 METRICS: dict[str, Metric] = {
@@ -130,9 +123,9 @@ METRICS: dict[str, Metric] = {
 def together(sequences: Iterable[Figures], known: Mapping[str, Metric] = METRICS) -> Figures:
     """Figures of several sequences of a test as one, each by its metric's rule.
 
-    This is the one rule, for laws and for bounds: means, but the largest of what is itself a largest value
-    (``max_asse``), the least of a least one, and the sum of a count. Raises ParamsError for a figure that
-    is no known metric: nobody could say how to put it together.
+    Laws and bounds use this rule: the mean, but the largest of largest values (``max_asse``), the smallest of
+    smallest values, and the sum of counts. Raises ParamsError for a figure without a metric, because it has
+    no rule.
     """
     rows = list(sequences)
     names = dict.fromkeys(name for row in rows for name in row)
@@ -141,7 +134,7 @@ def together(sequences: Iterable[Figures], known: Mapping[str, Metric] = METRICS
             raise ParamsError(
                 f"the figure {name!r} is scored, but is no metric; add Metric({name!r}, ...) to the case's own_metrics"
             )
-    # What is counted may be missing where nothing was: ``from_nmpc``.
+    # A count of zero may be missing: ``from_nmpc``.
     return {
         name: float(REDUCE[how](row.get(name, 0.0) if how == "sum" else row[name] for row in rows))
         for name, how in ((name, known[name].together) for name in names)
@@ -151,21 +144,21 @@ def together(sequences: Iterable[Figures], known: Mapping[str, Metric] = METRICS
 def mean_of_draws(draws: Iterable[Figures]) -> Figures:
     """Figures of one sequence under several draws of the noise: means, of every figure.
 
-    A draw is a repeated measurement of the same loop. The largest value over the draws would grow with
-    their number, and would say nothing of the loop.
+    A draw repeats the measurement of one loop. The largest value over the draws would grow with their
+    number, so it is no property of the loop.
     """
     rows = list(draws)
     return {name: statistics.fmean(row[name] for row in rows) for name in rows[0]}
 
 
 def ratio_to_bound(own: float, bound: float, floor: float) -> float | None:
-    """Error over the bound's; None where noise would hide the bound, which is then no yardstick.
+    """Error over the bound's; None if noise can hide the bound.
 
-    An NMPC that knows of a disturbance before it acts leaves an error of 1e-11.
+    Example: an NMPC that knows a disturbance in advance has an error of 1e-11.
     """
     return own / bound if bound > 0 and bound >= floor else None
 
 
 def gate_ratio(own: float, bound: float, floor: float) -> float:
-    """Error over the bound's, both at least ``floor`` > 0: 1 is the bound, or an error that noise would hide."""
+    """Error over the bound's, both at least ``floor`` > 0; 1 is the bound, or an error that noise can hide."""
     return max(own, floor) / max(bound, floor)

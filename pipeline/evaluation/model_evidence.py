@@ -1,4 +1,4 @@
-"""What fit measured of a set of models: one figure by its path, and the rows of the report's tables."""
+"""The figures of a model set: one figure by its path, and the rows of the report's tables."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def _dig(row: Any, path: str) -> Any:
     if path in row:
         return row[path]
     for key, value in row.items():
-        if path.startswith(f"{key}.") and (found := _dig(value, path[len(key) + 1 :])) is not None:
-            return found
+        if path.startswith(f"{key}.") and (inner := _dig(value, path[len(key) + 1 :])) is not None:
+            return inner
     return None
 
 
@@ -45,15 +45,15 @@ def _values(leaf: Any, how: str) -> list[float]:
 def model_rows(name: str, model: Metrics) -> list[dict[str, Any]]:
     """Rows of the models table, one for each part."""
     rows = []
-    for part, found in (model.get("parts") or {}).items():
-        seeds = found.get("per_seed") or {}
-        median = found.get("median") or {}
+    for part, figures in (model.get("parts") or {}).items():
+        seeds = figures.get("per_seed") or {}
+        median = figures.get("median") or {}
         rows.append(
             {
                 "model": name,
                 "part": part,
-                "kind": found.get("kind", ""),
-                "horizon": found.get("horizon"),
+                "kind": figures.get("kind", ""),
+                "horizon": figures.get("horizon"),
                 "centres": median.get("centres"),
                 "rmse": median.get("rmse"),
                 "free_run": median.get("free_run_rmse"),
@@ -71,8 +71,8 @@ def candidates(name: str, model: Metrics) -> list[dict[str, Any]]:
     ``chosen`` of a row counts the seeds that took that candidate.
     """
     tables = []
-    for part, found in (model.get("parts") or {}).items():
-        searches = [row["candidates"] for row in (found.get("per_seed") or {}).values() if row.get("candidates")]
+    for part, figures in (model.get("parts") or {}).items():
+        searches = [row["candidates"] for row in (figures.get("per_seed") or {}).values() if row.get("candidates")]
         sizes: dict[tuple[Any, ...], list[Metrics]] = {}
         for candidate in (c for search in searches for c in search):
             sizes.setdefault((candidate["n_y"], candidate["n_u"], *candidate["hidden"]), []).append(candidate)

@@ -1,4 +1,4 @@
-"""How the laws of a case stand: what its validation.json says, as the overview and the terminal show it."""
+"""The laws of a case, read from its validation.json, for the overview and the terminal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LawStanding:
     high: float | None
     seeds: int | None
     lock_ups: int | None
-    ratio: float | None  # to the bound, or to what noise would hide where the bound is less: ``Standing.hidden``
+    ratio: float | None  # to the bound, or to the noise floor if the bound is less: ``Standing.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
 
@@ -41,11 +41,11 @@ class Standing:
     test: str
     test_title: str
     bound: float | None  # of the perfect-model NMPC
-    hidden: bool  # the bound is less than measurement noise would hide, which takes its place in the ratios
+    hidden: bool  # the bound is below the noise floor, which replaces it in the ratios
     laws: tuple[LawStanding, ...]
     requirements: tuple[Statement, ...]
     claims: tuple[Statement, ...]
-    reproduced: tuple[int, int]  # figures of the paper's tables: those that do, and those that were measured
+    reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -62,8 +62,7 @@ class Standing:
         bare = test.removesuffix(NOISE_SUFFIX)
         bound, floor = validation.bound(test), validation.floor(bare)
         laws = [_law(validation, law, folder) for law in validation.laws]
-        # A row of a figure that the paper does not print stands beside another implementation's alone.
-        judged = [row.holds for row in validation.paper if row.paper is not None and row.holds is not None]
+        judged = [row.holds for row in validation.paper if row.holds is not None]
         return cls(
             case=validation.case,
             folder=folder,
@@ -88,15 +87,19 @@ class Standing:
 
 def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:
     """How many hold, of those that were measured."""
-    known = [row.holds for row in rows if row.holds is not None]
-    return sum(known), len(known)
+    verdicts = [row.holds for row in rows if row.holds is not None]
+    return sum(verdicts), len(verdicts)
 
 
 def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
-    test, metric, found = validation.main, validation.metric, validation.laws[law]
+    test, metric, result = validation.main, validation.metric, validation.laws[law]
     row = validation.scenarios.get(test, {}).get(law, {})
     own, bound, floor = row.get(metric), validation.bound(test), validation.floor(test.removesuffix(NOISE_SUFFIX))
     file = folder / f"{law}.onnx"
+    ratio = None
+    if own is not None and bound is not None:
+        # A bound below the noise floor: the ratio to the floor, at least 1.
+        ratio = gate_ratio(own, bound, floor) if bound < floor else ratio_to_bound(own, bound, floor)
     return LawStanding(
         law=law,
         title=validation.titles.laws.get(law, law),
@@ -104,14 +107,9 @@ def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
         figure=own,
         low=row.get(f"{metric}_min"),
         high=row.get(f"{metric}_max"),
-        seeds=found.seeds,
-        lock_ups=found.lock_ups,
-        ratio=None if own is None or bound is None else _ratio(own, bound, floor),
-        step_us=found.step_us,
+        seeds=result.seeds,
+        lock_ups=result.lock_ups,
+        ratio=ratio,
+        step_us=result.step_us,
         bytes=file.stat().st_size if file.exists() else None,
     )
-
-
-def _ratio(own: float, bound: float, floor: float) -> float | None:
-    """Error over the bound's; where noise would hide the bound, over what it would hide, and no less than 1."""
-    return gate_ratio(own, bound, floor) if bound < floor else ratio_to_bound(own, bound, floor)

@@ -1,4 +1,4 @@
-"""One exported file on trial: its closed loops over every test of the case, and what they say."""
+"""The trial of one exported file: its closed loops over every test of the case, and their figures."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import locked_up
+from pipeline.evaluation.law_evidence import BASE
 from pipeline.evaluation.metric import mean_of_draws, together
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
@@ -19,7 +20,6 @@ from serving.controller import Controller
 from serving.errors import LoopwrightError
 
 Metrics = dict[str, float]
-BASE = "base"  # the form of a controller that is shipped; the others are its variants
 ROUNDS = 8  # of timing a step
 DRAW = 1_000  # added to the noise's seed for every further draw of it
 DEVELOPED = "development"  # stands for all development sequences among the names of tests
@@ -60,9 +60,9 @@ class Repeated:
 
 
 def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
-    """Run the file of one form and data seed over the case's tests, and over its development unless it is a variant.
+    """Run the file of one form and data seed over the case's tests; the shipped form also runs the development tests.
 
-    Variants run the tests that the case says, with noise only where the plant is never measured without.
+    Variants run the tests in ``variants_run``, with noise only if development has noise too.
     """
     form, seed, path = item
     controller = Controller(path)
@@ -75,13 +75,13 @@ def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
         if form != BASE and not case.variants_run(tests):
             continue
         for noise in noisy:
-            found = [repeated(controller, case, test, noise, noise_seed + i) for i, test in enumerate(tests)]
+            runs = [repeated(controller, case, test, noise, noise_seed + i) for i, test in enumerate(tests)]
             key = name + (NOISE_SUFFIX if noise else "")
-            metrics[key] = together((one.metrics for one in found), case.metrics)
-            curves[key] = found[0].first
-            locked_up[key] = sum(one.lock_ups for one in found)
+            metrics[key] = together((one.metrics for one in runs), case.metrics)
+            curves[key] = runs[0].first
+            locked_up[key] = sum(one.lock_ups for one in runs)
             if len(tests) > 1 and not noise:
-                sequences[name] = {str(test.seed): one.metrics for test, one in zip(tests, found, strict=True)}
+                sequences[name] = {str(test.seed): one.metrics for test, one in zip(tests, runs, strict=True)}
     development = [
         repeated(controller, case, test, case.development_noise, noise_seed + DEVELOPMENT + i)
         for i, test in enumerate(case.development() if form == BASE else ())
@@ -92,12 +92,12 @@ def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
     mean = statistics.fmean(one.metrics[case.metric] for one in development) if development else float("nan")
     locked_up[DEVELOPED] = sum(one.lock_ups for one in development)
     locked_up = {name: count for name, count in locked_up.items() if count}
-    told = {key: replace(c, info=c.info[:, :-1]) for key, c in curves.items()}
-    return Trial(form, seed, controller.manifest.info, metrics, sequences, mean, locked_up, told)
+    trajectories = {key: replace(c, info=c.info[:, :-1]) for key, c in curves.items()}
+    return Trial(form, seed, controller.manifest.info, metrics, sequences, mean, locked_up, trajectories)
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
-    """One test; with noise as many times as the case draws it."""
+    """One test; with noise it runs ``noise_draws`` times."""
     draws = range(case.noise_draws if noise else 1)
     loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
@@ -105,43 +105,45 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
 
 
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
-    """One closed loop, with one more entry of info: whether the controller refused the step.
+    """One closed loop; an extra entry of info is 1 if the controller refused the step.
 
-    The MV is then kept, as the real loop's HOLD keeps it.
+    The MV then stays at its last value, as in the real loop's HOLD. Measured disturbances stay nominal.
     """
-    state = controller.cold_state()
+    plant, state = test.plant or case.plant, controller.cold_state()
+    dv = plant.dv_nominal
     n_info = len(controller.manifest.info)
 
     def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, Array]:
         nonlocal state
         try:
-            mv, state, info = controller.step(sp=sp, pv=pv, mv_applied=mv_applied, state=state)
+            mv, state, info = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=mv_applied, state=state)
         except LoopwrightError:
             state = controller.cold_state()
             return mv_applied, np.append(np.zeros(n_info), 1.0)
         return mv, np.append(info, 0.0)
 
-    return simulate_closed(test.plant or case.plant, step, test, noise=noise, seed=seed)
+    return simulate_closed(plant, step, test, noise=noise, seed=seed)
 
 
 def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
-    """Locked up at an end of the MV, or with a step that the controller refused."""
+    """Whether the loop locked up at an end of the MV, or the controller refused a step."""
     mv, sp = case.plant.mv_signals[0], case.plant.sp_signals[0]
     limits = {"low": mv.low, "high": mv.high, "span": sp.high - sp.low}
     return locked_up(loop.sp[:, 0], loop.pv[:, 0], loop.mv[:, 0], test.hold, **limits) or bool(loop.info[:, -1].any())
 
 
-def step_us(controller: Controller, loop: Trajectory) -> dict[str, float]:
-    """Time of one step along a loop [us], all checks included: of several rounds the quietest.
+def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:
+    """Time of one step along a loop under dv (n_dv,) [us], with all checks: the fastest of several rounds.
 
-    Other processes run beside this one; a round that they disturb says nothing of the controller.
+    Other processes can slow down a round.
     """
     rounds = np.empty((ROUNDS, len(loop.sp) - 1))
     for taken in rounds:
         state = controller.cold_state()
         for k in range(1, len(loop.sp)):
             begun = time.perf_counter()
-            state = controller.step(sp=loop.sp[k], pv=loop.pv[k], mv_applied=loop.mv[k - 1], state=state).state
+            sample = {"sp": loop.sp[k], "pv": loop.pv[k], "dv": dv, "mv_applied": loop.mv[k - 1]}
+            state = controller.step(**sample, state=state).state
             taken[k - 1] = 1e6 * (time.perf_counter() - begun)
     p50, p99 = np.quantile(rounds, [0.5, 0.99], axis=1)
     best = int(np.argmin(p50))

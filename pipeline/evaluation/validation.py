@@ -1,21 +1,17 @@
-"""validation.json: what was found of a case's laws, for programs. This module alone writes and reads it."""
+"""validation.json: the figures and verdicts of a case, for programs. This module alone writes and reads it."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
 
-from pipeline.config.params import parse
-from pipeline.errors import ParamsError, PipelineError
+from pipeline.evaluation.law_evidence import Analysis, Row
+from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
 SCHEMA = 1
-"""Another meaning of an entry is another number; a new entry that has a default is not."""
+"""It changes with the meaning of an entry; a new entry with a default does not change it."""
 FILE = "validation.json"
-Row = Mapping[str, int | float]
-"""Figures by metric; of a law also ``<criterion>_min`` and ``<criterion>_max`` over the seeds, and ``seeds``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +19,7 @@ class Statement:
     """A requirement or a claim in words, what was measured, and whether it holds; None: not measured."""
 
     what: str
-    limit: str  # of a requirement what was asked, empty for a claim
+    limit: str  # the limit of a requirement; empty for a claim
     measured: str
     holds: bool | None
     because: str = ""
@@ -31,31 +27,23 @@ class Statement:
 
 @dataclass(frozen=True, slots=True)
 class PaperResult:
-    """A figure of the paper's tables beside ours; ``paper`` is None where the paper prints none."""
+    """A figure of the paper's tables beside ours, None where ours was not measured."""
 
     table: int
     label: str
     metric: str
-    paper: float | None
+    paper: float
     ours: float | None
     verdict: str
     holds: bool | None
 
 
 @dataclass(frozen=True, slots=True)
-class Analysis:
-    """What one form of a law says of itself apart from its tests."""
-
-    figures: Row = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class LawResult:
-    """What was found of a law apart from its figures.
+    """A law's results beside its figures.
 
-    ``locked_up``: test -> data seed -> closed loops that got stuck. ``as_printed``: a reproduction of a paper's
-    law, which is shipped all the same. ``analysis``: by the form's name, ``base`` for the shipped one.
+    ``locked_up``: test -> data seed -> closed loops that locked up. ``as_printed``: a reproduction of a paper's
+    law, which is shipped nevertheless. ``analysis``: by the form's name, ``base`` for the shipped one.
     """
 
     seeds: int
@@ -79,7 +67,7 @@ class GateResult:
 class GateRecord:
     """The promotion gate: what it measures, and each law's result.
 
-    ``floor`` is the standard deviation of the noise, ``floors`` what it makes of each scenario in the case's metric.
+    ``floor`` is the standard deviation of the noise, ``floors`` the floor of each scenario in the case's metric.
     """
 
     id: str
@@ -107,7 +95,8 @@ class Titles:
 class Validation:
     """The whole file. ``metric`` is the one that laws are compared by, ``main`` the test that weighs most.
 
-    ``scenarios``: test -> law -> figures, medians over the data seeds; ``bounds``: test -> bound -> figures.
+    ``scenarios``: test -> law -> figures, medians over the data seeds, with ``<criterion>_min`` and
+    ``<criterion>_max`` over the seeds and their number, ``seeds``; ``bounds``: test -> bound -> figures.
     """
 
     case: str
@@ -124,44 +113,18 @@ class Validation:
     paper: tuple[PaperResult, ...]
 
     def to_json(self) -> str:
-        """The file's text; entries that equal their default are left out. ValueError for NaN and infinity."""
-        return json.dumps({"schema": SCHEMA, **_plain(self)}, indent=1, allow_nan=False) + "\n"
+        """The file's text; ValueError for NaN and infinity."""
+        return to_json(self, SCHEMA)
 
     @classmethod
-    def read(cls, path: Path) -> Self:
+    def read(cls, path: Path) -> Validation:
         """The file's content; PipelineError names what is wrong with it and the remedy."""
-        try:
-            tree = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise PipelineError(f"{path} cannot be read ({error}); {REMEDY}") from None
-        version = tree.pop("schema", None) if isinstance(tree, dict) else None
-        if version != SCHEMA:
-            raise PipelineError(f"{path} has schema {version!r}; this release reads schema {SCHEMA}: {REMEDY}")
-        try:
-            return parse(cls, tree, str(path))
-        except ParamsError as error:
-            raise PipelineError(f"{error}; {REMEDY}") from None
+        return parsed(cls, read_mapping(path), str(path), SCHEMA)
 
     def bound(self, test: str, kind: str = "nmpc") -> float | None:
         """A bound's figure in the case's metric; None where none was computed."""
         return self.bounds.get(test, {}).get(kind, {}).get(self.metric)
 
     def floor(self, test: str) -> float:
-        """The error that noise would hide in a test, whose name is given without the suffix of noise."""
+        """The error that noise can hide in a test; ``test`` has no noise suffix."""
         return self.gate.floors.get(test, self.gate.floor)
-
-
-REMEDY = "run `dvc repro`, which writes it again"
-
-
-def _plain(value: Any) -> Any:
-    """Dataclasses, mappings and tuples as JSON has them."""
-    if is_dataclass(value):
-        return {f.name: _plain(v) for f in fields(value) if (v := getattr(value, f.name)) != _default(f)}
-    if isinstance(value, Mapping):
-        return {key: _plain(v) for key, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, tuple) else value
-
-
-def _default(f: Any) -> Any:
-    return f.default if f.default_factory is MISSING else f.default_factory()

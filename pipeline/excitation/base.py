@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError
 from pipeline.plants.simulator import Array, Simulator
@@ -14,24 +15,26 @@ from pipeline.records.record import Record
 from pipeline.simulation.simulate import noise_draws, simulate_open
 
 
+def within(default: Any, least: float, most: float = np.inf) -> Any:
+    """A field of an excitation that must lie in [least, most]; None, where the field allows it, always may stand."""
+    return field(default=default, metadata={"range": (least, most)})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Excitation(ABC):
-    """An experiment on a plant, repeatable by its seed.
+    """An experiment of ``samples`` samples on a plant, repeatable by its seed.
 
-    Attributes
-    ----------
-    samples : int
-        Number of samples [-].
-    noise : tuple of float
-        Standard deviation of the measurement noise of each PV [unit of the PV]; empty: no noise.
+    ``noise`` is the standard deviation of each PV's measurement noise [unit of the PV]; empty: no noise.
     """
 
     kind: ClassVar[str]
-    samples: int = 60_000
+    samples: int = within(60_000, 1)
     noise: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        self.require("samples", 1)
+        for f in fields(self):
+            if "range" in f.metadata and getattr(self, f.name) is not None:
+                self.require(f.name, *f.metadata["range"])
 
     @abstractmethod
     def run(self, plant: Simulator, seed: int) -> Record:
@@ -44,20 +47,22 @@ class Excitation(ABC):
             allowed = f"at least {least:g}" if most == np.inf else f"between {least:g} and {most:g}"
             raise ParamsError(f"excitation {self.kind!r}: {name} is {value!r}; it must be {allowed}")
 
+    def measured(
+        self, plant: Simulator, x: Array, mv: Array, rng: np.random.Generator, run: NDArray[np.int64] | None = None
+    ) -> Record:
+        """The record of states x (n, n_x) and MVs (n, n_mv), measured with noise; one run unless ``run`` says."""
+        pv = plant.measured(x) + noise_draws(plant, len(x), self.noise, rng)
+        return Record.of(plant.signals, pv, mv, run=run, dv=plant.dv_nominal)
+
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoop(Excitation):
     """An excitation whose MVs do not depend on what the plant does.
 
-    Attributes
-    ----------
-    low, high : float, optional
-        Range of the MVs [unit of the MV], inside their signals' range, which is the default.
-    spacing : "linear" or "log"
-        Whether levels are spread evenly over the range, or evenly over its logarithm: where an MV acts by
-        its ratio (a flow by the time that it leaves), even levels hardly visit the low end.
-    start : tuple of float
-        State at sample 0; empty: where the plant's experiments start (``Simulator.start``).
+    ``low`` and ``high`` are the range of the MVs [unit of the MV], inside their signals' range, which is the default.
+    ``spacing`` "linear" spreads levels evenly over the range, "log" evenly over its logarithm: where an MV acts by
+    its ratio (a flow by the time that it leaves), even levels hardly visit the low end. ``start`` is the state at
+    sample 0; empty: where the plant's experiments start (``Simulator.start``).
     """
 
     low: float | None = None
@@ -73,10 +78,7 @@ class OpenLoop(Excitation):
         """The record of one run; the MVs and the noise come from ``seed``."""
         rng = np.random.default_rng(seed)
         mv = self.levels(plant, self.unit_sequence(len(plant.mv_signals), rng))
-        x = simulate_open(plant, self.initial_state(plant), mv)[:-1]
-        return Record.of(
-            plant.signals, plant.measured(x) + noise_draws(plant, len(x), self.noise, rng), mv, dv=plant.dv_nominal
-        )
+        return self.measured(plant, simulate_open(plant, self.initial_state(plant), mv)[:-1], mv, rng)
 
     def levels(self, plant: Simulator, unit: Array) -> Array:
         """The MVs for values on [0, 1], shape (n, n_mv): over the range, of a discrete MV its values by equal shares.

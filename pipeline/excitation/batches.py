@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError
-from pipeline.excitation.base import OpenLoop
+from pipeline.excitation.base import OpenLoop, within
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
-from pipeline.simulation.simulate import noise_draws, simulate_batch
+from pipeline.simulation.simulate import simulate_batch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,39 +26,32 @@ class Batches(OpenLoop):
 
     Attributes
     ----------
-    samples : int
-        Samples of a batch [-]; the record has ``batches`` times as many.
-    batches : int
-        Number of batches, each a run of the record [-].
-    hold : int
-        Samples for which a level after the first is held [-].
-    constant, binary : float
+    samples [-]
+        Samples of a batch; the record has ``batches`` times as many.
+    batches [-]
+        Number of batches, each a run of the record.
+    hold [-]
+        Samples for which a level after the first is held.
+    constant, binary [-]
         Fractions of the batches that keep one level, and that go from one end of the MV's range to
-        the other only [-]; together at most 1.
-    end_fraction : float
-        Fraction of the other batches' levels that are an end of the range [-], 0 to 1; the rest are
-        uniform over it.
-    start_spread : tuple of float
-        Standard deviation of each state at the start of a batch [unit of the state], within the
-        state's range; empty: every batch starts alike.
-
+        the other only; together at most 1.
+    end_fraction [-]
+        Fraction of the other batches' levels that are an end of the range, 0 to 1; the rest are uniform over it.
+    start_spread [unit of the state]
+        Standard deviation of each state at the start of a batch, within the state's range; empty: all start alike.
     """
 
     kind: ClassVar[str] = "batches"
-    samples: int = 50
-    batches: int = 100
-    hold: int = 3
-    constant: float = 0.1
-    binary: float = 0.2
-    end_fraction: float = 0.3
+    samples: int = within(50, 1)
+    batches: int = within(100, 1)
+    hold: int = within(3, 1)
+    constant: float = within(0.1, 0, 1)
+    binary: float = within(0.2, 0, 1)
+    end_fraction: float = within(0.3, 0, 1)
     start_spread: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("batches", "hold"):
-            self.require(name, 1)
-        for name in ("constant", "binary", "end_fraction"):
-            self.require(name, 0, 1)
         self.require("binary", 0, 1 - self.constant)
 
     def run(self, plant: Simulator, seed: int) -> Record:
@@ -71,9 +63,8 @@ class Batches(OpenLoop):
         mv = self.levels(plant, self.unit_sequence(len(plant.mv_signals), rng))
         moves = mv.reshape(self.batches, self.samples, -1)
         x = simulate_batch(plant, self.initial_states(plant, rng), moves)[:, :-1]
-        pv = plant.measured(x.reshape(len(mv), -1)) + noise_draws(plant, len(mv), self.noise, rng)
-        return Record.of(
-            plant.signals, pv, mv, run=np.repeat(np.arange(self.batches), self.samples), dv=plant.dv_nominal
+        return self.measured(
+            plant, x.reshape(len(mv), -1), mv, rng, run=np.repeat(np.arange(self.batches), self.samples)
         )
 
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
@@ -86,12 +77,9 @@ class Batches(OpenLoop):
         ends = rng.integers(0, 2, (b, n, n_mv)).astype(np.float64)
         levels = np.where(rng.random((b, n, n_mv)) < share, ends, levels)
         first = np.where(constant, n, rng.integers(1, n + 1, b))
-        return np.concatenate([levels[i, self._level(int(first[i]))] for i in range(b)])
-
-    def _level(self, first: int) -> NDArray[np.int64]:
-        """Number of the level at each sample of a batch whose first one is held ``first`` samples, shape (samples,)."""
-        after = np.arange(self.samples) - first
-        return np.where(after < 0, 0, 1 + after // self.hold)
+        after = np.arange(n) - first[:, None]  # samples since the first level ended
+        number = np.where(after < 0, 0, 1 + after // self.hold)
+        return np.take_along_axis(levels, number[:, :, None], axis=1).reshape(b * n, n_mv)
 
     def initial_states(self, plant: Simulator, rng: np.random.Generator) -> Array:
         """State at the start of each batch, shape (batches, n_x)."""

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
-from pipeline.excitation.base import Excitation
+from pipeline.excitation.base import Excitation, within
 from pipeline.plants.equations import EquationPlant, equations
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
@@ -38,75 +37,66 @@ class OperatingPoint(Excitation):
 
     Attributes
     ----------
-    samples : int
-        Closed-loop samples in all [-].
-    run_length : int
-        Samples after which the loop is started anew, at the steady state of a random set point [-];
+    samples [-]
+        Closed-loop samples in all.
+    run_length [-]
+        Samples after which the loop is started anew, at the steady state of a random set point;
         a loop that has lost its plant at a limit is thereby set free.
-    sp_low, sp_high : float, optional
-        Range of the set points [unit of the CV]; default: its signal's, less 2 % at both ends.
-    sp_hold_low, sp_hold_high : int
-        Fewest and most samples for which a set point is held [-].
-    filter_s : float, optional
-        Time constant of the IMC filter that sets the PID for the plant linearized at ``tune_cv`` [s];
+    sp_low, sp_high [unit of the CV]
+        Range of the set points; default: its signal's, less 2 % at both ends.
+    sp_hold_low, sp_hold_high [-]
+        Fewest and most samples for which a set point is held.
+    filter_s [s]
+        Time constant of the IMC filter that sets the PID for the plant linearized at ``tune_cv``;
         default: the shortest one that is robust (``robust_imc``).
-    tune_cv : float, optional
-        CV of that steady state [unit of the CV]; default: the middle of the set points' range.
-    kc, ti_s, td_s : float, optional
-        The PID itself, instead of IMC: gain [MV/CV], integral and derivative time [s].
-    dither : float, optional
-        The dither is uniform over +-dither [unit of the MV]; default: 5 % of the MV's range.
-    dither_hold : int
-        Samples for which a dither is held [-].
-    restarts : int
-        Number of short runs [-], each of moves * move_hold + 1 rows.
-    moves : int
-        Moves of a short run, one after the other [-]. Several lead on from the states that the feedback
+    tune_cv [unit of the CV]
+        CV of that steady state; default: the middle of the set points' range.
+    kc [MV/CV], ti_s, td_s [s]
+        Gain, integral and derivative time of the PID itself, instead of IMC.
+    dither [unit of the MV]
+        The dither is uniform over +-dither; default: 5 % of the MV's range.
+    dither_hold [-]
+        Samples for which a dither is held.
+    restarts [-]
+        Number of short runs, each of moves * move_hold + 1 rows.
+    moves [-]
+        Moves of a short run, one after the other. Several lead on from the states that the feedback
         visits to those which a controller meets that uses the whole MV.
-    move_hold : int
-        Samples for which each MV of a short run is held [-].
-    near : float, optional
+    move_hold [-]
+        Samples for which each MV of a short run is held.
+    near [unit of the MV]
         Standard deviation, around the MV that the feedback had used in that state, of the MVs that
-        are not drawn over the whole range [unit of the MV]; default: 10 % of the MV's range.
-    near_fraction : float
-        Fraction of the short runs whose first MV is such a one [-], 0 to 1.
-    end_fraction : float
-        Fraction of the other moves that go to an end of the MV's range [-], 0 to 1.
+        are not drawn over the whole range; default: 10 % of the MV's range.
+    near_fraction [-]
+        Fraction of the short runs whose first MV is such a one.
+    end_fraction [-]
+        Fraction of the other moves that go to an end of the MV's range.
     """
 
     kind: ClassVar[str] = "operating_point"
-    samples: int = 40_000
-    run_length: int = 1_000
+    samples: int = within(40_000, 1)
+    run_length: int = within(1_000, 1)
     sp_low: float | None = None
     sp_high: float | None = None
-    sp_hold_low: int = 20
+    sp_hold_low: int = within(20, 1)
     sp_hold_high: int = 80
     filter_s: float | None = None
     tune_cv: float | None = None
     kc: float | None = None
     ti_s: float | None = None
-    td_s: float = 0.0
-    dither: float | None = None
-    dither_hold: int = 3
-    restarts: int = 60_000
-    moves: int = 1
-    move_hold: int = 3
-    near: float | None = None
-    near_fraction: float = 0.5
-    end_fraction: float = 0.0
+    td_s: float = within(0.0, 0)
+    dither: float | None = within(None, 0)
+    dither_hold: int = within(3, 1)
+    restarts: int = within(60_000, 0)
+    moves: int = within(1, 1)
+    move_hold: int = within(3, 1)
+    near: float | None = within(None, 0)
+    near_fraction: float = within(0.5, 0, 1)
+    end_fraction: float = within(0.0, 0, 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("run_length", "sp_hold_low", "dither_hold", "moves", "move_hold"):
-            self.require(name, 1)
         self.require("sp_hold_high", self.sp_hold_low)
-        for name in ("restarts", "td_s"):
-            self.require(name, 0)
-        for name in ("dither", "near"):
-            if getattr(self, name) is not None:
-                self.require(name, 0)
-        for name in ("near_fraction", "end_fraction"):
-            self.require(name, 0, 1)
 
     def run(self, plant: Simulator, seed: int) -> Record:
         """The record: closed-loop runs, each followed by the short runs from its states.
@@ -166,10 +156,8 @@ class OperatingPoint(Excitation):
             x[k] = state
             pv[k] = plant.measure(state) + noise[k]
             if left == 0:
-                sp, left = (
-                    float(rng.uniform(sp_low, sp_high)),
-                    int(rng.integers(self.sp_hold_low, self.sp_hold_high + 1)),
-                )
+                sp = float(rng.uniform(sp_low, sp_high))
+                left = int(rng.integers(self.sp_hold_low, self.sp_hold_high + 1))
             left -= 1
             if k % self.dither_hold == 0:
                 dither = float(rng.uniform(-reach, reach))
@@ -198,19 +186,13 @@ class OperatingPoint(Excitation):
         ends = np.searchsorted(pick, np.cumsum([len(loop.x) for loop in loops]))
         pvs: list[Array] = []
         mvs: list[Array] = []
-        lengths: list[NDArray[np.int64]] = []
+        lengths: list[int] = []
         for loop, start, end in zip(loops, np.r_[0, ends[:-1]], ends, strict=True):
             pvs += [loop.pv, pv[start:end].reshape(-1, pv.shape[2])]
             mvs += [loop.mv, move[start:end].reshape(-1, 1)]
-            lengths += [np.array([len(loop.x)]), np.full(end - start, rows)]
-        length = np.concatenate(lengths)
-        return Record.of(
-            plant.signals,
-            np.concatenate(pvs),
-            np.concatenate(mvs),
-            run=np.repeat(np.arange(len(length)), length),
-            dv=plant.dv_nominal,
-        )
+            lengths += [len(loop.x), *[rows] * int(end - start)]
+        run = np.repeat(np.arange(len(lengths)), lengths)
+        return Record.of(plant.signals, np.concatenate(pvs), np.concatenate(mvs), run=run, dv=plant.dv_nominal)
 
     def sequence(self, plant: Simulator, used: Array, rng: np.random.Generator) -> Array:
         """The MVs of each short run, shape (restarts, moves): over the whole range, the first maybe near ``used``."""
@@ -218,8 +200,8 @@ class OperatingPoint(Excitation):
         shape = (len(used), self.moves)
         anywhere = rng.uniform(signal.low, signal.high, shape)
         end = np.where(rng.random(shape) < 0.5, signal.low, signal.high)
-        found = np.where(rng.random(shape) < self.end_fraction, end, anywhere)
+        moves = np.where(rng.random(shape) < self.end_fraction, end, anywhere)
         spread = 0.1 * (signal.high - signal.low) if self.near is None else self.near
         close = np.clip(used + spread * rng.standard_normal(len(used)), signal.low, signal.high)
-        found[:, 0] = np.where(rng.random(len(used)) < self.near_fraction, close, found[:, 0])
-        return found
+        moves[:, 0] = np.where(rng.random(len(used)) < self.near_fraction, close, moves[:, 0])
+        return moves

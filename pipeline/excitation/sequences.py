@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ParamsError
-from pipeline.excitation.base import OpenLoop
+from pipeline.excitation.base import OpenLoop, within
 from pipeline.plants.simulator import Array
 
 TAPS: dict[int, tuple[int, ...]] = {
@@ -49,20 +49,11 @@ def maximal_length(order: int) -> NDArray[np.int8]:
 class RandomSteps(OpenLoop):
     """Levels drawn uniformly over the MV's range, each held ``hold`` samples.
 
-    Attributes
-    ----------
-    hold : int
-        Samples for which a level is held [-].
-
     Source: [inverse_rbf, section 4.2] (0..500 K, held one period, 60,000 samples).
     """
 
     kind: ClassVar[str] = "random_steps"
-    hold: int = 1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require("hold", 1)
+    hold: int = within(1, 1)
 
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
         """Levels on [0, 1], shape (samples, n_mv)."""
@@ -76,22 +67,13 @@ class Prbs(OpenLoop):
     Several MVs get the same sequence, shifted by equal parts of its period, so that they are
     nearly uncorrelated. The seed draws the start within the period.
 
-    Attributes
-    ----------
-    hold : int
-        Samples a clock of the shift register [-].
-    order : int
-        Bits of the register [-], 2 to 18; the sequence repeats after (2**order - 1) hold samples.
+    A clock of the shift register lasts ``hold`` samples. The register has ``order`` bits, 2 to 18: the sequence
+    repeats after (2**order - 1) hold samples.
     """
 
     kind: ClassVar[str] = "prbs"
-    hold: int = 1
-    order: int = 11
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require("hold", 1)
-        self.require("order", min(TAPS), max(TAPS))
+    hold: int = within(1, 1)
+    order: int = within(11, min(TAPS), max(TAPS))
 
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
         """Zeros and ones, shape (samples, n_mv)."""
@@ -114,7 +96,7 @@ class Aprbs(Prbs):
     """
 
     kind: ClassVar[str] = "aprbs"
-    hold: int = 4
+    hold: int = within(4, 1)
 
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
         """Levels on [0, 1], shape (samples, n_mv)."""
@@ -130,29 +112,17 @@ class Multisine(OpenLoop):
 
         u(k) = sum_i cos(2 pi i k / cycle - pi i (i - 1) / lines),   i = 1 .. lines
 
-    scaled so that it just fills the MV's range. Of several MVs, each has its own lines, interleaved
-    with those of the others, so that their effects can be told apart. The seed draws the start
-    within the cycle.
-
-    Attributes
-    ----------
-    cycle : int
-        Samples after which it repeats [-].
-    lines : int
-        Number of cosines of each MV [-]; the highest frequency is lines n_mv / (cycle period_s) [Hz].
+    scaled so that it just fills the MV's range. It repeats after ``cycle`` samples. Each MV has ``lines`` cosines of
+    its own, interleaved with those of the others, so that their effects can be told apart; the highest frequency
+    is lines n_mv / (cycle period_s) [Hz]. The seed draws the start within the cycle.
 
     Source: Schroeder, Synthesis of low-peak-factor signals and binary sequences with low
     autocorrelation, IEEE Transactions on Information Theory 16, 1970.
     """
 
     kind: ClassVar[str] = "multisine"
-    cycle: int = 2_000
-    lines: int = 200
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require("cycle", 4)
-        self.require("lines", 1)
+    cycle: int = within(2_000, 4)
+    lines: int = within(200, 1)
 
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
         """Values on [0, 1], shape (samples, n_mv)."""

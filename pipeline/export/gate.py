@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pipeline.errors import ExportError
 from pipeline.export.controller_file import assembled, write_sidecar
-from pipeline.export.graph import law_graph
+from pipeline.export.graph import example_inputs, law_graph
 from pipeline.files import draft_of
 from pipeline.laws.base import ControlLaw
+from pipeline.plants.simulator import Array
 from serving.controller import Controller
 from serving.errors import LoopwrightError
-from serving.manifest import INPUTS, Manifest
+from serving.manifest import Manifest, Signal
 
-Array: TypeAlias = NDArray[np.float64]
 GATE_STEPS = 1_000
 GATE_TOLERANCE = 1e-9
 INFO_TOLERANCE = 1e-6
@@ -34,15 +33,12 @@ def export(
     *,
     case: str,
     provenance: Mapping[str, Any],
-    evidence: Mapping[str, Any] | None = None,
     drive: Callable[[Array], Array] | None = None,
 ) -> Manifest:
     """Write ``law`` as one ONNX graph with its manifest, and the manifest again as .json beside it.
 
     The file is written to a draft, loaded by the runtime that will serve it, and renamed only
-    after a closed loop of 1,000 steps agrees with the torch module: MV and state to 1e-9 of each
-    entry's largest value, info to 1e-6 (``INFO_TOLERANCE`` says why). State and applied MV are fed
-    back from each side's own outputs, so that a difference could grow.
+    after a closed loop of 1,000 steps agrees with the torch module, see ``parity_gate``.
 
     Parameters
     ----------
@@ -52,12 +48,10 @@ def export(
         The .onnx file; its folder is made if need be.
     case
         Name of the case that the controller belongs to.
-    provenance, evidence
-        JSON-ready values for the manifest.
+    provenance
+        JSON-ready values for the manifest, whose evidence is empty until the file is validated.
     drive
         ``mv (n_mv,) -> pv (n_pv,)``: the plant in the loop, one period further with each call.
-        Both sides see its process variables and the MV that it received, so that a loop that rings
-        does not amplify rounding; the state is each side's own.
         Without it the process variables walk at random over their ranges.
 
     Raises
@@ -71,25 +65,22 @@ def export(
     _check_shapes(law)
     model, inputs = law_graph(law)
     manifest = Manifest(
+        **{name: getattr(law.signals, name) for name in ("period_s", "sp", "pv", "dv", "mv")},
         case=case,
         law=law.name,
-        period_s=law.signals.period_s,
-        sp=law.signals.sp,
-        pv=law.signals.pv,
-        dv=law.signals.dv,
-        mv=law.signals.mv,
         n_state=law.n_state,
         info=tuple(law.info),
         inputs=inputs,
         provenance=dict(provenance),
-        evidence=dict(evidence or {}),
+        evidence={},
     )
     with draft_of(path) as draft:
         draft.write_bytes(assembled(model.SerializeToString(), manifest))
         try:
             controller = Controller(draft)
         except LoopwrightError as error:
-            raise ExportError(f"law {law.name!r} does not make a controller: {_after_path(error, draft)}") from error
+            reason = str(error).removeprefix(f"{draft}: ")
+            raise ExportError(f"law {law.name!r} does not make a controller: {reason}") from error
         parity_gate(law, controller, drive=drive)
     write_sidecar(path, manifest)
     return manifest
@@ -100,6 +91,10 @@ def parity_gate(
 ) -> float:
     """Largest difference between the law and its controller over a closed loop in MV and state, relative.
 
+    The state is fed back from each side's own outputs, so that a difference could grow; so is the applied MV
+    without a plant. With ``drive`` both sides have the plant's process variables and the MV that it received, so
+    that a loop that rings does not amplify rounding.
+
     Relative to each entry's largest value over the loop; 1e-13 of the largest number anywhere is
     allowed beside it, because an output that ought to be zero is rounding alone. For MV and state
     "anywhere" means among themselves: a large entry of info excuses nothing there.
@@ -108,12 +103,12 @@ def parity_gate(
     largest value, and where either side has no number to give.
     """
     signals, rng = law.signals, np.random.default_rng(0)
-    walk = {name: _Walk(getattr(signals, name), rng) for name in ("sp", "pv", "dv")}
+    courses = (_course(signals.sp, rng, 1 / 40), _course(signals.pv, rng), _course(signals.dv, rng))
     mv = np.array([s.middle for s in signals.mv])
     ours = theirs = (mv, np.zeros(law.n_state), np.zeros(len(law.info)))
     pairs = []
     for k in range(steps):
-        sp, pv, dv = walk["sp"].jump(1 / 40), walk["pv"].step(), walk["dv"].step()
+        sp, pv, dv = (step() for step in courses)
         if drive is not None:
             pv = np.asarray(drive(theirs[0]), dtype=np.float64)
         with torch.inference_mode():
@@ -143,40 +138,29 @@ def parity_gate(
     return float(relative[:, :n_fed].max())
 
 
-class _Walk:
-    """A random walk over the ranges of some signals, reflected at their ends."""
+def _course(signals: Sequence[Signal], rng: np.random.Generator, jumps: float | None = None) -> Callable[[], Array]:
+    """A random walk over the ranges of some signals, reflected at their ends; or jumps of this probability a step."""
+    low, span = (np.array([(s.low, s.high - s.low) for s in signals]).reshape(-1, 2)).T
+    at = rng.uniform(size=len(signals))  # in units of the range
 
-    def __init__(self, signals: Any, rng: np.random.Generator) -> None:
-        self.low = np.array([s.low for s in signals])
-        self.span = np.array([s.high - s.low for s in signals])
-        self.rng = rng
-        self.at = rng.uniform(size=len(signals))  # in units of the range
+    def step() -> Array:
+        nonlocal at
+        if jumps is None:
+            at = np.abs(at + 0.05 * rng.standard_normal(len(at)))
+            at = np.where(at > 1, np.maximum(2 - at, 0), at)
+        elif rng.uniform() < jumps:
+            at = rng.uniform(size=len(at))
+        return np.asarray(low + span * at)
 
-    def step(self) -> Array:
-        moved = np.abs(self.at + 0.05 * self.rng.standard_normal(len(self.at)))
-        self.at = np.where(moved > 1, np.maximum(2 - moved, 0), moved)
-        return np.asarray(self.low + self.span * self.at)
-
-    def jump(self, probability: float) -> Array:
-        if self.rng.uniform() < probability:
-            self.at = self.rng.uniform(size=len(self.at))
-        return np.asarray(self.low + self.span * self.at)
+    return step
 
 
 def _check_shapes(law: ControlLaw) -> None:
     """ExportError unless the law maps float64 vectors to float64 vectors of the sizes that it declares."""
-    signals = law.signals
-    sizes = {
-        "sp": len(signals.sp),
-        "pv": len(signals.pv),
-        "dv": len(signals.dv),
-        "mv_applied": len(signals.mv),
-        "state": law.n_state,
-    }
-    wanted = {"mv": len(signals.mv), "state_next": law.n_state, "info": len(law.info)}
+    wanted = {"mv": len(law.signals.mv), "state_next": law.n_state, "info": len(law.info)}
     try:
         with torch.no_grad():
-            outputs = law(*(torch.zeros(sizes[name], dtype=torch.float64) for name in INPUTS))
+            outputs = law(*example_inputs(law))
     except RuntimeError as error:
         raise ExportError(f"law {law.name!r} cannot be stepped on vectors: {error}") from error
     if len(outputs) != len(wanted):
@@ -187,7 +171,3 @@ def _check_shapes(law: ControlLaw) -> None:
                 f"law {law.name!r} gives {name} as {output.dtype} of shape {tuple(output.shape)}; "
                 f"it must be torch.float64 of shape ({n},)"
             )
-
-
-def _after_path(error: LoopwrightError, draft: Path) -> str:
-    return str(error).removeprefix(f"{draft}: ")

@@ -55,6 +55,12 @@ def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     return proto, inputs
 
 
+def example_inputs(law: ControlLaw) -> tuple[torch.Tensor, ...]:
+    """``sp, pv, dv, mv_applied, state`` of the law's sizes, all zero."""
+    sizes = (*(len(getattr(law.signals, name)) for name in ("sp", "pv", "dv", "mv")), law.n_state)
+    return tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
+
+
 @dataclass(frozen=True)
 class _Traced:
     """A law as torch traces it. Equal to that of another law which differs in its buffers' values alone.
@@ -70,14 +76,12 @@ class _Traced:
 
     @classmethod
     def of(cls, law: ControlLaw) -> Self:
-        signals = law.signals
-        sizes = (len(signals.sp), len(signals.pv), len(signals.dv), len(signals.mv), law.n_state)
-        example = tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
+        example = example_inputs(law)
         with _quiet():
             program = torch.export.export(law, example, strict=False)
         constants = {name: t.numpy() for name, t in program.constants.items() if isinstance(t, torch.Tensor)}
         values = b"".join(f"{n} {t.dtype} {t.shape}".encode() + t.tobytes() for n, t in sorted(constants.items()))
-        return cls(str(program), values, sizes, program)
+        return cls(str(program), values, tuple(map(len, example)), program)
 
 
 @lru_cache(maxsize=16)
@@ -110,16 +114,16 @@ def _filled(translated: onnx.ModelProto, law: ControlLaw) -> onnx.ModelProto:
 
 def _python_floats(program: torch.export.ExportedProgram) -> set[float]:
     """Every Python float that stands in the traced law."""
-    found: set[float] = set()
+    floats: set[float] = set()
 
     def walk(value: Any) -> Any:
         if isinstance(value, float):
-            found.add(value)
+            floats.add(value)
         return value
 
     for node in program.graph.nodes:
         torch.fx.node.map_aggregate((node.args, node.kwargs), walk)
-    return found
+    return floats
 
 
 def _restore_floats(model: ir.Model, floats: set[float]) -> None:
@@ -185,8 +189,7 @@ def _simplify(model: ir.Model) -> None:
         passes.ClearMetadataAndDocStringPass(),
     ):
         step(model)
-    unused = [v for v in model.graph.inputs if not v.uses()]
-    for value in unused:
+    for value in [v for v in model.graph.inputs if not v.uses()]:
         model.graph.inputs.remove(value)
 
 

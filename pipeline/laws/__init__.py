@@ -1,23 +1,19 @@
-"""Control laws by name: adding one is a file in this folder and a line here."""
+"""Control laws by name: adding one is a file in a family's folder and a line here."""
 
 from __future__ import annotations
 
 from pipeline.laws.base import ControlLaw
-from pipeline.laws.fuzzy.fuzzy_feedforward import FuzzyFeedforward
+from pipeline.laws.fuzzy.fuzzy_feedforward import FuzzyFeedforward, FuzzyFeedforwardPi
 from pipeline.laws.fuzzy.fuzzy_feedforward_observer import FuzzyFeedforwardObserver
-from pipeline.laws.fuzzy.fuzzy_feedforward_pi import FuzzyFeedforwardPi
 from pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
 from pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob
-from pipeline.laws.linearized.gauss_newton_pid import GaussNewtonPid
+from pipeline.laws.linearized.gauss_newton import GaussNewtonPid, MinimumVariance
 from pipeline.laws.linearized.linearized_pid import LinearizedPid
-from pipeline.laws.linearized.minimum_variance import MinimumVariance
-from pipeline.laws.local.auto_pid_network import AutoPidNetwork
-from pipeline.laws.local.local_pid_network import LocalPidNetwork
+from pipeline.laws.local.pid_networks import AutoPidNetwork, LocalPidNetwork
 from pipeline.laws.pid.pid import PID
 from pipeline.laws.recursive.recursive_pid import RecursivePid
 from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
-from pipeline.laws.reference.model_reference import ModelReference
-from pipeline.laws.reference.model_reference_two_error import ModelReferenceTwoError
+from pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
 from pipeline.laws.reference.pi_reference import PiReference
 
 LAWS: dict[str, type[ControlLaw]] = {

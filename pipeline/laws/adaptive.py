@@ -1,52 +1,55 @@
-"""What the laws share that adapt PID gains at every sample to a linear model of the next one."""
+"""Shared by the adaptive PID laws, which fit the gains at every sample to a linear one-step model."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from scipy.special import chdtri
 from torch import Tensor, nn
 
 from pipeline.errors import LawError
+from pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
 from pipeline.laws.gain_update import PidForm, gain_update
-from pipeline.models.memory import Named, Slot, constant
+from pipeline.models.memory import Memory, Named, Slot, Stage, constant
 from pipeline.plants.signals import Signals
 
 Three = tuple[float, float, float]
-CONFIDENCE = 0.99  # of the update criterion: noise alone trips it in one sample of a hundred
+CONFIDENCE = 0.99  # of the update criterion: noise alone triggers it in 1 % of the samples
 
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveParams:
-    """Numbers of an adaptive PID; MVs count in units of half the MV's range, PVs in their own.
+    """Settings of an adaptive PID. Moves are in units of half the MV's range, errors in the PV's unit.
 
     Parameters
     ----------
     penalty
-        Penalty mu > 0 of the move [pv^2].
+        mu > 0, the weight of the move [pv^2].
     stiffness
-        lambda > 0: what a change of the gains costs; small, it only tells equally good gains apart.
+        lambda > 0, the weight of a change of the gains; a small value only selects among equally good gains.
     weights
-        How easily kc, Ki and Kd give way.
+        How easily kc, Ki and Kd change.
     gain_low, gain_high
         Bounds of kc, Ki = kc dt/tau_i and Kd = kc tau_d/dt [1/pv], 0 <= low < high.
     gains
-        Where they start; None takes those of the model at the centre of its data.
+        First gains; None takes those of the model at the centre of its data.
     momentum
-        gamma in [0, 1): share of the last change in the next one.
+        gamma in [0, 1), the share of the last change in the next one.
     window, noise_variance
-        The gains stay as long as the mean square of the last ``window`` errors is what noise of this
-        variance [pv^2] explains; None always updates.
+        The gains stay while noise of this variance [pv^2] explains the mean square of the last ``window`` errors.
+        None: they always change.
     preview
-        What is known of r(t+1): ``held``, as now; ``ramp``, as far on as it came with this sample.
+        The assumed r(t+1): ``held``, equal to r(t); ``ramp``, r(t) plus its last change.
     plant_gain
-        Sign of dPV/dMV; ``auto`` takes the model's at the centre of its data.
+        Sign of dPV/dMV; ``auto`` takes the model's sign at the centre of its data.
     slope_min
-        The model is acted on where its slope, in that sign, is above this [pv].
+        The gains stay where the model's slope, in that sign, is not above this [pv].
     mv_rate
-        Largest change of the MV a sample [mv]; None is unlimited.
+        Largest change of the MV per sample [mv]; None is unlimited.
     """
 
     penalty: float = 1.0
@@ -94,8 +97,8 @@ def signed_unit(signals: Signals, plant_gain: str, model_slope: float) -> float:
     if sign is None:
         if model_slope == 0 or model_slope != model_slope:
             raise LawError(
-                f"the model's slope over the MV is {model_slope} at the centre of its data, so that it does not tell "
-                "which way to move; give plant_gain: positive or negative"
+                f"the model's slope over the MV is {model_slope} at the centre of its data, which gives no "
+                "direction of the move; give plant_gain: positive or negative"
             )
         sign = 1.0 if model_slope > 0 else -1.0
     mv = signals.mv[0]
@@ -103,53 +106,47 @@ def signed_unit(signals: Signals, plant_gain: str, model_slope: float) -> float:
 
 
 def minimum_variance_gains(a: Tensor, slope: float, params: AdaptiveParams) -> Three:
-    """The PID that moves as a linear model y(t) = -sum_i a_i y(t-i) + b u(t-1) + .. asks for at a held set point.
+    """Gains of the PID with the minimum-variance move of y(t) = -sum_i a_i y(t-i) + b u(t-1) + .. at a held set point.
 
         (b^2 + mu) du = b [r - y0(t+1)],   r - y0 = e - sum_i a_i (e(t+1-i) - e(t-i))
 
     which is a PID for n_y <= 2, with g = b/(b^2 + mu): Ki = g, kc = g (1/2 - sum a_i), Kd = g a_2.
-    Longer lags are gathered in Kd, and all is taken within the bounds. ``a`` (n_y,), ``slope`` b [pv].
+    Longer lags add to Kd, and the bounds limit all gains. ``a`` (n_y,), ``slope`` b [pv].
     """
     g = slope / (slope**2 + params.penalty)
     later = sum(i * float(a_i) for i, a_i in enumerate(a))
-    wanted = (g * (0.5 - float(a.sum())), g, g * later)
-    kc, ki, kd = (min(max(z, lo), hi) for z, lo, hi in zip(wanted, params.gain_low, params.gain_high, strict=True))
+    unbounded = (g * (0.5 - float(a.sum())), g, g * later)
+    kc, ki, kd = (min(max(z, lo), hi) for z, lo, hi in zip(unbounded, params.gain_low, params.gain_high, strict=True))
     return kc, ki, kd
 
 
 def target(p: Named, preview: str) -> Tensor:
-    """The formula of r(t+1), as far as it is known."""
+    """The assumed set point r(t+1)."""
     return 2 * p["r"] - p["r1"] if preview == "ramp" else p["r"]
 
 
 def target_slots(preview: str) -> dict[str, Slot]:
-    """What ``target`` remembers: the last set point, where it must; the first sample holds."""
+    """The memory of ``target``: the last set point for ``ramp``; at the first sample it is the present one."""
     return {"r1": Slot(1, lambda p: p["r"], lambda p: p["r"])} if preview == "ramp" else {}
 
 
 class AdaptiveGains(nn.Module):
-    """PID gains z = (kc, Ki, Kd) that follow a wanted move v of curvature c, within bounds.
+    """PID gains z = (kc, Ki, Kd) that follow a desired move v of curvature c, within bounds.
 
         du = rho'z,   rho = (e - e1, (e + e1)/2, e - 2 e1 + e2),   e = r - y
         z  = the nearest gains whose move is nearest to v, see ``gain_update``
         dz = gamma dz1 + (1 - gamma) (z - z1),   z = clip(z1 + dz)           with ``momentum``
 
-    The gains stay, and dz is forgotten, where the model's slope does not tell the way (the guard) or
-    the mean square S of the last m errors is within noise: S <= var chi2(m, .99)/m. At the first
-    sample e1 = e2 = e, so that a controller that starts on its set point, or takes over, does not
-    kick. Moves are added to the MV that was applied, which is the anti-windup.
+    The gains stay and dz is 0 if the model's slope is too small (the guard), or if noise explains
+    the mean square S of the last m errors: S <= var chi2(m, .99)/m. At the first sample
+    e1 = e2 = e, so a start at the set point and a transfer from manual are bumpless. The law adds
+    its move to the applied MV, which is the anti-windup.
 
-    A law gives ``slots`` to its Memory and ``terms`` to its Stage, and then calls ``update``,
-    ``free``, ``settled`` and ``move`` in this order with the stage's results.
+    A law gives ``slots`` to its Memory and ``terms`` to its Stage, and then calls ``free``, ``update``,
+    ``settled`` and ``step`` with the stage's results. ``unit`` is one unit of move [mv] with its sign, see
+    ``signed_unit``; ``start`` the gains without a past.
 
     Source: [chen2004, eqs 2-4, 19-28].
-
-    Parameters
-    ----------
-    params, unit
-        The numbers; one unit of move [mv] with its sign, see ``signed_unit``.
-    start
-        Gains without a past.
     """
 
     info: ClassVar[tuple[str, ...]] = ("kc", "tau_i_s", "tau_d_s", "b1", "updated")
@@ -171,20 +168,19 @@ class AdaptiveGains(nn.Module):
         self.window = 0 if params.window is None else params.window
         m, variance = self.window, params.noise_variance or 0.0
         self.form = PidForm(signals.period_s, unit, params.gain_high)
-        numbers = {
-            "unit": [unit],
-            "lam": [params.stiffness],
-            "weights": params.weights,
-            "lo": params.gain_low,
-            "hi": params.gain_high,
-            "gamma": [params.momentum],
-            "fresh_share": [1 - params.momentum],
-            "threshold": [variance * float(chdtri(m, 1 - CONFIDENCE)) if m else 0.0],
-            "slope_min": [params.slope_min],
-            "by_unit": [1 / unit],
-        }
-        for name, values in numbers.items():
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
+        hold_numbers(
+            self,
+            unit=unit,
+            lam=params.stiffness,
+            weights=params.weights,
+            lo=params.gain_low,
+            hi=params.gain_high,
+            gamma=params.momentum,
+            fresh_share=1 - params.momentum,
+            threshold=variance * float(chdtri(m, 1 - CONFIDENCE)) if m else 0.0,
+            slope_min=params.slope_min,
+            by_unit=1 / unit,
+        )
         first = torch.tensor(start, dtype=torch.float64)
         if not ((first >= self.lo) & (first <= self.hi)).all():
             raise LawError(f"the first gains are {list(start)}; they must lie within gain_low and gain_high")
@@ -201,42 +197,42 @@ class AdaptiveGains(nn.Module):
             self.slots["square"] = Slot(1, constant(torch.zeros(1, dtype=torch.float64)))
 
     def terms(self, p: Named) -> dict[str, Tensor]:
-        """Formulas of what the gains need of the past and the sample."""
+        """The terms that the gains need from the memory and the sample."""
         e = _error(p)
-        found = {
+        terms = {
             "rho": torch.cat([e - p["e1"], (e + p["e1"]) / 2, e - 2 * p["e1"] + p["e2"]], dim=-1),
             "gains": p["gains"],
             "mv": p["u"],
         }
         if self.filtered:
-            found["change"] = self.gamma * p["change"]
+            terms["change"] = self.gamma * p["change"]
         if self.window:
-            found["error"] = e
+            terms["error"] = e
         if self.window > 1:
-            found["quiet"] = self.threshold - p["square"] - p["squares"].sum(dim=-1, keepdim=True)
-        return found
+            terms["quiet"] = self.threshold - p["square"] - p["squares"].sum(dim=-1, keepdim=True)
+        return terms
 
     def update(self, now: Named, v: Tensor, c: Tensor) -> Tensor:
-        """Gains (..., 3) for a wanted move v and its curvature c, (..., 1) each."""
+        """Gains (..., 3) for a desired move v and its curvature c, (..., 1) each."""
         return gain_update(now["gains"], now["rho"], v, c, self.lam, self.weights, self.lo, self.hi)
 
     def free(self, now: Named, slope: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Whether the gains may change (..., 1), for a slope [pv] in the plant's sign; and what is remembered of it."""
-        told = slope > self.slope_min
+        """Whether the gains may change (..., 1), for a slope [pv] in the plant's sign; and the next memory."""
+        clear = slope > self.slope_min
         if not self.window:
-            return told, {}
+            return clear, {}
         square = now["error"] * now["error"]
         loud = square > (now["quiet"] if self.window > 1 else self.threshold)
-        return told & loud, {"square": square} if self.window > 1 else {}
+        return clear & loud, {"square": square} if self.window > 1 else {}
 
     def settled(self, now: Named, z: Tensor, free: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The gains (..., 3) after filter and guard, and what is remembered of them."""
+        """The gains (..., 3) after filter and guard, and the next memory."""
         if not self.filtered:
             z = torch.where(free, z, now["gains"])
             return z, {"gains": z}
         change = now["change"] + self.fresh_share * (z - now["gains"])
         change = torch.where(free, change, torch.zeros_like(change))
-        # Filtered changes may lead out of the bounds although neither gains do.
+        # A filtered change can leave the bounds even if both gains are within them.
         z = torch.minimum(torch.maximum(now["gains"] + change, self.lo), self.hi)
         return z, {"gains": z, "change": change}
 
@@ -244,9 +240,52 @@ class AdaptiveGains(nn.Module):
         """The move du = rho'z in units, (..., 1), of gains (..., 3)."""
         return (now["rho"] * z).sum(dim=-1, keepdim=True)
 
-    def told(self, z: Tensor, slope: Tensor, free: Tensor) -> Tensor:
+    def info_of(self, z: Tensor, slope: Tensor, free: Tensor) -> Tensor:
         """``info``: kc [mv/pv], tau_i and tau_d [s], the slope [pv/mv], and whether the gains were free to change."""
         return torch.cat([self.form(z), slope * self.by_unit, free.to(z.dtype)], dim=-1)
+
+
+class AdaptivePid(ControlLaw):
+    """A PID law whose gains follow a model: the memory and the formulas of both. ``forward`` is the law's.
+
+    Parameters
+    ----------
+    a, b
+        The linear model at the centre of the data, as in ``minimum_variance_gains``, but b [pv/mv].
+    model
+        Returns the model, with its ``slots``, for one unit of move [mv].
+    more, info
+        The law's own slots; its info names after those of the gains.
+    """
+
+    incremental = True
+    model: Any
+
+    def __init__(
+        self,
+        signals: Signals,
+        params: AdaptiveParams,
+        a: Tensor,
+        b: float,
+        model: Callable[[float], nn.Module],
+        more: Mapping[str, Slot],
+        info: tuple[str, ...],
+    ) -> None:
+        super().__init__(signals, params.mv_rate)
+        require_single_loop(signals, self.name)
+        unit = signed_unit(signals, params.plant_gain, b)
+        self.params, self.model = params, model(unit)
+        self.gains = AdaptiveGains(params, signals, unit, params.gains or minimum_variance_gains(a, b * unit, params))
+        self.memory = Memory({**target_slots(params.preview), **self.model.slots, **self.gains.slots, **more})
+        self.stage = Stage(
+            self.memory.layout, lambda p: {"known": self.memory.then(p), **self.gains.terms(p), **self.formulas(p)}
+        )
+        self.n_state = self.memory.n_state
+        self.info = (*AdaptiveGains.info, *info)
+
+    @abstractmethod
+    def formulas(self, p: Named) -> Named:
+        """The terms that the law needs from the memory and the sample, beside those of its gains."""
 
 
 def _error(p: Named) -> Tensor:

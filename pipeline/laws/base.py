@@ -1,4 +1,4 @@
-"""What every control law is: a torch module with explicit state, exported whole."""
+"""The base of the control laws: a torch module with explicit state, exported as one graph."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,14 +17,16 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 
 M = TypeVar("M", bound=Model)
+Stepped: TypeAlias = tuple[Tensor, Tensor, Tensor]
+"""Result of a step: the MV (..., n_mv), the next state (..., n_state), and info (..., n_info)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """What can be said of a law without a closed-loop test: a proof of stability, how a training went.
+    """Results of a law that need no closed-loop test, such as a proof of stability or a training history.
 
-    ``figures`` go where people and programs read figures (report, manifest, registry); ``arrays`` are
-    kept for pictures; ``notes`` are sentences that stand below the figures in the report.
+    ``figures`` go to the report, the manifest and the registry. ``arrays`` are for pictures.
+    ``notes`` are sentences below the figures in the report.
     """
 
     figures: Mapping[str, float] = field(default_factory=dict)
@@ -32,15 +34,20 @@ class Analysis:
     notes: tuple[str, ...] = ()
 
 
+def hold_numbers(module: nn.Module, **numbers: Any) -> None:
+    """Register float64 buffers in this order, each in the shape of its values; a single number has shape (1,)."""
+    for name, values in numbers.items():
+        buffer = torch.tensor(values, dtype=torch.float64)
+        module.register_buffer(name, buffer if buffer.ndim else buffer.reshape(1))
+
+
 def require_part(models: Mapping[str, Model], part: str, law: str, n_in: int, n_out: int) -> Model:
     """The model named ``part`` of a model set, checked for its numbers of inputs and outputs.
 
-    Raises LawError that says what the law needs and what the set has.
+    Raises a LawError that names the law's need and the parts of the set.
     """
     needs = f"law {law!r} needs a part {part!r} ({n_in} inputs, {n_out} outputs)"
-    if part not in models:
-        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
-    model = models[part]
+    model = _named(models, part, needs)
     try:
         shape = tuple(model(torch.zeros(n_in, dtype=torch.float64)).shape)
     except (RuntimeError, ValueError, IndexError) as error:
@@ -51,18 +58,22 @@ def require_part(models: Mapping[str, Model], part: str, law: str, n_in: int, n_
 
 
 def require_kind(models: Mapping[str, Model], cls: type[M], law: str) -> M:
-    """The model of a set that stands under its kind's own name, for laws that hold one loop by it.
+    """The model whose part name is its kind, for laws of a single loop.
 
-    Raises LawError that says what the law needs and what the set has.
+    Raises a LawError that names the law's need and the parts of the set.
     """
     part = cls.kind
     needs = f"law {law!r} needs a part {part!r} (kind {part}, one MV, delay 1)"
-    if part not in models:
-        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
-    model = models[part]
+    model = _named(models, part, needs)
     if not isinstance(model, cls):
         raise LawError(f"{needs}; the model set's is of kind {model.kind}")
     return model
+
+
+def _named(models: Mapping[str, Model], part: str, needs: str) -> Model:
+    if part not in models:
+        raise LawError(f"{needs}; the model set has {', '.join(sorted(models)) or 'no parts'}: add it to `parts:`")
+    return models[part]
 
 
 def require_single_loop(signals: Signals, law: str) -> None:
@@ -77,17 +88,17 @@ class ControlLaw(nn.Module, ABC):
     """One step of a controller: ``(sp, pv, dv, mv_applied, state) -> (mv, state_next, info)``.
 
     Shapes ``(..., n_sp)``, ``(..., n_pv)``, ``(..., n_dv)``, ``(..., n_mv)``, ``(..., n_state)``;
-    engineering units; float64. A state of zeros means "no past": the law handles its own first
-    step. ``mv_applied`` is what the plant received over the last period; a law that remembers its
-    MV remembers this one, which is the anti-windup and the bumpless transfer. The law limits its
-    own MV to the signal's range and to ``rate`` per sample.
+    engineering units; float64. A state of zeros means "no history": the law handles its own first
+    step. ``mv_applied`` is the MV that the plant received over the last period. A law that needs
+    its last MV uses this value, which gives anti-windup and bumpless transfer. The law limits its
+    MV to the signal's range and to ``rate`` per sample.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
-    Params: ClassVar[type[Any]]  # frozen dataclass: what params.yaml may say of this law; `mv_rate` among it
-    # Does the law add a move to the applied MV? Such a law takes over from manual without a bump and, started on
-    # set point, keeps the actuator where it is; the others compute the MV afresh, whatever was applied.
+    Params: ClassVar[type[Any]]  # frozen dataclass: the law's parameters in params.yaml, with `mv_rate`
+    # True if the law adds a move to the applied MV: its transfer from manual is bumpless, and a start at the set
+    # point does not move the actuator. Other laws compute the MV without the applied one.
     incremental: ClassVar[bool] = False
     n_state: int
     info: tuple[str, ...]
@@ -102,7 +113,7 @@ class ControlLaw(nn.Module, ABC):
         self.register_buffer("high", torch.tensor([s.high for s in signals.mv], dtype=torch.float64))
         if mv_rate is not None and not mv_rate > 0:
             raise LawError(f"mv_rate is {mv_rate}; give the largest MV change a sample, above 0, or leave it out")
-        # A valve that is open or shut has no rate: half way is nowhere.
+        # An on-off valve has no positions between, so no rate.
         rates = [inf if s.values else mv_rate for s in signals.mv]
         self.register_buffer("rate", None if mv_rate is None else torch.tensor(rates, dtype=torch.float64))
 
@@ -111,28 +122,26 @@ class ControlLaw(nn.Module, ABC):
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with numbers from ``params`` and models by part name; raises LawError.
 
-        ``plant`` is for laws that are tuned in simulation; a law from data alone ignores it. A law that needs
-        a simulator, or its equations, and has none raises PlantError.
+        ``plant`` is for laws that are tuned in simulation; a law from data alone ignores it. PlantError: the
+        law needs a simulator or its equations, and there are none.
         """
 
     @abstractmethod
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step."""
 
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
-        """Raise LawError where ``design`` would refuse the plant; without training, so ``models`` may lack parts."""
+        """Raise LawError if ``design`` would refuse the plant. No training is run; ``models`` may lack parts."""
 
     def analysis(self, plant: Simulator | None) -> Analysis:
-        """What the law says of itself beside its closed loops over ``plant``; nothing, unless it has a theory."""
+        """The law's results without closed-loop tests on ``plant``; empty by default."""
         return Analysis()
 
     def limited(self, mv: Tensor, mv_applied: Tensor) -> Tensor:
-        """The MV within the actuator's range and, where a rate is set, within reach of the applied one.
+        """The MV limited to ``rate`` around the applied MV, if a rate is set, and then to the range.
 
-        The range comes last: an applied MV outside it (an operator's doing) is led back at once.
+        The range comes last, so an applied MV outside it (set by an operator) returns to it at once.
         """
         if self.rate is not None:
             mv = torch.minimum(torch.maximum(mv, mv_applied - self.rate), mv_applied + self.rate)

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from pipeline.laws.base import hold_numbers
+
 LONGEST = 1e4  # periods; a time as long says only that there is no such action
 NEXT_TO_NOTHING = 1e-8  # share of its bound at which a gain counts as none
 
@@ -27,18 +29,9 @@ def gain_update(
     bound if the left side at its own breakpoint is still below the right one. So the active set
     takes no iteration, and multiplied by q_i it takes no division: zero errors are no special case.
 
-    Parameters
-    ----------
-    z_prev : (..., 3)
-        Last gains, within their bounds.
-    rho : (..., 3)
-        What each gain is multiplied with to give the move.
-    v, c : (..., 1)
-        Wanted move; curvature c >= 0 of the objective along it.
-    lam, w : (1,), (3,)
-        Stiffness lambda > 0, and how easily each gain gives way, w > 0.
-    lo, hi : (3,)
-        Bounds.
+    ``z_prev`` (..., 3): the last gains, within their bounds ``lo`` and ``hi`` (3,). ``rho`` (..., 3): what each gain
+    is multiplied with to give the move. ``v``, ``c`` (..., 1): the wanted move, and the curvature c >= 0 of the
+    objective along it. ``lam`` (1,): stiffness lambda > 0; ``w`` (3,) > 0: how easily each gain gives way.
 
     Source: [chen2004, eqs 20-26]. The matrix of eq. 22 has rank one and is never
     inverted; the stiffness, not in the paper, makes the optimum unique.
@@ -58,21 +51,12 @@ def gain_update(
 
 
 class PidForm(nn.Module):
-    """kc [mv/pv], tau_i and tau_d [s], shape (..., 3), of gains z = (kc, Ki, Kd) >= 0 of one unit of move.
+    """kc [mv/pv], tau_i and tau_d [s], shape (..., 3), of gains z = (kc, Ki, Kd) >= 0 of one ``unit`` of move [mv].
 
         tau_i = kc dt/Ki,   tau_d = Kd dt/kc
 
-    A gain that is nothing beside its bound counts as none, and no time is longer than LONGEST
+    A gain that is nothing beside its bound in ``largest`` counts as none, and no time is longer than LONGEST
     periods: what is divided by next to nothing is rounding, and has no meaning either.
-
-    Parameters
-    ----------
-    period_s
-        dt [s].
-    unit
-        One unit of move [mv], with its sign.
-    largest
-        Upper bounds of the gains.
 
     Source: [chen2004, eq. 4]; eq. 25 there is the inverse of another form, without the
     trapezoidal integral.
@@ -85,12 +69,12 @@ class PidForm(nn.Module):
     def __init__(self, period_s: float, unit: float, largest: Sequence[float]) -> None:
         super().__init__()
         h = period_s
-        for name, values in (
-            ("forms", [[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]]),
-            ("least", [NEXT_TO_NOTHING * largest[1], NEXT_TO_NOTHING * largest[0]]),
-            ("longest", [LONGEST * h]),
-        ):
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
+        hold_numbers(
+            self,
+            forms=[[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]],
+            least=[NEXT_TO_NOTHING * largest[1], NEXT_TO_NOTHING * largest[0]],
+            longest=LONGEST * h,
+        )
 
     def forward(self, z: Tensor) -> Tensor:
         """Shape (..., 3), of gains (..., 3)."""

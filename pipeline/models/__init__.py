@@ -1,4 +1,4 @@
-"""Models by kind: adding one is a file in this folder (the model and its Part) and a line here."""
+"""Models by kind: adding one is a file in a family's folder (the model and its Part) and a line here."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pipeline.models.lagged.arx import ArxPart
 from pipeline.models.lagged.nnarx_part import NnarxPart
 from pipeline.models.local.linearized import LinearizedPart
 from pipeline.models.local.local_models_part import LocalModelsPart
-from pipeline.models.part import Learnt, Part
-from pipeline.models.state_space.state_space_part import StateSpacePart
+from pipeline.models.part import Learnt, Part, Source
+from pipeline.models.state_space.state_space import StateSpacePart
 from pipeline.models.static.leverage_domain import DomainPart
 from pipeline.models.static.rbf_part import RbfPart
 from pipeline.models.training.network_parts import MlpPart
@@ -26,4 +26,4 @@ MODELS: dict[str, type[Part]] = {
     HybridFuzzyPart.model.kind: HybridFuzzyPart,
 }
 
-__all__ = ["MODELS", "Learnt", "Model", "Part", "load_model"]
+__all__ = ["MODELS", "Learnt", "Model", "Part", "Source", "load_model"]

@@ -1,15 +1,14 @@
-"""How params.yaml asks for the models of a set, and how each is learnt from a record."""
+"""The parts of a model set in params.yaml, and their training."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pipeline.config.params import choose
 from pipeline.errors import ModelError
@@ -17,20 +16,44 @@ from pipeline.metrics import per_region, r2, rmse
 from pipeline.models.base import Model
 from pipeline.models.training.regressors import Pairs, forward_pairs, inverse_pairs
 from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
 
 if TYPE_CHECKING:
     from pipeline.models.static.sweep import SweepResult
-
-Array = NDArray[np.float64]
 Regions = Mapping[str, tuple[float, float]]
-ROWS = 8192  # predicted at a time
+ROWS = 8192  # predicted in one call
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The data that a part is trained on.
+
+    ``record`` is None for a set that is made from equations. ``regions`` are ranges of the controlled variable, for
+    the figures only. ``plant`` is for parts that are made from equations or compared with the plant.
+    """
+
+    record: Record | None
+    signals: Signals
+    regions: Regions = field(default_factory=dict)
+    seed: int = 0
+    plant: Simulator | None = None
+
+    def data(self, kind: str) -> Record:
+        """The record, for a part of this kind; ModelError without one."""
+        if self.record is None:
+            raise ModelError(f"a part of kind {kind!r} learns from a record; point `data:` of its set at one")
+        return self.record
+
+    def pv_index(self, name: str | None) -> int:
+        """Index of a process variable, None for the controlled variable; ParamsError for an unknown name."""
+        names = {s.name: i for i, s in enumerate(self.signals.pv)}
+        return 0 if name is None else choose(names, name, "process variable", "target")
 
 
 @dataclass(frozen=True)
 class Learnt:
-    """A trained part: the model, how well it does, and what its report shows beside the figures."""
+    """A trained part: the model, its figures, and the data for its pictures."""
 
     model: Model
     metrics: dict[str, Any]
@@ -45,23 +68,17 @@ class Part(ABC):
     model: ClassVar[type[Model]]
 
     @abstractmethod
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
-        """The trained model; ``regions`` (ranges of the controlled variable) are for the figures only.
-
-        ``plant`` is for parts that are made from equations, or compared with the plant itself; PlantError where one
-        needs it and has none. The others know the signals alone.
-        """
+    def learn(self, source: Source) -> Learnt:
+        """The trained model. Raises ModelError without the needed data, PlantError without the equations."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StaticPart(Part):
     """A part that learns a static map from pairs of a record.
 
-    ``task`` inverse: [pv(k), cv(k+h)] -> mv(k); forward: [pv(k), mv(k)] -> target(k+h). ``horizon`` h
-    in periods; ``target`` a PV's name, None for the controlled variable; ``train_fraction`` of the pairs
-    train, split in ``time`` or at ``random``.
+    ``task`` inverse: [pv(k), cv(k+h)] -> mv(k); forward: [pv(k), mv(k)] -> target(k+h). ``horizon``: h
+    in periods. ``target``: a PV's name, None for the controlled variable. ``train_fraction``: share of the
+    pairs for training; ``split`` takes them in ``time`` order or at ``random``.
     """
 
     task: Literal["inverse", "forward"]
@@ -70,48 +87,45 @@ class StaticPart(Part):
     train_fraction: float = 0.7
     split: Literal["time", "random"] = "time"
 
-    def pairs(self, record: Record | None, signals: Signals) -> Pairs:
+    def pairs(self, source: Source) -> Pairs:
         """All pairs of the record; raises ParamsError for an unknown target, ModelError without a record."""
-        if record is None:
-            raise ModelError(
-                f"a part of kind {self.model.kind!r} learns from a record; point `data:` of its set at one"
-            )
+        record = source.data(self.model.kind)
         if self.task == "inverse":
             return inverse_pairs(record, self.horizon)
-        names = {s.name: i for i, s in enumerate(signals.pv)}
-        target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
-        return forward_pairs(record, self.horizon, target)
+        return forward_pairs(record, self.horizon, source.pv_index(self.target))
 
     def limits(self, signals: Signals) -> tuple[float, float] | None:
-        """Range of an inverse's output, the MV's; a forward model's is not limited."""
+        """The MV's range, which limits the output of an inverse model; None for a forward model."""
         mv = signals.mv[0]
         return (mv.low, mv.high) if self.task == "inverse" else None
-
-    def unit(self, signals: Signals) -> str:
-        """Unit of the output."""
-        if self.task == "inverse":
-            return signals.mv[0].unit
-        return next((s.unit for s in signals.pv if s.name == self.target), signals.pv[0].unit)
-
-    def scored(self, model: Model, pairs: Pairs, signals: Signals, regions: Regions) -> dict[str, Any]:
-        """RMSE and R2 over some pairs, overall and by the region of cv(k), predictions limited as in use."""
-        predicted = self.limited(predict(model, pairs.x), signals)
-        cv = pairs.x[:, 0]
-        counts = per_region(lambda a, _: float(len(a)), pairs.y, predicted, cv, regions)
-        errors = per_region(rmse, pairs.y, predicted, cv, regions)
-        return {
-            "rmse": rmse(pairs.y, predicted),
-            "r2": r2(pairs.y, predicted),
-            "regions": {name: {"rmse": errors[name], "n": int(counts[name])} for name in errors},
-        }
 
     def limited(self, predicted: Array, signals: Signals) -> Array:
         """Predictions within the output's range."""
         limits = self.limits(signals)
         return predicted if limits is None else predicted.clip(*limits)
 
+    def scored(self, model: Model, pairs: Pairs, source: Source) -> dict[str, Any]:
+        """``accuracy`` over the pairs, with limited predictions, and the number of pairs in each region."""
+        predicted = self.limited(predict(model, pairs.x), source.signals)
+        cv = pairs.x[:, 0]
+        figures = accuracy(pairs.y, predicted, cv, source.regions)
+        counts = per_region(lambda a, _: float(len(a)), pairs.y, predicted, cv, source.regions)
+        for name, count in counts.items():
+            figures["regions"][name]["n"] = int(count)
+        return figures
+
 
 def predict(model: Model, x: Array) -> Array:
     """Outputs (N, n_out) of a model for inputs (N, n_in), a chunk of rows at a time."""
     with torch.no_grad():
         return np.concatenate([model(rows).numpy() for rows in torch.split(torch.from_numpy(x), ROWS)])
+
+
+def accuracy(actual: Array, predicted: Array, cv: Array, regions: Regions) -> dict[str, Any]:
+    """RMSE [unit of the output] and R2 of predictions (N, ...), and the RMSE by the region of cv (N,)."""
+    errors = per_region(rmse, actual, predicted, cv, regions)
+    return {
+        "rmse": rmse(actual, predicted),
+        "r2": r2(actual, predicted),
+        "regions": {name: {"rmse": error} for name, error in errors.items()},
+    }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import hashlib
 import inspect
 import json
 import textwrap
@@ -18,6 +17,7 @@ from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import together
+from pipeline.files import digest
 from pipeline.plants.equations import EquationPlant, equations
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
@@ -30,7 +30,7 @@ DEFAULTS: dict[str, Any] = {
     "limits": {},
     "effort": json.loads(json.dumps(asdict(Effort()))),
 }
-"""What a file means that does not say."""
+"""The values of entries that a file leaves out."""
 
 
 def bounds_path(case: Case) -> Path:
@@ -52,8 +52,8 @@ def kinds(case: Case) -> tuple[str, ...]:
 
 def problem(case: Case) -> dict[str, Any]:
     """What the bounds of a whole case depend on, beside the scenarios: stored, and compared with what is stored."""
-    found = {key: getattr(case, key) for key in DEFAULTS} | {"limits": dict(case.limits), "effort": asdict(case.effort)}
-    as_read: dict[str, Any] = json.loads(json.dumps(found))
+    aim = {key: getattr(case, key) for key in DEFAULTS} | {"limits": dict(case.limits), "effort": asdict(case.effort)}
+    as_read: dict[str, Any] = json.loads(json.dumps(aim))
     return {"plant": plant_digest(equations(case.plant, f"a bound of case {case.name!r}")), **as_read}
 
 
@@ -80,18 +80,18 @@ def plant_digest(plant: EquationPlant) -> str:
         what.append(_probe(plant))
     if any(s.values is not None for s in plant.mv_signals):
         what.append(_probe(plant.relaxed()))
-    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+    return digest(what)
 
 
 def _probe(plant: EquationPlant) -> list[str]:
     signals = (*plant.state_signals, *plant.mv_signals)
     low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
-    found = []
+    digits = []
     for fractions in np.random.default_rng(0).uniform(0.1, 0.9, (7, len(signals))):
         x, mv = np.split(low + fractions * (high - low), [len(plant.state_signals)])
         values = (plant.measure(x), plant.rate(x, mv, plant.dv_nominal, plant.parameters()))
-        found += [f"{v:.6g}" for v in np.concatenate([np.array(v).ravel() for v in values])]
-    return found
+        digits += [f"{v:.6g}" for v in np.concatenate([np.array(v).ravel() for v in values])]
+    return digits
 
 
 def read_stored(path: Path) -> dict[str, Any]:
@@ -101,14 +101,6 @@ def read_stored(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return stored if isinstance(stored, dict) and stored.get("schema") == SCHEMA else {}
-
-
-def load_bounds(case: Case, path: Path | None = None) -> Bounds:
-    """All bounds of a case, as ``stored_bounds`` gives them; raises LawError also where figures are missing."""
-    found, missing = stored_bounds(case, path)
-    if missing:
-        raise LawError(missing[0])
-    return found
 
 
 def stored_bounds(case: Case, path: Path | None = None) -> tuple[Bounds, list[str]]:
@@ -132,7 +124,7 @@ def stored_bounds(case: Case, path: Path | None = None) -> tuple[Bounds, list[st
         if stored.get(key, default) != current[key]:
             was = f"{key} {stored.get(key, default)!r}, and the case has {current[key]!r}"
             raise LawError(f"the bounds in {path} were computed for the {was}; {remedy}")
-    found: Bounds = {}
+    bounds: Bounds = {}
     absent: list[str] = []
     for name, scenarios in case.scenarios().items():
         for kind in kinds(case) if bounded(case, scenarios) else ():
@@ -143,7 +135,7 @@ def stored_bounds(case: Case, path: Path | None = None) -> tuple[Bounds, list[st
                 absent.append(f"{path} has no {kind} figures of scenario {name!r}{which} as it is now; {remedy}")
                 continue
             key = name + NOISE_SUFFIX if kind == "nmpc_noise" else name
-            found.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows, case.metrics)
-        if "nmpc" in found.get(name, {}):
-            found.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(found[name]["nmpc"])})
-    return found, absent
+            bounds.setdefault(key, {})[kind.removesuffix("_noise")] = together(rows, case.metrics)
+        if "nmpc" in bounds.get(name, {}):
+            bounds.setdefault(name + NOISE_SUFFIX, {"nmpc": dict(bounds[name]["nmpc"])})
+    return bounds, absent

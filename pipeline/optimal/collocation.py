@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.plants.equations import EquationPlant
+from pipeline.plants.equations import EquationPlant, rk4_step
+from pipeline.plants.simulator import Array
 from serving.manifest import Signal
-
-Array = NDArray[np.float64]
 
 
 def scaling(signals: tuple[Signal, ...]) -> tuple[Array, Array]:
@@ -57,10 +55,6 @@ def trace(plant: EquationPlant, elements: int, degree: int) -> ca.Function:
         substeps = int(np.ceil(span * plant.substeps))
         h = span * period / substeps
         for _ in range(substeps):
-            k1 = plant.rate(state, mv, plant.dv_nominal, p)
-            k2 = plant.rate(state + h / 2 * k1, mv, plant.dv_nominal, p)
-            k3 = plant.rate(state + h / 2 * k2, mv, plant.dv_nominal, p)
-            k4 = plant.rate(state + h * k3, mv, plant.dv_nominal, p)
-            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            state = rk4_step(lambda at: plant.rate(at, mv, plant.dv_nominal, p), state, h)
         found.append(state)
     return ca.Function("trace", [x, mv, p], [ca.horzcat(*found)])

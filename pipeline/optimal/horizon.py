@@ -8,14 +8,12 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.optimal.collocation import collocation, scaling, trace
 from pipeline.plants.equations import EquationPlant
-
-Array = NDArray[np.float64]
+from pipeline.plants.simulator import Array
 
 # The plan is never allowed to leave the states' ranges by more than this fraction of them.
 MARGIN = 0.1
@@ -32,7 +30,6 @@ class Plan:
     x: Array  # (n + 1, n_x) states at the samples, the first one given
     cost: float  # of the controlled variables' errors alone, absolute or squared, in fractions of their ranges
     solved: bool
-    iterations: int
     values: Array  # all variables of the problem, (per period, n)
     multipliers: tuple[Array, Array] | None  # of bounds and constraints
 
@@ -66,9 +63,6 @@ class Horizon:
         limits: Mapping[str, tuple[float, float]] | None = None,
         elements: int = 3,
         degree: int = 3,
-        move_weight: float | None = None,
-        tolerance: float = 1e-7,
-        max_iterations: int = 150,
     ) -> None:
         if metric.floor is None:
             able = ", ".join(name for name, known in METRICS.items() if known.floor is not None)
@@ -99,13 +93,12 @@ class Horizon:
         defects = collocation(plant, elements, degree).map(n)(starts, z, u, p)
         error = sp - self._controlled().map(n)(ends)
         moves = u[:, 1:] - u[:, :-1]
-        weight = MOVE_WEIGHT[metric.squared] if move_weight is None else move_weight
         cost = ca.sumsqr(s) if self._squared else ca.sum1(ca.vec(s))
         binds = [ca.vec(s - error)] if self._squared else [ca.vec(s - error), ca.vec(s + error)]
         problem: Any = {
             "x": w,
             "p": ca.vertcat(x0, ca.vec(sp), ca.vec(p)),
-            "f": cost + weight * ca.sumsqr(moves),
+            "f": cost + MOVE_WEIGHT[metric.squared] * ca.sumsqr(moves),
             "g": ca.vertcat(ca.vec(defects), *binds),
         }
         options: Any = {
@@ -114,8 +107,8 @@ class Horizon:
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.linear_solver": "mumps",
-            "ipopt.tol": tolerance,
-            "ipopt.max_iter": max_iterations,
+            "ipopt.tol": 1e-7,
+            "ipopt.max_iter": 150,
             "ipopt.mu_init": 1e-5,
             "ipopt.warm_start_init_point": "yes",
             "ipopt.warm_start_bound_push": 1e-6,
@@ -123,6 +116,7 @@ class Horizon:
             "ipopt.warm_start_mult_bound_push": 1e-6,
         }
         self._solver = ca.nlpsol("horizon", "ipopt", problem, options)
+
         low, high = np.zeros((rows, n)), np.ones((rows, n))
         low[:n_z], high[:n_z] = -MARGIN, 1 + MARGIN
         self._limited: list[tuple[int, int]] = []  # a state, and where its value at sample 1 stands
@@ -157,7 +151,7 @@ class Horizon:
         ``x0`` (n_x,); set points ``sp`` (n, n_sp) at samples 1..n; plant parameters ``p`` (n, n_p)
         over periods 0..n-1.
 
-        Not being solved is told by the plan, not raised: the caller has an older plan to go on with.
+        A plan that was not solved says so (``solved``) and raises nothing: the caller has an older one to go on with.
         """
         scaled = (x0 - self._x_low) / self._x_span
         given = np.concatenate([scaled, (sp / self._cv_span).ravel(), p.ravel()])
@@ -169,11 +163,10 @@ class Horizon:
             arguments |= {"lbx": low, "ubx": high}
         if start.multipliers is not None:
             arguments |= {"lam_x0": start.multipliers[0], "lam_g0": start.multipliers[1]}
-        found = self._solver(**arguments)
-        stats = self._solver.stats()
-        values = np.array(found["x"]).reshape(self._rows, self.n, order="F")
-        multipliers = (np.array(found["lam_x"]), np.array(found["lam_g"]))
-        return self._plan(x0, sp, values, bool(stats["success"]), int(stats["iter_count"]), multipliers)
+        result, stats = self._solver(**arguments), self._solver.stats()
+        values = np.array(result["x"]).reshape(self._rows, self.n, order="F")
+        multipliers = (np.array(result["lam_x"]), np.array(result["lam_g"]))
+        return self._plan(x0, sp, values, bool(stats["success"]), multipliers)
 
     def _plan(
         self,
@@ -181,7 +174,6 @@ class Horizon:
         sp: Array,
         values: Array,
         solved: bool = False,
-        iterations: int = 0,
         multipliers: tuple[Array, Array] | None = None,
     ) -> Plan:
         n_z = self._n_x * self._points
@@ -190,7 +182,7 @@ class Horizon:
         cv = self.plant.measured(x[1:])[:, : self._n_cv]
         error = np.abs(sp - cv) / self._cv_span
         cost = float(np.sum(error**2 if self._squared else error))
-        return Plan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), iterations, values, multipliers)
+        return Plan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), values, multipliers)
 
     def _kept(self, x: Array, fraction: float, mv: Array, p: Array, step: Callable[..., Array]) -> float:
         """The fraction of the first MV's range nearest to ``fraction`` that keeps the limits over a period.
@@ -204,23 +196,14 @@ class Horizon:
             low, high = self._bounds["lbx"], self._bounds["ubx"]
             return all(low[end] <= after[state] <= high[end] for state, end in self._limited)
 
-        if keeps(fraction):
-            return fraction
-        for inside in (1.0, 0.0):
-            if keeps(inside):
-                outside = fraction
-                for _ in range(12):
-                    middle = 0.5 * (inside + outside)
-                    inside, outside = (middle, outside) if keeps(middle) else (inside, middle)
-                return inside
-        return fraction
+        end = None if keeps(fraction) else next((end for end in (1.0, 0.0) if keeps(end)), None)
+        return fraction if end is None else _halved(end, fraction, keeps)[0]
 
     def shifted(self, plan: Plan) -> Plan:
         """The rest of a plan, its last period repeated: where the next sample's solve starts."""
+        mv, x = (np.vstack([rows[1:], rows[-1:]]) for rows in (plan.mv, plan.x))
         values = np.hstack([plan.values[:, 1:], plan.values[:, -1:]])
-        x = np.vstack([plan.x[1:], plan.x[-1:]])
-        mv = np.vstack([plan.mv[1:], plan.mv[-1:]])
-        return Plan(mv, x, plan.cost, plan.solved, 0, values, plan.multipliers)
+        return Plan(mv, x, plan.cost, plan.solved, values, plan.multipliers)
 
     def rollout(
         self, x0: Array, sp: Array, p: Array, reach: int, step: Callable[..., Array], moves: Array | None = None
@@ -267,7 +250,12 @@ def _root(miss: Callable[[float], float]) -> float:
     at_low, at_high = miss(low), miss(high)
     if at_low * at_high > 0:
         return low if abs(at_low) < abs(at_high) else high
+    return 0.5 * sum(_halved(low, high, lambda middle: miss(middle) * at_low > 0))
+
+
+def _halved(one: float, other: float, like_one: Callable[[float], bool]) -> tuple[float, float]:
+    """Where ``like_one`` changes between two numbers, by bisection: a number on either side."""
     for _ in range(12):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if miss(middle) * at_low > 0 else (low, middle)
-    return 0.5 * (low + high)
+        middle = 0.5 * (one + other)
+        one, other = (middle, other) if like_one(middle) else (one, middle)
+    return one, other

@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
@@ -32,10 +31,10 @@ from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.optimal.horizon import Horizon, Plan
 from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import noise_draws
 
-Array = NDArray[np.float64]
 Score = Callable[[Scenario, Array, Array], dict[str, float]]
 """Figures of a closed loop, from the test, PVs (n, n_pv) and MVs (n, n_mv): ``Case.score``."""
 Limits = Mapping[str, tuple[float, float]]
@@ -102,11 +101,9 @@ class PerfectNmpc:
 
     def _follow(self, x: Array, rest: Plan, p: Array) -> bool:
         """Whether the rest of the last plan still stands: young, and neither state nor parameters surprise it."""
-        if self.age + 1 >= self._every or not rest.solved or self._parameters is None:
-            return False
-        if not np.array_equal(self._parameters, p):
-            return False
-        return bool(np.all(np.abs(x - rest.x[0]) <= CAME_TRUE * self._span))
+        young = self.age + 1 < self._every and rest.solved
+        expected = self._parameters is not None and np.array_equal(self._parameters, p)
+        return young and expected and bool(np.all(np.abs(x - rest.x[0]) <= CAME_TRUE * self._span))
 
 
 def search(
@@ -118,7 +115,7 @@ def search(
     reaches: Sequence[int] = DEFAULT.reaches,
     moves: Array | None = None,
 ) -> Plan:
-    """The best plan found from several rollouts; the best rollout itself where none was solved.
+    """The best plan from several rollouts; the best rollout itself where none was solved.
 
     ``moves`` (m, n_mv) are one more start: what another controller did over the first m periods.
     """
@@ -148,12 +145,12 @@ def run_nmpc(
     plant whose PVs are not its states.
     """
     plant = nmpc.plant
-    if noise_std is not None and not plant.measures_states:
+    if noise_std is None:
+        noise = np.zeros((scenario.samples, len(scenario.x0)))
+    elif plant.measures_states:
+        noise = noise_draws(plant, scenario.samples, noise_std, np.random.default_rng(seed))
+    else:
         raise PlantError(f"plant {plant.name!r} measures other things than its states; its NMPC cannot be given noise")
-    rng = np.random.default_rng(seed)
-    noise = np.zeros((scenario.samples, len(scenario.x0)))
-    if noise_std is not None:
-        noise = noise_draws(plant, scenario.samples, noise_std, rng)
     nmpc.reset()
     simulate, parameters = plant.stepper(), scenario.parameters(plant)
     known = parameters[np.maximum(np.arange(scenario.samples) - unforeseen, 0)]
@@ -167,8 +164,8 @@ def run_nmpc(
         if not nmpc.age:
             times.append(1e3 * (time.process_time() - begun))
         x = simulate(x, mv[-1], plant.dv_nominal, p)
-    found = _figures(plant, scenario, np.array(states), np.array(mv), score) | {"failures": float(nmpc.failures)}
-    return found | {f"step_ms_p{q}": float(np.percentile(times, q)) for q in (50, 99)}
+    figures = _figures(plant, scenario, np.array(states), np.array(mv), score) | {"failures": float(nmpc.failures)}
+    return figures | {f"step_ms_p{q}": float(np.percentile(times, q)) for q in (50, 99)}
 
 
 def run_offline(
@@ -183,11 +180,9 @@ def run_offline(
 ) -> dict[str, float]:
     """Closed-loop metrics of the offline optimum, and how many of its plans were not solved.
 
-    ``moves`` (n, n_mv) are a controller's over the same test, such as ``PerfectNmpc.moves``: each plan is
-    also searched from there, so that it need not be worse than what is known to be feasible.
-
-    There is one plan for every stretch of equal set points, or a single one for a ``recipe``,
-    which ends with its last sample: nothing comes after it that it must be at rest for.
+    There is one plan for every stretch of equal set points, or a single one for a ``recipe``, which ends with
+    its last sample. Each is also searched from ``moves`` (n, n_mv), a controller's over the same test such as
+    ``PerfectNmpc.moves``, so that it need not be worse than what is known to be feasible.
     """
     course = _course(scenario, recipe)
     edges = [0] if recipe else [0, *np.flatnonzero(np.any(np.diff(scenario.sp, axis=0) != 0, axis=1)) + 1]

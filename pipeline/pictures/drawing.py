@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ from matplotlib.legend import Legend
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 
+from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import Array
 from pipeline.evaluation.metric import NO_UNIT
 from pipeline.files import write_bytes
+from serving.manifest import Signal
 
 BASELINE_COLOUR = "#7f7f7f"
 PALETTE = ("#d55e00", "#0072b2", "#cc79a7", "#009e73", "#56b4e9", "#e69f00", "#8c564b", "#332288")
@@ -50,6 +53,19 @@ LEGEND_GAP = 0.03  # of the axes' height, between a legend and the curves
 LONGEST_IN_S, LONGEST_IN_MIN = 3000.0, 30_000.0  # [s] of a picture whose axis counts seconds, minutes
 
 
+Draw = Callable[[Evidence], Canvas]
+"""Draws what was measured; raises NotMeasuredError where that is missing, and there is no picture."""
+
+
+@dataclass(frozen=True, slots=True)
+class CasePicture:
+    """A picture that only one case has: figures/<name>.png, below its title."""
+
+    name: str
+    title: str
+    draw: Draw
+
+
 def colour_of(law: str, laws: Iterable[str], baseline: str) -> str:
     """The law's colour among all of its case, whose ``baseline`` is grey."""
     if law == baseline:
@@ -78,6 +94,11 @@ def symbol(name: str) -> str:
 def axis_label(words: str, unit: str) -> str:
     """``words [unit]``; a number without a unit stands alone."""
     return words if unit in NO_UNIT else f"{words} [{unit.replace('deg', '°')}]"
+
+
+def signal_label(signal: Signal) -> str:
+    """A signal as a formula, with its unit."""
+    return axis_label(symbol(signal.name), signal.unit)
 
 
 def ratio_unit(top: str, bottom: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.evaluation.case import Case, Curve, Figure
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import Array, Loop
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from pipeline.evaluation.law_evidence import BASE, Array, Loop
 from pipeline.evaluation.metric import Metric
 from pipeline.pictures.drawing import (
     REFERENCE,
@@ -27,10 +28,11 @@ from pipeline.pictures.drawing import (
     legend_below,
     ratio_unit,
     scale,
-    symbol,
+    signal_label,
     time_axis,
 )
-from pipeline.pictures.words import law_label, number, ratio
+from pipeline.pictures.numbers import number, ratio
+from pipeline.pictures.words import curve_label, law_name
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from serving.manifest import Signal
 
@@ -89,10 +91,10 @@ class LoopPanels:
         self.error: Axes | None = panels[1] if late_from else None
         self.bottom = panels[-1]
         self.cv.set_title(title)
-        self.cv.set_ylabel(axis_label(symbol(cv.name), cv.unit))
+        self.cv.set_ylabel(signal_label(cv))
         for (i, owner), axes in self.mvs.items():
             mv = self.signals[i]
-            axes.set_ylabel(axis_label(symbol(mv.name), mv.unit))
+            axes.set_ylabel(signal_label(mv))
             if owner:
                 axes.set_title(owner, loc="right", fontsize="small", fontweight="normal", pad=2.0)
             if mv.values is not None:
@@ -208,73 +210,63 @@ def first(values: Array) -> Array:
     return values if values.ndim == 1 else values[:, 0]
 
 
-def curves_and_loops(evidence: Evidence, figure: Figure, curves: Sequence[Curve]) -> list[tuple[Curve, Loop]]:
-    """The curves that have a trajectory."""
-    found = [(c, evidence.loop(c, figure.scenario or "")) for c in curves]
-    return [(c, loop) for c, loop in found if loop is not None]
-
-
-def colours(evidence: Evidence, figure: Figure) -> dict[int, str]:
-    """Colour of each curve by its place: the law's, or shades where several settings of one law are shown."""
-    laws = [c.law for c in figure.curves]
+def colours(evidence: Evidence, curves: Sequence[Curve]) -> list[str]:
+    """Colour of each curve: the law's, or shades where several settings of one law are shown."""
+    laws = [c.law for c in curves]
     if len(set(laws)) < len(laws):
-        return {i: SHADES[i % len(SHADES)] for i in range(len(laws))}
-    return {i: colour_of(law, evidence.laws, evidence.case.baseline) for i, law in enumerate(laws)}
+        return [SHADES[i % len(SHADES)] for i in range(len(laws))]
+    return [colour_of(law, evidence.laws, evidence.case.baseline) for law in laws]
 
 
-def loops_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
+def loops_picture(evidence: Evidence, figure: Figure) -> Canvas:
     """A figure of the paper: its curves, and our best controller with them."""
-    curves: Sequence[Curve] = figure.curves
-    best = None if evidence.best is None else Curve(evidence.best)
-    if best is not None and not any(_is_shipped(evidence, c) for c in curves if c.law == best.law):
-        curves = (*curves, best)
-    found = curves_and_loops(evidence, figure, curves)
-    if not found:
-        return None
-    late, reference = evidence.late_from(figure.scenario or ""), reference_of(evidence, figure.scenario or "")
-    own = colours(evidence, figure)
-    labels = [_label(curve) + (" (ours, best)" if curve is best else "") for curve, _ in found]
+    scenario, best = figure.scenario or "", evidence.best
+    drawn = {
+        curve_label(evidence, curve): (curve, colour)
+        for curve, colour in zip(figure.curves, colours(evidence, figure.curves), strict=True)
+    }
+    shipped = (c.law for c in figure.curves if c.law == best and evidence.laws[c.law].form_of(c.setting) == BASE)
+    if best is not None and best not in shipped:
+        drawn[f"{law_name(best)} (ours, best)"] = Curve(best), "black"
     # The paper's curves lie in front: the figure is about them.
-    loops = {label: loop for label, (_, loop) in zip(labels, found, strict=True)}
+    loops = {label: loop for label, (c, _) in drawn.items() if (loop := evidence.loop(c, scenario)) is not None}
+    if not loops:
+        raise NotMeasuredError
+    late, reference = evidence.late_from(scenario), reference_of(evidence, scenario)
     panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", loops, late, reference)
-    for label, (curve, loop) in zip(labels, found, strict=True):
-        panels.add(loop, label, "black" if curve is best else own[curves.index(curve)])
-    return panels.finish(found[0][1])
+    for label, loop in loops.items():
+        panels.add(loop, label, drawn[label][1])
+    return panels.finish(next(iter(loops.values())))
 
 
-def _is_shipped(evidence: Evidence, curve: Curve) -> bool:
-    return evidence.laws[curve.law].variant_of(curve.setting) == ""
-
-
-def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
+def info_picture(evidence: Evidence, figure: Figure) -> Canvas:
     """What the controllers of a figure say of themselves over time, a panel for each entry of info."""
-    found = []
-    for curve, loop in curves_and_loops(evidence, figure, figure.curves):
-        names = evidence.laws[curve.law].info(curve.setting)
-        if "info" in loop and set(figure.info) <= set(names):
-            columns = {name: loop["info"][:, names.index(name)] for name in figure.info}
-            period_s = evidence.case.plant.period_s
-            found.append((curve, loop, {name: finite(v, name, period_s) for name, v in columns.items()}))
+    found: dict[str, tuple[str, Loop, dict[str, Array]]] = {}
+    period_s = evidence.case.plant.period_s
+    for curve, colour in zip(figure.curves, colours(evidence, figure.curves), strict=True):
+        with suppress(NotMeasuredError):
+            loop, info = evidence.info(curve, figure.scenario or "", *figure.info)
+            columns = {name: finite(values, name, period_s) for name, values in info.items()}
+            found[curve_label(evidence, curve)] = colour, loop, columns
     if not found:
-        return None
+        raise NotMeasuredError
     count = len(figure.info)
     canvas = Canvas(figsize=(SIZE[0], 1.0 + 1.7 * count), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(count, 1, sharex=True)))
-    own = colours(evidence, figure)
-    for curve, loop, values in found:
+    for label, (colour, loop, columns) in found.items():
         time, words = time_axis(loop["time_s"])
-        colour = own[figure.curves.index(curve)]
         for axes, name in zip(panels, figure.info, strict=True):
-            axes.step(time, values[name], where="post", color=colour, linewidth=1.3, label=_label(curve))
+            axes.step(time, columns[name], where="post", color=colour, linewidth=1.3, label=label)
         panels[-1].set_xlabel(words)
-    gaps = any(np.isnan(v).any() for _, _, values in found for v in values.values())
+    first_label, (_, first_loop, _) = next(iter(found.items()))
+    gaps = any(np.isnan(v).any() for *_, columns in found.values() for v in columns.values())
     for axes, name in zip(panels, figure.info, strict=True):
         axes.set_ylabel(info_label(evidence.case, name))
-        shown = np.concatenate([values[name] for _, _, values in found])
+        shown = np.concatenate([columns[name] for *_, columns in found.values()])
         if name in SCALES and over_orders(shown):
             scale(axes.yaxis, shown)
             gaps = gaps or bool((shown <= 0).any())
-        for at in moves(found[0][1]):
+        for at in moves(first_loop):
             axes.axvline(at, color="#b0b0b0", linewidth=0.8, linestyle=":", zorder=1)
         axes.margins(x=0.01)
     canvas.align_ylabels(panels)
@@ -283,17 +275,13 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas | None:
         handles, labels = panels[0].get_legend_handles_labels()
         legend_below(canvas, handles, labels)
     else:
-        words = _label(found[0][0]) + ("; gaps: no such action" if gaps else "")
+        words = first_label + ("; gaps: no such action" if gaps else "")
         beside = panels[0].set_title(words, loc="right", fontweight="normal", fontsize="medium")
         canvas.draw_without_rendering()
         if title.get_window_extent().x1 > beside.get_window_extent().x0:
             title.set_text(f"{title.get_text()}\n{words}")
             beside.set_text("")
     return canvas
-
-
-def _label(curve: Curve) -> str:
-    return law_label(curve.law, curve.setting)
 
 
 def moves(loop: Loop) -> Array:
@@ -336,28 +324,26 @@ def info_label(case: Case, name: str) -> str:
     return axis_label(*known.get(name, (name.replace("_", " "), "")))
 
 
-def overview_picture(evidence: Evidence, law: str) -> Canvas | None:
+def overview_picture(evidence: Evidence, law: str) -> Canvas:
     """A law beside the baseline on the first sequence of the test that weighs most, with the figures over all."""
-    scenario, metric = evidence.main_test, evidence.case.criterion
+    scenario, metric, baseline = evidence.main_test, evidence.case.criterion, evidence.case.baseline
     own = evidence.loop(Curve(law), scenario)
     if own is None:
-        return None
+        raise NotMeasuredError
     error, times = evidence.figure(law, scenario), evidence.ratio(law, scenario)
     beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
     late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{metric.short} {_error(error, metric)}{beside}{rest}"
-    drawn = {law_label(law, {}): (own, law)}
-    other = evidence.case.baseline
-    baseline = evidence.loop(Curve(other), scenario) if law != other else None
-    if baseline is not None:
-        error = evidence.figure(other, scenario)
-        drawn[f"{law_label(other, {})}, {metric.short} {_error(error, metric)}"] = (baseline, other)
-    late_from, reference = evidence.late_from(scenario), reference_of(evidence, scenario)
-    loops = {label: loop for label, (loop, _) in drawn.items()}
-    panels = LoopPanels(evidence.case, title, loops, late_from, reference)
-    for label, (loop, name) in drawn.items():
-        panels.add(loop, label, colour_of(name, evidence.laws, evidence.case.baseline))
+    loops, names = {law_name(law): own}, [law]
+    other = evidence.loop(Curve(baseline), scenario) if law != baseline else None
+    if other is not None:
+        error = evidence.figure(baseline, scenario)
+        loops[f"{law_name(baseline)}, {metric.short} {_error(error, metric)}"] = other
+        names.append(baseline)
+    panels = LoopPanels(evidence.case, title, loops, evidence.late_from(scenario), reference_of(evidence, scenario))
+    for (label, loop), name in zip(loops.items(), names, strict=True):
+        panels.add(loop, label, colour_of(name, evidence.laws, baseline))
     return panels.finish(own)
 
 

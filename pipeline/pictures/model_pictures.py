@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.evaluation.case import Case, Figure
+from pipeline.evaluation.case import Figure
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.law_evidence import Array
-from pipeline.pictures.drawing import PALETTE, SIZE, axis_label, scale, symbol, time_axis
-from pipeline.pictures.words import number
+from pipeline.pictures.drawing import PALETTE, SIZE, axis_label, scale, signal_label, time_axis
+from pipeline.pictures.numbers import number
 
 PREDICTED = PALETTE[1]
 ONE_STEP = {
@@ -26,13 +26,12 @@ BEYOND = 0.5
 """Of the measured range: how far beyond it a panel reaches; recursive models leave any."""
 
 
-def predictions_picture(case: Case, figure: Figure, models: Path) -> Canvas | None:
+def predictions_picture(evidence: Evidence, figure: Figure) -> Canvas:
     """The inverse model's MV beside the real one over some validation samples."""
-    arrays = next(
-        (a for p in sorted(models.glob("*/predictions.npz")) if {"actual", "predicted"} <= set(a := load(p))), None
-    )
+    sets = (evidence.predictions(name) for name in sorted(evidence.models))
+    arrays = next((a for a in sets if {"actual", "predicted"} <= set(a)), None)
     if arrays is None:
-        return None
+        raise NotMeasuredError
     time_s, actual, predicted = (np.ravel(arrays[k]) for k in ("time_s", "actual", "predicted"))
     canvas = Canvas(figsize=(SIZE[0], 4.2), layout="constrained")
     axes = canvas.subplots(1, 2, gridspec_kw={"width_ratios": (2.4, 1)})
@@ -42,8 +41,8 @@ def predictions_picture(case: Case, figure: Figure, models: Path) -> Canvas | No
     axes[0].plot(time_s[:n], predicted[:n], ".", color=PREDICTED, markersize=4, label="predicted")
     axes[0].set_title(f"Figure {figure.number}. {figure.title}")
     axes[0].set_xlabel("time [s]")
-    mv = case.plant_class.mv_signals[0]
-    axes[0].set_ylabel(axis_label(symbol(mv.name), mv.unit))
+    mv = evidence.case.plant_class.mv_signals[0]
+    axes[0].set_ylabel(signal_label(mv))
     canvas.legend(loc="outside lower center", ncols=2)
     axes[1].plot(actual, predicted, ".", color=PREDICTED, markersize=3)
     ends = [float(min(actual.min(), predicted.min())), float(max(actual.max(), predicted.max()))]
@@ -54,19 +53,12 @@ def predictions_picture(case: Case, figure: Figure, models: Path) -> Canvas | No
     return canvas
 
 
-def load(path: Path) -> dict[str, Array]:
-    """The arrays of a predictions.npz."""
-    with np.load(path, allow_pickle=False) as file:
-        return {key: np.asarray(file[key], float) for key in file.files}
-
-
-def one_step_picture(figure: Figure, models: Path) -> Canvas | None:
+def one_step_picture(evidence: Evidence, figure: Figure) -> Canvas:
     """One-step predictions beside the measurement: network and linearization above, recursive models below."""
-    path = models / (figure.model or "") / "predictions.npz"
-    arrays = load(path) if path.exists() else {}
+    arrays = evidence.predictions(figure.model or "")
     names = [key for key in arrays if key not in {"time_s", "measured"}]
     if "measured" not in arrays or not names:
-        return None
+        raise NotMeasuredError
     recursive = [key for key in names if key.startswith("recursive")]
     groups = [group for group in ([n for n in names if n not in recursive], recursive) if group]
     canvas = Canvas(figsize=(SIZE[0], 1.2 + 2.2 * len(groups)), layout="constrained")
@@ -103,25 +95,15 @@ def candidates_picture(table: Mapping[str, Any], unit: str) -> Canvas:
     at = np.arange(len(rows))
     canvas = Canvas(figsize=(SIZE[0], 3.8), layout="constrained")
     axes = canvas.subplots()
-    for key, words, mark, colour in (
-        ("free_run_rmse", "free run", "o", "#0072b2"),
-        ("rmse", "one step", "s", "#e69f00"),
-    ):
+    kinds = (("free_run_rmse", "free run", "o", "#0072b2"), ("rmse", "one step", "s", "#e69f00"))
+    for key, words, mark, colour in kinds:
         axes.plot(at, [row[key] for row in rows], mark, color=colour, markersize=5, label=words)
-    for i, row in enumerate(rows):
-        if row["chosen"]:
-            axes.plot(
-                i, row["free_run_rmse"], "o", color="#d55e00", fillstyle="none", markersize=12, markeredgewidth=1.6
-            )
-            axes.annotate(
-                f"chosen by {row['chosen']} of {table['seeds']}",
-                (i, row["free_run_rmse"]),
-                xytext=(0, 10),
-                textcoords="offset points",
-                ha="center",
-                fontsize="small",
-                color="#d55e00",
-            )
+    ring: Any = {"color": "#d55e00", "fillstyle": "none", "markersize": 12, "markeredgewidth": 1.6}
+    beside: Any = {"xytext": (0, 10), "textcoords": "offset points", "ha": "center", "fontsize": "small"}
+    for place in ((i, row["free_run_rmse"]) for i, row in enumerate(rows) if row["chosen"]):
+        words = f"chosen by {rows[place[0]]['chosen']} of {table['seeds']}"
+        axes.plot(*place, "o", **ring)
+        axes.annotate(words, place, color="#d55e00", **beside)
     scale(axes.yaxis, np.array([row[key] for row in rows for key in ("free_run_rmse", "rmse")]))
     axes.set_ylabel(axis_label("validation RMSE", unit))
     axes.set_xlabel("past outputs, past inputs | hidden units, by number of parameters")

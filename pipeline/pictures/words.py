@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-from pipeline.pictures.numbers import number, ratio
+from pipeline.evaluation.case import Curve, Setting
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.law_evidence import BASE
 from pipeline.simulation.scenario import NOISE_SUFFIX
-
-__all__ = [
-    "law_label",
-    "law_name",
-    "number",
-    "ratio",
-    "scenario_name",
-    "setting_text",
-]
 
 WORDS = frozenset({"two"})
 """Short words in the names of laws that are no abbreviations."""
@@ -27,15 +19,22 @@ def law_name(law: str) -> str:
     return " ".join(p.upper() if (len(p) <= 3 or len(parts) == 1) and p not in WORDS else p for p in parts)
 
 
-def law_label(law: str, setting: Mapping[str, Any]) -> str:
-    """A law with its setting: INCAD (r=2.5)."""
-    return law_name(law) + (f" ({setting_text(setting)})" if setting else "")
+def law_label(law: str, words: str) -> str:
+    """A law with its setting in words: INCAD (r=2.5)."""
+    return law_name(law) + (f" ({words})" if words else "")
 
 
-def setting_text(setting: Mapping[str, Any]) -> str:
-    """``r=2.5, correction=back_calculation``: how params.yaml names a variant."""
+def curve_label(evidence: Evidence, curve: Curve) -> str:
+    """A form of a law, by the variant's name in params.yaml; by its setting, where that is the shipped one or none."""
+    law = evidence.laws.get(curve.law)
+    form = None if law is None else law.form_of(curve.setting)
+    return law_label(curve.law, setting_text(curve.setting) if form in (None, BASE) else str(form))
+
+
+def setting_text(setting: Setting) -> str:
+    """``r=2.5, correction=back_calculation, adaptive``."""
     return ", ".join(
-        key if value is True else f"{key}={value:g}" if isinstance(value, int | float) else f"{key}={value}"
+        key if value is True else f"{key}={value}" if isinstance(value, str) else f"{key}={value:g}"
         for key, value in setting.items()
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -110,31 +110,12 @@ class EquationPlant(Simulator):
     @cached_property
     def transition(self) -> ca.Function:
         """CasADi function (x, mv, dv, p) -> x one period later; fixed-step RK4, ``substeps`` a period."""
-        return self.rk4(self.substeps)
-
-    def rk4(self, substeps: int) -> ca.Function:
-        """The transition over one period with another number of RK4 substeps."""
         x, mv, dv, p, _ = self._symbols
-        h = self.period_s / self.time_unit_s / substeps
+        h = self.period_s / self.time_unit_s / self.substeps
         state = x
-        for _ in range(substeps):
-            k1 = self.rate(state, mv, dv, p)
-            k2 = self.rate(state + h / 2 * k1, mv, dv, p)
-            k3 = self.rate(state + h / 2 * k2, mv, dv, p)
-            k4 = self.rate(state + h * k3, mv, dv, p)
-            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        for _ in range(self.substeps):
+            state = rk4_step(lambda at: self.rate(at, mv, dv, p), state, h)
         return ca.Function("transition", [x, mv, dv, p], [ca.densify(state)])
-
-    @cached_property
-    def exact_transition(self) -> ca.Function:
-        """The same map by CVODES at tight tolerances: the reference for ``transition``."""
-        x, mv, dv, p, dx = self._symbols
-        dae = {"x": x, "p": ca.vertcat(mv, dv, p), "ode": dx}
-        options = {"abstol": 1e-12, "reltol": 1e-10, "max_num_steps": 100_000}
-        span = self.period_s / self.time_unit_s
-        solver = ca.integrator("exact", "cvodes", dae, 0.0, span, options)
-        x0, m0, d0, p0 = (ca.MX.sym(n, s.numel()) for n, s in zip("xmdp", (x, mv, dv, p), strict=True))
-        return ca.Function("exact_transition", [x0, m0, d0, p0], [solver(x0=x0, p=ca.vertcat(m0, d0, p0))["xf"]])
 
     # ------------------------------------------------------------------ what a closed loop needs
     def step(self, x: Array, mv: Array, dv: Array, p: Array) -> Array:
@@ -152,11 +133,11 @@ class EquationPlant(Simulator):
         flat = x.reshape(-1, x.shape[-1])
         return np.array(self.measurement(flat.T)).T.reshape(*x.shape[:-1], -1)
 
-    def many(self, n: int, parameters: Mapping[str, float] | None = None) -> AdvanceMany:
+    def many(self, n: int) -> AdvanceMany:
         """``step`` of ``n`` runs side by side through one CasADi map; as in Simulator."""
         batch = self.transition.map(n)
         dv = np.tile(self.dv_nominal[:, None], (1, n))
-        p = np.tile(self.parameters(parameters)[:, None], (1, n))
+        p = np.tile(self.parameters()[:, None], (1, n))
 
         def advance(x: Array, mv: Array) -> Array:
             return np.array(batch(x.T, mv.T, dv, p)).T
@@ -233,8 +214,8 @@ class EquationPlant(Simulator):
             found.append(self.steady_state_at(float(cv))[0])
         return found
 
-    @cached_property
-    def _turning_points(self) -> list[tuple[Array, float]]:
+    def turning_points(self) -> list[tuple[Array, float]]:
+        """(x, mv) where two steady states meet: extrema of the steady MV over the CV, smallest CV first."""
         cvs, _, mvs = self.steady_curve
 
         def singular(cv: float) -> float:
@@ -247,22 +228,17 @@ class EquationPlant(Simulator):
             found.append((x, float(mv[0])))
         return found
 
-    def turning_points(self) -> list[tuple[Array, float]]:
-        """(x, mv) where two steady states meet: extrema of the steady MV over the CV, smallest CV first."""
-        return list(self._turning_points)
-
     @cached_property
     def regions(self) -> dict[str, tuple[float, float]]:
         """Operating regions by name: the range [low, high) of the CV in each, smallest CV first.
 
         The turning points bound them: within one region every steady state is of one branch.
         """
-        bounds = [float(self.measure(x)[0]) for x, _ in self._turning_points]
+        bounds = [float(self.measure(x)[0]) for x, _ in self.turning_points()]
         edges = [-np.inf, *bounds, np.inf]
-        n = len(edges) - 1
-        names = {1: ("all",), 2: ("low", "high"), 3: ("low", "middle", "high")}
-        ranges = pairwise(edges)
-        return dict(zip(names.get(n, tuple(f"region {i + 1}" for i in range(n))), ranges, strict=True))
+        numbered = tuple(f"region {i}" for i in range(1, len(edges)))
+        names = {1: ("all",), 2: ("low", "high"), 3: ("low", "middle", "high")}.get(len(numbered), numbered)
+        return dict(zip(names, pairwise(edges), strict=True))
 
     def linearize(self, x: Array, mv: Array) -> Linearization:
         """Linearization at a steady state (x, mv), per second."""
@@ -279,6 +255,15 @@ class EquationPlant(Simulator):
     def __getstate__(self) -> dict[str, Any]:
         # The cached CasADi functions are rebuilt in the process that unpickles the plant.
         return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+def rk4_step(rate: Callable[[Any], Any], x: Any, h: float) -> Any:
+    """The state a time h after x by the classic Runge-Kutta method of order four; ``rate(x)`` is dx/dt."""
+    k1 = rate(x)
+    k2 = rate(x + h / 2 * k1)
+    k3 = rate(x + h / 2 * k2)
+    k4 = rate(x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def equations(plant: Simulator | None, why: str) -> EquationPlant:

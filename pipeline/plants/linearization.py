@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-Array = NDArray[np.float64]
+from pipeline.plants.simulator import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

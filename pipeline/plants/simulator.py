@@ -101,9 +101,9 @@ class Simulator(ABC):
         """``step`` for a loop over many samples."""
         return self.step
 
-    def many(self, n: int, parameters: Mapping[str, float] | None = None) -> AdvanceMany:
-        """``step`` of ``n`` runs side by side, measured disturbances nominal, some parameters changed by name."""
-        dv, p = self.dv_nominal, self.parameters(parameters)
+    def many(self, n: int) -> AdvanceMany:
+        """``step`` of ``n`` runs side by side, measured disturbances and parameters its own."""
+        dv, p = self.dv_nominal, self.parameters()
 
         def advance(x: Array, mv: Array) -> Array:
             return np.array([self.step(a, b, dv, p) for a, b in zip(x, mv, strict=True)], dtype=np.float64)
@@ -121,12 +121,7 @@ class Simulator(ABC):
         """Operating regions by name: the range [low, high) of the CV in each, smallest CV first."""
         return {"all": (-np.inf, np.inf)}
 
-    @property
-    def region_names(self) -> tuple[str, ...]:
-        """Names of the operating regions, smallest CV first."""
-        return tuple(self.regions)
-
     def region(self, cv: Array) -> NDArray[np.int64]:
-        """Index into ``region_names`` of each controlled variable, same shape as ``cv``."""
+        """Number among ``regions`` of the region of each controlled variable, same shape as ``cv``."""
         bounds = [low for low, _ in self.regions.values()][1:]
         return np.asarray(np.searchsorted(bounds, np.asarray(cv, dtype=np.float64), side="right"), dtype=np.int64)

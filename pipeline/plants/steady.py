@@ -7,12 +7,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
+from pipeline.plants.simulator import Array
 from serving.manifest import Signal
-
-Array = NDArray[np.float64]
 
 GRID = 800  # points of the curve over the set point's range
 STARTS = 60  # random starts for the first point of the curve
@@ -38,7 +36,24 @@ class SteadyStates:
         x, mv = v[:-1], v[-1:]
         miss = (cv_of(x) - cv) / (self.range.high - self.range.low)
         balance = ca.vertcat(rate(x, mv) / self.span[:-1], miss)
-        self.balance = ca.Function("balance", [z, cv], [balance, ca.densify(ca.jacobian(balance, z))])
+        function = ca.Function("balance", [z, cv], [ca.densify(balance), ca.densify(ca.jacobian(balance, z))])
+        n = len(unknown)
+        self._z, self._cv = np.zeros(n), np.zeros(1)
+        self._miss, self._slope = np.zeros(n), np.zeros((n, n), order="F")
+        # CasADi's buffers skip its conversion of arguments, which takes far longer than these few sums.
+        self._buffer: Any  # CasADi's types have other signatures than its buffers
+        self._evaluate: Any
+        self._buffer, self._evaluate = function.buffer()
+        self._buffer.set_arg(0, self._z.data)
+        self._buffer.set_arg(1, self._cv.data)
+        self._buffer.set_res(0, self._miss.data)
+        self._buffer.set_res(1, self._slope.T.data)
+
+    def balance(self, z: Array, cv: float) -> tuple[Array, Array]:
+        """[dx/dt; cv(x) - cv] and its Jacobian by the scaled unknowns z, shapes (n,) and (n, n)."""
+        self._z[:], self._cv[0] = z, cv
+        self._evaluate()
+        return self._miss.copy(), self._slope.copy()
 
     def at(self, cv: float, guess: tuple[Array, float] | None) -> tuple[Array, float] | None:
         """(x, mv) of the steady state at ``cv`` found from a near one; None where none is found."""
@@ -74,9 +89,9 @@ class SteadyStates:
 
     def _newton(self, z: Array, cv: float) -> Array | None:
         for _ in range(12):
-            miss, slope = (np.array(o) for o in self.balance(z, cv))
+            miss, slope = self.balance(z, cv)
             try:
-                step = np.linalg.solve(slope, miss[:, 0])
+                step = np.linalg.solve(slope, miss)
             except np.linalg.LinAlgError:
                 return None
             z = z - step
@@ -88,13 +103,10 @@ class SteadyStates:
         return None
 
     def _robust(self, z: Array, cv: float) -> Array | None:
-        def miss(v: Array) -> Any:
-            return np.array(self.balance(v, cv)[0])[:, 0]
-
-        def slope(v: Array) -> Any:
-            return np.array(self.balance(v, cv)[1])
+        def balance(v: Array) -> Any:
+            return self.balance(v, cv)
 
         with np.errstate(all="ignore"):
-            found = optimize.root(miss, z, jac=slope, method="hybr", tol=1e-13)
-        solved = np.all(np.isfinite(found.x)) and np.max(np.abs(miss(found.x))) < 1e-9
+            found = optimize.root(balance, z, jac=True, method="hybr", tol=1e-13)
+        solved = np.all(np.isfinite(found.x)) and np.max(np.abs(self.balance(found.x, cv)[0])) < 1e-9
         return np.asarray(found.x) if solved else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -26,43 +25,26 @@ MV_TOLERANCE = 1e-9  # of a signal's span
 class Record:
     """Rows of one or more runs. Row k: the PVs measured at sample k, the MVs held over [k, k+1).
 
-    Attributes
-    ----------
-    period_s : float
-        Sampling period [s], the same in every run.
-    pv_signals, mv_signals, dv_signals : tuple of Signal
-        Process variables (controlled ones first), manipulated variables, measured disturbances.
-    run : array, shape (N,)
-        Number of the run that a row belongs to; rows of one run are contiguous.
-    time_s : array, shape (N,)
-        Time since the start of the row's run [s].
-    pv, mv, dv : array, shapes (N, n_pv), (N, n_mv), (N, n_dv)
-        Values in the units of their signals. The MV of a run's last row acts after the data end.
+    Values are in the units of their signals. The MV of a run's last row acts after the data end.
     """
 
-    period_s: float
-    pv_signals: tuple[Signal, ...]
-    mv_signals: tuple[Signal, ...]
-    dv_signals: tuple[Signal, ...]
-    run: NDArray[np.int64]
-    time_s: Array
-    pv: Array
-    mv: Array
-    dv: Array
+    period_s: float  # [s] sampling period, the same in every run
+    pv_signals: tuple[Signal, ...]  # process variables, controlled ones first
+    mv_signals: tuple[Signal, ...]  # manipulated variables
+    dv_signals: tuple[Signal, ...]  # measured disturbances
+    run: NDArray[np.int64]  # (N,) number of the run that a row belongs to; rows of one run are contiguous
+    time_s: Array  # (N,) [s] since the start of the row's run
+    pv: Array  # (N, n_pv)
+    mv: Array  # (N, n_mv)
+    dv: Array  # (N, n_dv)
 
     def __post_init__(self) -> None:
         n = len(self.run)
-        for name, values, signals in (
-            ("pv", self.pv, self.pv_signals),
-            ("mv", self.mv, self.mv_signals),
-            ("dv", self.dv, self.dv_signals),
-        ):
-            if values.shape != (n, len(signals)):
-                raise RecordError(
-                    f"record: {name} has shape {values.shape}; {n} rows and its signals need {(n, len(signals))}"
-                )
-        if self.time_s.shape != (n,):
-            raise RecordError(f"record: time_s has shape {self.time_s.shape}; {n} rows need {(n,)}")
+        wanted = {name: (n, len(getattr(self, f"{name}_signals"))) for name in ("pv", "mv", "dv")}
+        for name, shape in {**wanted, "time_s": (n,)}.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise RecordError(f"record: {name} has shape {found}; {n} rows and its signals need {shape}")
         broken = broken_run(self.run)
         if broken is not None:
             raise RecordError(
@@ -83,27 +65,6 @@ class Record:
         dv = np.tile(dv, (n, 1)) if dv.ndim == 1 else dv
         time_s = position_in_run(run).astype(np.float64) * signals.period_s
         return cls(signals.period_s, signals.pv, signals.mv, signals.dv, run, time_s, pv, mv, dv)
-
-    @classmethod
-    def joined(cls, records: Sequence[Record]) -> Self:
-        """One record with the runs of all, numbered anew. Raises RecordError where signals or periods differ."""
-        if not records:
-            raise RecordError("record: no records to join")
-        first = records[0]
-        runs, offset = [], 0
-        for i, r in enumerate(records):
-            if r.columns != first.columns or r.period_s != first.period_s:
-                raise RecordError(
-                    f"record: number {i} has other signals or another period than number 0; join records of one plant"
-                )
-            numbers = np.unique(r.run, return_inverse=True)[1] + offset
-            offset = int(numbers.max(initial=offset - 1)) + 1
-            runs.append(numbers.astype(np.int64))
-        time_s, pv, mv, dv = (
-            np.concatenate([getattr(r, name) for r in records]) for name in ("time_s", "pv", "mv", "dv")
-        )
-        signals = first.pv_signals, first.mv_signals, first.dv_signals
-        return cls(first.period_s, *signals, np.concatenate(runs), time_s, pv, mv, dv)
 
     def __len__(self) -> int:
         return len(self.run)
@@ -141,50 +102,35 @@ class Record:
         columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {"run": self.run, "time_s": self.time_s}
         columns |= dict(zip(self.columns, np.hstack([self.pv, self.mv, self.dv]).T, strict=True))
         signals = {"pv": self.pv_signals, "mv": self.mv_signals, "dv": self.dv_signals}
-        write_table(
-            path, columns, {"period_s": self.period_s} | {k: [s.to_dict() for s in v] for k, v in signals.items()}
-        )
+        described = {kind: [s.to_dict() for s in group] for kind, group in signals.items()}
+        write_table(path, columns, {"period_s": self.period_s, **described})
 
     @classmethod
-    def read(
-        cls,
-        path: Path,
-        *,
-        pv: tuple[Signal, ...],
-        mv: tuple[Signal, ...],
-        dv: tuple[Signal, ...] = (),
-        period_s: float,
-    ) -> Self:
+    def read(cls, path: Path, signals: Signals) -> Self:
         """The record in a Parquet or CSV file, checked against the plant's signals and period.
 
         Columns: ``time_s``, one ``NAME [unit]`` a signal, and ``run`` where the file holds more
         than one run; others are ignored. Time may start anywhere; in the record each run starts at 0.
 
-        Raises
-        ------
-        RecordError
-            Naming file, column and row: a missing column, another unit, a cell that is not a
-            finite number, time that is not uniform or not at ``period_s``, a run in pieces, a PV
-            mostly outside its range, an MV outside its own or one that never changes.
+        Raises RecordError, naming file, column and row, for a missing column, another unit, a cell that is not a
+        finite number, time that is not uniform or not at ``period_s``, a run in pieces, a PV mostly outside its
+        range, an MV outside its own or one that never changes.
         """
         table = read_table(Path(path))
         runs = table.numbers("run") if "run" in table.header else np.zeros(table.rows)
         check_runs(table, runs)
         time_s = table.numbers("time_s")
-        values = {s: table.numbers(table.find(s)) for s in (*pv, *mv, *dv)}
-        check_time(table, runs, time_s, period_s)
-        for signal in pv:
-            check_pv(table, signal, values[signal])
-        for signal in mv:
-            check_mv(table, signal, values[signal])
-
-        def block(signals: tuple[Signal, ...]) -> Array:
-            return np.column_stack([np.empty((table.rows, 0)), *(values[s] for s in signals)])
-
-        run = runs.astype(np.int64)
-        # On the exact grid, so that a file's rounded time stamps do not change the digest.
-        grid = position_in_run(run).astype(np.float64) * period_s
-        return cls(period_s, pv, mv, dv, run, grid, block(pv), block(mv), block(dv))
+        pv, mv, dv = (
+            np.column_stack([np.empty((table.rows, 0)), *(table.numbers(table.find(s)) for s in group)])
+            for group in (signals.pv, signals.mv, signals.dv)
+        )
+        check_time(table, runs, time_s, signals.period_s)
+        for signal, values in zip(signals.pv, pv.T, strict=True):
+            check_pv(table, signal, values)
+        for signal, values in zip(signals.mv, mv.T, strict=True):
+            check_mv(table, signal, values)
+        # ``of`` puts times on the exact grid, so that a file's rounded time stamps do not change the digest.
+        return cls.of(signals, pv, mv, run=runs.astype(np.int64), dv=dv)
 
 
 def position_in_run(run: NDArray[np.int64]) -> NDArray[np.int64]:

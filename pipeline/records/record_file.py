@@ -7,7 +7,7 @@ import difflib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,15 +59,15 @@ class Table:
 
     def find(self, signal: Signal) -> str:
         """The header of the signal's column; RecordError for a missing column or another unit."""
-        known = {split_column(h): h for h in reversed(self.header)}
-        found = known.get((signal.name, signal.unit))
-        if found is not None:
-            return found
-        for (name, unit), column in known.items():
+        columns = {split_column(h): h for h in reversed(self.header)}
+        header = columns.get((signal.name, signal.unit))
+        if header is not None:
+            return header
+        for (name, unit), column in columns.items():
             if name == signal.name:
-                said = f"the unit {unit!r}" if unit else "no unit"
+                stated = f"the unit {unit!r}" if unit else "no unit"
                 raise RecordError(
-                    f"{self.at(column)} has {said}; {signal.unit!r} is wanted: "
+                    f"{self.at(column)} has {stated}; {signal.unit!r} is wanted: "
                     f"convert the values and head the column {column_name(signal)!r}"
                 )
         raise self._missing(column_name(signal))
@@ -86,25 +86,21 @@ class Table:
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             cell = cells[bad[0]]
-            said = "is empty" if cell is None or str(cell).strip() in {"", "None"} else f"holds {str(cell)!r}"
-            raise RecordError(f"{self.at(column, bad[0])} {said}; a finite number is wanted in every row")
+            fault = "is empty" if cell is None or str(cell).strip() in {"", "None"} else f"holds {str(cell)!r}"
+            raise RecordError(f"{self.at(column, bad[0])} {fault}; a finite number is wanted in every row")
         return values
 
-    def _missing(self, wanted: str) -> RecordError:
-        near = difflib.get_close_matches(wanted, self.header, n=1, cutoff=0.6)
+    def _missing(self, column: str) -> RecordError:
+        near = difflib.get_close_matches(column, self.header, n=1, cutoff=0.6)
         nearest = f"; the nearest is {near[0]!r}" if near else ""
         return RecordError(
-            f"{self.path}: column {wanted!r} is missing{nearest}; the file has {', '.join(map(repr, self.header))}"
+            f"{self.path}: column {column!r} is missing{nearest}; the file has {', '.join(map(repr, self.header))}"
         )
 
 
 def read_table(path: Path) -> Table:
     """The table in a ``.parquet`` or ``.csv`` file; RecordError where it cannot be read or is empty."""
-    readers = {".parquet": _read_parquet, ".csv": _read_csv}
-    try:
-        reader = readers[path.suffix.lower()]
-    except KeyError:
-        raise _unknown_format(path) from None
+    reader = _reader(path)
     try:
         table = reader(path)
     except FileNotFoundError:
@@ -121,11 +117,9 @@ def read_table(path: Path) -> Table:
 
 def write_table(path: Path, columns: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any]) -> None:
     """Write columns by the suffix of ``path``, whole or not at all."""
-    suffix = path.suffix.lower()
-    if suffix not in {".parquet", ".csv"}:
-        raise _unknown_format(path)
+    is_csv = _reader(path) is _read_csv
     with draft_of(path) as draft:
-        if suffix == ".csv":
+        if is_csv:
             import pandas as pd  # here, because stages read Parquet and importing pandas takes long
 
             pd.DataFrame(dict(columns)).to_csv(draft, index=False, lineterminator="\n")
@@ -134,10 +128,14 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]], metadata: Mappi
             pq.write_table(table, draft)
 
 
-def _unknown_format(path: Path) -> RecordError:
-    return RecordError(
-        f"{path}: records are kept as .parquet or .csv, not as {path.suffix or 'a file without suffix'!r}"
-    )
+def _reader(path: Path) -> Callable[[Path], Table]:
+    """The reader of the file's format; RecordError for another suffix than .parquet and .csv."""
+    readers = {".parquet": _read_parquet, ".csv": _read_csv}
+    if path.suffix.lower() not in readers:
+        raise RecordError(
+            f"{path}: records are kept as .parquet or .csv, not as {path.suffix or 'a file without suffix'!r}"
+        )
+    return readers[path.suffix.lower()]
 
 
 def _read_parquet(path: Path) -> Table:

@@ -3,65 +3,63 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.figure import Figure as Canvas
 
 from pipeline.evaluation.case import Figure
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import ReportError
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.model_evidence import candidates
-from pipeline.evaluation.verdicts import CasePicture
-from pipeline.pictures.drawing import STYLE, save
+from pipeline.evaluation.typed_json import ReportError
+from pipeline.pictures.drawing import STYLE, CasePicture, save
 from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
 from pipeline.pictures.words import scenario_name
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 
-def draw_all(evidence: Evidence, folder: Path, models: Path, own: Sequence[CasePicture] = ()) -> dict[str, str]:
+def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) -> dict[str, str]:
     """Draw every figure that the evidence has trajectories for; returns file name -> caption.
 
     The case's own figures are ``figure_05.png`` and so on, with the best controller added;
     ``closed_loop_<law>.png`` shows each law beside the case's baseline on the test that weighs most, and
     ``closed_loop.png`` the best one; ``candidates_<set>_<part>.png`` the search over a model's
-    size; ``own`` are the pictures that only this case has. ``models`` is work/<case>/models.
+    size; ``own`` are the pictures that only this case has.
     Raises ReportError where two pictures have the same file name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, str] = {}
     where, untuned = main_words(evidence)
+
+    def keep(name: str, canvas: Canvas, caption: str) -> None:
+        save(canvas, folder / f"{name}.png")
+        drawn[f"{name}.png"] = caption
+
     with mpl.rc_context(STYLE):
         for figure in evidence.case.figures:
-            canvas = _own(evidence, figure, models)
-            if canvas is not None:
-                name = f"figure_{figure.number:02d}.png"
-                save(canvas, folder / name)
-                drawn[name] = f"Figure {figure.number}. {figure.title}"
-        for law in evidence.laws:
-            canvas = overview_picture(evidence, law)
-            if canvas is None:
-                continue
-            name = f"closed_loop_{law}.png"
-            save(canvas, folder / name)
-            drawn[name] = f"{evidence.laws[law].title} on {where}"
-            if law == evidence.best:
-                shutil.copyfile(folder / name, folder / "closed_loop.png")
-                drawn["closed_loop.png"] = f"{evidence.laws[law].title} on {untuned}"
+            with suppress(NotMeasuredError):
+                title = f"Figure {figure.number}. {figure.title}"
+                keep(f"figure_{figure.number:02d}", _own(evidence, figure), title)
+        for name, law in evidence.laws.items():
+            with suppress(NotMeasuredError):
+                keep(f"closed_loop_{name}", overview_picture(evidence, name), f"{law.title} on {where}")
+                if name == evidence.best:
+                    shutil.copyfile(folder / f"closed_loop_{name}.png", folder / "closed_loop.png")
+                    drawn["closed_loop.png"] = f"{law.title} on {untuned}"
         for table in (t for name, model in evidence.models.items() for t in candidates(name, model)):
-            name = f"candidates_{table['model']}_{table['part']}.png"
-            save(candidates_picture(table, evidence.case.plant_class.sp_signals[0].unit), folder / name)
-            drawn[name] = f"Lags and widths tried for {table['part']} of the model {table['model']}"
+            words = f"Lags and widths tried for {table['part']} of the model {table['model']}"
+            keep(
+                f"candidates_{table['model']}_{table['part']}", candidates_picture(table, evidence.case.cv_unit), words
+            )
         for picture in own:
-            canvas, name = picture.draw(evidence), f"{picture.name}.png"
-            if name in drawn:
-                raise ReportError(f"picture {picture.name!r} of the claims would overwrite {name}; give another name")
-            if canvas is not None:
-                save(canvas, folder / name)
-                drawn[name] = picture.title
-    for path in sorted(models.glob("*/sweep.png")):
+            if (name := f"{picture.name}.png") in drawn:
+                raise ReportError(f"the case's own picture {picture.name!r} would overwrite {name}; give another name")
+            with suppress(NotMeasuredError):
+                keep(picture.name, picture.draw(evidence), picture.title)
+    for path in sorted(evidence.model_folder.glob("*/sweep.png")):
         name = f"sweep_{path.parent.name}.png"
         shutil.copyfile(path, folder / name)
         drawn[name] = f"Partition sweep of the model {path.parent.name}"
@@ -78,9 +76,9 @@ def main_words(evidence: Evidence) -> tuple[str, str]:
     return "a held-out sequence", "set points that nothing was tuned on"
 
 
-def _own(evidence: Evidence, figure: Figure, models: Path) -> Canvas | None:
+def _own(evidence: Evidence, figure: Figure) -> Canvas:
     if figure.model is not None:
-        return one_step_picture(figure, models)
+        return one_step_picture(evidence, figure)
     if figure.scenario is None:
-        return predictions_picture(evidence.case, figure, models)
+        return predictions_picture(evidence, figure)
     return info_picture(evidence, figure) if figure.info else loops_picture(evidence, figure)

@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from typing import Any
 
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.validation import (
-    Analysis,
-    GateRecord,
-    GateResult,
-    LawResult,
-    PaperResult,
-    Row,
-    Titles,
-    Validation,
-)
-from pipeline.evaluation.verdicts import Judged
+from pipeline.evaluation.law_evidence import LawEvidence, Row
+from pipeline.evaluation.validation import GateRecord, GateResult, LawResult, PaperResult, Titles, Validation
+from pipeline.files import digest
 from pipeline.pictures.words import law_name
-from pipeline.report.verdict_words import statement, table_row
+from pipeline.report.verdicts import Judged
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 DEFAULT = "mae"  # the metric that the digests of gates leave out
 
 
 def validation(evidence: Evidence, judged: Judged) -> Validation:
-    """What programs are told of a case."""
+    """The figures and verdicts of a case, for programs."""
     case = evidence.case
-    scenarios: dict[str, dict[str, Row]] = {}
-    for name in (n + end for end in ("", NOISE_SUFFIX) for n in evidence.scenarios):
-        rows = {law: _row(evidence, law, name) for law in evidence.laws if evidence.figure(law, name) is not None}
-        if rows:
-            scenarios[name] = rows
+    tests = (n + end for end in ("", NOISE_SUFFIX) for n in evidence.scenarios)
+    measured = {name: [law for law in evidence.laws if evidence.figure(law, name) is not None] for name in tests}
+    scenarios = {n: {law: _row(evidence, law, n) for law in laws} for n, laws in measured.items() if laws}
     return Validation(
         case=case.name,
         metric=case.metric,
@@ -41,7 +29,7 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
         scenarios=scenarios,
         bounds=evidence.bounds,
         gate=_gate(evidence),
-        laws={law: _law(evidence, law) for law in evidence.laws},
+        laws={name: _law(law) for name, law in evidence.laws.items()},
         titles=Titles(
             case=case.title,
             metric=case.criterion.long,
@@ -50,12 +38,12 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
             laws={name: law.title for name, law in evidence.laws.items()},
             scenarios=evidence.scenarios,
         ),
-        requirements=tuple(statement(v, evidence) for v in judged.acceptance),
-        claims=tuple(statement(v, evidence) for v in judged.statements),
+        requirements=judged.acceptance,
+        claims=judged.statements,
         paper=tuple(
             PaperResult(table.number, row.label, row.metric, row.paper, row.ours, row.verdict, row.holds)
-            for table, verdicts in judged.tables
-            for row in (table_row(v, evidence) for v in verdicts)
+            for table, rows in judged.tables
+            for row in rows
         ),
     )
 
@@ -71,19 +59,9 @@ def _row(evidence: Evidence, law: str, scenario: str) -> Row:
     return row
 
 
-def _law(evidence: Evidence, law: str) -> LawResult:
-    found = evidence.laws[law]
-    return LawResult(
-        seeds=found.seeds,
-        lock_ups=found.lock_ups,
-        step_us=found.step_us,
-        locked_up=found.locked_up,
-        as_printed=found.as_printed,
-        analysis={
-            form or "base": Analysis(said.get("figures") or {}, tuple(said.get("notes") or ()))
-            for form, said in found.analyses.items()
-        },
-    )
+def _law(evidence: LawEvidence) -> LawResult:
+    own = evidence.metrics
+    return LawResult(evidence.seeds, own.lock_ups, evidence.step_us, own.locked_up, own.as_printed, evidence.analyses)
 
 
 def _gate(evidence: Evidence) -> GateRecord:
@@ -116,4 +94,4 @@ def gate_id(evidence: Evidence) -> str:
     what["floor"] = evidence.noise
     if case.metric != DEFAULT:
         what["metric"] = case.metric
-    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:12]
+    return digest(what)[:12]

@@ -72,5 +72,5 @@ def _verdict(standing: Standing) -> str:
     if best.ratio is None:
         return f"Best controller: {best.title}."
     if standing.hidden:
-        return f"Best controller: {best.title}, {ratio(best.ratio)} × the {standing.metric} that noise would hide."
+        return f"Best controller: {best.title}, {ratio(best.ratio)} × the {standing.metric} that noise can hide."
     return f"Best controller: {best.title}, {ratio(best.ratio)} × the perfect-model NMPC's {standing.metric}."

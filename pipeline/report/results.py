@@ -13,19 +13,20 @@ from rich.table import Table
 from pipeline.errors import PipelineError
 from pipeline.evaluation.standing import LawStanding, Standing, tally
 from pipeline.evaluation.validation import FILE, Validation
+from pipeline.pictures.numbers import ratio
 from pipeline.simulation import NOISE_SUFFIX
 
 WIDTH = 120
 
 
 def show_results(artifacts: Path, console: Console | None = None, case: str | None = None) -> None:
-    """Print one table over all artifacts/<case>/validation.json, or that of one case with all of its tests.
+    """Print one table over all artifacts/<case>/validation.json, or the table of one case with all its tests.
 
     Raises PipelineError where there is none.
     """
     console = console or Console()
     if not console.is_terminal:
-        # A log has no width of its own; the table is not worth cutting for one.
+        # A log has no width; a fixed one keeps the table whole.
         console = Console(file=console.file, width=WIDTH)
     folders = sorted(path.parent for path in artifacts.glob("*/validation.json"))
     if not folders:
@@ -37,12 +38,12 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     where = artifacts / (case or "<case>")
     if any(law.lock_ups for standing in standings.values() for law in standing.laws if case in (None, standing.case)):
         console.print(
-            "!          the closed loops that it locked up in; it reproduces a paper: do not run it on a plant"
+            "!          number of closed loops that locked up; the law reproduces a paper: do not run it on a plant"
         )
     if case is None:
         if any(standing.hidden for standing in standings.values()):
-            console.print("n          the bound is less than noise would hide: the ratio is to that, and at least 1")
-        console.print("*          the best of its case, chosen on sequences that are never scored")
+            console.print("n          noise can hide more than the bound: the ratio is to the hidden error, at least 1")
+        console.print("*          the best law of its case, chosen on development sequences that are not scored")
         console.print(f"overview   {artifacts / 'report.html'} (and .md)")
         console.print(f"a case     {where / 'report.html'}; its tests here: loopwright results CASE")
     else:
@@ -94,7 +95,7 @@ def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
 
 
 def _tests(standing: Standing) -> Table:
-    """A case's laws in all of its tests, a row a test: there are more tests than laws, and their names are short."""
+    """The laws of a case in all its tests, a row a test."""
     validation = Validation.read(standing.folder / FILE)
     scenarios, metric, weights = validation.scenarios, validation.metric, validation.gate.weights
     names = [name for name in scenarios if not name.endswith(NOISE_SUFFIX) or name in weights]
@@ -102,7 +103,7 @@ def _tests(standing: Standing) -> Table:
     table.title = f"{standing.case}: {standing.metric_long}, median over data seeds"
     table.add_column("test", no_wrap=True)
     for name in ("perfect_NMPC", *(law.law for law in standing.laws)):
-        # A name breaks at its underscores: six of them side by side leave no line room.
+        # Six names side by side fit a line only if each breaks at its underscores.
         table.add_column(name.replace("_", "_\n"), justify="right", no_wrap=True)
 
     def ours(name: str, law: str) -> float | None:
@@ -122,12 +123,10 @@ def _size(law: LawStanding) -> str:
 
 
 def _multiple(standing: Standing, law: LawStanding) -> str:
-    """Two decimals, and more where a law comes within a hundredth of the bound; n: of noise, which hides the bound."""
+    """Two decimals, more within 1 % of the bound; ``n`` marks a bound below the error that noise can hide."""
     if law.ratio is None:
         return "-"
-    if standing.hidden:
-        return f"{law.ratio:.2f}n"
-    return f"{law.ratio:.3f}" if abs(law.ratio - 1) < 0.01 else f"{law.ratio:.2f}"
+    return f"{law.ratio:.2f}n" if standing.hidden else ratio(law.ratio)
 
 
 def _figure(value: float | None) -> str:

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import IO, Protocol
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from pipeline.errors import PlantError
-from pipeline.plants.simulator import Simulator
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.simulation.timetable import Timetable
 from serving.guard import Sample
+from serving.manifest import Signal
 
-Array = NDArray[np.float64]
 WINDOW_S = 60.0
 WIDTH = 60
 BARS = "▁▂▃▄▅▆▇█"
+Show = Callable[[float, str, Array, str, str | None], None]
+"""``show(time_s, mode, values, reason, mark)`` shows one scan: set points, PVs and MVs in ``values``, what was wrong
+in ``reason`` (empty if nothing), what happens in ``mark``."""
 
 
 class SimulatedPlant:
@@ -28,8 +32,7 @@ class SimulatedPlant:
 
     def __init__(self, plant: Simulator, run: Timetable) -> None:
         self.plant, self.run = plant, run
-        self._step = plant.stepper()
-        self._parameters = plant.parameters()
+        self._step, self._parameters = plant.stepper(), plant.parameters()
         self._places = {plant.parameter_names().index(name): values for name, values in run.changes.items()}
         self.k = 0
         self.x, self.mv = run.x0.copy(), run.mv0.copy()
@@ -51,127 +54,79 @@ class SimulatedPlant:
         self.x = self._step(self.x, mv, self.plant.dv_nominal, self._parameters)
         self.k += 1
         if not np.isfinite(self.x).all():
-            at_s = self.k * self.plant.period_s
             raise PlantError(
-                f"plant {self.plant.name!r} has left what it can compute at {at_s:g} s; "
+                f"plant {self.plant.name!r} has left what it can compute at {self.k * self.plant.period_s:g} s; "
                 "give disturbances that it can physically meet"
             )
 
 
-class Snapshot(Protocol):
-    """What a view shows of one scan (serving's Command fits)."""
-
-    @property
-    def mode(self) -> str:
-        """MANUAL, AUTO or HOLD."""
-
-    @property
-    def sp(self) -> Array:
-        """Set points, shape (n_sp,)."""
-
-    @property
-    def mv(self) -> Array:
-        """MV, shape (n_mv,)."""
-
-    @property
-    def reason(self) -> str:
-        """What was wrong; empty if nothing."""
-
-
-class View(Protocol):
-    """Where a running loop is shown."""
-
-    def __enter__(self) -> View:
-        """Start showing."""
-
-    def __exit__(self, *_: object) -> None:
-        """Leave the terminal as it was."""
-
-    def show(self, time_s: float, pv: Array, command: Snapshot, mark: str | None) -> None:
-        """Show one scan; ``mark`` says what happens in it."""
-
-
-def view_of(plant: Simulator, title: str, duration_s: float, stream: IO[str]) -> View:
+@contextmanager
+def view_of(plant: Simulator, title: str, duration_s: float, stream: IO[str]) -> Iterator[Show]:
     """A live view on a terminal, plain lines anywhere else."""
-    if stream.isatty():
-        return TerminalView(plant, title, duration_s, Console(file=stream))
-    return PlainView(plant, duration_s, stream)
+    if not stream.isatty():
+        yield PlainView(plant, duration_s, stream).show
+        return
+    with Live(console=Console(file=stream), auto_refresh=False) as live:
+        yield TerminalView(plant, title, duration_s, live).show
 
 
 class PlainView:
     """A line where something happens, and twenty others on the way."""
 
     def __init__(self, plant: Simulator, duration_s: float, stream: IO[str]) -> None:
-        self.plant, self.stream = plant, stream
+        self.signals, self.stream = _labelled(plant), stream
         self.every_s, self.next_s = duration_s / 20, 0.0
         self.last: tuple[str, str, tuple[float, ...]] | None = None
+        self.n_sp = len(plant.sp_signals)
 
-    def __enter__(self) -> PlainView:
-        """Nothing to start."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to leave."""
-
-    def show(self, time_s: float, pv: Array, command: Snapshot, mark: str | None) -> None:
+    def show(self, time_s: float, mode: str, values: Array, reason: str, mark: str | None) -> None:
         """Print the scan if it is one of those worth a line."""
-        now = (command.mode, command.reason, tuple(command.sp))
+        now = (mode, reason, tuple(values[: self.n_sp]))
         if now == self.last and mark is None and time_s < self.next_s:
             return
         self.last, self.next_s = now, time_s + self.every_s
-        notes = "  ".join(note for note in (mark, command.reason) if note)
-        print(
-            f"{time_s:9.1f} s  {command.mode:<6}  {_values(self.plant, pv, command)}  {notes}".rstrip(),
-            file=self.stream,
-        )
+        figures = [
+            f"{label} {value:.5g}" + ("" if s.unit == "-" else f" {s.unit}")
+            for (label, s), value in zip(self.signals, values, strict=True)
+        ]
+        notes = "  ".join(note for note in (mark, reason) if note)
+        print(f"{time_s:9.1f} s  {mode:<6}  {'  '.join(figures)}  {notes}".rstrip(), file=self.stream)
 
 
 class TerminalView:
     """Mode, values and the last minute of each signal, redrawn ten times a second."""
 
-    def __init__(self, plant: Simulator, title: str, duration_s: float, console: Console) -> None:
-        self.plant, self.title, self.duration_s = plant, title, duration_s
+    def __init__(self, plant: Simulator, title: str, duration_s: float, live: Live) -> None:
+        self.signals, self.title, self.duration_s, self.live = _labelled(plant), title, duration_s, live
+        self.last_s = duration_s - plant.period_s - 1e-9
         self.recent: deque[Array] = deque(maxlen=max(2, round(WINDOW_S / plant.period_s)))
         self.events: deque[str] = deque(maxlen=4)
         self.reason = ""
-        self.live = Live(console=console, refresh_per_second=10, auto_refresh=False)
         self.drawn_s = -np.inf
 
-    def __enter__(self) -> TerminalView:
-        """Take the terminal."""
-        self.live.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Draw the end and give the terminal back."""
-        self.live.refresh()
-        self.live.__exit__(None, None, None)
-
-    def show(self, time_s: float, pv: Array, command: Snapshot, mark: str | None) -> None:
+    def show(self, time_s: float, mode: str, values: Array, reason: str, mark: str | None) -> None:
         """Keep the scan; draw at most ten times a second of the viewer's time."""
-        self.recent.append(np.concatenate([command.sp, pv, command.mv]))
+        self.recent.append(values)
         if mark:
             self.events.append(f"{time_s:.1f} s  {mark}")
-        if command.reason and command.reason != self.reason:
-            self.events.append(f"{time_s:.1f} s  fault: {command.reason}")
-        self.reason = command.reason
+        if reason and reason != self.reason:
+            self.events.append(f"{time_s:.1f} s  fault: {reason}")
+        self.reason = reason
         now = self.live.console.get_time()
-        if now - self.drawn_s >= 0.1 or time_s + self.plant.period_s >= self.duration_s - 1e-9:
+        if now - self.drawn_s >= 0.1 or time_s >= self.last_s:
             self.drawn_s = now
-            self.live.update(self._picture(time_s, command), refresh=True)
+            self.live.update(self._picture(time_s, mode), refresh=True)
 
-    def _picture(self, time_s: float, command: Snapshot) -> Group:
-        style = {"AUTO": "bold green", "MANUAL": "bold yellow", "HOLD": "bold red"}[str(command.mode)]
+    def _picture(self, time_s: float, mode: str) -> Group:
+        style = {"AUTO": "bold green", "MANUAL": "bold yellow", "HOLD": "bold red"}[mode]
         head = Text.assemble(
-            (f"{self.title}  ", "bold"), (f" {command.mode} ", style), f"  {time_s:.1f} of {self.duration_s:.1f} s"
+            (f"{self.title}  ", "bold"), (f" {mode} ", style), f"  {time_s:.1f} of {self.duration_s:.1f} s"
         )
         table = Table(box=None, pad_edge=False)
         for column in ("", "now", "", f"last {WINDOW_S:g} s"):
             table.add_column(column, justify="right" if column == "now" else "left", no_wrap=True)
         rows = np.array(self.recent)
-        p = self.plant
-        labels = [f"SP {s.name}" for s in p.sp_signals] + [s.name for s in (*p.pv_signals, *p.mv_signals)]
-        for i, (label, s) in enumerate(zip(labels, (*p.sp_signals, *p.pv_signals, *p.mv_signals), strict=True)):
+        for i, (label, s) in enumerate(self.signals):
             table.add_row(label, f"{rows[-1, i]:.5g}", s.unit, sparkline(rows[:, i], s.low, s.high))
         return Group(head, table, *(Text(event, style="dim") for event in self.events))
 
@@ -184,10 +139,9 @@ def sparkline(values: Array, low: float, high: float, width: int = WIDTH) -> str
     return "".join(BARS[i] for i in places)
 
 
-def _values(plant: Simulator, pv: Array, command: Snapshot) -> str:
-    parts = [f"SP {s.name} {v:.4g}" for s, v in zip(plant.sp_signals, command.sp, strict=True)]
-    parts += [
-        f"{s.name} {v:.5g}" + ("" if s.unit == "-" else f" {s.unit}")
-        for s, v in zip((*plant.pv_signals, *plant.mv_signals), (*pv, *command.mv), strict=True)
+def _labelled(plant: Simulator) -> list[tuple[str, Signal]]:
+    """Label and signal of each of a scan's values."""
+    return [
+        *((f"SP {s.name}", s) for s in plant.sp_signals),
+        *((s.name, s) for s in (*plant.pv_signals, *plant.mv_signals)),
     ]
-    return "  ".join(parts)

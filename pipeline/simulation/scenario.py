@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import PlantError
+from pipeline.files import digest
 from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.simulator import Simulator
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.simulation import NOISE_SUFFIX as NOISE_SUFFIX
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,18 +37,15 @@ class Scenario:
     reference: Array | None = None  # (n, 1) what the CV should do, where that is not to be at its set point at once
 
     def __post_init__(self) -> None:
+        what = f"scenario {self.name!r}"
         if self.sp.ndim != 2 or not len(self.sp):
-            raise PlantError(f"scenario {self.name!r}: sp has shape {self.sp.shape}; give (n, n_sp) with n >= 1")
+            raise PlantError(f"{what}: sp has shape {self.sp.shape}; give (n, n_sp) with n >= 1")
+        n = len(self.sp)
         for key, values in self.changes.items():
-            if values.shape != (len(self.sp),):
-                raise PlantError(
-                    f"scenario {self.name!r}: {key} has shape {values.shape}; "
-                    f"give one value a period, ({len(self.sp)},)"
-                )
+            if values.shape != (n,):
+                raise PlantError(f"{what}: {key} has shape {values.shape}; give one value a period, ({n},)")
         if self.reference is not None and self.reference.shape != self.sp.shape:
-            raise PlantError(
-                f"scenario {self.name!r}: reference has shape {self.reference.shape}; give that of sp, {self.sp.shape}"
-            )
+            raise PlantError(f"{what}: reference has shape {self.reference.shape}; give that of sp, {self.sp.shape}")
 
     @property
     def samples(self) -> int:
@@ -72,14 +65,18 @@ class Scenario:
 
     def digest(self) -> str:
         """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""
+
+        def digits(values: Array) -> list[str]:
+            return [f"{v:.7g}" for v in np.ravel(values)]
+
         arrays = {"sp": self.sp, "x0": self.x0, "mv0": self.mv0, **self.changes}
-        text = {key: [f"{v:.7g}" for v in np.ravel(values)] for key, values in arrays.items()}
+        text = {key: digits(values) for key, values in arrays.items()}
         what: list[Any] = [text, self.hold, *([self.late_from] if self.late_from else [])]
         if self.reference is not None:
-            what.append([f"{v:.7g}" for v in np.ravel(self.reference)])
+            what.append(digits(self.reference))
         if self.plant is not None:
-            what.append([self.plant.name, *(f"{v:.7g}" for v in self.plant.parameters())])
-        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+            what.append([self.plant.name, *digits(self.plant.parameters())])
+        return digest(what)
 
 
 def held(levels: list[float], hold: int) -> Array:

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.config.params import nearest
-from pipeline.errors import ParamsError
+from pipeline.errors import ParamsError, nearest
 from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.simulator import Simulator
+from pipeline.plants.simulator import Array, Simulator
 from pipeline.simulation.scenario import Scenario
+from pipeline.simulation.simulate import noise_draws
+from serving.manifest import Signal
 
-Array = NDArray[np.float64]
 SETTLE_SAMPLES = 80  # after the last event, where no duration was asked for
 MAX_SAMPLES = 10_000_000
 
@@ -101,20 +100,12 @@ def timetable(
     steady state of ``start_cv``, or at that in the middle of the set point's range; a plant without
     equations starts at its ``start``. A test that has a plant of its own is run on that.
     """
-    sp_signal = plant.sp_signals[0]
     if set_points and len(plant.sp_signals) > 1:
         raise ParamsError(f"plant {plant.name!r} has {len(plant.sp_signals)} set points; run one of its scenarios")
     for event in set_points:
-        if not sp_signal.low <= event.value <= sp_signal.high:
-            raise ParamsError(
-                f"set point {sp_signal.name} = {event.value:g} {sp_signal.unit} is outside "
-                f"[{sp_signal.low:g}, {sp_signal.high:g}] {sp_signal.unit}"
-            )
-    cv = plant.pv_signals[0]
-    if start_cv is not None and not cv.low <= start_cv <= cv.high:
-        raise ParamsError(
-            f"a start at {cv.name} = {start_cv:g} {cv.unit} is outside [{cv.low:g}, {cv.high:g}] {cv.unit}"
-        )
+        _check_range("set point", plant.sp_signals[0], event.value)
+    if start_cv is not None:
+        _check_range("a start at", plant.pv_signals[0], start_cv)
     changes: dict[str, Array] = {}
     marks: dict[float, str] = {}
     if set_points:
@@ -128,25 +119,22 @@ def timetable(
     else:
         if test is None:
             raise ParamsError("the plant belongs to no case, so it has no scenarios; give set points (--sp)")
-        chosen = test
-        plant = plant if chosen.plant is None else chosen.plant
-        n = _samples(plant, duration_s, chosen.samples)
-        x0, mv0 = (chosen.x0, chosen.mv0) if start_cv is None else _rest(plant, start_cv)[:2]
-        sp = _stretched(chosen.sp, n)
-        changes = {name: _stretched(values, n) for name, values in chosen.changes.items()}
+        plant = test.plant or plant
+        n = _samples(plant, duration_s, test.samples)
+        x0, mv0 = (test.x0, test.mv0) if start_cv is None else _rest(plant, start_cv)[:2]
+        sp = _stretched(test.sp, n)
+        changes = {name: _stretched(values, n) for name, values in test.changes.items()}
         if changes:
             marks[0.0] = ", ".join(changes)
+    nominal = dict(zip(plant.parameter_names(), plant.parameters(), strict=True))
     for event in sorted(disturbances, key=lambda e: e.time_s):
-        if event.name not in plant.parameter_names():
-            raise ParamsError(
-                f"plant {plant.name!r} has no parameter {event.name!r}{nearest(event.name, plant.parameter_names())}"
-            )
+        if event.name in {s.name for s in plant.dv_signals}:
+            raise ParamsError(f"{event.name!r} is a measured disturbance, which stays nominal in every simulation")
+        if event.name not in nominal:
+            raise ParamsError(f"plant {plant.name!r} has no parameter {event.name!r}{nearest(event.name, nominal)}")
         k = _sample(plant, event, n)
-        nominal = plant.parameters()[plant.parameter_names().index(event.name)]
-        row = changes.setdefault(event.name, np.full(n, nominal))
-        row[k:] = event.value
-        unit = plant.parameter_units()[event.name]
-        text = f"{event.name} = {event.value:g} {unit}".strip()
+        changes.setdefault(event.name, np.full(n, nominal[event.name]))[k:] = event.value
+        text = f"{event.name} = {event.value:g} {plant.parameter_units()[event.name]}".strip()
         at = k * plant.period_s
         marks[at] = f"{marks[at]}, {text}" if at in marks else text
     for span in manual:
@@ -180,11 +168,15 @@ def _check_manual(plant: Simulator, span: ManualSpan) -> None:
             f"{', '.join(s.name for s in signals)}: give {','.join(s.name for s in signals)}"
         )
     for s, value in zip(signals, span.mv, strict=True):
-        unit = "" if s.unit == "-" else f" {s.unit}"
         if s.values is not None and value not in s.values:
             raise ParamsError(f"manual {s.name} = {value:g} is none of {', '.join(f'{v:g}' for v in s.values)}")
-        if not s.low <= value <= s.high:
-            raise ParamsError(f"manual {s.name} = {value:g}{unit} is outside [{s.low:g}, {s.high:g}]{unit}")
+        _check_range("manual", s, value)
+
+
+def _check_range(what: str, s: Signal, value: float) -> None:
+    if not s.low <= value <= s.high:
+        unit = "" if s.unit == "-" else f" {s.unit}"
+        raise ParamsError(f"{what} {s.name} = {value:g}{unit} is outside [{s.low:g}, {s.high:g}]{unit}")
 
 
 def _number(text: str, whole: str, form: str) -> float:
@@ -220,16 +212,12 @@ def _stretched(values: Array, n: int) -> Array:
 
 
 def _noise(plant: Simulator, deviations: Sequence[Event], n: int, seed: int) -> Array:
-    """Gaussian, shape (n, n_pv); each PV has a stream of its own, so that one's noise does not change another's."""
-    names = [s.name for s in plant.pv_signals]
-    noise = np.zeros((n, len(names)))
+    """Measurement noise, shape (n, n_pv), from the standard deviations of some PVs."""
+    std = {s.name: 0.0 for s in plant.pv_signals}
     for event in deviations:
-        if event.name not in names:
-            raise ParamsError(
-                f"plant {plant.name!r} has no process variable {event.name!r}{nearest(event.name, names)}"
-            )
+        if event.name not in std:
+            raise ParamsError(f"plant {plant.name!r} has no process variable {event.name!r}{nearest(event.name, std)}")
         if event.value < 0:
-            raise ParamsError(f"noise {event.name}={event.value:g}: a standard deviation must not be negative")
-        i = names.index(event.name)
-        noise[:, i] = np.random.default_rng([seed, i]).normal(0.0, event.value, n)
-    return noise
+            raise ParamsError(f"the noise of {event.name} is {event.value:g}; a standard deviation is 0 or above")
+        std[event.name] = event.value
+    return noise_draws(plant, n, list(std.values()), np.random.default_rng(seed))

@@ -1,26 +1,20 @@
 """What no controller can beat by much: perfect-model NMPC and the offline optimum.
 
-``pipeline.optimal.perfect`` says what they know and what they do not.
+``pipeline.optimal.perfect`` says what they know and what they do not. A plant with a discrete MV is replaced by
+its ``relaxed()``. The offline optimum is searched from the NMPC's moves too; where no plan is better than the
+NMPC, the NMPC's figures stand for the optimum (``from_nmpc``).
 
-A plant with a discrete MV is replaced by its ``relaxed()``, the figures' MVs being those that stand
-for its own. A test on a plant in discrete time has no bounds.
-
-An optimum is no worse than a policy that was seen to be feasible: the offline optimum is searched from the
-NMPC's moves too, and where no plan is better than the NMPC its figures stand for the optimum (``from_nmpc``).
-
-``loopwright bounds CASE`` computes both for every scenario of a case, NMPC also with
-measurement noise, and stores them in ``pipeline/cases/<case>.bounds.json``, from where
-``pipeline.optimal.bounds.load_bounds`` gives them as long as neither the plant nor the scenario has changed.
+``loopwright bounds CASE`` computes both for every scenario of a case, NMPC also with measurement noise, and
+stores them beside the case. ``pipeline.optimal.bounds.stored_bounds`` reads them.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -77,14 +71,9 @@ def better(offline: dict[str, float], nmpc: dict[str, float], metric: str) -> di
 
 def _remark(figures: dict[str, float]) -> str:
     """What a person must know of an offline optimum; empty where all is well."""
-    said = [f"{figures['failures']:.0f} plans were not solved"] if figures.get("failures") else []
-    said += ["no plan was better than the NMPC, whose figures stand here"] if figures.get("from_nmpc") else []
-    return f" - {'; '.join(said)}" if said else ""
-
-
-def _current(rows: dict[str, Any], tests: Sequence[Scenario]) -> dict[str, Any]:
-    """Of the figures stored of a test, those that a case may still have: of random sequences, all."""
-    return {digest: row for digest, row in rows.items() if tests[0].seed is not None or digest == tests[0].digest()}
+    remarks = [f"{figures['failures']:.0f} plans were not solved"] if figures.get("failures") else []
+    remarks += ["no plan was better than the NMPC, whose figures stand here"] if figures.get("from_nmpc") else []
+    return f" - {'; '.join(remarks)}" if remarks else ""
 
 
 def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = None) -> Iterator[str]:
@@ -94,24 +83,28 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
     Every figure is stored at once, so an interruption loses only the figure in work.
     """
     path = path or bounds_path(case)
-    stored = read_stored(path)
-    current = problem(case)
+    stored, current, noisy_too = read_stored(path), problem(case), "nmpc_noise" in kinds(case)
     if any((DEFAULTS | stored).get(key) != value for key, value in current.items()):
         stored = {"schema": SCHEMA, "case": case.name, **current, "figures": {}}
     scenarios = case.tests()
-    stored["figures"] = {n: _current(rows, scenarios[n]) for n, rows in stored["figures"].items() if n in scenarios}
+    # What no test can have any more is left out; of random sequences, all are kept.
+    stored["figures"] = {
+        name: {d: row for d, row in rows.items() if (s := scenarios[name][0]).seed is not None or d == s.digest()}
+        for name, rows in stored["figures"].items()
+        if name in scenarios
+    }
     work = [
-        Job(s, i, tuple(k for k in kinds(case) if (k == "nmpc_noise") is noisy))
+        Job(s, i, together)
         for name in names
         if bounded(case, scenarios[name])
         for i, s in enumerate(scenarios[name])
-        for noisy in ((False, True) if "nmpc_noise" in kinds(case) else (False,))
+        for together in (("nmpc", "offline"), ("nmpc_noise",))[: 1 + noisy_too]
     ]
     results = Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(_compute)(case, job) for job in work)
     for done, (job, figures, seconds) in enumerate(results, start=1):
         entry = stored["figures"].setdefault(job.scenario.name, {}).setdefault(job.scenario.digest(), {})
-        for kind, found in figures.items():
-            entry[kind] = {key: float(f"{value:.6g}") for key, value in found.items()}
+        for kind, row in figures.items():
+            entry[kind] = {key: float(f"{value:.6g}") for key, value in row.items()}
         write_text(path, json.dumps(stored, indent=1, sort_keys=True, allow_nan=False) + "\n")
         for kind in figures:
             which, figure = f"{job.scenario.name} {job.index} {kind}", entry[kind][case.metric]

@@ -25,40 +25,43 @@ from pipeline.errors import ParamsError, PipelineError
 from pipeline.evaluation.case import Case
 from pipeline.laws import LAWS
 from pipeline.models.local.linearized import LinearizedPart
-from pipeline.models.part import Part
+from pipeline.models.part import Source
 from pipeline.models.training.network_parts import trainer_of
 from pipeline.optimal.bounds import bounds_path, stored_bounds
 from pipeline.stages.excite import excitations
-from pipeline.stages.fit import part_of
+from pipeline.stages.fit import parts_of
 from pipeline.stages.paths import WORK, record_folder
 from serving.errors import LoopwrightError
 
 
 def mistakes() -> list[str]:
     """One line for every section that its stage would refuse, in the order of the stages."""
-    found = []
+    lines = []
     for kind, check in CHECKS.items():
         for name in sections(kind):
             try:
                 check(name)
             except (PipelineError, OSError, np.linalg.LinAlgError) as error:
-                found.append(" ".join(str(error).split()))
-    return list(dict.fromkeys(found))  # a record that cannot be read is met by every model set
+                lines.append(" ".join(str(error).split()))
+    return list(dict.fromkeys(lines))  # a record that cannot be read is met by every model set
 
 
 def notes() -> list[str]:
-    """One line for each bound that a report will lack: no mistake, as the report says so and comes without."""
-    found = []
+    """One line for what may be missing on purpose: cases without a section, bounds that a report will lack."""
+    unused = [name for name in CASES if name not in sections("cases")]
+    lines = [f"params.yaml has no section for {_listed(unused)}: the case takes no part"] if unused else []
     for name in sections("cases"):
         try:
             case = _case_of(name)
-            if bounds_path(case).exists():
-                found += stored_bounds(case)[1]
-            else:
-                found.append(f"case {name!r} has no bounds; run `loopwright bounds {name}`")
+            has_bounds = bounds_path(case).exists()
+            lines += (
+                stored_bounds(case)[1]
+                if has_bounds
+                else [f"case {name!r} has no bounds; run `loopwright bounds {name}`"]
+            )
         except LoopwrightError as error:
-            found.append(" ".join(str(error).split()))
-    return found
+            lines.append(" ".join(str(error).split()))
+    return lines
 
 
 def _case_of(name: str) -> Case:
@@ -70,6 +73,8 @@ def _case(name: str) -> None:
     case = _case_of(name)
     _ = case.plant  # raises where its class is abstract
     case.tests()
+    if not case.development():
+        raise ParamsError(f"case {name!r} has no development sequences; without them no controller can be chosen")
 
 
 def _record(name: str) -> None:
@@ -81,14 +86,13 @@ def _record(name: str) -> None:
 def _model(name: str) -> None:
     params, where = ModelParams.read(name), f"models.{name}"
     _known_case(params.case, where)
-    for part, values in params.parts.items():
-        found = part_of(CASES[params.case], values, f"{where}.parts.{part}")
-        trainer = getattr(found, "trainer", None)
+    for name, part in parts_of(params, where).items():
+        trainer = getattr(part, "trainer", None)
         if isinstance(trainer, Mapping):
             try:
                 trainer_of(trainer)
             except ParamsError as error:
-                raise ParamsError(f"{where}.parts.{part}: {error}") from None
+                raise ParamsError(f"{where}.parts.{name}: {error}") from None
     records = {record_folder(r.case, r.record) for r in map(RecordParams.read, sections("records"))}
     if params.data.is_relative_to(WORK) and params.data not in records:
         raise ParamsError(f"{where}.data is {params.data}, which no record makes; records are {_listed(records)}")
@@ -105,13 +109,19 @@ def _controller(name: str) -> None:
         for form, settings in {"": {}, **params.variants}.items()
     }
     read = {place: parse(law.Params, settings, place) for place, settings in forms.items()}
-    models = {m.model for m in map(ModelParams.read, sections("models")) if m.case == params.case}
+    sets = {name: ModelParams.read(name) for name in sections("models")}
+    models = {m.model: (name, m) for name, m in sets.items() if m.case == params.case}
     if params.model not in models:
         raise ParamsError(f"{where}.model is {params.model!r}; {params.case} has the model sets {_listed(models)}")
+    name, model_set = models[params.model]
+    try:
+        described = parts_of(model_set, f"models.{name}")
+    except ParamsError:  # the check of that model set says so
+        described = {}
     plant = CASES[params.case].plant
     parts = {
-        k: p.learn(None, plant.signals, {}, 0, plant).model
-        for k, p in _parts(params).items()
+        k: p.learn(Source(None, plant.signals, plant=plant)).model
+        for k, p in described.items()
         if isinstance(p, LinearizedPart)
     }
     for place, settings in read.items():
@@ -119,20 +129,6 @@ def _controller(name: str) -> None:
             law.check(settings, parts, plant)
         except PipelineError as error:
             raise ParamsError(f"{place}: {error}") from None
-
-
-def _parts(params: ControllerParams) -> dict[str, Part]:
-    """The parts of a controller's model set, as params.yaml describes them; none of one that cannot be read."""
-    for name in sections("models"):
-        of = ModelParams.read(name)
-        if (of.case, of.model) == (params.case, params.model):
-            try:
-                return {
-                    k: part_of(CASES[of.case], values, f"models.{name}.parts.{k}") for k, values in of.parts.items()
-                }
-            except ParamsError:  # the check of that model set tells it
-                return {}
-    return {}
 
 
 def _known_case(case: str, where: str) -> None:

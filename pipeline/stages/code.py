@@ -8,12 +8,15 @@ dvc.lock short, which DVC reads and writes after every stage.
 
 from __future__ import annotations
 
+import sys
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import grimp
 
 from pipeline.cases import CASES
+from pipeline.engine.command import run_stage
 from pipeline.files import sha256, write_json
 from pipeline.stages.paths import WORK
 
@@ -40,46 +43,43 @@ APART = {
     },
 }
 # Stage -> the modules beside case.py that it loads.
-BESIDE = {"excite": ("excitations",), "fit": ("models",), "report": ("paper",)}
+BESIDE = {"excite": ("excitations",), "fit": ("models",), "report": ("paper", "pictures")}
 # Files that are read and not imported.
 TEMPLATES = "pipeline/report/templates/*"
 
 
 def code() -> None:
     """Write work/code: one file for each stage of each case, one for each of those at the end."""
-    root = Path.cwd()
-    for stage in LAST:
-        write_json(WORK / "code" / f"{stage}.json", listing(root, stage))
-    for case in CASES:
-        for stage in STAGES:
-            write_json(WORK / "code" / f"{stage}-{case}.json", listing(root, stage, case))
+    for stage, case in (*((stage, "") for stage in LAST), *product(STAGES, CASES)):
+        write_json(WORK / "code" / f"{stage}{case and '-' + case}.json", listing(Path.cwd(), stage, case))
 
 
 def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:
     """Path -> sha256 of every file that the stage runs or reads (for the case)."""
-    found = {path_of(root, module) for module in modules(stage, case)}
+    files = {path_of(root, module) for module in modules(stage, case)}
     if stage in {"report", "overview"}:
-        found |= set(root.glob(TEMPLATES))
-    if stage == "report":
-        found |= {path for path in [path_of(root, beside(case, "bounds")).with_suffix(".json")] if path.exists()}
-    return {p.relative_to(root).as_posix(): sha256(p) for p in sorted(found)}
+        files |= set(root.glob(TEMPLATES))
+    bounds = path_of(root, beside(case, "bounds")).with_suffix(".json") if stage == "report" else root
+    if bounds.is_file():
+        files.add(bounds)
+    return {p.relative_to(root).as_posix(): sha256(p) for p in sorted(files)}
 
 
 def modules(stage: str, case: str = "") -> set[str]:
     """The modules that have a part in the stage's result, by what imports what."""
     imports = graph()
-    found: set[str] = set()
+    reached: set[str] = set()
     todo = [f"pipeline.stages.{stage}"]
     if case:
         own = [beside(case, name) for name in ("case", *BESIDE.get(stage, ()))]
         todo += [module for module in own if module in imports.modules]
     while todo:
         module = todo.pop()
-        found.add(module)
+        reached.add(module)
         # The list of cases imports them all; this stage runs its own alone.
         used = imports.find_modules_directly_imported_by(module) if module != "pipeline.cases" else set()
-        todo += [m for m in used - found if not _within(m, CARRIERS) and not _apart(stage, module, m)]
-    return found
+        todo += [m for m in used - reached if not _within(m, CARRIERS) and not _apart(stage, module, m)]
+    return reached
 
 
 @cache
@@ -109,4 +109,4 @@ def _within(module: str, packages: tuple[str, ...]) -> bool:
 
 
 if __name__ == "__main__":
-    code()
+    sys.exit(run_stage(code, sys.argv))

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.cases import CASES
-from pipeline.config.params import ControllerParams, choose, digest, parse
+from pipeline.config.params import ControllerParams, choose, parse
 from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
-from pipeline.evaluation.trial import BASE
+from pipeline.evaluation.law_evidence import BASE
 from pipeline.export.gate import export
-from pipeline.files import read_json, write_json
+from pipeline.files import digest, read_json, write_json
 from pipeline.laws import LAWS, ControlLaw
 from pipeline.models import load_model
 from pipeline.plants.simulator import Array, Simulator
@@ -74,8 +74,8 @@ def _analysed(law: ControlLaw, plant: Simulator, path: Path) -> dict[str, Any]:
     if analysis.arrays:
         arrays: dict[str, Any] = {name: np.asarray(array) for name, array in analysis.arrays.items()}
         np.savez_compressed(path, **arrays)
-    said = {"figures": {k: float(v) for k, v in analysis.figures.items()}, "notes": list(analysis.notes)}
-    return {"analysis": said} if any(said.values()) else {}
+    words = {"figures": {k: float(v) for k, v in analysis.figures.items()}, "notes": list(analysis.notes)}
+    return {"analysis": words} if any(words.values()) else {}
 
 
 def _closed_loop(plant: Simulator) -> Callable[[Array], Array]:

@@ -40,7 +40,7 @@ def _record(excitation: Excitation, plant: Simulator, folder: Path, seed: int) -
     record = excitation.run(plant, seed)
     record.write(folder / f"seed{seed}.parquet")
     where = plant.region(record.pv[:, 0])
-    share = {name: float((where == i).mean()) for i, name in enumerate(plant.region_names)}
+    share = {name: float((where == i).mean()) for i, name in enumerate(plant.regions)}
     return str(seed), {"rows": len(record), "regions": share, "digest": record.digest()}
 
 

@@ -19,8 +19,7 @@ from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
 from pipeline.files import write_json
-from pipeline.models import MODELS, Part
-from pipeline.pictures.sweep_plot import draw
+from pipeline.models import MODELS, Part, Source
 from pipeline.records.record import Record
 from pipeline.stages.paths import model_folder
 
@@ -29,38 +28,35 @@ def fit(name: str) -> None:
     """Train the parts of ``models.<name>`` on each data seed; write them, metrics.json and the sweep."""
     params = ModelParams.read(name)
     case = choose(CASES, params.case, "case", f"models.{name}")
-    parts = {part: part_of(case, values, f"models.{name}.parts.{part}") for part, values in params.parts.items()}
+    parts = parts_of(params, f"models.{name}")
     folder = model_folder(params.case, params.model)
     shutil.rmtree(folder, ignore_errors=True)
     data = data_files(params.data)
     work = [(seed, part) for seed in data for part in parts]
-    results = dict(
-        zip(work, parallel_map(partial(_learn, parts, data, case, folder), work, f"fit {name}"), strict=True)
-    )
+    learnt = parallel_map(partial(_learn, parts, data, case, folder), work, f"fit {name}")
+    results = dict(zip(work, learnt, strict=True))
     digests = {str(seed): digest for (seed, _), (digest, _, _) in results.items()}
     metrics: dict[str, Any] = {"model": params.model, "data": digests, "parts": {}}
     for part, description in parts.items():
         per_seed = {str(seed): results[seed, part][1] for seed in data}
         fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
-        metrics["parts"][part] = {
-            "kind": description.model.kind,
-            **fields,
-            "per_seed": per_seed,
-            "median": _median(per_seed),
-        }
+        own = {"per_seed": per_seed, "median": _median(per_seed)}
+        metrics["parts"][part] = {"kind": description.model.kind, **fields, **own}
         predictions = results[0, part][2] if 0 in data else None
         if predictions is not None:
             np.savez(folder / "predictions.npz", **predictions)
     write_json(folder / "metrics.json", metrics)
 
 
-def part_of(case: Case, values: Mapping[str, Any], where: str) -> Part:
-    """The description of one part of a set; ParamsError says what of it cannot be."""
-    options = dict(values)
-    kind = choose(
-        {**MODELS, **beside(case, "models", "MODELS", {})}, options.pop("kind", None), "kind of part", f"{where}.kind"
-    )
-    return parse(kind, options, where)
+def parts_of(params: ModelParams, where: str) -> dict[str, Part]:
+    """The descriptions of a set's parts by name; ParamsError says what of them cannot be."""
+    kinds = {**MODELS, **beside(CASES[params.case], "models", "MODELS", {})}
+    parts = {}
+    for name, values in params.parts.items():
+        place, options = f"{where}.parts.{name}", dict(values)
+        kind = choose(kinds, options.pop("kind", None), "kind of part", f"{place}.kind")
+        parts[name] = parse(kind, options, place)
+    return parts
 
 
 def data_files(data: Path) -> dict[int, Path | None]:
@@ -83,9 +79,11 @@ def _learn(
 ) -> tuple[str | None, dict[str, Any], Mapping[str, Any] | None]:
     seed, name = item
     record = _record(data[seed], case)
-    learnt = parts[name].learn(record, case.plant.signals, case.regions, seed, case.plant)
+    learnt = parts[name].learn(Source(record, case.plant.signals, case.regions, seed, case.plant))
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:
+        from pipeline.pictures.sweep_plot import draw  # here, because matplotlib takes a second to load
+
         learnt.sweep.save(folder / "sweep.json")
         draw(learnt.sweep, folder / "sweep.png")
     return None if record is None else record.digest(), learnt.metrics, learnt.predictions
@@ -94,24 +92,19 @@ def _learn(
 @lru_cache(maxsize=1)
 def _record(path: Path | None, case: Case) -> Record | None:
     """The record of a file; the last one is kept, because a seed's parts follow each other."""
-    signals = case.plant.signals
-    return (
-        None
-        if path is None
-        else Record.read(path, pv=signals.pv, mv=signals.mv, dv=signals.dv, period_s=signals.period_s)
-    )
+    return None if path is None else Record.read(path, case.plant.signals)
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Median over the seeds of every number, nested mappings kept; lists and texts are left out."""
     rows = list(per_seed.values())
-    found: dict[str, Any] = {}
+    medians: dict[str, Any] = {}
     for key, value in rows[0].items():
         if isinstance(value, Mapping):
-            found[key] = _median({str(i): row[key] for i, row in enumerate(rows) if key in row})
+            medians[key] = _median({str(i): row[key] for i, row in enumerate(rows) if key in row})
         elif isinstance(value, (int, float)):
-            found[key] = statistics.median(row[key] for row in rows if key in row)
-    return found
+            medians[key] = statistics.median(row[key] for row in rows if key in row)
+    return medians
 
 
 if __name__ == "__main__":

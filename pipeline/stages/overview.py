@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from pipeline.config.params import sections
-from pipeline.errors import PipelineError
+from pipeline.engine.command import run_stage
 from pipeline.evaluation.standing import Standing
 from pipeline.report.overview import write_overview
 from pipeline.stages.paths import ARTIFACTS
@@ -18,15 +18,5 @@ def overview() -> None:
         print(path)
 
 
-def main() -> int:
-    """The exit status: 2 and one line where it could not."""
-    try:
-        overview()
-    except (PipelineError, OSError) as error:
-        print(f"overview: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_stage(overview, sys.argv))

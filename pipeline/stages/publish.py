@@ -5,23 +5,17 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from pipeline.errors import PipelineError
+from pipeline.engine.command import run_stage
 from pipeline.files import write_json
-from pipeline.tracking.publish import publish
+from pipeline.tracking.publish import publish as write_store
 
 RECEIPT = Path("published.json")
 
 
-def main() -> int:
+def publish() -> None:
     """Publish what dvc.lock records; the receipt is the stage's output."""
-    try:
-        receipt = publish(Path.cwd())
-    except PipelineError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    write_json(RECEIPT, receipt)
-    return 0
+    write_json(RECEIPT, write_store(Path.cwd()))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_stage(publish, sys.argv))

@@ -22,16 +22,15 @@ def report(name: str) -> None:
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
     case = choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
     case.tests()  # raises where there are none
-    # A new case has no bounds until the oracle has run; stale ones are an error, never shown.
+    # A new case has no bounds until `loopwright bounds` has run; stale ones are an error, never shown.
     bounds, missing = stored_bounds(case) if bounds_path(case).exists() else ({}, [])
     for line in missing or ([] if bounds else [f"no bounds yet; `loopwright bounds {name}` computes them"]):
         print(f"report {name}: {line}", file=sys.stderr)
     laws, models = entries("controllers", name, "name"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
-    evidence = Evidence.load(case, bounds, WORK / name, laws, models, own_data, TIMING / name)
-    for path in write_report(
-        evidence, beside(case, "paper", "CLAIMS", PLAIN), WORK / name / "models", ARTIFACTS / name
-    ):
+    evidence = Evidence.load(case, bounds, WORK / name, TIMING / name, laws, models, own_data)
+    claims, pictures = beside(case, "paper", "CLAIMS", PLAIN), beside(case, "pictures", "PICTURES", ())
+    for path in write_report(evidence, claims, pictures, ARTIFACTS / name):
         print(path)
     verdicts = (ARTIFACTS / name / "validation.json").read_bytes()
     write_json(receipt_file(name), {"validation_sha256": hashlib.sha256(verdicts).hexdigest()})

@@ -18,11 +18,10 @@ from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
-from pipeline.evaluation.law_evidence import lock_up_text
-from pipeline.evaluation.trial import BASE, Metrics, Trial, step_us, try_file
+from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
+from pipeline.evaluation.trial import Metrics, Trial, step_us, try_file
 from pipeline.export.controller_file import with_evidence
 from pipeline.files import read_json, write_json
-from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.stages.paths import (
     ARTIFACTS,
     analysis_file,
@@ -63,19 +62,9 @@ def validate(name: str) -> None:
     folder = validation_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
     designed = read_json(design_folder(params.case, params.name) / "metrics.json")
-    analysis = {r["form"]: r["analysis"] for r in designed["controllers"] if _is_told(r, shipped.seed)}
-    metrics = {
-        "name": params.name,
-        "law": params.law,
-        "title": designed["title"],
-        **_summary(params, base, trials, shipped),
-        "as_printed": params.as_printed,
-        "locked_up": locked_up,
-        "analysis": analysis,
-        "metric": case.metric,
-    }
-    write_json(folder / "metrics.json", metrics)
-    took = step_us(Controller(source), next(iter(shipped.curves.values())))
+    metrics = _metrics(params, case, designed, trials, shipped)
+    metrics.write(folder / "metrics.json")
+    took = step_us(Controller(source), next(iter(shipped.curves.values())), case.plant.dv_nominal)
     write_json(step_time_file(params.case, params.name), took)
     print(f"validate {name}: one step takes {took['p50']:.0f} us (median)", file=sys.stderr)
     curves = {f"{s}/{t.form}/{t.seed}": c for t in trials if t.seed == shipped.seed for s, c in t.curves.items()}
@@ -83,8 +72,8 @@ def validate(name: str) -> None:
     np.savez_compressed(folder / "trajectories.npz", **arrays)
     _keep_analysis(params, shipped.seed, folder / "analysis.npz")
     evidence = _evidence(case, base, shipped)
-    if BASE in analysis:
-        evidence["analysis"] = analysis[BASE]["figures"]
+    if (analysis := metrics.forms[BASE].analysis) is not None:
+        evidence["analysis"] = analysis.figures
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     with_evidence(source, ARTIFACTS / params.case / f"{params.name}.onnx", evidence)
@@ -94,10 +83,6 @@ def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:
     """Test -> data seed -> closed loops that locked up, of those where any did."""
     tests = dict.fromkeys(test for t in base for test in t.locked_up)
     return {test: {str(t.seed): t.locked_up[test] for t in base if test in t.locked_up} for test in tests}
-
-
-def _is_told(row: Mapping[str, Any], seed: int) -> bool:
-    return row["seed"] == seed and "analysis" in row
 
 
 def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:
@@ -112,37 +97,47 @@ def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:
         np.savez_compressed(path, **arrays)
 
 
-def _summary(params: ControllerParams, base: list[Trial], trials: list[Trial], shipped: Trial) -> dict[str, Any]:
-    clean = [name for name in base[0].metrics if not name.endswith(NOISE_SUFFIX)]
-    forms = {t.form: [u for u in trials if u.form == t.form] for t in trials if t.form != BASE}
-    return {
-        "info": list(shipped.info),
-        "variant_info": {form: list(rows[0].info) for form, rows in forms.items()},  # a setting may tell more
-        "setting": {k: v for k, v in params.settings.items() if isinstance(v, (int, float, str))},
-        "seeds": [t.seed for t in base],
-        "shipped_seed": shipped.seed,
-        "lock_ups": sum(t.lock_ups for t in base),
-        "development_lock_ups": sum(t.development_lock_ups for t in base),
-        "development": {str(t.seed): t.development for t in base},
-        "scenarios": {name: _over_seeds({t.seed: t.metrics[name] for t in base}) for name in clean},
-        "noise": {name: _over_seeds({t.seed: t.metrics[name + NOISE_SUFFIX] for t in base}) for name in clean},
-        "sequences": {
-            name: {seed: _over_seeds({t.seed: t.sequences[name][seed] for t in base})["median"] for seed in rows}
+def _metrics(
+    params: ControllerParams, case: Case, designed: Mapping[str, Any], trials: list[Trial], shipped: Trial
+) -> LawMetrics:
+    """What is kept of the trials; ``designed`` is what design left of every form and seed."""
+    base = [t for t in trials if t.form == BASE]
+    analyses = {row["form"]: row.get("analysis") for row in designed["controllers"] if row["seed"] == shipped.seed}
+
+    def form(name: str, settings: Mapping[str, Any]) -> Form:
+        rows = [t for t in trials if t.form == name]
+        analysis = parse(Analysis, analyses[name], f"analysis of {name}") if analyses.get(name) else None
+        tests = {test: _over_seeds({t.seed: t.metrics[test] for t in rows}) for test in rows[0].metrics}
+        plain = {key: value for key, value in settings.items() if isinstance(value, (int, float, str))}
+        return Form(plain, rows[0].info, tests, analysis)
+
+    return LawMetrics(
+        name=params.name,
+        title=designed["title"],
+        metric=case.metric,
+        seeds=tuple(t.seed for t in base),
+        shipped_seed=shipped.seed,
+        forms={name: form(name, settings) for name, settings in {BASE: params.settings, **params.variants}.items()},
+        lock_ups=sum(t.lock_ups for t in base),
+        development_lock_ups=sum(t.development_lock_ups for t in base),
+        development={str(t.seed): t.development for t in base},
+        locked_up=_locked_up(base),
+        as_printed=params.as_printed,
+        sequences={
+            name: {seed: _over_seeds({t.seed: t.sequences[name][seed] for t in base}).median for seed in rows}
             for name, rows in base[0].sequences.items()
         },
-        "variants": {
-            form: {name: _over_seeds({t.seed: t.metrics[name] for t in rows}) for name in rows[0].metrics}
-            for form, rows in forms.items()
-        },
-    }
+    )
 
 
-def _over_seeds(rows: Mapping[int, Metrics]) -> dict[str, Any]:
+def _over_seeds(rows: Mapping[int, Metrics]) -> OverSeeds:
     """Median and range of each figure over the data seeds, and each seed's own."""
-    found: dict[str, Any] = {}
-    for name, reduce in (("median", statistics.median), ("min", min), ("max", max)):
-        found[name] = {key: float(reduce(row[key] for row in rows.values())) for key in next(iter(rows.values()))}
-    return found | {"per_seed": {str(seed): row for seed, row in rows.items()}}
+    names = next(iter(rows.values()))
+    median, low, high = (
+        {name: float(reduce(row[name] for row in rows.values())) for name in names}
+        for reduce in (statistics.median, min, max)
+    )
+    return OverSeeds(median, low, high, {str(seed): row for seed, row in rows.items()})
 
 
 def _evidence(case: Case, base: list[Trial], shipped: Trial) -> dict[str, Any]:

@@ -6,10 +6,12 @@ strips ``data:`` images and every size or style, so pictures are drawn in the si
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from html import escape
 
+from pipeline.evaluation.law_evidence import Analysis
 from pipeline.evaluation.metric import ratio_to_bound
-from pipeline.evaluation.validation import Analysis, Validation
+from pipeline.evaluation.validation import Validation
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.tracking.gate import Gate, Rank
 
@@ -26,7 +28,7 @@ def model_description(case: str, law: str, validation: Validation | None, champi
     name = f"{case}-{law}"
     take = case if name == champion else name
     return (
-        f"<p>{escape(_standing(name, law, validation, champion))}</p>"
+        f"<p>{escape(standing(name, law, validation, champion)[1])}</p>"
         f"<p><b>{escape(title)}</b> for {escape(place)}. "
         "Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup.</p>"
         f"<p>Take it: <code>loopwright registry fetch {escape(take)} FOLDER</code></p>"
@@ -35,31 +37,21 @@ def model_description(case: str, law: str, validation: Validation | None, champi
     )
 
 
-def _standing(name: str, law: str, validation: Validation | None, champion: str | None) -> str:
-    """Where a controller stands, in a sentence or two without markup."""
-    rank, gate = Rank.of_laws(validation).get(law), Gate.of(validation, law)
-    if rank is None or gate.score is None:
-        return "Not compared yet: the report stage of its case has not run."
-    score = f"{gate.score:.3f} times the bound"
+def standing(name: str, law: str, validation: Validation | None, champion: str | None) -> tuple[str, str]:
+    """Where a controller stands: in a few words for the list of models, and in a sentence or two without markup."""
+    rank, score = Rank.of_laws(validation).get(law), Gate.of(validation, law).score
+    if rank is None or score is None:
+        return "not compared yet", "Not compared yet: the report stage of its case has not run."
+    place, ratio = f"{rank.place} of {rank.of}", f"{score:.3f} times the bound"
+    if name == champion and rank.place == 1:
+        return f"champion, {place}", f"CHAMPION: the best of the {rank.of} controllers of its case, {ratio}."
     if name == champion:
-        if rank.place == 1:
-            return f"CHAMPION: the best of the {rank.of} controllers of its case, {score}."
-        return f"CHAMPION of its case, {score}; rank {rank.place} of {rank.of} in the newest comparison."
-    best = f" The champion is {champion}." if champion else " The case has no champion."
+        return f"champion, {place}", f"CHAMPION of its case, {ratio}; rank {place} in the newest comparison."
+    best = f"The champion is {champion}." if champion else "The case has no champion."
     if rank.refusal:
-        return f"Rank {rank.place} of {rank.of}, {score}. It does not pass the gate: {rank.refusal}.{best}"
-    return f"Rank {rank.place} of {rank.of}, {score}.{best}"
-
-
-def standing_tag(name: str, law: str, validation: Validation | None, champion: str | None) -> str:
-    """The same in a few words, for the list of models."""
-    rank = Rank.of_laws(validation).get(law)
-    if rank is None:
-        return "not compared yet"
-    place = f"{rank.place} of {rank.of}"
-    if name == champion:
-        return f"champion, {place}"
-    return f"{place}, did not pass the gate" if rank.refusal else place
+        sentence = f"Rank {place}, {ratio}. It does not pass the gate: {rank.refusal}. {best}"
+        return f"{place}, did not pass the gate", sentence
+    return place, f"Rank {place}, {ratio}. {best}"
 
 
 def version_description(validation: Validation | None, gate: Gate, run_id: str, picture: str | None) -> str:
@@ -89,15 +81,8 @@ def _verdict(gate: Gate) -> str:
 def _table(validation: Validation, shown: Gate) -> str:
     law = shown.law
     scenarios, metric, titles = validation.scenarios, validation.metric, validation.titles
-    heads = [
-        f"Scenario ({titles.metric})",
-        "this law",
-        "range over seeds",
-        "with noise",
-        shown.baseline_name,
-        "NMPC",
-        "ratio",
-    ]
+    heads = [f"Scenario ({titles.metric})", "this law", "range over seeds", "with noise"]
+    heads += [shown.baseline_name, "NMPC", "ratio"]
     rows = []
     for name, laws in scenarios.items():
         own = laws.get(law)
@@ -117,35 +102,32 @@ def _table(validation: Validation, shown: Gate) -> str:
                 "" if ratio is None else f"{ratio:.2f}",
             ]
         )
-    if not rows:
-        return ""
+    return _html_table(heads, rows) if rows else ""
+
+
+def _html_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     head = "".join(f"<th>{cell}{GAP}</th>" for cell in heads)
     body = "".join("<tr>" + "".join(f"<td>{cell}{GAP}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def analysis_figures(validation: Validation | None, law: str) -> dict[str, float]:
-    """What the shipped form of a law found apart from its tests, by name; empty where it has no analysis."""
+    """The figures of a law's analysis, of its shipped form, by name; empty where it has none."""
     return {} if validation is None else dict(_analysed(validation, law).figures)
 
 
 def _analysed(validation: Validation, law: str) -> Analysis:
-    found = validation.laws.get(law)
-    return (found.analysis.get("base") if found else None) or Analysis()
+    result = validation.laws.get(law)
+    return (result.analysis.get("base") if result else None) or Analysis()
 
 
 def _analysis(validation: Validation, law: str) -> str:
-    words, said = validation.titles.figures, _analysed(validation, law)
-    figures, notes = said.figures, said.notes
-    if not figures and not notes:
+    words, analysis = validation.titles.figures, _analysed(validation, law)
+    if not analysis.figures and not analysis.notes:
         return ""
-    rows = "".join(
-        f"<tr><td>{escape(words.get(name, name.replace('_', ' ')))}{GAP}</td><td>{_figure(value)}</td></tr>"
-        for name, value in figures.items()
-    )
-    table = f"<table><thead><tr><th>Analysis{GAP}</th><th></th></tr></thead><tbody>{rows}</tbody></table>"
-    listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    return (table if rows else "<p>Analysis</p>") + (f"<ul>{listed}</ul>" if listed else "")
+    rows = [(escape(words.get(n, n.replace("_", " "))), _figure(value)) for n, value in analysis.figures.items()]
+    listed = "".join(f"<li>{escape(note)}</li>" for note in analysis.notes)
+    return (_html_table(("Analysis", ""), rows) if rows else "<p>Analysis</p>") + (listed and f"<ul>{listed}</ul>")
 
 
 def _figure(value: float | None) -> str:

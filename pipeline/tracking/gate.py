@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from pipeline.evaluation.law_evidence import lock_up_text
-from pipeline.evaluation.validation import Validation
+from pipeline.evaluation.validation import GateResult, Validation
 
 BASELINE = "pid"  # of a validation that names none
 
@@ -41,7 +41,7 @@ class Gate:
     score: float | None
     baseline: float | None  # the baseline's score on the same test
     lock_ups: int | None
-    ratios: dict[str, float]
+    ratios: Mapping[str, float]
     baseline_law: str = BASELINE
     baseline_name: str = "PID"
     locked_up: str = ""  # on which tests, of which data seeds
@@ -51,18 +51,20 @@ class Gate:
         """The figures of ``law``; scores are None where the validation, or the whole of it, is missing."""
         if validation is None:
             return cls(law, "", None, None, None, {})
-        gate = validation.gate
-        own, baseline, found = gate.laws.get(law), gate.laws.get(gate.baseline), validation.laws.get(law)
+        gate, absent = validation.gate, GateResult(None, None, {})
+        own, baseline = gate.laws.get(law, absent), gate.laws.get(gate.baseline, absent)
+        result = validation.laws.get(law)
+        locked_up = "" if result is None else lock_up_text(result.locked_up)
         return cls(
-            law=law,
-            id=gate.id,
-            score=None if own is None else own.score,
-            baseline=None if baseline is None else baseline.score,
-            lock_ups=None if own is None else own.lock_ups,
-            ratios={} if own is None else dict(own.ratios),
-            baseline_law=gate.baseline,
-            baseline_name=gate.baseline_name,
-            locked_up="" if found is None else lock_up_text(found.locked_up),
+            law,
+            gate.id,
+            own.score,
+            baseline.score,
+            own.lock_ups,
+            own.ratios,
+            gate.baseline,
+            gate.baseline_name,
+            locked_up,
         )
 
     def tags(self) -> dict[str, str]:
@@ -114,8 +116,5 @@ class Rank:
     def of_laws(cls, validation: Validation | None) -> dict[str, Self]:
         """The rank of every law that has a score."""
         gates = [Gate.of(validation, law) for law in (validation.gate.laws if validation else ())]
-        scored = [(gate.refusal() is not None, gate.score, gate.law) for gate in gates if gate.score is not None]
-        return {
-            law: cls(place, len(scored), Gate.of(validation, law).refusal())
-            for place, (_, _, law) in enumerate(sorted(scored), 1)
-        }
+        scored = sorted((g.refusal() is not None, g.score, g.law, g.refusal()) for g in gates if g.score is not None)
+        return {law: cls(place, len(scored), refusal) for place, (_, _, law, refusal) in enumerate(scored, 1)}

@@ -11,10 +11,11 @@ import statistics
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
+from pipeline.evaluation.law_evidence import BASE, LawMetrics
 from pipeline.evaluation.validation import Validation
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.tracking.gate import Gate
-from pipeline.tracking.lock import flat
+from pipeline.tracking.stage_results import flat
 
 MOST = 12
 OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
@@ -26,14 +27,14 @@ Figures = dict[str, float]
 
 def headline(kind: str, metrics: Mapping[str, Any], validation: Validation | None) -> Figures:
     """The metrics of a run of stage ``kind``, from its own metrics.json and its case's validation.json."""
-    if kind == "validate":
-        found = _of_law(metrics, validation)
-    elif kind == "report":
-        found = _of_case(validation)
-    else:
-        own = {"excite": _of_record, "fit": _of_models, "design": _of_files}.get(kind)
-        found = own(metrics) if own else {}
-    finite = {name: float(value) for name, value in found.items() if _is_figure(value)}
+    figures = {
+        "excite": lambda: _of_record(metrics),
+        "fit": lambda: _of_models(metrics),
+        "design": lambda: _of_files(metrics),
+        "validate": lambda: _of_law(metrics, validation),
+        "report": lambda: _of_case(validation),
+    }.get(kind, dict)()
+    finite = {name: float(value) for name, value in figures.items() if _is_figure(value)}
     return dict(list(finite.items())[:MOST])
 
 
@@ -69,19 +70,22 @@ def _of_files(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str, Any]:
     """The case's score on each kind of test, the tests of the gate first: the median over the data seeds."""
-    metric = str(tree.get("metric") or (validation.metric if validation else "mae"))
-    scenarios, noisy = tree.get("scenarios") or {}, tree.get("noise") or {}
+    if not tree:
+        return {}
+    law = LawMetrics.of(tree)
+    tests = law.forms[BASE].tests
     weights = validation.gate.weights if validation else {}
     errors = {}
-    for test in sorted(scenarios, key=lambda name: -max(weights.get(name, 0), weights.get(name + NOISE_SUFFIX, 0))):
-        rows = noisy if test + NOISE_SUFFIX in weights and test not in weights else scenarios
-        errors[f"{metric}/{test}"] = rows[test]["median"].get(metric)
-    own = validation.laws.get(str(tree.get("name"))) if validation else None
+    plain = (name for name in tests if not name.endswith(NOISE_SUFFIX))
+    for test in sorted(plain, key=lambda name: -max(weights.get(name, 0), weights.get(name + NOISE_SUFFIX, 0))):
+        noisy = test + NOISE_SUFFIX in weights and test not in weights
+        errors[f"{law.metric}/{test}"] = tests[test + NOISE_SUFFIX * noisy].median.get(law.metric)
+    own = validation.laws.get(law.name) if validation else None
     shown = {
-        **of_gate(str(tree.get("name")), validation),
-        "lock_ups": tree.get("lock_ups"),
+        **of_gate(law.name, validation),
+        "lock_ups": law.lock_ups,
         "step_us": own.step_us if own else None,
-        "data_seeds": len(tree.get("seeds") or ()),
+        "data_seeds": len(law.seeds),
     }
     return shown | errors
 
@@ -94,13 +98,8 @@ def _of_case(validation: Validation | None) -> dict[str, Any]:
     shown: dict[str, Any] = {"laws": len(laws), "laws_that_locked_up": sum(bool(r.lock_ups) for r in laws.values())}
     if scores:
         shown |= {"best_ratio_to_bound": min(scores), "median_ratio_to_bound": statistics.median(scores)}
-    judged = (
-        ("requirements", "met", validation.requirements),
-        ("claims", "confirmed", validation.claims),
-        ("paper", "reproduced", validation.paper),
-    )
-    for name, words, rows in judged:
-        known = [row.holds for row in rows if row.holds is not None]
+    for name, words in (("requirements", "met"), ("claims", "confirmed"), ("paper", "reproduced")):
+        known = [row.holds for row in getattr(validation, name) if row.holds is not None]
         if known:
             shown |= {f"{name}/checked": len(known), f"{name}/{words}": sum(known)}
     return shown

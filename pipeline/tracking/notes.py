@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pipeline.evaluation.validation import Validation
 from pipeline.tracking.gate import Gate
-from pipeline.tracking.lock import StageResult
-from pipeline.tracking.times import Times
+from pipeline.tracking.stage_results import StageResult, Times
 
 WHAT = {
     "excite": "Made the data set **{item}** of the case *{case}*: the simulated plant, excited, with measurement noise."
@@ -33,7 +32,7 @@ METRICS = {
 
 def run_note(result: StageResult, case: str, validation: Validation | None, times: Times) -> str:
     """The description of a run: what the stage did, what came out, and what its metrics mean."""
-    item = item_of(result)
+    item = result.item
     words = {"case": case, "item": item, "metric": "mae"}
     if validation is not None:
         words |= {"case": validation.titles.case, "metric": validation.metric}
@@ -52,11 +51,6 @@ def run_note(result: StageResult, case: str, validation: Validation | None, time
             " Created is when the files were written."
         )
     return "\n\n".join(filter(None, parts))
-
-
-def item_of(result: StageResult) -> str:
-    """What the stage was run for, without its case: a record, a model set, a controller; the case for a report."""
-    return result.name.partition("@")[2].removeprefix(f"{result.case}-")
 
 
 def _verdict(gate: Gate) -> str:

@@ -10,16 +10,11 @@ from typing import Any
 from mlflow import MlflowClient
 
 from pipeline.evaluation.validation import FILE, Validation
-from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_current, read_lock
+from pipeline.files import sha256
 from pipeline.tracking.notes import experiment_note
-from pipeline.tracking.registry import (
-    describe,
-    elect_champion,
-    file_digest,
-    register,
-    rename_aliases,
-)
+from pipeline.tracking.registry import describe, elect_champion, register
 from pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
+from pipeline.tracking.stage_results import StageResult, dataset_hash, datasets, read_lock
 from pipeline.tracking.store import experiment_id, hide_default, store
 
 
@@ -30,68 +25,60 @@ def publish(root: Path) -> dict[str, Any]:
     run ids, so it is the same after a deleted store was rebuilt. A result whose files on disk are
     not those of dvc.lock (a stage that was killed) is left out, with a line saying so.
 
-    Raises
-    ------
-    TrackingError
-        Where there is no dvc.lock or the store does not answer.
+    Raises TrackingError where there is no dvc.lock or the store does not answer.
     """
     results = read_lock(root)
     by_case: dict[str, list[StageResult]] = {}
     for result in results:
         if result.case is None:
             continue
-        if is_current(result, root):
+        if result.is_current(root):
             by_case.setdefault(result.case, []).append(result)
         else:
             _say(f"left out {result.name}: its files are not those of dvc.lock; run `dvc repro`")
+    receipt: dict[str, Any] = {"stages": {r.name: r.key for own in by_case.values() for r in own}, "controllers": {}}
     with store() as client:
-        receipt: dict[str, Any] = {"stages": {}, "controllers": {}}
         for case, own in by_case.items():
-            _publish_case(client, case, own, results, root, receipt)
+            receipt["controllers"] |= _publish_case(client, case, own, results, root)
         hide_default(client)
     return receipt
 
 
 def _publish_case(
-    client: MlflowClient,
-    case: str,
-    own: list[StageResult],
-    results: list[StageResult],
-    root: Path,
-    receipt: dict[str, Any],
-) -> None:
+    client: MlflowClient, case: str, own: list[StageResult], results: list[StageResult], root: Path
+) -> dict[str, str]:
+    """Publish a case's own results; returns registered model -> digest of its file."""
     experiment = experiment_id(client, case)
-    rename_aliases(client, case)
     known = published(client, experiment)
-    runs = {key: str(run.info.run_id) for key, run in known.items()}
-    commit = git_commit(root)
     evidence = root / "artifacts" / case / FILE
     validation = Validation.read(evidence) if evidence.exists() else None
-    new = 0
+    common = {"git_commit": git_commit(root)}
+    records = {result.name: datasets(result, results) for result in own}
+    tags = {name: common | {"dataset_sha256": dataset_hash(data)} for name, data in records.items()}
+    runs = {key: str(run.info.run_id) for key, run in known.items()}
+    new = [result for result in own if result.key not in runs]
     for number, result in enumerate(own, 1):
         if result.key not in runs:
-            tags = {"case": case, "git_commit": commit, "dataset_sha256": dataset_hash(result, results)}
-            records = datasets(result, results)
-            runs[result.key] = write_run(client, experiment, result, root, records, validation, tags)
-            new += 1
+            marks = {"case": case, **tags[result.name]}
+            runs[result.key] = write_run(client, experiment, result, root, records[result.name], validation, marks)
             _say(f"[{number}/{len(own)}] {case}: run {result.name}")
-        receipt["stages"][result.name] = result.key
-    made = 0
+    digests, made = {}, 0
     for result in own:
         for path in sorted(root / out for out in result.outs if result.kind == "validate" and out.endswith(".onnx")):
-            run_id = runs[result.key]
+            run_id, law = runs[result.key], path.stem
             if result.key in known:
-                refresh(client, known[result.key], path.stem, validation)
-            picture = _add_picture(client, run_id, evidence.parent / "figures" / f"closed_loop_{path.stem}.png")
-            tags = {"git_commit": commit, "dataset_sha256": dataset_hash(result, results), "stage_key": result.key}
-            line, is_new = register(client, case, path, run_id, validation, picture, tags)
+                refresh(client, known[result.key], law, validation)
+            picture = _add_picture(client, run_id, evidence.parent / "figures" / f"closed_loop_{law}.png")
+            marks = {**tags[result.name], "stage_key": result.key}
+            line, is_new = register(client, case, path, run_id, validation, picture, marks)
             made += is_new
             _say(line)
-            receipt["controllers"][f"{case}-{path.stem}"] = file_digest(path)
+            digests[f"{case}-{law}"] = sha256(path)
     champion = elect_champion(client, case)
     describe(client, case, validation, champion)
     describe_experiment(client, experiment, experiment_note(case, validation, champion))
-    _say(f"{case}: {new} new runs of {len(own)}, {made} new versions; champion: {champion or 'none'}")
+    _say(f"{case}: {len(new)} new runs of {len(own)}, {made} new versions; champion: {champion or 'none'}")
+    return digests
 
 
 def _add_picture(client: MlflowClient, run_id: str, picture: Path) -> str | None:

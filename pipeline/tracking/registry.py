@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import sys
@@ -25,20 +24,13 @@ from mlflow.types import Schema, TensorSpec
 
 from pipeline.errors import TrackingError
 from pipeline.evaluation.validation import Validation
-from pipeline.files import write_bytes
+from pipeline.files import sha256, write_bytes
 from pipeline.tracking import card
 from pipeline.tracking.gate import Gate
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
-FORMER = "case_champion"
-"""What ``champion`` was called when ``champion`` meant ``best``."""
 BY_HAND = "champion_by"
 REQUIREMENTS = ["onnxruntime>=1.20", "numpy>=2.0"]
-
-
-def file_digest(path: Path) -> str:
-    """sha256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def registered(client: MlflowClient) -> list[RegisteredModel]:
@@ -59,13 +51,11 @@ def _order(model: RegisteredModel) -> tuple[str, bool, int, str]:
 
 def versions(client: MlflowClient, name: str) -> list[ModelVersion]:
     """All versions of a registered model with their tags and aliases, the newest first."""
-    found = client.search_model_versions(f"name = '{name}'", max_results=10_000)
-    aliases: dict[str, list[str]] = {}
-    for alias, number in (client.get_registered_model(name).aliases if found else {}).items():
-        aliases.setdefault(str(number), []).append(alias)
-    for version in found:
-        version.aliases = sorted(aliases.get(str(version.version), []))
-    return sorted(found, key=lambda v: -int(v.version))
+    rows = client.search_model_versions(f"name = '{name}'", max_results=10_000)
+    aliases = client.get_registered_model(name).aliases if rows else {}
+    for version in rows:
+        version.aliases = sorted(alias for alias, number in aliases.items() if str(number) == str(version.version))
+    return sorted(rows, key=lambda v: -int(v.version))
 
 
 def register(
@@ -84,18 +74,12 @@ def register(
     law = path.stem
     name = f"{case}-{law}"
     gate = Gate.of(validation, law)
-    digest = file_digest(path)
+    digest = sha256(path)
     if not client.search_registered_models(f"name = '{name}'"):
         client.create_registered_model(name, tags={"standing": "not compared yet", "case": case, "law": law})
     known = next((v for v in versions(client, name) if v.tags.get("sha256") == digest), None)
     manifest = json.loads(path.with_suffix(".json").read_text()) if path.with_suffix(".json").exists() else {}
-    own = {
-        "sha256": digest,
-        "law": law,
-        "case": case,
-        "plant": str((manifest.get("provenance") or {}).get("plant", case)),
-        "period_s": str(manifest.get("period_s", "")),
-    }
+    own = {"sha256": digest, "law": law, "case": case, "period_s": str(manifest.get("period_s", ""))}
     description = card.version_description(validation, gate, run_id, picture)
     analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
     tags = {**gate.tags(), **analysis, **own, **tags}  # in this order they are shown
@@ -121,8 +105,7 @@ def _log(client: MlflowClient, name: str, path: Path, run_id: str, description: 
     of the run and write it a second time.
     """
     model = onnx.load(path)
-    run = client.get_run(run_id)
-    made = client.create_logged_model(run.info.experiment_id, name=name, source_run_id=run_id)
+    made = client.create_logged_model(client.get_run(run_id).info.experiment_id, name=name, source_run_id=run_id)
     info = mlflow.onnx.log_model(
         model,
         model_id=made.model_id,
@@ -150,32 +133,21 @@ def _schema(values: Iterable[onnx.ValueInfoProto]) -> Schema:
 def _elect(client: MlflowClient, name: str, number: str, gate: Gate) -> str:
     """Move ``best`` to the version if it earned it; returns the verdict in words."""
     holder = next((v for v in versions(client, name) if BEST in v.aliases), None)
-    if holder is not None and str(holder.version) == number:
-        return "is the best version"
-    refusal = gate.refusal() or (gate.refusal_against(holder.tags) if holder is not None else None)
-    if refusal:
-        return f"not the best version: {refusal}"
-    client.set_registered_model_alias(name, BEST, number)
+    if holder is None or str(holder.version) != number:
+        refusal = gate.refusal() or (gate.refusal_against(holder.tags) if holder is not None else None)
+        if refusal:
+            return f"not the best version: {refusal}"
+        client.set_registered_model_alias(name, BEST, number)
     return "is the best version"
 
 
 def _of_case(client: MlflowClient, case: str) -> list[ModelVersion]:
     """Every version of every controller of a case."""
-    models = client.search_registered_models(f"tags.`case` = '{case}'", max_results=1000)
-    return [version for model in models for version in versions(client, model.name)]
+    return [version for model in _models(client, case) for version in versions(client, model.name)]
 
 
-def rename_aliases(client: MlflowClient, case: str) -> None:
-    """Bring the aliases of an earlier release to this one's names: champion was case_champion, best was champion."""
-    rows = _of_case(client, case)
-    if not any(FORMER in v.aliases for v in rows):
-        return
-    for version in rows:
-        if CHAMPION in version.aliases:
-            client.set_registered_model_alias(version.name, BEST, str(version.version))
-            client.delete_registered_model_alias(version.name, CHAMPION)
-        if FORMER in version.aliases:
-            client.delete_registered_model_alias(version.name, FORMER)
+def _models(client: MlflowClient, case: str) -> list[RegisteredModel]:
+    return list(client.search_registered_models(f"tags.`case` = '{case}'", max_results=1000))
 
 
 def elect_champion(client: MlflowClient, case: str) -> str | None:
@@ -208,10 +180,10 @@ def _crown(client: MlflowClient, holders: Iterable[ModelVersion], best: ModelVer
 
 def describe(client: MlflowClient, case: str, validation: Validation | None, champion: str | None) -> None:
     """Say on the page of every controller of a case where it stands."""
-    for model in client.search_registered_models(f"tags.`case` = '{case}'", max_results=1000):
+    for model in _models(client, case):
         law = model.tags["law"]
         description = card.model_description(case, law, validation, champion)
-        standing = card.standing_tag(model.name, law, validation, champion)
+        standing, _ = card.standing(model.name, law, validation, champion)
         if model.description != description:
             client.update_registered_model(model.name, description)
         if model.tags.get("standing") != standing:
@@ -234,11 +206,11 @@ def _find(client: MlflowClient, what: str, default_alias: str) -> ModelVersion:
         hint = f"did you mean {near[0]!r}? `list` shows all" if near else "the registry is empty: run `dvc repro`"
         raise TrackingError(f"no controller {bare!r} is registered; {hint}")
     number, alias = what.partition("/")[2], what.partition("@")[2] or default_alias
-    found = versions(client, bare)
-    for version in found:
+    rows = versions(client, bare)
+    for version in rows:
         if (str(version.version) == number) if number else (alias in version.aliases):
             return version
-    have = ", ".join(str(v.version) + "".join(f" @{a}" for a in v.aliases) for v in reversed(found))
+    have = ", ".join(str(v.version) + "".join(f" @{a}" for a in v.aliases) for v in reversed(rows))
     wanted = f"version {number}" if number else f"alias {alias!r}"
     raise TrackingError(f"{bare} has no {wanted}; it has {have}; give NAME/NUMBER or NAME@ALIAS")
 
@@ -258,7 +230,7 @@ def promote(client: MlflowClient, name: str, number: str, alias: str) -> str:
     case = version.tags.get("case")
     if alias == BEST and case:
         elect_champion(client, case)
-    said = f"{version.name} version {version.version} is now @{alias}"
+    line = f"{version.name} version {version.version} is now @{alias}"
     if alias == CHAMPION and case:
         rows = _of_case(client, case)
         for other in rows:
@@ -267,11 +239,11 @@ def promote(client: MlflowClient, name: str, number: str, alias: str) -> str:
         client.set_model_version_tag(version.name, str(version.version), BY_HAND, "hand")
         best = next(v for v in rows if v.name == version.name and str(v.version) == str(version.version))
         _crown(client, [v for v in rows if CHAMPION in v.aliases], best)
-        said += (
+        line += (
             f" of {case}, by hand: the gate (no lock-up, better than the baseline and than the other controllers) was "
             f"not asked. It stays champion until you promote another one or delete its tag {BY_HAND!r}"
         )
-    return said
+    return line
 
 
 def fetch(client: MlflowClient, what: str, folder: Path) -> list[Path]:
@@ -280,13 +252,14 @@ def fetch(client: MlflowClient, what: str, folder: Path) -> list[Path]:
     law = version.tags.get("law", "")
     with tempfile.TemporaryDirectory() as draft:
         files = [_download(client, version, f"{law}{suffix}", draft) for suffix in (".onnx", ".json")]
-        if file_digest(files[0]) != version.tags.get("sha256"):
+        if sha256(files[0]) != version.tags.get("sha256"):
             raise TrackingError(
                 f"{version.name} version {version.version}: the stored {files[0].name} is not the file that was "
                 "registered (its sha256 differs); delete the version and run `make registry`"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        return [_place(file, folder / file.name) for file in files]
+        for file in files:
+            write_bytes(folder / file.name, file.read_bytes())
+        return [folder / file.name for file in files]
 
 
 def _download(client: MlflowClient, version: ModelVersion, file: str, draft: str) -> Path:
@@ -301,9 +274,3 @@ def _download(client: MlflowClient, version: ModelVersion, file: str, draft: str
             "if mlflow.db was moved or copied, put its folder mlruns beside it, "
             "otherwise delete mlflow.db and run `make registry`"
         ) from error
-
-
-def _place(source: Path, target: Path) -> Path:
-    """Copy a file; a loop that reloads it never sees half of it."""
-    write_bytes(target, source.read_bytes())
-    return target

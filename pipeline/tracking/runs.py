@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,9 +15,8 @@ from mlflow.utils.time import get_current_time_millis
 
 from pipeline.evaluation.validation import Validation
 from pipeline.tracking.headline import curves, headline, of_gate, table
-from pipeline.tracking.lock import StageResult
-from pipeline.tracking.notes import item_of, run_note
-from pipeline.tracking.times import Times
+from pipeline.tracking.notes import run_note
+from pipeline.tracking.stage_results import StageResult, Times
 
 KEY_TAG = "stage_key"
 ARTIFACTS = {".png", ".json", ".html", ".md", ".onnx"}
@@ -31,13 +30,11 @@ PARAMS_A_CALL, PARAM_CHARACTERS, DIGEST_CHARACTERS = 100, 6000, 36  # mlflow's l
 
 def git_commit(root: Path) -> str:
     """The commit that the working tree stands on; "unknown" without git."""
+    command = ["git", "-C", str(root), "rev-parse", "HEAD"]
     try:
-        found = subprocess.run(
-            ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=True, timeout=20
-        )
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=20).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-    return found.stdout.strip()
 
 
 def published(client: MlflowClient, experiment: str) -> dict[str, Run]:
@@ -45,18 +42,18 @@ def published(client: MlflowClient, experiment: str) -> dict[str, Run]:
 
     A run that was being written when the publisher was killed is deleted, and so written again.
     """
-    found: dict[str, Run] = {}
+    finished: dict[str, Run] = {}
     token: str | None = None
     while True:
         page = client.search_runs([experiment], max_results=1000, page_token=token)
         for run in page:
             if run.info.status == "FINISHED":
-                found[run.data.tags.get(KEY_TAG, "")] = run
+                finished[run.data.tags.get(KEY_TAG, "")] = run
             elif KEY_TAG in run.data.tags:
                 client.delete_run(run.info.run_id)
         token = page.token
         if not token:
-            return found
+            return finished
 
 
 def write_run(
@@ -73,24 +70,29 @@ def write_run(
     Start and end are the stage's. ``records`` are the data that it descends from: path -> content hash.
     """
     times = Times.of(result, root)
-    trees = _trees(result, root)
+    files = list(result.files(root))
+    trees = {path.name: _read(path) for path, folder in files if not folder and path.name in FIGURES}
     rows = table(trees)
     own = {KEY_TAG: result.key, "stage": result.kind, "dvc_stage": result.name, "mlflow.source.name": result.cmd}
     own[NOTE_TAG] = run_note(result, str(result.case), validation, times)
     own |= {f"out.{_name(path)}": md5 for path, md5 in result.outs.items()}
     if rows:
         own[TABLES_TAG] = json.dumps([{"path": TABLE, "type": "table"}])
-    run_name = result.kind if result.kind == "report" else f"{result.kind} {item_of(result)}"
+    run_name = result.kind if result.kind == "report" else f"{result.kind} {result.item}"
     run = client.create_run(experiment, start_time=times.start_ms, run_name=run_name, tags={**own, **tags})
     run_id = str(run.info.run_id)
     params = [Param(_name(k), _text(v)) for k, v in result.params.items()]
-    metrics = list(_metrics(result, trees, validation, times.end_ms))
+    own_figures, sweep = trees.get("metrics.json", {}), trees.get("sweep.json", {})
+    points = [(name, 0, value) for name, value in headline(result.kind, own_figures, validation).items()]
+    points += curves(own_figures, sweep)
+    metrics = [Metric(_name(name), value, times.end_ms, step) for name, step, value in points]
     for start in range(0, max(len(params), 1), PARAMS_A_CALL):
         client.log_batch(run_id, params=params[start : start + PARAMS_A_CALL], metrics=metrics if start == 0 else [])
     if records:
         client.log_inputs(run_id, [_dataset(*record, result, root) for record in records.items()])
-    for path, folder in _artifacts(result, root):
-        client.log_artifact(run_id, str(path), folder)
+    for path, folder in files:
+        if path.suffix in ARTIFACTS and path.stat().st_size <= LARGEST_ARTIFACT:
+            client.log_artifact(run_id, str(path), folder)
     if rows:
         client.log_text(run_id, json.dumps({"columns": ["figure", "value"], "data": rows}), TABLE)
     client.set_terminated(run_id, "FINISHED", times.end_ms)
@@ -137,38 +139,5 @@ def _text(value: Any) -> str:
     return text if len(text) <= PARAM_CHARACTERS else text[: PARAM_CHARACTERS - 1] + "…"
 
 
-def _files(result: StageResult, root: Path) -> Iterator[tuple[Path, str | None]]:
-    """Every file of the stage's outputs, and the folder that it lies in, relative to the output."""
-    for out in result.outs:
-        top = root / out
-        if top.is_file():
-            yield top, None
-            continue
-        for path in sorted(p for p in top.rglob("*") if p.is_file()):
-            folder = path.parent.relative_to(top).as_posix()
-            yield path, None if folder == "." else folder
-
-
-def _artifacts(result: StageResult, root: Path) -> Iterator[tuple[Path, str | None]]:
-    for path, folder in _files(result, root):
-        if path.suffix in ARTIFACTS and path.stat().st_size <= LARGEST_ARTIFACT:
-            yield path, folder
-
-
-def _trees(result: StageResult, root: Path) -> dict[str, Any]:
-    """The stage's files of figures, by name: metrics.json, validation.json and sweep.json."""
-    return {path.name: _read(path) for path, folder in _files(result, root) if not folder and path.name in FIGURES}
-
-
 def _read(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-
-
-def _metrics(
-    result: StageResult, trees: Mapping[str, Any], validation: Validation | None, at_ms: int
-) -> Iterator[Metric]:
-    own, sweep = trees.get("metrics.json", {}), trees.get("sweep.json", {})
-    for name, value in headline(result.kind, own, validation).items():
-        yield Metric(_name(name), value, at_ms, 0)
-    for name, step, value in curves(own, sweep):
-        yield Metric(_name(name), value, at_ms, step)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from urllib.request import url2pathname
 
@@ -50,7 +50,7 @@ def store() -> Iterator[MlflowClient]:
     """
     uri = store_uri()
     try:
-        if uri.startswith("sqlite:"):
+        if uri.startswith("sqlite:") and _database(uri).exists() and _database(uri).stat().st_size:
             _migrate(uri)
             _follow(_database(uri))
         mlflow.set_tracking_uri(uri)
@@ -77,12 +77,8 @@ def _migrate(uri: str) -> None:
 
     mlflow retries for a minute on a file that is no database, so that is found out here.
     """
-    path = _database(uri)
-    if not path.exists() or path.stat().st_size == 0:
-        return
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(_database(uri))) as connection:
         connection.execute("PRAGMA schema_version")
-    connection.close()
     engine = database.create_sqlalchemy_engine_with_retry(uri)
     if database._get_schema_version(engine) not in {None, database._get_latest_schema_revision()}:
         database._upgrade_db(engine)
@@ -100,31 +96,24 @@ def _follow(path: Path) -> None:
     mlflow stores absolute locations. Where the folder of an experiment lies beside the database and
     its stored location is elsewhere, that place is put in the place of the old one.
     """
-    if not path.exists() or path.stat().st_size == 0:
-        return
-    with sqlite3.connect(path) as connection:
+    folder = path.resolve().parent / FILES
+    with closing(sqlite3.connect(path)) as connection, connection:
         tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if "experiments" in tables:
-            for old, new in _moves(connection, path.resolve().parent / FILES):
-                for table, column in LOCATIONS:
-                    if table in tables:
-                        connection.execute(
-                            f"UPDATE {table} SET {column} = ? || substr({column}, ?) "
-                            f"WHERE {column} = ? OR substr({column}, 1, ?) = ?",
-                            (new, len(old) + 1, old, len(old) + 1, old + "/"),
-                        )
-    connection.close()
-
-
-def _moves(connection: sqlite3.Connection, folder: Path) -> list[tuple[str, str]]:
-    """Stored location of an experiment -> where its files lie now, as far as these differ."""
-    moves = []
-    for (old,) in connection.execute("SELECT artifact_location FROM experiments").fetchall():
-        case = str(old).rpartition("/")[2]
-        new = (folder / url2pathname(case)).as_uri() if str(old).startswith("file:") else str(folder / case)
-        if str(old).rpartition("/")[0].endswith("/" + FILES) and old != new and (folder / url2pathname(case)).is_dir():
-            moves.append((str(old), new))
-    return moves
+        if "experiments" not in tables:
+            return
+        for (old,) in connection.execute("SELECT artifact_location FROM experiments").fetchall():
+            parent, _, case = str(old).rpartition("/")
+            here = folder / url2pathname(case)
+            new = here.as_uri() if old.startswith("file:") else str(folder / case)
+            if not parent.endswith("/" + FILES) or old == new or not here.is_dir():
+                continue
+            for table, column in LOCATIONS:
+                if table in tables:
+                    connection.execute(
+                        f"UPDATE {table} SET {column} = ? || substr({column}, ?) "
+                        f"WHERE {column} = ? OR substr({column}, 1, ?) = ?",
+                        (new, len(old) + 1, old, len(old) + 1, old + "/"),
+                    )
 
 
 def experiment_id(client: MlflowClient, case: str) -> str:
@@ -145,7 +134,6 @@ def experiment_id(client: MlflowClient, case: str) -> str:
 def hide_default(client: MlflowClient) -> None:
     """Take mlflow's own empty experiment off the list of cases."""
     default = client.get_experiment_by_name("Default")
-    if default is None or default.experiment_id != "0" or default.lifecycle_stage != "active":
-        return
-    if not client.search_runs(["0"], max_results=1):
+    active = default is not None and default.experiment_id == "0" and default.lifecycle_stage == "active"
+    if active and not client.search_runs(["0"], max_results=1):
         client.delete_experiment("0")

@@ -1,4 +1,4 @@
-"""Closed loops for tuning: random set points of development seeds, many candidates of a law at once."""
+"""Closed loops side by side: over development set points for tuning, and from anywhere until they hold theirs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,43 @@ from torch import Tensor
 
 from pipeline.errors import PlantError
 from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Simulator
-
-Array = NDArray[np.float64]
+from pipeline.plants.simulator import Array, Simulator
 
 LawStep = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 """A control law or its ``forward``: (sp, pv, dv, mv_applied, state) -> (mv, state_next, info)."""
 
-# Share of the reachable range of the controlled variable that is left out at either end.
-MARGIN = 0.02
+MARGIN = 0.02  # share of the reachable range of the controlled variable that is left out at either end
+CHECK = 25  # samples between two looks at who has arrived
+
+
+class BatchLoops:
+    """Closed loops of a law over a nominal plant, all at once, without noise; ``lanes`` is the loops' shape."""
+
+    def __init__(
+        self, plant: Simulator, law: LawStep, n_state: int, lanes: tuple[int, ...], x: Array, mv: Array
+    ) -> None:
+        self.plant, self.law, self.lanes = plant, law, lanes
+        self.x, self.mv = x, torch.from_numpy(mv)  # (loops, n_x), (*lanes, n_mv)
+        self.state = torch.zeros(*lanes, n_state, dtype=torch.float64)
+        self.dv = torch.from_numpy(np.tile(plant.dv_nominal, (*lanes, 1)))
+        self.advance = plant.many(len(x))
+
+    def measured(self) -> Array:
+        """The PVs (*lanes, n_pv)."""
+        return self.plant.measured(self.x).reshape(*self.lanes, -1)
+
+    @torch.no_grad()
+    def step(self, sp: Tensor, pv: Array) -> None:
+        """One period on, with set points (*lanes, n_sp) and PVs."""
+        self.mv, self.state, _ = self.law(sp, torch.from_numpy(pv), self.dv, self.mv, self.state)
+        self.x = self.advance(self.x, self.mv.reshape(len(self.x), -1).numpy())
+
+    def keep(self, stay: NDArray[np.bool_]) -> None:
+        """Go on with some of the loops alone, (n,); ``lanes`` is (n,)."""
+        self.x, self.mv, self.state, self.dv = self.x[stay], self.mv[stay], self.state[stay], self.dv[stay]
+        self.lanes = (len(self.x),)
+        if len(self.x):
+            self.advance = self.plant.many(len(self.x))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,19 +111,103 @@ class DevelopmentLoops:
         """
         n, s = self.sp.shape
         lanes = (candidates, s)
-        advance = self.plant.many(candidates * s)
-        x = np.tile(self.x0, (candidates, 1))
-        mv = torch.from_numpy(np.tile(self.mv0, (candidates, 1, 1)))
-        state = torch.zeros(*lanes, n_state, dtype=torch.float64)
-        seen_dv = torch.from_numpy(np.tile(self.plant.dv_nominal, (*lanes, 1)))
-        error = np.zeros(lanes)
-        with torch.no_grad():
-            for k in range(n):
-                pv = self.plant.measured(x).reshape(*lanes, -1)
-                weight = k % self.hold if time_weighted else 1
-                error += weight * np.abs(self.sp[k] - pv[..., 0])
-                sp = torch.from_numpy(self.sp[k])[:, None].expand(*lanes, 1)
-                mv, state, _ = step(sp, torch.from_numpy(pv), seen_dv, mv, state)
-                x = advance(x, mv.reshape(candidates * s, -1).numpy())
+        x0, mv0 = np.tile(self.x0, (candidates, 1)), np.tile(self.mv0, (candidates, 1, 1))
+        loops, error = BatchLoops(self.plant, step, n_state, lanes, x0, mv0), np.zeros(lanes)
+        for k in range(n):
+            pv = loops.measured()
+            weight = k % self.hold if time_weighted else 1
+            error += weight * np.abs(self.sp[k] - pv[..., 0])
+            loops.step(torch.from_numpy(self.sp[k])[:, None].expand(*lanes, 1), pv)
         total = error.mean(axis=1) / n
         return np.where(np.isfinite(total), total, np.inf)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Starts:
+    """Where loops begin: states, set points and MVs, a row each."""
+
+    x: Array  # (n, n_x)
+    sp: Array  # (n, n_sp)
+    mv: Array  # (n, n_mv) applied before the first sample
+
+    def __post_init__(self) -> None:
+        if not len(self.x) == len(self.sp) == len(self.mv) or not len(self.x):
+            raise PlantError(
+                f"starts have {len(self.x)} states, {len(self.sp)} set points and {len(self.mv)} MVs; one of each"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recovery:
+    """How loops ended."""
+
+    arrived: NDArray[np.bool_]  # (n,) within the band for the whole of the holding time
+    samples: Array  # (n,) from the start until the band was entered for good; all of them where not arrived
+    end: Array  # (n, n_x) last state seen
+    courses: Array  # (watched, samples / every, n_x) of the first loops; NaN after they arrived
+
+
+def recover(
+    plant: Simulator,
+    law: LawStep,
+    n_state: int,
+    starts: Starts,
+    *,
+    samples: int,
+    band: float,
+    holding: int,
+    watched: int = 0,
+    every: int = 5,
+) -> Recovery:
+    """Run a law from many starts, all in one batch, without noise, until they hold their set points.
+
+    A loop has arrived when its controlled variable stays within ``band`` [CV] of the set point for
+    ``holding`` samples, and is then no longer simulated: a linear loop's stability says the rest.
+    What has not arrived after ``samples`` has not arrived. The first ``watched`` loops keep their
+    courses, one state in ``every``. A state that is not finite never arrives.
+    """
+    n, n_x = starts.x.shape
+    arrived, taken, end = np.zeros(n, dtype=bool), np.full(n, float(samples)), starts.x.copy()
+    courses = np.full((watched, -(-samples // every), n_x), np.nan)
+    at, sp, inside = np.arange(n), torch.from_numpy(starts.sp), np.zeros(n)  # of the loops that still run
+    loops = BatchLoops(plant, law, n_state, (n,), starts.x.copy(), starts.mv)
+    for k in range(samples):
+        if k % every == 0:
+            courses[at[at < watched], k // every] = loops.x[at < watched]
+        pv = loops.measured()
+        inside = np.where(np.abs(pv[:, 0] - sp[:, 0].numpy()) <= band, inside + 1, 0)
+        done = inside >= holding
+        if k % CHECK == 0 and done.any():
+            arrived[at[done]], taken[at[done]] = True, k + 1 - inside[done]
+            end[at[done]] = loops.x[done]
+            stay = ~done & np.isfinite(loops.x).all(axis=1)
+            at, sp, inside, pv = at[stay], sp[stay], inside[stay], pv[stay]
+            loops.keep(stay)
+            if not len(at):
+                break
+        loops.step(sp, pv)
+    end[at] = loops.x
+    return Recovery(arrived, taken, end, courses)
+
+
+def other_rests(plant: EquationPlant, samples: int = 1_500, moving: float = 1e-9) -> Array:
+    """States (n, n_x) at which the plant rests, the MV at one of its ends, outside the range of its set point.
+
+    They are looked for from the corners of the states' ranges: a reactor that has gone out, or run away. Empty
+    where the plant has none.
+    """
+    low, high = (np.array([getattr(s, end) for s in plant.state_signals]) for end in ("low", "high"))
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(len(low), -1).T
+    sp, mv = plant.sp_signals[0], plant.mv_signals[0]
+    rests: list[Array] = []
+    advance = plant.many(len(corners))
+    for end in (mv.low, mv.high):
+        x, before = corners, corners
+        for _ in range(samples):
+            before, x = x, advance(x, np.full((len(x), 1), end))
+        cv = plant.measured(x)[:, 0]
+        still = np.isfinite(x).all(axis=1) & (np.abs(x - before).max(axis=1) <= moving * np.abs(x).max(axis=1))
+        for state in x[still & ~((cv >= sp.low) & (cv <= sp.high))]:
+            if all(np.abs(state - known).max() > 1e-6 * np.abs(state).max() for known in rests):
+                rests.append(state)
+    return np.array(rests).reshape(-1, len(low))

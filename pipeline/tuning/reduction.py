@@ -1,19 +1,23 @@
-"""A linearized plant as tuning rules want it: without states that do not count, or as a lag with dead time."""
+"""A plant as tuning rules want it: without states that do not count, or as lags, with or without dead time."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from pipeline.errors import LawError
+from pipeline.errors import LawError, PlantError
 from pipeline.plants.linearization import Linearization
+from pipeline.plants.simulator import Array, Simulator
 
-# Singular values of the Hankel matrix below this share of the largest are rounding.
-RANK = 1e-8
-# A largest one below this share of |C| |B| is nothing at all.
-NOTHING = 1e-14
+RANK = 1e-8  # singular values of the Hankel matrix below this share of the largest are rounding
+NOTHING = 1e-14  # a largest one below this share of |C| |B| is nothing at all
+DIFFERENCE = 1e-4  # of a signal's size: the step of the central differences
+REST = 1e-6  # of a state's size: what the start may move in one period and count as at rest
 
 
 def minimal(lin: Linearization, pv: int = 0, mv: int = 0) -> Linearization:
@@ -93,3 +97,59 @@ class LagWithDeadTime:
             )
         tau = min(float(np.sqrt(variance)), mean)
         return cls(gain, tau, mean - tau)
+
+
+def start_lag(plant: Simulator) -> Linearization:
+    """The lags with the gain and the residence times' mean and variance of the plant near its start, first MV to CV.
+
+        r(k) = 1 - y(k)/K,   T = h sum_k r(k) - h/2,   S = 2 h^2 sum_k k r(k) - T^2
+        G(s) = K / ((t1 s + 1) (t2 s + 1)),   t1 + t2 = T,   t1^2 + t2^2 = S
+
+    y is the response to a unit step of the MV, K its end, h the period; it follows from central differences of
+    ``step`` and ``measure``. A dead time counts as part of T; where S is too small for two lags, they are equal, and
+    where the smaller one would be below h/2, there is one lag. Raises PlantError where the start is not at rest or not
+    stable, or the CV does not follow the MV.
+    """
+    x0, mv0 = (np.asarray(v, dtype=np.float64) for v in plant.start)
+    dv, p, h = plant.dv_nominal, plant.parameters(), plant.period_s
+    size = np.maximum(np.abs(x0), 1e-3 * max(1.0, float(np.abs(x0).max())))
+    moved = np.abs(plant.step(x0, mv0, dv, p) - x0)
+    remedy = "tune the controller by hand (`manual`), or give the plant's equations"
+    if not (moved <= REST * size).all():
+        raise PlantError(
+            f"plant {plant.name!r} is not at rest at its start: its state moves by up to {moved.max():.3g} in a period "
+            f"with the MV held; give a start at rest, {remedy}"
+        )
+    span = DIFFERENCE * np.array([s.high - s.low for s in plant.mv_signals])
+    phi = _slope(lambda x: plant.step(x, mv0, dv, p), x0, DIFFERENCE * size)
+    low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
+    gamma = _slope(lambda mv: plant.step(x0, mv, dv, p), mv0, span, low, high)[:, 0]
+    c = _slope(plant.measure, x0, DIFFERENCE * size)[0]
+    radius = float(np.abs(np.linalg.eigvals(phi)).max())
+    if not radius < 1 - 1e-6:
+        raise PlantError(
+            f"plant {plant.name!r} is not stable at its start (a sampled pole of size {radius:.6g}); {remedy}"
+        )
+    ends = np.linalg.inv(np.eye(len(phi)) - phi)
+    rest = ends @ gamma
+    gain = float(c @ rest)
+    time_s = h * float(c @ ends @ rest) / gain - h / 2 if gain else 0.0
+    if not time_s > 0:
+        raise PlantError(
+            f"plant {plant.name!r} is no lag at its start: gain {gain:.3g}, mean residence time {time_s:.3g} s; "
+            f"{remedy}"
+        )
+    variance = 2 * h**2 * float(c @ phi @ ends @ ends @ rest) / gain - time_s**2
+    apart = np.sqrt(max(0.0, variance / 2 - time_s**2 / 4))
+    slow, fast = time_s / 2 + apart, time_s / 2 - apart
+    if fast < h / 2:
+        rate = np.array([[1 / time_s]])
+        return Linearization(np.zeros(1), mv0[:1], -rate, gain * rate, np.eye(1))
+    a, b = np.array([[-1 / slow, 0.0], [1 / fast, -1 / fast]]), np.array([[gain / slow], [0.0]])
+    return Linearization(np.zeros(2), mv0[:1], a, b, np.array([[0.0, 1.0]]))
+
+
+def _slope(f: Callable[[Array], Array], at: Array, by: Array, low: ArrayLike = -inf, high: ArrayLike = inf) -> Array:
+    """Central differences of ``f`` (m,) at ``at`` (n,), steps ``by`` (n,), one-sided at a limit; shape (m, n)."""
+    ends = [(np.clip(at - d, low, high), np.clip(at + d, low, high)) for d in np.diag(by)]
+    return np.column_stack([(f(above) - f(below)) / (above - below).sum() for below, above in ends])

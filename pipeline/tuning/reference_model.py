@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
-Array = NDArray[np.float64]
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.simulator import Array
 
 ORDERS = range(1, 7)
 # D. Graham, R. C. Lathrop, The synthesis of "optimum" transient response, AIEE Transactions 72, 1953.
@@ -26,20 +25,9 @@ CLASSIC: dict[int, tuple[float, ...]] = {
     6: (3.25, 6.6, 8.6, 7.45, 3.95),
 }
 """Coefficients of s^(n-1)..s^1 of the tables in use, found on an analogue computer."""
-GRID = 0.01  # of the time wn t over which a cost is integrated
+GRID = 0.01  # of the time wn t over which the ITAE is integrated
 DOUBLINGS = 13  # of the grid: 8192 points, up to wn t = 82
 DECIMALS = 4  # of a coefficient: far finer than the criterion tells apart, coarser than a search's last bits
-
-
-class Sampled(NamedTuple):
-    """x(k+1) = phi x(k) + gamma r(k),  y(k) = c x(k), the set point r held over each period.
-
-    Shapes (n, n), (n, 1), (1, n).
-    """
-
-    phi: Array
-    gamma: Array
-    c: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,19 +39,8 @@ class ReferenceModel:
     Its state is x_i = y^(i-1) / wn^(i-1), i = 1..n, in the unit of the set point: at rest at a level
     it is (level, 0, .., 0).
 
-    Parameters
-    ----------
-    order
-        n >= 1.
-    coefficients
-        d_{n-1} .. d_1, for s^(n-1) .. s^1 [-].
-    wn
-        Natural frequency [rad/s].
-
-    Raises
-    ------
-    ValueError
-        An order, a number of coefficients or a frequency that make no model, or poles that are not stable.
+    ``order`` is n >= 1, ``coefficients`` d_{n-1} .. d_1 for s^(n-1) .. s^1 [-], ``wn`` the natural frequency
+    [rad/s]. Raises ValueError where they make no model, or one with poles that are not stable.
 
     Source: [reference_ann, eq. 7 and 8].
     """
@@ -98,26 +75,23 @@ class ReferenceModel:
             raise ValueError(f"the classic table has no order {order}; it has 1 to {max(CLASSIC)}")
         return cls(order, CLASSIC[order], wn)
 
-    def continuous(self) -> tuple[Array, Array, Array]:
-        """(A (n, n), B (n, 1), C (1, n)) of dx/dt = A x + B r, y = C x [1/s]."""
-        a, b, c = _companion(np.array(self.coefficients))
-        return self.wn * a, self.wn * b, c
+    def continuous(self) -> Linearization:
+        """A (n, n) and B (n, 1) [1/s], and C (1, n), of dx/dt = A x + B r, y = C x = x_1."""
+        return _chain(np.array(self.coefficients), self.wn)
 
-    def sampled(self, period_s: float) -> Sampled:
-        """The exact model at the samples, ``period_s`` [s] apart."""
-        a, b, c = self.continuous()
-        phi, gamma = _held(a, b, period_s)
-        return Sampled(phi, gamma, c)
+    def sampled(self, period_s: float) -> tuple[Array, Array]:
+        """(phi (n, n), gamma (n, 1)) of x(k+1) = phi x(k) + gamma r(k), the set point r held over each period."""
+        return self.continuous().sampled(period_s)
 
     def response(self, levels: ArrayLike, period_s: float) -> Array:
         """The course y, shape (n, 1), for the set points r, (n,) or (n, 1), from rest at the first of them."""
         r = np.asarray(levels, dtype=np.float64).reshape(-1)
-        phi, gamma, c = self.sampled(period_s)
+        phi, gamma = self.sampled(period_s)
         x = np.zeros(self.order)
         x[0] = r[0]
         y = np.empty((len(r), 1))
         for k, level in enumerate(r):
-            y[k] = c @ x
+            y[k] = x[0]
             x = phi @ x + gamma[:, 0] * level
         return y
 
@@ -127,28 +101,22 @@ class ReferenceModel:
 
 
 def itae(coefficients: Array) -> float:
-    """ITAE of a unit step for d_{n-1} .. d_1 at wn = 1, to about 1e-5; inf where the model is not stable."""
-    return cost(coefficients, lambda t, e: t * e)
+    """ITAE of a unit step for d_{n-1} .. d_1 at wn = 1, to about 1e-5; inf where the model is not stable.
 
-
-def cost(coefficients: Array, integrand: Callable[[Array, Array], Array]) -> float:
-    """Integral over time of |f(t, e)|, e = 1 - y the error after a unit step at wn = 1; inf if not stable.
-
-    By the trapezoidal rule; where a smooth f changes its sign between two points, |f| is that of a straight
-    line: the cost then stays smooth in the coefficients, and a search finds its bottom.
+    By the trapezoidal rule; where f = t (1 - y) changes its sign between two points, |f| is that of a straight
+    line: the ITAE then stays smooth in the coefficients, and a search finds its bottom.
     """
     if not _stable(coefficients):
         return math.inf
-    a, b, _ = _companion(coefficients)
-    phi, _ = _held(a, b, GRID)
+    phi, _ = _chain(coefficients).sampled(GRID)
     # The error's own state starts at (1, 0, .., 0) and decays: x(k) = phi^k x(0), twice as many points a pass.
-    x = np.zeros((len(a), 1))
+    x = np.zeros((len(phi), 1))
     x[0] = 1.0
     for _ in range(DOUBLINGS):
         x = np.hstack([x, phi @ x])
         phi = phi @ phi
     times: Array = GRID * np.arange(x.shape[1], dtype=np.float64)
-    f = integrand(times, x[0])
+    f = times * x[0]
     size = np.abs(f)
     crossed = np.flatnonzero(f[:-1] * f[1:] < 0)
     excess = size[crossed] * size[crossed + 1] / (size[crossed] + size[crossed + 1])
@@ -175,9 +143,9 @@ def searched(order: int, seed: int = 0, neighbours: int = 400) -> tuple[float, .
     least, width = itae(best), 0.2
     for _ in range(neighbours):
         trial = best * np.exp(width * rng.standard_normal(order - 1))
-        found = itae(trial)
-        if found < least:
-            best, least, width = trial, found, min(1.5 * width, 0.5)
+        cost = itae(trial)
+        if cost < least:
+            best, least, width = trial, cost, min(1.5 * width, 0.5)
         else:
             width = max(0.95 * width, 1e-3)
     polished = minimize(itae, best, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-12, "maxiter": 2_000})
@@ -188,18 +156,9 @@ def _stable(coefficients: Array) -> bool:
     return bool(np.all(np.roots([1.0, *coefficients, 1.0]).real < 0))
 
 
-def _companion(coefficients: Array) -> tuple[Array, Array, Array]:
-    """(A, B, C) at wn = 1 of the chain of integrators y, dy/dt, .."""
+def _chain(coefficients: Array, wn: float = 1.0) -> Linearization:
+    """The chain of integrators y, dy/dt / wn, .. from r to y."""
     n = len(coefficients) + 1
     a = np.diag(np.ones(n - 1), 1)
     a[-1] = [-1.0, *(-d for d in coefficients[::-1])]
-    b, c = np.zeros((n, 1)), np.zeros((1, n))
-    b[-1], c[0, 0] = 1.0, 1.0
-    return a, b, c
-
-
-def _held(a: Array, b: Array, period: float) -> tuple[Array, Array]:
-    """(phi, gamma) over one period with the input held: the matrix exponential of [[A, B], [0, 0]]."""
-    n = len(a)
-    both = expm(period * np.block([[a, b], [np.zeros((1, n + 1))]]))
-    return both[:n, :n], both[:n, n:]
+    return Linearization(np.zeros(n), np.zeros(1), wn * a, wn * np.eye(n)[:, -1:], np.eye(n)[:1])

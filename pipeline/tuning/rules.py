@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import LawError
 from pipeline.plants.linearization import Linearization
+from pipeline.plants.simulator import Array
 from pipeline.tuning.reduction import LagWithDeadTime, minimal
 
-Array = NDArray[np.float64]
-
-# An IMC filter is looked for between half a period and this many of them.
-LONGEST_FILTER = 40.0
+LONGEST_FILTER = 40.0  # periods; an IMC filter is looked for between half a period and this
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,15 +250,15 @@ def robust_imc(lin: Linearization, period_s: float, peak: float = 2.0) -> PidSet
     Where none does, the filter with the smallest peak. Raises LawError where no filter stabilizes.
     """
     process, lin = AllPole.of(lin), minimal(lin)
-    found = [imc_pid(process, float(v)) for v in np.geomspace(0.5, LONGEST_FILTER, 90) * period_s]
-    peaks = np.array([peak_sensitivity(lin, s, period_s) for s in found])
+    tried = [imc_pid(process, float(v)) for v in np.geomspace(0.5, LONGEST_FILTER, 90) * period_s]
+    peaks = np.array([peak_sensitivity(lin, s, period_s) for s in tried])
     if np.isinf(peaks).all():
         raise LawError(
             f"no IMC filter from {0.5 * period_s:g} to {LONGEST_FILTER * period_s:g} s stabilizes the sampled loop; "
             "shorten the period or tune by hand (`manual`)"
         )
     good = np.nonzero(peaks <= peak)[0]
-    return found[int(good[0]) if good.size else int(peaks.argmin())]
+    return tried[int(good[0]) if good.size else int(peaks.argmin())]
 
 
 def optimized_imc(

@@ -10,15 +10,13 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import linalg
 from torch import Tensor
 
 from pipeline.errors import LawError
 from pipeline.plants.equations import EquationPlant
+from pipeline.plants.simulator import Array
 from pipeline.tuning.development import LawStep
-
-Array = NDArray[np.float64]
 
 SETTLING = 50  # steps at rest until a law's state no longer changes
 BISECTIONS = 9  # of the contraction rate: to within 0.2 % of the way to 1
@@ -59,8 +57,8 @@ class FrozenLoops:
         if not torch.allclose(given, mv, rtol=0, atol=1e-6 * float(mv.abs().max())):
             raise LawError("a law that moves its MV while on set point has no linear loop there: let it come to rest")
 
-        def step(seen: Tensor, applied: Tensor, past: Tensor, r: Tensor, d: Tensor) -> Tensor:
-            move, after, _ = law(r, seen, d, applied, past)
+        def step(measured: Tensor, applied: Tensor, past: Tensor, r: Tensor, d: Tensor) -> Tensor:
+            move, after, _ = law(r, measured, d, applied, past)
             return torch.cat([move, after])
 
         slopes = torch.func.vmap(torch.func.jacrev(step, argnums=(0, 1, 2)))(pv, mv, state, sp, dv)
@@ -75,11 +73,11 @@ class FrozenLoops:
         """M (g, n, n) that takes z one period on, set point at rest, of a plant ``gain`` times as strong."""
         g, n_x, n_mv = self.gamma.shape
         n = self.law.shape[2]
-        found = np.zeros((g, n, n))
-        found[:, n_x:] = self.law
-        found[:, :n_x] = gain * self.gamma @ self.law[:, :n_mv]
-        found[:, :n_x, :n_x] += self.phi
-        return found
+        m = np.zeros((g, n, n))
+        m[:, n_x:] = self.law
+        m[:, :n_x] = gain * self.gamma @ self.law[:, :n_mv]
+        m[:, :n_x, :n_x] += self.phi
+        return m
 
     def gain_margin(self) -> float:
         """By how much the plant's gain may grow until one of the loops is no longer stable; ``LARGEST_MARGIN`` at most.
@@ -137,20 +135,19 @@ def quadratic_contraction(loops: Array) -> float:
     constraints = [p >> np.eye(n), *(m.T @ p @ m << rate * p for m in at)]
     problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(p)), constraints)
     best = float("nan")
-    trials = [1.0 - 1e-5, *([None] * BISECTIONS)]
-    for trial in trials:
+    for trial in [1.0 - 1e-5, *([None] * BISECTIONS)]:
         r = 0.5 * (low + high) if trial is None else trial
         rate.value = r**2
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that a solution may be inaccurate: it is checked below
             try:
                 problem.solve(solver=cvxpy.CLARABEL)
-                found = float("nan") if p.value is None else _rate(at, np.asarray(p.value))
+                reached = float("nan") if p.value is None else _rate(at, np.asarray(p.value))
             except cvxpy.SolverError:
-                found = float("nan")
-        if found < 1 - ROUNDING:
-            best = found if np.isnan(best) else min(best, found)
-            high = min(r, found)
+                reached = float("nan")
+        if reached < 1 - ROUNDING:
+            best = reached if np.isnan(best) else min(best, reached)
+            high = min(r, reached)
         elif trial is None:
             low = r
         else:
@@ -164,14 +161,13 @@ def pairwise_contraction(loops: Array, at: Array, points: Sequence[float]) -> Ar
     ``loops`` (g, n, n) belong to the operating points ``at`` (g,); those from one point to the next,
     both included, share a function. Raises LawError where a pair has fewer than two loops.
     """
-    edges = sorted(points)
-    found = []
-    for low, high in pairwise(edges):
+    rates = []
+    for low, high in pairwise(sorted(points)):
         inside = (at >= low - 1e-12) & (at <= high + 1e-12)
         if inside.sum() < 2:
             raise LawError(f"between {low:g} and {high:g} lie {inside.sum()} linear loops; a pair needs its two ends")
-        found.append(quadratic_contraction(loops[inside]))
-    return np.array(found)
+        rates.append(quadratic_contraction(loops[inside]))
+    return np.array(rates)
 
 
 def _balanced(loops: Array, radius: float) -> Array:

@@ -231,7 +231,7 @@ def test_a_test_without_sequences_is_one_error(monkeypatch: pytest.MonkeyPatch) 
 
 def test_an_abstract_plant_class_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(NoTests, "plant_class", Unwritten)
-    with pytest.raises(PlantError, match="plant class Unwritten is abstract, as it lacks derivative; write that"):
+    with pytest.raises(PlantError, match="plant class Unwritten is abstract, as it lacks derivative; implement that"):
         _ = NoTests().plant
 
 

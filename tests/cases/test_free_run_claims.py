@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pytest
 
 from pipeline.cases import CASES
 from pipeline.cases.reversible_cstr.reference_models import beats_the_classic_tables, reference_models_picture
-from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.pictures.free_runs import free_run_fit_at_least, free_run_picture, one_step_says_little
 
 
@@ -25,13 +26,13 @@ def evidence(first: dict[str, float] | None, then: dict[str, float] | None) -> E
 
 def test_fit_is_held_to_its_limit() -> None:
     check = free_run_fit_at_least(99.0, "plant_network", "nnarx", "C_B")
-    good, bad = (check(evidence(row(1e-5, 90.0), row(2e-5, fit))) for fit in (99.2, 98.9))
+    good, bad = (check.statement(evidence(row(1e-5, 90.0), row(2e-5, fit))) for fit in (99.2, 98.9))
     assert (good.holds, bad.holds) == (True, False)
     assert "99.20 %" in good.measured
 
 
 def test_one_step_accuracy_says_little_only_where_it_does() -> None:
-    check = one_step_says_little("plant_network", "nnarx", "C_B", "mol/l")
+    check = partial(one_step_says_little, "plant_network", "nnarx", "C_B", "mol/l")
     assert check(evidence(row(1e-5, 90.0), row(2e-5, 99.0))).holds is True
     assert check(evidence(row(2e-5, 90.0), row(1e-5, 99.0))).holds is False
     assert check(evidence(row(1e-5, 99.0), row(2e-5, 90.0))).holds is False
@@ -39,14 +40,15 @@ def test_one_step_accuracy_says_little_only_where_it_does() -> None:
 
 def test_nothing_measured_is_no_verdict() -> None:
     nothing = evidence(None, None)
-    assert free_run_fit_at_least(99.0, "plant_network", "nnarx", "C_B")(nothing).holds is None
-    assert one_step_says_little("plant_network", "nnarx", "C_B", "mol/l")(nothing).holds is None
-    assert free_run_picture("plant_network", "C_B", "mol/l")(nothing) is None
+    assert free_run_fit_at_least(99.0, "plant_network", "nnarx", "C_B").statement(nothing).holds is None
+    with pytest.raises(NotMeasuredError):
+        one_step_says_little("plant_network", "nnarx", "C_B", "mol/l", nothing)
+    with pytest.raises(NotMeasuredError):
+        free_run_picture("plant_network", "C_B", "mol/l")(nothing)
 
 
 def test_picture_has_a_point_a_seed_and_training() -> None:
     canvas = free_run_picture("plant_network", "C_B", "mol/l")(evidence(row(1e-5, 90.0), row(2e-5, 99.0)))
-    assert canvas is not None
     points = [line for line in canvas.axes[0].lines if line.get_linestyle() == "None"]
     assert [len(line.get_xdata()) for line in points] == [2, 2]
 

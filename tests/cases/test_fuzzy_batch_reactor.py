@@ -70,4 +70,3 @@ def test_one_step_is_that_of_the_difference_quotient() -> None:
     plant, x, mv = FuzzyBatchReactor(), np.array([25.0, 33.0]), np.array([0.3, HOT])
     rate = np.array(plant.rate(x, mv, plant.dv_nominal, plant.parameters()))[:, 0]
     assert x + plant.period_s * rate == pytest.approx(after(plant, x, mv), abs=1e-12)
-    assert plant.rk4(7) is plant.exact_transition is plant.transition

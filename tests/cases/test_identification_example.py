@@ -13,13 +13,14 @@ from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.config.params import parse
 from pipeline.models import Learnt
 from pipeline.models.lagged.nnarx import NNARX
+from pipeline.models.part import Source
 
 N = 100
 
 
 @pytest.fixture(scope="module")
 def learnt() -> Learnt:
-    return IdentificationExamplePart().learn(None, ThiosulfateCstr().signals, {}, 0)
+    return IdentificationExamplePart().learn(Source(None, ThiosulfateCstr().signals))
 
 
 @pytest.fixture(scope="module")

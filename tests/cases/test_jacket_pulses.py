@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cases.jacketed_batch_reactor.excitations import EXCITATIONS
-from pipeline.cases.jacketed_batch_reactor.jacket_pulses import JacketPulses
+from pipeline.cases.jacketed_batch_reactor.excitations import EXCITATIONS, JacketPulses
 from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import ParamsError, PlantError

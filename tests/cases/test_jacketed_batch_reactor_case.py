@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure as Canvas
 
 from pipeline.cases import CASES
+from pipeline.cases.jacketed_batch_reactor.case import OBSERVER
 from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
 from pipeline.cases.jacketed_batch_reactor.paper import CLAIMS, _quiet
-from pipeline.evaluation.evidence import Evidence
+from pipeline.cases.jacketed_batch_reactor.pictures import PICTURES
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from pipeline.evaluation.law_evidence import Form, LawEvidence, LawMetrics
 from pipeline.evaluation.metric import together
-from pipeline.evaluation.verdicts import Met, acceptance, statements
+from pipeline.report.verdicts import judge
 from pipeline.simulation.scenario import Scenario
 
 CASE = CASES["jacketed_batch_reactor"]
@@ -76,16 +79,28 @@ def test_the_printed_model_is_tested_as_it_stands() -> None:
 
 def test_where_nothing_was_measured_nothing_is_claimed() -> None:
     empty = Evidence(CASE, {}, {}, {})
-    claims = CLAIMS
+    judged = judge(empty, CLAIMS)
     known = "an extreme input gives an extreme output in each mode"  # of the printed matrices themselves
-    assert [v.what for v in statements(empty, claims) if v.holds is not None] == [known]
-    rows = [v for v in acceptance(empty, claims) if isinstance(v, Met) or not v.what.startswith("best controller,")]
-    assert all(v.holds is None for v in rows)
-    assert all(picture.draw(empty) is None for picture in claims.pictures)
+    assert [v.what for v in judged.statements if v.holds is not None] == [known]
+    assert all(v.holds is None for v in judged.acceptance if not v.what.startswith("best controller, "))
+    for picture in PICTURES:
+        with pytest.raises(NotMeasuredError):
+            picture.draw(empty)
 
 
-def told(switches: dict[str, float], a1_hot: float = 1.01) -> Any:
-    """Evidence of the feedforward's switches over each identification; shut, mode cold cools the jacket at 26 deg C."""
+class Switching(Evidence):
+    """Evidence of the feedforward's switches over each identification, and no other figure."""
+
+    def __init__(self, switches: dict[str, float], models: dict[str, Any]) -> None:
+        super().__init__(CASE, {}, {}, models)
+        object.__setattr__(self, "switches", switches)
+
+    def figure(self, law, scenario, metric=None, setting=None, how="median"):
+        return self.switches.get(setting["part"])
+
+
+def told(switches: dict[str, float], a1_hot: float = 1.01) -> Evidence:
+    """Shut, mode cold cools the jacket at 26 deg C."""
     line = {"a1": (a1_hot, 0.99), "a2": (0.0, 0.0), "r": (0.0, 0.0)}
     parameters = {
         f"{name}_{mode}_{centre}": value
@@ -94,10 +109,7 @@ def told(switches: dict[str, float], a1_hot: float = 1.01) -> Any:
         for centre in (20, 40, 70)
     }
     parts = {how: {"median": {"parameters": parameters}} for how in switches}
-    return SimpleNamespace(
-        models={"hybrid_fuzzy": {"parts": parts}},
-        figure=lambda law, scenario, metric, setting: switches.get(setting["part"]),
-    )
+    return Switching(switches, {"hybrid_fuzzy": {"parts": parts}})
 
 
 def test_a_model_that_alternates_falls_short_and_says_where() -> None:
@@ -108,13 +120,12 @@ def test_a_model_that_alternates_falls_short_and_says_where() -> None:
     assert "local: at 26 °C a shut throttle moves the jacket by +0.26 °C a period in mode hot and -0.26" in many.because
     assert "tied" not in many.because
     assert _quiet(told({"tied": 6.0, "global": 6.0, "local": 214.0}, a1_hot=0.99)).because == ""
-    assert _quiet(told({"tied": 6.0})).holds is None
+    with pytest.raises(NotMeasuredError):
+        _quiet(told({"tied": 6.0}))
 
 
 def test_pictures_of_a_recipe_need_what_the_law_tells(tmp_path: Path) -> None:
-    """A loop whose law tells no adjusted reference gives no picture, not an error."""
-    from pipeline.evaluation.law_evidence import LawEvidence
-
+    """A loop whose law tells no adjusted reference gives no picture."""
     n = 5
     arrays = {
         "time_s": np.arange(n),
@@ -124,9 +135,13 @@ def test_pictures_of_a_recipe_need_what_the_law_tells(tmp_path: Path) -> None:
         "info": np.ones((n, 2)),
     }
     np.savez(tmp_path / "trajectories.npz", **{f"profile_noise/base/0/{k}": v for k, v in arrays.items()})
-    (recipe,) = (p for p in CLAIMS.pictures if p.name == "recipe_reactor")
-    for info, drawn in ((["a", "b"], False), (["adjusted_reference", "wanted_jacket"], True)):
-        metrics = {"info": info, "setting": {}, "shipped_seed": 0, "seeds": [0], "scenarios": {}}
-        law = LawEvidence("fuzzy_feedforward_observer", metrics, tmp_path / "trajectories.npz")
-        canvas = recipe.draw(Evidence(CASE, {}, {law.law: law}, {}))
-        assert (canvas is not None) == drawn
+    (recipe,) = (p for p in PICTURES if p.name == "recipe_reactor")
+
+    def draw(*info: str) -> Canvas:
+        metrics = LawMetrics(OBSERVER, "x", "mae", (0,), 0, {"base": Form({}, info, {})})
+        law = LawEvidence(metrics, tmp_path / "trajectories.npz")
+        return recipe.draw(Evidence(CASE, {}, {OBSERVER: law}, {}))
+
+    assert draw("adjusted_reference", "wanted_jacket").axes
+    with pytest.raises(NotMeasuredError):
+        draw("a", "b")

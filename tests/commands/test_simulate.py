@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.live import Live
 
 from pipeline.__main__ import main
 from pipeline.cases import CASES
@@ -22,7 +23,7 @@ from pipeline.metrics import mae
 from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.live import SimulatedPlant, TerminalView, sparkline
 from pipeline.simulation.simulate import simulate_closed
-from serving import Command, Controller, Mode
+from serving import Controller, Mode
 
 CASE = "thiosulfate_cstr"
 pytest_plugins = ["small_laws"]
@@ -137,11 +138,11 @@ def test_real_time_takes_its_time_and_gives_the_same(pid_file: Path) -> None:
         (["--disturbance", "UA"], "'UA' is not of the form NAME=VALUE@TIME_S"),
         (["--disturbance", "T_inn=3"], "has no parameter 'T_inn'; did you mean 'T_in'?"),
         (["--noise", "CA=1"], "has no process variable 'CA'; did you mean 'C_A'?"),
-        (["--noise", "C_A=-1"], "must not be negative"),
+        (["--noise", "C_A=-1"], "the noise of C_A is -1; a standard deviation is 0 or above"),
         (["--noise", "C_A=nan"], "not finite"),
         (["--manual", "9..3"], "end after that"),
         (["--manual", "3..9=900"], "manual T_j = 900 K is outside [0, 500] K"),
-        (["--duration", "0"], "not above zero"),
+        (["--duration", "0"], "is not above 0"),
         (["--speed", "fast"], "no finite number"),
         (["--picture", "/dev/null/x.png"], "/dev/null/x.png cannot be written"),
         (["--picture", "x.docx"], "cannot be written: Format 'docx' is not supported"),
@@ -203,11 +204,11 @@ def test_as_a_program(pid_file: Path) -> None:
 
 def test_the_live_view_shows_mode_values_and_faults(plant: EquationPlant) -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=120, height=30)
-    with TerminalView(plant, "pid", 10.0, console) as view:
+    with Live(console=console, auto_refresh=False) as live:
+        view = TerminalView(plant, "pid", 10.0, live)
         for k in range(20):
             mode, reason = (Mode.HOLD, "PV C_A is nan") if k > 10 else (Mode.AUTO, "")
-            command = Command(k, mode, np.array([0.5]), np.array([250.0 + k]), None, None, reason)
-            view.show(k * 0.5, np.array([0.4, 310.0]), command, "UA = 1" if k == 3 else None)
+            view.show(k * 0.5, mode.value, np.array([0.5, 0.4, 310.0, 250.0 + k]), reason, "UA = 1" if k == 3 else None)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     for part in ("HOLD", "SP C_A", "269", "1.5 s  UA = 1", "5.5 s  fault: PV C_A is nan", "9.5 of 10.0 s"):
         assert part in text

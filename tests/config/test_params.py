@@ -12,12 +12,13 @@ import yaml
 from shipped import required
 
 from pipeline.cases import CASES
-from pipeline.config.params import ControllerParams, ModelParams, RecordParams, choose, digest, parse, read_section
+from pipeline.config.params import ControllerParams, ModelParams, RecordParams, choose, parse, read_section
 from pipeline.errors import ParamsError
+from pipeline.files import digest
 from pipeline.laws import LAWS
 from pipeline.models import MODELS
 from pipeline.stages.excite import excitations
-from pipeline.stages.fit import part_of
+from pipeline.stages.fit import parts_of
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,7 @@ def test_the_shipped_file_is_read_whole(monkeypatch: pytest.MonkeyPatch) -> None
         assert name == f"{record.case}-{record.record}"
     for name in tree["models"]:
         model = ModelParams.read(name)
-        for part in model.parts.values():
-            part_of(CASES[model.case], part, name)
+        assert set(parts_of(model, name)) == set(model.parts)
         models.add((model.case, model.model))
         assert name == f"{model.case}-{model.model}"
     for name in tree["controllers"]:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from whole_bounds import whole_bounds
 
 from pipeline.cases import CASES
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.metric import METRICS, REDUCE, Metric, gate_ratio, mean_of_draws, ratio_to_bound, together
-from pipeline.optimal.bounds import bounded, kinds, load_bounds, read_stored
+from pipeline.optimal.bounds import bounded, kinds, read_stored
 from pipeline.optimal.bounds import bounds_path as path_of
 
 OWN = {metric.name: metric for metric in (Metric("overshoot_max", "largest overshoot", together="max"),)}
@@ -47,7 +48,7 @@ def test_draws_of_the_noise_are_averaged_whatever_the_metric() -> None:
 
 def test_bounds_are_put_together_as_the_laws_are(case: Case) -> None:
     """Of each stored figure of each bounded test: the sequences' own, by the metric's rule."""
-    stored, found = read_stored(path_of(case))["figures"], load_bounds(case)
+    stored, found = read_stored(path_of(case))["figures"], whole_bounds(case)
     for name, tests in case.scenarios().items():
         if not bounded(case, tests):
             continue

@@ -13,8 +13,9 @@ from hypothesis.extra import numpy as npst
 from pipeline import metrics
 from pipeline.evaluation import closed_loop
 from pipeline.evaluation.closed_loop import closed_loop_metrics, locked_up
+from pipeline.evaluation.metric import METRICS
 
-KEYS = {"mae", "sse", "ise", "masse", "max_asse", "overshoot", "settling", "mv_travel"}
+KEYS = {m.name for m in METRICS.values() if m.of} | {"ise", "masse", "max_asse", "overshoot", "settling", "mv_travel"}
 SIGNAL = npst.arrays(np.float64, 40, elements=st.floats(-1e3, 1e3))
 
 

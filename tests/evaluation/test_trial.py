@@ -28,12 +28,14 @@ class Proportional:
 
     def __init__(self, gain: float = 0.02, refused: int = -1) -> None:
         self.gain, self.refused, self.steps = gain, refused, 0
+        self.dv: list[Any] = []
 
     def cold_state(self) -> np.ndarray:
         return np.zeros(1)
 
-    def step(self, *, sp: Any, pv: Any, mv_applied: Any, state: Any) -> Any:
+    def step(self, *, sp: Any, pv: Any, dv: Any, mv_applied: Any, state: Any) -> Any:
         self.steps += 1
+        self.dv.append(dv)
         if self.steps == self.refused:
             raise OutputError("no")
         error = sp - pv
@@ -66,6 +68,15 @@ def test_figures_of_a_test_with_a_late_part_count_it(case: Case) -> None:
     found = case.score(test, loop.pv, loop.mv)
     assert found["sse_late"] == pytest.approx(float(np.sum(error[test.late_from :] ** 2)))
     assert found["sse"] > 5 * found["sse_late"] > 0
+
+
+def test_a_law_gets_the_nominal_measured_disturbances(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    test, controller = case.scenarios()["trajectory"][0], Proportional()
+    monkeypatch.setattr(type(case.plant), "dv_nominal", np.array([295.0]))
+    monkeypatch.setattr(type(case.plant), "stepper", lambda self: lambda x, mv, dv, p: x)
+    close_loop(controller, case, test, None, 0)  # type: ignore[arg-type]
+    assert len(controller.dv) == test.samples
+    assert {tuple(dv) for dv in controller.dv} == {(295.0,)}
 
 
 def test_a_refused_step_keeps_the_mv_and_counts_as_a_lock_up(case: Case) -> None:

@@ -11,12 +11,11 @@ from typing import Any
 import pytest
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.law_evidence import lock_up_text
+from pipeline.evaluation.law_evidence import Analysis, lock_up_text
 from pipeline.evaluation.standing import Standing
 from pipeline.evaluation.validation import (
     FILE,
     SCHEMA,
-    Analysis,
     GateRecord,
     GateResult,
     LawResult,
@@ -57,7 +56,7 @@ def validation() -> Validation:
         titles=Titles("The tank", "mean absolute error", "MAE", {}, {"pid": "PID"}, {"steps": "Steps"}),
         requirements=(Statement("fast", "≤ 1 s", "0.5 s", True),),
         claims=(Statement("stable", "yes", "no", False, "noise"), Statement("cheap", "", "not measured", None)),
-        paper=(PaperResult(2, "PID", "MAE [m]", None, 0.1, "reproduces", True),),
+        paper=(PaperResult(2, "PID", "MAE [m]", 0.1, 0.1, "reproduces", True),),
     )
 
 
@@ -95,7 +94,7 @@ def test_what_json_cannot_hold_is_not_written(validation: Validation) -> None:
     [
         (lambda tree: {**tree, "schema": 2}, r"has schema 2; this release reads schema 1: run `dvc repro`"),
         (lambda tree: {k: v for k, v in tree.items() if k != "schema"}, r"has schema None.*run `dvc repro`"),
-        (lambda tree: [tree], r"has schema None"),
+        (lambda tree: [tree], r"holds no mapping; run `dvc repro`"),
         (lambda _: "{", r"cannot be read .*run `dvc repro`"),
         (lambda tree: {k: v for k, v in tree.items() if k != "gate"}, r"'gate' is missing; run `dvc repro`"),
         (lambda tree: {**tree, "gates": {}}, r"unknown key 'gates'; did you mean 'gate'.*; run `dvc repro`"),
@@ -124,7 +123,7 @@ def test_a_missing_file_names_the_remedy(tmp_path: Path) -> None:
 def test_standing_gate_and_card_say_what_the_file_says(validation: Validation, write: Callable[[Any], Path]) -> None:
     standing = Standing.read(write(validation.to_json()).parent)
     assert [(law.law, law.lock_ups, law.ratio) for law in standing.laws] == [("inc", 4, 0.5), ("pid", 0, 1.5)]
-    assert standing.reproduced == (0, 0)  # the paper prints no such figure
+    assert standing.reproduced == (1, 1)
     gate = Gate.of(validation, "inc")
     assert (gate.score, gate.baseline, gate.lock_ups) == (0.5, 1.5, 4)
     assert gate.refusal() == "it locked up in 4 of its closed loops"

@@ -79,9 +79,7 @@ def test_mv_stays_in_its_range_and_moves(kind, plant, tmp_path):
     record = EXCITATIONS[kind](**SMALL[kind]).run(plant, 1)
     record.write(tmp_path / "r.parquet")
     # Reading checks range, movement, time and runs.
-    again = Record.read(
-        tmp_path / "r.parquet", pv=plant.pv_signals, mv=plant.mv_signals, dv=plant.dv_signals, period_s=plant.period_s
-    )
+    again = Record.read(tmp_path / "r.parquet", plant.signals)
     assert again.digest() == record.digest()
 
 

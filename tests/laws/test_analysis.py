@@ -10,7 +10,8 @@ import pytest
 
 from pipeline.cases import PLANTS
 from pipeline.config.params import ControllerParams
-from pipeline.evaluation.law_evidence import LawEvidence
+from pipeline.evaluation.law_evidence import Analysis as Said
+from pipeline.evaluation.law_evidence import Form, LawEvidence, LawMetrics
 from pipeline.laws.base import Analysis
 from pipeline.stages.design import _analysed
 from pipeline.stages.paths import analysis_file
@@ -61,13 +62,17 @@ def test_design_tells_what_there_is(designed: dict[str, dict[str, Any]]) -> None
 
 def test_the_report_finds_the_shipped_seeds(designed: dict[str, dict[str, Any]], tmp_path: Path) -> None:
     _keep_analysis(PARAMS, 1, tmp_path / "analysis.npz")
-    told = {form: designed[f"{form}/1"]["analysis"] for form in ("base", "r=2")}
-    metrics = {"setting": {"r": 1.0}, "variants": {"r=2": {}, "r=3": {}}, "analysis": told}
-    law = LawEvidence("pid", metrics, tmp_path / "trajectories.npz")
-    assert law.analysis({})["figures"] == {"radius": 1.5}
-    assert law.analysis({"r": 2.0})["figures"] == {"radius": 1.7}
-    assert law.analysis({"r": 3.0}) == {}
-    assert law.analysis({"r": 9.0}) == {}
+    said = {form: Said(**designed[f"{form}/1"]["analysis"]) for form in ("base", "r=2")}
+    forms = {
+        name: Form(setting, (), {}, said.get(name))
+        for name, setting in {"base": {"r": 1.0}, "r=2": {"r": 2.0}, "r=3": {"r": 3.0}}.items()
+    }
+    law = LawEvidence(LawMetrics("pid", "PID", "mae", (0,), 0, forms), tmp_path / "trajectories.npz")
+    assert {form: analysis.figures for form, analysis in law.analyses.items()} == {
+        "base": {"radius": 1.5},
+        "r=2": {"radius": 1.7},
+    }
+    assert law.form({"r": 9.0}) is None
     assert np.array_equal(law.analysis_arrays({"r": 2.0})["starts"], np.full((2, 3), 1.7))
     assert law.analysis_arrays({"r": 3.0}) == law.analysis_arrays({"r": 9.0}) == {}
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from shipped import required
 from torch import Tensor
 
 from pipeline.errors import LawError
@@ -60,7 +61,7 @@ def run(law, disturbance: float, sp: float, n: int = 60) -> tuple[np.ndarray, np
 
 
 def design(cls, parts, signals: Signals, plant, **params: Any):
-    return cls.design(cls.Params(**params), parts, signals, plant)
+    return cls.design(cls.Params(**(required(cls.name) | params)), parts, signals, plant)
 
 
 def test_inc_is_the_network_and_its_limits(parts, signals, plant) -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shipped import required
 from torch import Tensor
 
 from pipeline.errors import LawError
@@ -27,6 +28,7 @@ SIGNALS = Signals(
 )
 A, B = 0.8, 0.5  # x(k+1) = A x + B (u + d), y(k+1) = 0.7 y + x(k+1)
 DVZ = torch.zeros(0, dtype=torch.float64)
+NUMBERS = ObserverLaw.Params(**required("inverse_dob"))
 
 
 def step_plant(y: float, x: float, u: float, d: float = 0.0) -> tuple[float, float]:
@@ -69,7 +71,7 @@ class ExactInverse(Model):
 
 def make(kind: str, sign: float = 1.0, **params: float) -> ObserverLaw:
     forward, observer = Exact(2, 0, sign), Exact(1, 1, sign)
-    settings_ = ObserverLaw.Params(**params)
+    settings_ = ObserverLaw.Params(**required("inverse_dob") | params)
     if kind == "inverse":
         return InverseDob(SIGNALS, ExactInverse(forward), forward, observer, settings_).eval()
     return ForwardDob(SIGNALS, forward, observer, settings_).eval()
@@ -159,9 +161,9 @@ def test_a_model_that_knows_nothing_pushes_the_right_way(kind: str) -> None:
 
     forward, observer = Flat(2, 0), Exact(1, 1)
     if kind == "inverse":
-        law: ObserverLaw = InverseDob(SIGNALS, ExactInverse(forward), forward, observer, ObserverLaw.Params())
+        law: ObserverLaw = InverseDob(SIGNALS, ExactInverse(forward), forward, observer, NUMBERS)
     else:
-        law = ForwardDob(SIGNALS, forward, observer, ObserverLaw.Params())
+        law = ForwardDob(SIGNALS, forward, observer, NUMBERS)
     state = torch.zeros(law.n_state, dtype=torch.float64)
     zero = torch.zeros(1, dtype=torch.float64)
     with torch.no_grad():
@@ -204,6 +206,6 @@ def test_candidates_of_any_model() -> None:
 
 def test_parameters_out_of_range_are_refused() -> None:
     with pytest.raises(ValueError, match=r"observer_gain is 1\.5"):
-        ObserverLaw.Params(observer_gain=1.5)
+        ObserverLaw.Params(**required("inverse_dob") | {"observer_gain": 1.5})
     with pytest.raises(LawError, match="observed is 'z'; the process variables are y, x"):
         make("inverse", observed="z")  # type: ignore[arg-type]

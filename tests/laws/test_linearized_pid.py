@@ -36,13 +36,16 @@ def ph_law(model: NNARX, **params) -> ControlLaw:
     return designed("linearized_pid", model, PH.plant, **params)
 
 
+ADAPTIVE = {"adaptive": True, "penalty_start": 20.0, "penalty_low": 0.1, "eps_high": 0.2, "eps_low": 0.05}
+
+
 class Plain:
     """The law as the formulas stand: plain Python, one sample at a time, the penalty doubled in a loop."""
 
     def __init__(self, model: NNARX, start: np.ndarray, **params) -> None:
         self.model, self.z, self.p = model, start, LinearizedPid.Params(**params)
         self.past, self.change, self.squares = None, np.zeros(3), []
-        self.mu, self.offset = self.p.penalty_start, None
+        (self.mu, self.mu_low), self.offset = self.p.penalties, None
 
     def network(self, y, u) -> float:
         with torch.no_grad():
@@ -85,7 +88,7 @@ class Plain:
         if told["free"]:
             self.change = p.momentum * self.change + (1 - p.momentum) * (z - self.z)
             self.z = np.clip(self.z + self.change, p.gain_low, p.gain_high)
-            self.mu = max(mu / 2, p.penalty_low) if found < p.eps_low else mu
+            self.mu = max(mu / 2, self.mu_low) if found < p.eps_low else mu
             told["penalty"] = mu
         else:
             self.change = np.zeros(3)
@@ -103,8 +106,8 @@ FORMS = [
     {"penalty": 0.1, "stiffness": 0.5, "weights": (1.0, 0.2, 3.0), "gain_high": (0.6, 0.4, 0.5)},
     {"preview": "ramp", "offset_filter": 0.4, "trust": 0.3},
     {"momentum": 0.4, "window": 4, "noise_variance": 0.01},
-    {"adaptive": True},
-    {"adaptive": True, "eps_high": 0.03, "eps_low": 0.01, "momentum": 0.2, "window": 1, "noise_variance": 0.01},
+    ADAPTIVE,
+    {**ADAPTIVE, "eps_high": 0.03, "eps_low": 0.01, "momentum": 0.2, "window": 1, "noise_variance": 0.01},
     {
         "adaptive": True,
         "eps_high": 1e-4,
@@ -136,7 +139,7 @@ def test_equals_the_formulas_as_they_stand(model: NNARX, params: dict) -> None:
 
 
 def test_the_penalty_adapts(model: NNARX) -> None:
-    law = ph_law(model, adaptive=True, penalty_low=0.1)
+    law = ph_law(model, **ADAPTIVE)
     track = closed(law, PH, scenario("set_point"))
     found = info(law, track)
     assert sse(track) < 9.0  # the fixed penalty of 20 from which it starts: 43.4
@@ -205,8 +208,8 @@ def test_an_mv_that_was_not_obeyed_is_no_windup(model: NNARX) -> None:
     ("params", "most"),
     [
         ({}, 100),
-        ({"adaptive": True}, 120),
-        ({"adaptive": True, "momentum": 0.4, "window": 5, "noise_variance": 1.0}, 150),
+        (ADAPTIVE, 120),
+        ({**ADAPTIVE, "momentum": 0.4, "window": 5, "noise_variance": 1.0}, 150),
     ],
 )
 def test_few_operators(model: NNARX, params: dict, most: int) -> None:
@@ -230,6 +233,7 @@ def test_few_operators(model: NNARX, params: dict, most: int) -> None:
         ({"preview": "known"}, "preview"),
         ({"penalty_low": 30.0}, "penalty_low"),
         ({"eps_low": 0.3}, "eps_low"),
+        ({"adaptive": True}, "eps_high"),
         ({"penalti": 1.0}, "did you mean 'penalty'"),
     ],
 )

@@ -15,9 +15,9 @@ from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from pipeline.config.params import parse
 from pipeline.errors import LawError, ParamsError
 from pipeline.laws import LAWS
-from pipeline.laws.local.auto_pid_network import one_knob
 from pipeline.laws.local.local_controllers import LocalControllers
 from pipeline.laws.local.local_stability import StabilityTest
+from pipeline.laws.local.pid_networks import one_knob
 from pipeline.plants.linearization import Linearization
 from pipeline.tuning.rules import PidSettings, sampled_loop
 from pipeline.tuning.stability import FrozenLoops, spectral_radius

@@ -21,6 +21,7 @@ from pipeline.laws.recursive.recursive_pid import RecursivePid
 from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
 from pipeline.models import Model
 from pipeline.models.lagged.arx import ARX, ArxPart
+from pipeline.models.part import Source
 from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import Trajectory, simulate_closed
@@ -37,7 +38,7 @@ def record() -> Record:
 
 @pytest.fixture(scope="module")
 def arx(record: Record) -> Model:
-    return ArxPart().learn(record, PH.plant.signals, {}, 0).model
+    return ArxPart().learn(Source(record, PH.plant.signals)).model
 
 
 def stepper(law: ControlLaw, through: Callable[[np.ndarray], np.ndarray] = lambda mv: mv):
@@ -152,7 +153,7 @@ def test_a_plant_of_negative_gain_is_the_mirror_image(record: Record, arx: Model
     def mirrored(value: np.ndarray) -> np.ndarray:
         return mv.low + mv.high - value
 
-    other = ArxPart().learn(replace(record, mv=mirrored(record.mv)), PH.plant.signals, {}, 0).model
+    other = ArxPart().learn(Source(replace(record, mv=mirrored(record.mv)), PH.plant.signals)).model
     test = scenario("set_point")
     straight = closed(designed(law, arx, **params), PH, test)
     turned = closed(designed(law, other, **params), PH, test, through=mirrored)
@@ -189,7 +190,7 @@ def test_lags_that_were_not_measured_teach_nothing(arx: ARX) -> None:
 def test_follows_the_batch_profile() -> None:
     """Over noise of variance 1: no more than the 13,282 (29.9 from 200 s on) of an independent implementation."""
     part = ArxPart(n_y=1, n_u=1)
-    model = part.learn(Batches(batches=100, noise=(1.0,)).run(BATCH.plant, 0), BATCH.plant.signals, {}, 0).model
+    model = part.learn(Source(Batches(batches=100, noise=(1.0,)).run(BATCH.plant, 0), BATCH.plant.signals)).model
     params = {"penalty": 100.0, "offset_filter": 0.3, "preview": "ramp"}
     law, test = designed(RecursivePid, model, BATCH, **params), scenario("trajectory", BATCH)
     tracks = [closed(law, BATCH, test, 1.0, seed) for seed in range(6)]
@@ -205,7 +206,7 @@ def test_what_it_cannot_use_is_said(arx: Model, parts, law) -> None:
         ({"arx": parts["nnarx"]}, "of kind nnarx"),
         ({"arx": ARX(2, 1, n_mv=2)}, "2 MVs and delay 1"),
         ({"arx": ARX(2, 1, delay=2)}, "1 MVs and delay 2"),
-        ({"arx": ARX(2, 1)}, "which way to move"),
+        ({"arx": ARX(2, 1)}, "direction of the move"),
     ):
         with pytest.raises(LawError, match=message):
             law.design(law.Params(**required(law.name)), models, signals, PH.plant)

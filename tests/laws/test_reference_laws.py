@@ -15,8 +15,7 @@ from pipeline.cases import CASES
 from pipeline.cases.reversible_cstr.plant import ReversibleCstr
 from pipeline.errors import LawError
 from pipeline.laws import LAWS, ControlLaw
-from pipeline.laws.reference.model_reference import ModelReference
-from pipeline.laws.reference.model_reference_two_error import ModelReferenceTwoError
+from pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
 from pipeline.laws.reference.pi_reference import PiReference
 from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
 from pipeline.laws.reference.reference_networks import IncrementalNetwork, Trainable, TrainablePi, TwoErrorNetwork
@@ -203,7 +202,7 @@ def test_a_pi_on_the_reference_is_a_pi(signals: Signals) -> None:
     mv, after, told = law(*values, state)
     assert float(mv) == pytest.approx(2.0 - 40.0 * ((0.01 - 0.004) + 2.0 / 8.0 * 0.01))
     assert float(told) == 0.45
-    phi, gamma, _ = law.model.sampled(2.0)
+    phi, gamma = law.model.sampled(2.0)
     np.testing.assert_allclose(after[1:3], phi @ [0.45, 0.0] + gamma[:, 0] * 0.46, rtol=1e-12)
 
 

@@ -13,6 +13,7 @@ from pipeline.laws.base import ControlLaw
 from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
 from pipeline.models import Model
 from pipeline.models.lagged.arx import ARX, ArxPart
+from pipeline.models.part import Source
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_closed
 
@@ -25,7 +26,7 @@ HALF = 100.0  # ml/min, one unit of move
 
 @pytest.fixture(scope="module")
 def arx() -> Model:
-    return ArxPart().learn(RandomSteps(samples=2000, hold=3).run(PH.plant, 0), PH.plant.signals, {}, 0).model
+    return ArxPart().learn(Source(RandomSteps(samples=2000, hold=3).run(PH.plant, 0), PH.plant.signals)).model
 
 
 def tensor(*values: float) -> torch.Tensor:

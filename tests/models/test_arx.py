@@ -12,6 +12,7 @@ from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import ModelError, ParamsError
 from pipeline.models import MODELS, load_model
 from pipeline.models.lagged.arx import ARX, ArxPart
+from pipeline.models.part import Source
 from pipeline.models.training.regressors import nnarx_pairs
 from pipeline.records.record import Record
 
@@ -28,7 +29,7 @@ def linear_record(noise: float = 0.0, samples: int = 800) -> Record:
 
 def test_exact_data_give_the_exact_coefficients(tmp_path: Path) -> None:
     record = linear_record()
-    learnt = ArxPart().learn(record, ThiosulfateCstr().signals, {}, 0)
+    learnt = ArxPart().learn(Source(record, ThiosulfateCstr().signals))
     model = learnt.model
     assert isinstance(model, ARX)
     np.testing.assert_allclose(model.weight.numpy(), [1.2, -0.4, 0.002, -0.0005], rtol=1e-9)
@@ -36,8 +37,8 @@ def test_exact_data_give_the_exact_coefficients(tmp_path: Path) -> None:
     assert learnt.metrics["rmse"] < 1e-11
     assert learnt.metrics["free_run_rmse"] < 1e-10
     assert learnt.metrics["r2"] == pytest.approx(1.0)
-    predicted, measured = model.k_step(record, 25)
-    np.testing.assert_allclose(predicted, measured, atol=1e-10)
+    cut = model.windows(record, 25)
+    np.testing.assert_allclose(model.free_run(cut), cut.future, atol=1e-10)
     model.save(tmp_path / "arx.npz")
     again = load_model(tmp_path / "arx.npz")
     assert again.config() == model.config()
@@ -56,16 +57,16 @@ def test_noisy_data_leave_a_residual_orthogonal_to_the_regressors() -> None:
 
 def test_part_is_known_by_its_kind_and_learns_another_target() -> None:
     assert MODELS["arx"] is ArxPart
-    model = ArxPart(target="T").learn(linear_record(), ThiosulfateCstr().signals, {}, 0).model
+    model = ArxPart(target="T").learn(Source(linear_record(), ThiosulfateCstr().signals)).model
     assert isinstance(model, ARX)
     assert model.bias.item() == pytest.approx(0.1 + 300 * 0.2, rel=1e-6)
     with pytest.raises(ParamsError, match="process variable"):
-        ArxPart(target="pressure").learn(linear_record(), ThiosulfateCstr().signals, {}, 0)
+        ArxPart(target="pressure").learn(Source(linear_record(), ThiosulfateCstr().signals))
 
 
 def test_what_the_data_do_not_determine_is_said() -> None:
     with pytest.raises(ModelError, match="learns from a record"):
-        ArxPart().learn(None, ThiosulfateCstr().signals, {}, 0)
+        ArxPart().learn(Source(None, ThiosulfateCstr().signals))
     with pytest.raises(ModelError, match="n_u=0"):
         ARX(2, 0)
     with pytest.raises(ModelError, match="7 regressor columns"):

@@ -11,15 +11,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.cases.jacketed_batch_reactor.excitations import JacketPulses
 from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
-from pipeline.cases.jacketed_batch_reactor.jacket_pulses import JacketPulses
 from pipeline.cases.jacketed_batch_reactor.models import PrintedFuzzyPart, printed_model
 from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.errors import ModelError
 from pipeline.models import MODELS, load_model
+from pipeline.models.base import simulate
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from pipeline.models.fuzzy.hybrid_fuzzy_identification import LEAST, Transitions, identify
+from pipeline.models.fuzzy.hybrid_fuzzy_identification import LEAST, Rules, Transitions, identify
 from pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart, coefficients, gap
+from pipeline.models.part import Source
 from pipeline.records.record import Record
 
 CENTRES = (12.0, 20.0, 40.0, 60.0, 70.0)
@@ -73,7 +75,7 @@ def same_function(model: HybridFuzzy, theta: np.ndarray, tolerance: float) -> No
 @given(st.floats(-50.0, 150.0))
 def test_memberships_are_a_partition_of_one_and_blend_the_centres_into_the_temperature(t_w: float) -> None:
     model = printed_model()
-    beta = model.memberships(torch.tensor([t_w], dtype=torch.float64)).numpy()
+    beta = Rules(model.centres.numpy(), np.array([t_w])).beta[0]
     assert beta.min() >= 0.0
     assert beta.sum() == pytest.approx(1.0, abs=1e-15)
     assert np.count_nonzero(beta) <= 2
@@ -81,9 +83,9 @@ def test_memberships_are_a_partition_of_one_and_blend_the_centres_into_the_tempe
 
 
 def test_a_rule_is_alone_at_its_centre_and_beyond_the_outer_ones() -> None:
-    t_w = torch.tensor([[12.0], [20.0], [40.0], [60.0], [70.0], [-3.0], [90.0]], dtype=torch.float64)
+    t_w = np.array([12.0, 20.0, 40.0, 60.0, 70.0, -3.0, 90.0])
     expected = np.vstack([np.eye(5), np.eye(5)[[0, 4]]])
-    np.testing.assert_array_equal(printed_model().memberships(t_w).numpy(), expected)
+    np.testing.assert_array_equal(Rules(printed_model().centres.numpy(), t_w).beta, expected)
 
 
 def test_the_line_over_the_throttle_is_the_weighted_sum_of_the_rules() -> None:
@@ -91,9 +93,10 @@ def test_the_line_over_the_throttle_is_the_weighted_sum_of_the_rules() -> None:
     t, t_w, k_m, _ = torch.split(x, 1, dim=-1)
     line = model.jacket(t, t_w)
     psi = torch.cat([t_w, t, k_m, torch.ones_like(t)], dim=-1)
+    beta = torch.from_numpy(Rules(model.centres.numpy(), t_w[:, 0].numpy()).beta)
     for q in range(2):
         # beta Theta' psi, as the paper writes it.
-        summed = torch.einsum("nj,ij,ni->n", model.memberships(t_w), model.consequents[q], psi)
+        summed = torch.einsum("nj,ij,ni->n", beta, model.consequents[q], psi)
         torch.testing.assert_close(line.base[:, q] + line.gain[:, q] * k_m[:, 0], summed, rtol=0, atol=1e-12)
 
 
@@ -113,7 +116,7 @@ def test_the_printed_model_and_its_plant_are_the_same() -> None:
     there = np.array([step(row[:2], row[2:], dv, p) for row in x.numpy()])
     np.testing.assert_allclose(model(x).numpy(), there, rtol=0, atol=1e-12)
     mv = x[:100, 2:]
-    run = model.simulate(torch.from_numpy(plant.start[0]), mv).numpy()
+    run = simulate(model, torch.from_numpy(plant.start[0]), mv).numpy()
     state = plant.start[0]
     for k, move in enumerate(mv.numpy()):
         state = step(state, move, dv, p)
@@ -231,16 +234,16 @@ def test_one_step_errors_are_those_of_an_independent_implementation(reactor_reco
     # A fifth is left for the draw of the pulses.
     expected = {"local": 0.18, "global": 0.070, "tied": 0.076}
     plant = JacketedBatchReactor()
-    found = {how: part(how).learn(reactor_record, plant.signals, {}, 0, plant).metrics for how in HOWS}
+    found = {how: part(how).learn(Source(reactor_record, plant.signals, plant=plant)).metrics for how in HOWS}
     assert {how: metrics["rmse"] for how, metrics in found.items()} == pytest.approx(expected, rel=0.2)
-    printed = PrintedFuzzyPart().learn(reactor_record, plant.signals, {}, 0, plant).metrics
+    printed = PrintedFuzzyPart().learn(Source(reactor_record, plant.signals, plant=plant)).metrics
     # The printed model has drifted off after an hour of free run.
     assert printed["free_run_rmse"] > 4 * found["tied"]["free_run_rmse"]
 
 
 def test_the_tied_models_parameters_are_those_of_the_physics(reactor_record: Record) -> None:
     plant = JacketedBatchReactor()
-    found = part("tied").learn(reactor_record, plant.signals, {}, 0, plant).metrics
+    found = part("tied").learn(Source(reactor_record, plant.signals, plant=plant)).metrics
     for centre in (20, 40, 60):
         for name, tolerance in (("a1", 0.01), ("a2", 0.006)):
             key = f"{name}_hot_{centre}"
@@ -256,7 +259,7 @@ def test_the_tied_models_parameters_are_those_of_the_physics(reactor_record: Rec
 def test_measurement_noise_hardly_moves_the_tied_parameters() -> None:
     plant = JacketedBatchReactor()
     noisy = JacketPulses(samples=12_000, noise=(0.05, 0.1)).run(plant, 0)
-    found = part("tied").learn(noisy, plant.signals, {}, 0, plant).metrics
+    found = part("tied").learn(Source(noisy, plant.signals, plant=plant)).metrics
     for key in ("a1_hot_20", "a1_hot_40", "a1_hot_60"):
         assert found["parameters"][key] == pytest.approx(found["physics"][key], abs=0.01)
     for key in ("b_hot_20", "b_hot_40", "b_cold_40", "b_cold_60"):
@@ -283,9 +286,9 @@ def test_the_printed_gap_is_what_was_found_independently() -> None:
 
 def test_only_the_printed_model_needs_no_record(reactor_record: Record) -> None:
     plant = JacketedBatchReactor()
-    assert "gap" in PrintedFuzzyPart().learn(None, plant.signals, {}, 0, plant).metrics
+    assert "gap" in PrintedFuzzyPart().learn(Source(None, plant.signals, plant=plant)).metrics
     with pytest.raises(ModelError, match="learns from a record; point `data:`"):
-        part("tied").learn(None, plant.signals, {}, 0, plant)
+        part("tied").learn(Source(None, plant.signals, plant=plant))
     assert MODELS["hybrid_fuzzy"] is HybridFuzzyPart
     odd = Record.of(plant.signals, reactor_record.pv[:50], np.full((50, 2), 1.5))
     with pytest.raises(ModelError, match=r"mode is 1\.5 somewhere; it must be 1 \(hot\) or 2 \(cold\)"):

@@ -14,6 +14,7 @@ from pipeline.errors import ModelError
 from pipeline.models.base import load_model
 from pipeline.models.local.local_models import LocalModels, Validity, spacing
 from pipeline.models.local.local_models_part import LocalModelsPart, free_run, operating_cv
+from pipeline.models.part import Source
 
 EXPECTED = [  # C, T, q_c solved exactly
     (0.129825, 432.949, 110.0),
@@ -44,7 +45,7 @@ def model(plant) -> LocalModels:
 @pytest.fixture(scope="module")
 def learnt(plant):
     part = LocalModelsPart(points=POINTS, mv_low=50.0, mv_high=110.0, mv_step=10.0, sizes=(3, 5))
-    return part.learn(None, plant.signals, {}, 0, plant)
+    return part.learn(Source(None, plant.signals, plant=plant))
 
 
 def test_operating_points_and_widths(model):

@@ -15,12 +15,11 @@ from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.config.params import parse
 from pipeline.errors import ModelError, ParamsError, RecordError
 from pipeline.models import load_model
-from pipeline.models.lagged.lag_search import Candidate, parsimonious
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.lagged.nnarx_part import NnarxPart
-from pipeline.models.training.objectives import Windows
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.models.training.time_split import longest_run, split_in_time
+from pipeline.models.lagged.nnarx_part import Candidate, NnarxPart, parsimonious
+from pipeline.models.part import Source
+from pipeline.models.training.objectives import Windows, regressor
+from pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
 from pipeline.records.record import Record
 from serving.manifest import Signal
 
@@ -52,10 +51,11 @@ def model_for(record: Record, n_y: int, n_u: int, delay: int, residual: bool = T
 
 @given(n_y=st.integers(1, 3), n_u=st.integers(1, 3), delay=st.integers(1, 2), steps=st.integers(1, 4))
 @settings(max_examples=20, deadline=None)
-def test_k_step_equals_a_plain_loop(n_y: int, n_u: int, delay: int, steps: int) -> None:
+def test_a_free_run_equals_a_plain_loop(n_y: int, n_u: int, delay: int, steps: int) -> None:
     record = made_up_record()
     model = model_for(record, n_y, n_u, delay)
-    predicted, measured = model.k_step(record, steps)
+    cut = model.windows(record, steps)
+    predicted, measured = model.free_run(cut)[:, -1], cut.future[:, -1]
     back = max(n_y - 1, n_u + delay - 2)
     starts = record.starts(back + steps) + back
     assert measured == pytest.approx(record.pv[starts + steps, 0])
@@ -72,7 +72,7 @@ def test_one_step_windows_are_the_pairs() -> None:
     record = made_up_record()
     pairs = nnarx_pairs(record, 2, 3, delay=2)
     cut = Windows.of(record, 2, 3, 1, delay=2)
-    phi = cut._regressor(list(torch.from_numpy(cut.past).unbind(1)), torch.from_numpy(cut.u), 0)
+    phi = regressor(list(torch.from_numpy(cut.past).unbind(1)), torch.from_numpy(cut.u), 0, n_y=2, n_u=3)
     assert np.array_equal(phi.numpy(), pairs.x)
     assert np.array_equal(cut.future, pairs.y)
 
@@ -94,7 +94,8 @@ def test_file_gives_the_same_model(tmp_path: Path) -> None:
     again = load_model(tmp_path / "nnarx.npz")
     assert isinstance(again, NNARX)
     assert again.config() == model.config()
-    np.testing.assert_array_equal(again.k_step(record, 3)[0], model.k_step(record, 3)[0])
+    cut = model.windows(record, 3)
+    np.testing.assert_array_equal(again.free_run(cut), model.free_run(cut))
 
 
 def test_wrong_arguments_are_one_clear_line() -> None:
@@ -127,7 +128,7 @@ def test_part_learns_from_a_record_one_step_and_free_run(runs: tuple[int, ...]) 
     """A linear first-order plant is learnt to rounding of the noise-free data, and runs free as well."""
     plant = ThiosulfateCstr()
     part = NnarxPart(n_y=1, n_u=1, hidden=(4,), steps=5, trainer={"kind": "lm", "iterations": 60})
-    learnt = part.learn(linear_record(plant, runs), plant.signals, {}, 0)
+    learnt = part.learn(Source(linear_record(plant, runs), plant.signals))
     assert learnt.metrics["fit_percent"] > 99
     assert learnt.metrics["free_run_rmse"] < 0.01
     assert learnt.metrics["n_train"] == 560
@@ -140,7 +141,7 @@ def test_search_takes_the_lags_that_the_plant_has() -> None:
     plant = ThiosulfateCstr()
     search = [{"n_y": 1}, {"n_y": 2}, {"n_y": 3, "hidden": [6]}]
     options = {"n_u": 1, "hidden": [3], "trainer": {"kind": "lm", "iterations": 80}, "search": search}
-    learnt = parse(NnarxPart, options, "nnarx").learn(linear_record(plant, order=2, noise=0.01), plant.signals, {}, 0)
+    learnt = parse(NnarxPart, options, "nnarx").learn(Source(linear_record(plant, order=2, noise=0.01), plant.signals))
     rows = learnt.metrics["candidates"]
     assert [r["chosen"] for r in rows] == [False, True, False]
     assert isinstance(learnt.model, NNARX)

@@ -12,7 +12,7 @@ from pipeline.metrics import rmse
 from pipeline.models import Learnt
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.lagged.nnarx_part import NnarxPart
-from pipeline.models.part import predict
+from pipeline.models.part import Source, predict
 from pipeline.models.training.objectives import Windows
 from pipeline.models.training.regressors import nnarx_pairs
 from pipeline.plants.equations import EquationPlant
@@ -52,7 +52,7 @@ def test_training_on_free_runs_makes_free_runs_better(
     rows = []
     for seed in SEEDS:
         record = EXCITATIONS["random_steps"](samples=2_000, hold=4, noise=noise).run(tank, seed)
-        plain, multi = (NnarxPart(steps=steps).learn(record, tank.signals, {}, seed) for steps in (1, 10))
+        plain, multi = (NnarxPart(steps=steps).learn(Source(record, tank.signals, seed=seed)) for steps in (1, 10))
         rows.append((plain.metrics["rmse"], free_run(plain, unseen), free_run(multi, unseen)))
     one, before, after = np.median(rows, axis=0)
     assert one < ahead
@@ -74,7 +74,9 @@ def test_a_batch_is_learnt_from_start_ups_with_mixed_levels() -> None:
         EXCITATIONS["random_steps"](samples=2_000),
         EXCITATIONS["batches"](samples=50, batches=40, hold=1),
     )
-    binary, mixed, startups = (one_step(part.learn(e.run(reactor, 0), reactor.signals, {}, 0), unseen) for e in records)
+    binary, mixed, startups = (
+        one_step(part.learn(Source(e.run(reactor, 0), reactor.signals)), unseen) for e in records
+    )
     assert startups < 0.13
     assert mixed > 2 * startups
     assert binary > 1.0

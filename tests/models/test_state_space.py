@@ -15,9 +15,10 @@ from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import ModelError, ParamsError, RecordError
 from pipeline.excitation import EXCITATIONS
 from pipeline.models import load_model
+from pipeline.models.base import simulate
 from pipeline.models.lagged.nnarx_part import NnarxPart
-from pipeline.models.state_space.state_space import StateSpace
-from pipeline.models.state_space.state_space_part import StateSpacePart, one_step_pairs
+from pipeline.models.part import Source
+from pipeline.models.state_space.state_space import StateSpace, StateSpacePart, one_step_pairs
 from pipeline.models.state_space.state_windows import StateWindows
 from pipeline.models.training.objectives import Samples
 from pipeline.records.record import Record
@@ -50,7 +51,7 @@ def test_free_run_equals_a_plain_loop() -> None:
     model = model_for(record)
     cut = StateWindows.of(record, 6)
     with torch.no_grad():
-        free = model.simulate(torch.from_numpy(cut.start), torch.from_numpy(cut.mv)).numpy()
+        free = simulate(model, torch.from_numpy(cut.start), torch.from_numpy(cut.mv)).numpy()
         for i in (0, 7, len(cut) - 1):
             x = cut.start[i]
             for step in range(6):
@@ -134,7 +135,7 @@ def test_windows_that_do_not_match_are_refused() -> None:
 
 def test_part_needs_a_record_and_steps() -> None:
     with pytest.raises(ModelError, match="learns from a record"):
-        StateSpacePart().learn(None, ReversibleCstr().signals, {}, 0)
+        StateSpacePart().learn(Source(None, ReversibleCstr().signals))
     with pytest.raises(ValueError, match="steps is 0"):
         StateSpacePart(steps=0)
 
@@ -146,7 +147,7 @@ def reactor_record() -> Record:
 
 def test_the_reactor_is_learnt_to_within_a_percent_of_a_long_free_run(reactor_record: Record) -> None:
     part = StateSpacePart(hidden=(10,), steps=30, long_run=400, trainer={"kind": "lm", "iterations": 40, "rows": 1500})
-    learnt = part.learn(reactor_record, ReversibleCstr().signals, {"all": (-np.inf, np.inf)}, 0)
+    learnt = part.learn(Source(reactor_record, ReversibleCstr().signals, regions={"all": (-np.inf, np.inf)}))
     figures = learnt.metrics["state_space"]
     assert set(figures) == {"one_step_trained", "free_run_trained"}
     for name in ("C_B", "T"):
@@ -158,7 +159,7 @@ def test_training_on_free_runs_mends_what_one_step_hides(reactor_record: Record)
     part = NnarxPart(
         hidden=(10,), steps=50, long_run=400, compared=0, trainer={"kind": "lm", "iterations": 40, "rows": 1500}
     )
-    learnt = part.learn(reactor_record, ReversibleCstr().signals, {}, 0)
+    learnt = part.learn(Source(reactor_record, ReversibleCstr().signals))
     first, then = (learnt.metrics["nnarx"][name]["C_B"] for name in ("one_step_trained", "free_run_trained"))
     assert first["one_step_rmse"] < 1e-3 * np.ptp(reactor_record.pv[:, 0])  # accurate, one step ahead
     assert first["free_run_rmse"] > 10 * first["one_step_rmse"]  # and far off, running free

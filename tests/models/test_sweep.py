@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -128,11 +129,10 @@ def test_rows_equal_the_estimator(cstr: tuple[np.ndarray, ...], result: SweepRes
 def test_the_file_holds_the_result(tmp_path: Path, result: SweepResult) -> None:
     path = tmp_path / "models" / "sweep.json"
     result.save(path)
-    assert SweepResult.load(path) == result
+    written = json.loads(path.read_text())
+    assert written == json.loads(json.dumps(result.to_dict()))
+    assert (written["chosen"], written["unit"]) == (result.best.partitions, "K")
     assert [p.name for p in path.parent.iterdir()] == ["sweep.json"]
-    path.write_text('{"rows": [{"partitions": 3}]}')
-    with pytest.raises(ModelError, match="run the sweep again"):
-        SweepResult.load(path)
 
 
 def test_the_picture_is_written(tmp_path: Path, result: SweepResult) -> None:

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from whole_bounds import whole_bounds
 
 from pipeline.cases import PLANTS
 from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
@@ -20,7 +21,7 @@ from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.metric import METRICS, Metric
-from pipeline.optimal.bounds import load_bounds, plant_digest
+from pipeline.optimal.bounds import plant_digest
 from pipeline.optimal.horizon import Horizon
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from pipeline.plants.equations import EquationPlant
@@ -239,7 +240,7 @@ def test_tests_on_other_plants_have_their_own_bounds_and_those_on_a_map_none(tmp
     case, path = Vessels(), tmp_path / "vessels.json"
     lines = list(oracle.compute(case, ["own", "cool", "map"], path=path))
     assert len(lines) == 4  # NMPC and offline, of two tests; nothing is measured with noise
-    bounds = load_bounds(case, path)
+    bounds = whole_bounds(case, path)
     assert set(bounds) == {"own", "own_noise", "cool", "cool_noise"}
     assert bounds["own"]["nmpc"]["hot_samples"] == 5
     assert bounds["own"]["nmpc"]["mae"] < bounds["cool"]["nmpc"]["mae"]

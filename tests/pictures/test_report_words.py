@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from pipeline.evaluation.law_evidence import parse_setting
 from pipeline.pictures.drawing import BASELINE_COLOUR, PALETTE, colour_of, ratio_unit, time_axis
 from pipeline.pictures.loop_pictures import finite, moves, over_orders
-from pipeline.pictures.words import law_name, number, ratio, scenario_name, setting_text
+from pipeline.pictures.numbers import number, ratio
+from pipeline.pictures.words import law_label, law_name, scenario_name, setting_text
 
 
-@given(
-    st.dictionaries(
-        st.from_regex(r"[a-z][a-z_]{0,8}", fullmatch=True),
-        st.one_of(st.just(True), st.integers(-999, 999).map(float), st.sampled_from(["as_printed", "ramp"])),
-        min_size=1,
-    )
-)
-def test_a_settings_words_say_what_it_is(setting):
-    assert parse_setting(setting_text(setting)) == setting
+def test_a_settings_words_say_what_it_is():
+    setting = {"r": 10.0, "correction": "back_calculation", "adaptive": True, "wc": 2.5}
+    assert setting_text(setting) == "r=10, correction=back_calculation, adaptive, wc=2.5"
+    assert law_label("incad", setting_text({"r": 10})) == "INCAD (r=10)"
+    assert law_label("incad", "") == "INCAD"
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,13 @@ from pipeline.export.gate import export
 from pipeline.laws import LAWS
 from pipeline.models.lagged.arx import ArxPart
 from pipeline.models.local.linearized import LinearizedPart
+from pipeline.models.part import Source
 from pipeline.optimal.bounds import problem
 from pipeline.plants.simulator import Simulator
 from pipeline.simulation.scenario import Scenario, from_rest, held
 from pipeline.simulation.simulate import simulate_batch, simulate_open
-from pipeline.tuning.start_lag import start_lag
+from pipeline.tuning.reduction import start_lag
+from serving.manifest import Signal
 
 PID = LAWS["pid"]
 QUICK = {"development_seeds": (1, 2), "development_set_points": 2, "development_hold": 40}
@@ -130,12 +132,12 @@ def test_records_and_models_of_a_users_own_simulator() -> None:
     plant = Tanks()
     record = EXCITATIONS["random_steps"](samples=400, low=0.3, high=0.7).run(plant, 0)
     assert np.array_equal(record.pv, simulate_open(plant, plant.start[0], record.mv)[:-1, 1:])
-    learnt = ArxPart().learn(record, plant.signals, plant.regions, 0)
+    learnt = ArxPart().learn(Source(record, plant.signals, regions=plant.regions))
     assert learnt.metrics["rmse"] < 0.05
     starts = np.array([[1.0, 1.0], [2.0, 0.5]])
-    batch = simulate_batch(plant, starts, np.full((2, 5, 1), 0.6), {"k": 0.4})
+    batch = simulate_batch(plant, starts, np.full((2, 5, 1), 0.6))
     for row, x0 in zip(batch, starts, strict=True):
-        assert np.array_equal(row, simulate_open(plant, x0, np.full((5, 1), 0.6), {"k": 0.4}))
+        assert np.array_equal(row, simulate_open(plant, x0, np.full((5, 1), 0.6)))
 
 
 def test_a_plant_without_equations_is_tuned_as_the_lags_at_its_start() -> None:
@@ -163,6 +165,19 @@ def test_a_plant_of_one_lag_is_that_lag() -> None:
     assert lag.b == pytest.approx(np.array([[0.5]]), rel=2e-3)
 
 
+class AtItsLimit(OneTank):
+    """Starts with its valve as far open as it goes."""
+
+    mv_signals = (Signal("u", "m3/s", 0.0, 0.5),)
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        return super().step(x, np.minimum(mv, 0.5), dv, p)
+
+
+def test_a_start_at_an_end_of_the_mvs_range_is_differenced_on_one_side() -> None:
+    assert start_lag(AtItsLimit()).b == pytest.approx(start_lag(OneTank()).b, rel=1e-6)
+
+
 class Restless(Tanks):
     """Starts in the middle of a rise."""
 
@@ -183,8 +198,8 @@ def test_what_needs_equations_says_so() -> None:
     law = PID.design(PID.Params(tuning="manual", kc=0.3, ti_s=10.0, examined_cv=(0.6, 2.0)), {}, plant.signals, None)
     asked = {
         "the stability of a law's linear loops": lambda: law.analysis(plant),
-        "a linearized part": lambda: LinearizedPart(at=1.0).learn(None, plant.signals, {}, 0, plant),
-        "a part without a plant": lambda: LinearizedPart(at=1.0).learn(None, plant.signals, {}, 0),
+        "a linearized part": lambda: LinearizedPart(at=1.0).learn(Source(None, plant.signals, plant=plant)),
+        "a part without a plant": lambda: LinearizedPart(at=1.0).learn(Source(None, plant.signals)),
         "a start at a steady state": lambda: from_rest(plant, "test", "", held([1.0], 5)),
         "bounds": lambda: problem(TanksCase()),
         "a tuning at another point": lambda: PID.design(

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pipeline.errors import RecordError
+from pipeline.plants.signals import Signals
 from pipeline.records.record import Record, broken_run, position_in_run
 from serving.manifest import Signal
 
 PV = (Signal("C_A", "mol/l", 0.0, 1.0), Signal("T", "K", 200.0, 600.0))
 MV = (Signal("T_j", "K", 0.0, 500.0),)
 DV = (Signal("T_in", "K", 200.0, 400.0),)
-PLANT = {"pv": PV, "mv": MV, "period_s": 0.5}
+PLANT = Signals(0.5, sp=(), pv=PV, dv=(), mv=MV)
 
 
 def make(runs: list[int], *, dv: tuple[Signal, ...] = (), seed: int = 0) -> Record:
@@ -59,7 +60,7 @@ def fault(path, frame: pd.DataFrame) -> str:
     """The one-line error of a file with these cells."""
     frame.to_csv(path, index=False) if path.suffix == ".csv" else frame.to_parquet(path)
     with pytest.raises(RecordError) as error:
-        Record.read(path, **PLANT)
+        Record.read(path, PLANT)
     text = str(error.value)
     assert text.startswith(str(path))
     assert "\n" not in text
@@ -75,7 +76,7 @@ def test_what_is_written_is_read(tmp_path, suffix, dv):
     record = make([5, 1, 7], dv=dv)
     path = tmp_path / "folder" / f"record{suffix}"
     record.write(path)
-    again = Record.read(path, dv=dv, **PLANT)
+    again = Record.read(path, dataclasses.replace(PLANT, dv=dv))
     assert equal(record, again)
     assert record.digest() == again.digest()
     assert [p.name for p in path.parent.iterdir()] == [path.name]  # no draft stays
@@ -88,7 +89,7 @@ def test_csv_keeps_every_bit(tmp_path, values):
     record.write(tmp_path / "bits.csv")
     largest = np.finfo(float).max
     anything = tuple(Signal(s.name, s.unit, -largest, largest) for s in PV)
-    assert np.array_equal(Record.read(tmp_path / "bits.csv", **{**PLANT, "pv": anything}).pv, values)
+    assert np.array_equal(Record.read(tmp_path / "bits.csv", dataclasses.replace(PLANT, pv=anything)).pv, values)
 
 
 def test_digest_sees_every_change():
@@ -130,7 +131,7 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 
 def test_a_file_without_run_is_one_run(tmp_path, frame):
     frame.assign(time_s=frame.time_s + 3600.0, comment="ok").to_csv(tmp_path / "f.csv", index=False)
-    record = Record.read(tmp_path / "f.csv", **PLANT)
+    record = Record.read(tmp_path / "f.csv", PLANT)
     assert record.run.tolist() == [0] * 8
     assert record.time_s.tolist() == (np.arange(8) * 0.5).tolist()
     assert np.array_equal(record.mv[:, 0], frame["T_j [K]"])
@@ -140,12 +141,12 @@ def test_spreadsheet_with_decimal_comma_byte_order_mark_and_blank_end(tmp_path, 
     frame.to_csv(tmp_path / "f.csv", index=False, sep=";", decimal=",", encoding="utf-8-sig")
     with (tmp_path / "f.csv").open("a") as file:
         file.write("\n;;;\n")
-    assert np.allclose(Record.read(tmp_path / "f.csv", **PLANT).pv[:, 0], frame["C_A [mol/l]"], rtol=1e-15)
+    assert np.allclose(Record.read(tmp_path / "f.csv", PLANT).pv[:, 0], frame["C_A [mol/l]"], rtol=1e-15)
 
 
 def test_rounded_time_stamps_are_accepted(tmp_path, frame):
     frame.assign(time_s=frame.time_s + np.resize([0.0, 2e-4], 8)).to_csv(tmp_path / "f.csv", index=False)
-    assert Record.read(tmp_path / "f.csv", **PLANT).time_s.tolist() == (np.arange(8) * 0.5).tolist()
+    assert Record.read(tmp_path / "f.csv", PLANT).time_s.tolist() == (np.arange(8) * 0.5).tolist()
 
 
 # ---------------------------------------------------------------- faults
@@ -208,7 +209,7 @@ def test_mv_outside_its_range(tmp_path, frame):
     frame.loc[2, "T_j [K]"] = 500.0 + 1e-8
     frame.loc[2, "T [K]"] = 1e4  # a measured PV may stray
     frame.to_csv(tmp_path / "f.csv", index=False)
-    assert Record.read(tmp_path / "f.csv", **PLANT).pv[2, 1] == 1e4
+    assert Record.read(tmp_path / "f.csv", PLANT).pv[2, 1] == 1e4
 
 
 def test_a_pv_in_another_unit_is_found_by_its_range(tmp_path, frame):
@@ -223,12 +224,12 @@ def test_a_discrete_mv_has_its_allowed_values_only(tmp_path, frame):
     valve = Signal("valve", "-", 1.0, 2.0, values=(1.0, 2.0))
     frame["valve [-]"] = [1, 1, 2, 2, 1, 2, 1 + 1e-12, 2]
     frame.to_csv(tmp_path / "f.csv", index=False)
-    with_valve = PLANT | {"mv": (*MV, valve)}
-    assert Record.read(tmp_path / "f.csv", **with_valve).mv[3, 1] == 2
+    with_valve = dataclasses.replace(PLANT, mv=(*MV, valve))
+    assert Record.read(tmp_path / "f.csv", with_valve).mv[3, 1] == 2
     frame.loc[4, "valve [-]"] = 1.5
     frame.to_csv(tmp_path / "f.csv", index=False)
     with pytest.raises(RecordError, match=r"line 6: 1\.5 is none of the values \[1\.0, 2\.0\] that valve may have"):
-        Record.read(tmp_path / "f.csv", **with_valve)
+        Record.read(tmp_path / "f.csv", with_valve)
 
 
 def test_files_that_are_no_tables(tmp_path, frame):
@@ -243,9 +244,9 @@ def test_files_that_are_no_tables(tmp_path, frame):
         path = tmp_path / name
         path.write_text(text)
         with pytest.raises(RecordError, match=said):
-            Record.read(path, **PLANT)
+            Record.read(path, PLANT)
     with pytest.raises(RecordError, match="no such file"):
-        Record.read(tmp_path / "absent.csv", **PLANT)
+        Record.read(tmp_path / "absent.csv", PLANT)
     with pytest.raises(RecordError, match=r"kept as \.parquet or \.csv"):
         make([3]).write(tmp_path / "r.json")
 
@@ -279,15 +280,3 @@ def test_starts_are_all_rows_with_room_in_their_run(runs, length):
 def test_broken_run_is_the_first_return(run):
     first = next((i for i in range(1, len(run)) if run[i] != run[i - 1] and run[i] in run[:i]), None)
     assert broken_run(np.array(run, dtype=np.int64)) == first
-
-
-def test_joined_records_keep_runs_apart():
-    a, b = make([3, 2]), make([4], seed=1)
-    both = Record.joined([a, b])
-    assert both.run.tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 2]
-    assert np.array_equal(both.pv, np.concatenate([a.pv, b.pv]))
-    assert both.starts(2).tolist() == [0, 5, 6]
-    with pytest.raises(RecordError, match="number 1 has other signals"):
-        Record.joined([a, make([3], dv=DV)])
-    with pytest.raises(RecordError, match="no records"):
-        Record.joined([])

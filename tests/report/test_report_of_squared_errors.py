@@ -15,19 +15,20 @@ from made_up_case import BATCH, PH, Miniature
 from rich.console import Console
 
 from pipeline.cases import CASES
+from pipeline.cases.batch_reactor.case import CALMED
 from pipeline.evaluation.case import Curve, Figure, PaperFigure, Requirement
-from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.metric import METRICS
 from pipeline.evaluation.model_evidence import candidates, model_figure
 from pipeline.evaluation.validation import Validation
-from pipeline.evaluation.verdicts import paper_row, plain_reason, requirement, statements
+from pipeline.evaluation.verdicts import plain_reason
 from pipeline.pictures.loop_picture import History, summary
 from pipeline.pictures.loop_pictures import info_picture
-from pipeline.pictures.words import ratio
+from pipeline.pictures.numbers import ratio
 from pipeline.report.for_programs import gate_id
 from pipeline.report.page import headline
 from pipeline.report.results import show_results
-from pipeline.report.verdict_words import statement, table_row
+from pipeline.report.verdicts import judge, requirement, table_row
 from pipeline.tracking.card import version_description
 from pipeline.tracking.gate import Gate
 
@@ -35,7 +36,7 @@ from pipeline.tracking.gate import Gate
 def load(root: Path, mini: Miniature, own_data: bool = False) -> Evidence:
     work = root / "work" / mini.case
     return Evidence.load(
-        mini.of, made_up.bounds(mini), work, tuple(mini.quality), own_data=own_data, timing=root / "timing" / mini.case
+        mini.of, made_up.bounds(mini), work, root / "timing" / mini.case, tuple(mini.quality), own_data=own_data
     )
 
 
@@ -45,7 +46,7 @@ def written(request, tmp_path_factory) -> tuple[Path, Evidence]:
     root = tmp_path_factory.mktemp(request.param.case)
     made_up.write_case(root, mini=request.param)
     evidence, out = load(root, request.param), root / "artifacts" / request.param.case
-    made_up.report(evidence, root / "work" / request.param.case / "models", out)
+    made_up.report(evidence, out)
     return out, evidence
 
 
@@ -144,10 +145,10 @@ def test_requirements_with_noise_with_late_errors_and_of_variants(batch):
     assert met(None, "trajectory_noise", "sse_late", noisy / 1000 - 0.01) is False
     assert met(None, "held_out", "sse", 1.0011, times="nmpc") is True
     assert met(None, "held_out_noise", "sse", 2.0, times="nmpc") is None  # no bound with noise
-    assert met("linearized_pid", "trajectory", "sse", 1e9, setting={"calmed": True}) is True
+    assert met("linearized_pid", "trajectory", "sse", 1e9, setting=CALMED.setting) is True
     assert met("linearized_pid", "trajectory", "sse", 1e9, setting={"penalty": 3.0}) is None
-    need = Requirement("linearized_pid", "trajectory", "sse", 13_320.0, setting={"calmed": True})
-    row = statement(requirement(need, evidence), evidence)
+    need = Requirement("linearized_pid", "trajectory", "sse", 13_320.0, setting=CALMED.setting)
+    row = requirement(need, evidence)
     assert row.what == "linearized PID (calmed), trajectory"
     assert row.limit == "SSE ≤ 13,320 °C²"
 
@@ -157,7 +158,7 @@ def test_a_model_sets_figures_have_their_place_in_a_table(batch):
 
     def judged(path: str, paper: float):
         row = PaperFigure("x", "identification_example", "", path, paper)
-        return table_row(paper_row(row, evidence, plain_reason), evidence)
+        return table_row(row, evidence, plain_reason)
 
     row = judged("one_step.recursive_0.8", 2.6)
     assert (row.ours, row.holds, row.metric) == (2.6, True, "one step")
@@ -181,34 +182,32 @@ def test_the_search_over_sizes_is_told_over_all_seeds(batch):
 
 def test_a_statement_is_judged_once():
     for name in CASES:
-        texts = [claim.text for claim in made_up.claims_of(name).statements]
+        texts = [check.what for check in made_up.claims_of(name).statements]
         assert len(set(texts)) == len(texts), name
 
 
-def rewrite(root: Path, mini: Miniature, law: str, path: tuple[str, ...], **figures: float) -> None:
-    """Change some measured figures of a law."""
+def rewrite(root: Path, mini: Miniature, law: str, of: tuple[str, str], **figures: float) -> None:
+    """Change some measured figures of a law: of a form, in a test."""
     file = root / "work" / mini.case / "validation" / law / "metrics.json"
     metrics = json.loads(file.read_text())
-    at = metrics
-    for key in path:
-        at = at[key]
-    at["median"] |= figures
+    form, test = of
+    metrics["forms"][form]["tests"][test]["median"] |= figures
     file.write_text(json.dumps(metrics))
 
 
 def test_claims_of_the_tank_follow_the_measurement(tmp_path):
     made_up.write_case(tmp_path, mini=PH)
-    claims, set_point = made_up.claims_of(PH.case), ("scenarios", "set_point")
+    claims, set_point = made_up.claims_of(PH.case), ("base", "set_point")
 
     def outcomes() -> dict[str, bool | None]:
-        return {v.what: v.holds for v in statements(load(tmp_path, PH), claims)}
+        return {v.what: v.holds for v in judge(load(tmp_path, PH), claims).statements}
 
     before = outcomes()
-    rewrite(tmp_path, PH, "linearized_pid", ("variants", "penalty=20", "set_point"), sse=43.4)
-    rewrite(tmp_path, PH, "linearized_pid", ("variants", "adaptive", "set_point"), sse=5.0)
+    rewrite(tmp_path, PH, "linearized_pid", ("penalty=20", "set_point"), sse=43.4)
+    rewrite(tmp_path, PH, "linearized_pid", ("adaptive", "set_point"), sse=5.0)
     rewrite(tmp_path, PH, "recursive_pid", set_point, sse=9.0)
-    rewrite(tmp_path, PH, "recursive_pid", ("scenarios", "disturbance"), max_asse=0.2)
-    rewrite(tmp_path, PH, "pid", ("variants", "tuning=itae, sampling=1", "set_point"), overshoot=0.02)
+    rewrite(tmp_path, PH, "recursive_pid", ("base", "disturbance"), max_asse=0.2)
+    rewrite(tmp_path, PH, "pid", ("tuning=itae, sampling=1", "set_point"), overshoot=0.02)
     after = outcomes()
     turned = {
         "the PID with fixed settings overshoots and oscillates": False,
@@ -223,7 +222,7 @@ def test_claims_of_the_tank_follow_the_measurement(tmp_path):
     assert before["the disturbance is one of the buffer's flow"] is False
     assert before["the best settings without bounds are negative"] is False  # no made-up gain lies at a bound
     row = next(r for t in CASES[PH.case].tables for r in t.rows if r.law == "self_tuning_pid")
-    assert "its tuning is not printed" in paper_row(row, load(tmp_path, PH), claims.reason).reason
+    assert "does not print its tuning" in table_row(row, load(tmp_path, PH), claims.reason).verdict
 
 
 def test_claims_of_the_reactor_follow_the_measurement(tmp_path):
@@ -231,24 +230,24 @@ def test_claims_of_the_reactor_follow_the_measurement(tmp_path):
     claims = made_up.claims_of(BATCH.case)
 
     def outcome(text: str) -> bool | None:
-        return {v.what: v.holds for v in statements(load(tmp_path, BATCH), claims)}[text]
+        return {v.what: v.holds for v in judge(load(tmp_path, BATCH), claims).statements}[text]
 
     ahead = "the linearized PID tracks better than the recursive one"
     assert outcome(ahead) is False
-    rewrite(tmp_path, BATCH, "linearized_pid", ("noise", "trajectory"), sse=13_000.0)
+    rewrite(tmp_path, BATCH, "linearized_pid", ("base", "trajectory_noise"), sse=13_000.0)
     assert outcome(ahead) is False  # better in all, not after the start
-    rewrite(tmp_path, BATCH, "linearized_pid", ("noise", "trajectory"), sse_late=1.0)
+    rewrite(tmp_path, BATCH, "linearized_pid", ("base", "trajectory_noise"), sse_late=1.0)
     assert outcome(ahead) is True
     assert outcome("filter and update criterion calm the settings") is True
     row = CASES[BATCH.case].tables[0].rows[1]
-    said = paper_row(row, load(tmp_path, BATCH), claims.reason).reason
+    said = table_row(row, load(tmp_path, BATCH), claims.reason).verdict
     assert "13,252 is lost while full heating cannot reach the profile" in said
     assert "the paper's 11,121" in said
 
 
 def test_a_persons_own_data_get_no_reasons_of_the_papers(batch, tmp_path):
     evidence = load(batch, BATCH, own_data=True)
-    made_up.report(evidence, tmp_path / "none", tmp_path)
+    made_up.report(evidence, tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "full heating" not in text
     assert "does not, because it is 0.6 times the paper's" in text
@@ -257,20 +256,20 @@ def test_a_persons_own_data_get_no_reasons_of_the_papers(batch, tmp_path):
 def test_info_is_drawn_by_its_name_whatever_else_the_setting_tells(batch):
     evidence = load(batch, BATCH)
     law = evidence.laws["linearized_pid"]
-    figure = Figure(1, "x", (Curve("linearized_pid", {"calmed": True}),), "trajectory", info=("kc", "penalty"))
+    figure = Figure(1, "x", (Curve("linearized_pid", CALMED.setting),), "trajectory", info=("kc", "penalty"))
     canvas = info_picture(evidence, figure)
-    assert canvas is not None
-    loop = law.loop("trajectory", {"calmed": True})
+    loop = law.loop("trajectory", CALMED.setting)
     assert loop is not None
     for axes, column in zip(canvas.axes, (0, 3), strict=True):
         assert np.array_equal(axes.lines[0].get_ydata(), loop["info"][:, column])
-    turned = {**law.metrics, "variant_info": {"calmed": ["penalty", "x", "y", "kc", "z"]}}
+    calmed = replace(law.metrics.forms["calmed"], info=("penalty", "x", "y", "kc", "z"))
+    turned = replace(law.metrics, forms={**law.metrics.forms, "calmed": calmed})
     swapped = replace(evidence, laws={**evidence.laws, "linearized_pid": replace(law, metrics=turned)})
     canvas = info_picture(swapped, figure)
-    assert canvas is not None
     assert np.array_equal(canvas.axes[0].lines[0].get_ydata(), loop["info"][:, 3])
-    assert info_picture(evidence, replace(figure, info=("colour",))) is None
-    assert info_picture(evidence, replace(figure, curves=(Curve("gauss_newton_pid"),))) is None  # tells nothing
+    for other in (replace(figure, info=("colour",)), replace(figure, curves=(Curve("gauss_newton_pid"),))):
+        with pytest.raises(NotMeasuredError):
+            info_picture(evidence, other)
 
 
 def test_the_table_in_the_terminal_and_the_card_in_the_registry(written):

@@ -18,16 +18,18 @@ from matplotlib.figure import Figure as Canvas
 
 from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from pipeline.evaluation.case import Array, Case, Requirement
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import ReportError
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from pipeline.evaluation.law_evidence import Analysis
 from pipeline.evaluation.metric import Metric
+from pipeline.evaluation.typed_json import ReportError
 from pipeline.evaluation.validation import Validation
-from pipeline.evaluation.verdicts import PLAIN, CasePicture, requirement
+from pipeline.evaluation.verdicts import PLAIN
+from pipeline.pictures.drawing import CasePicture
 from pipeline.pictures.loop_pictures import overview_picture
 from pipeline.plants.equations import EquationPlant
 from pipeline.report.figures import draw_all
 from pipeline.report.page import headline, write_report
-from pipeline.report.verdict_words import statement
+from pipeline.report.verdicts import requirement
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.tracking.card import version_description
 from pipeline.tracking.gate import Gate
@@ -81,23 +83,22 @@ MINI = TwoValvesMade(
     {"pid": 2.0, "fuzzy": 1.2},
     {"levels": 0.5, "other": 0.7},
     {"fuzzy": {"gain": 1.0}},
-    {"fuzzy": ("gain=2",)},
+    {"fuzzy": {"gain=2": {"gain": 2.0}}},
 )
 
 
 def load(root: Path) -> Evidence:
     bounds = {"levels": made_up.bounds(MINI)["levels"]}  # of the other plants nobody knows the bound
-    return Evidence.load(
-        MINI.of, bounds, root / "work" / MINI.case, tuple(MINI.quality), timing=root / "timing" / MINI.case
-    )
+    return Evidence.load(MINI.of, bounds, root / "work" / MINI.case, root / "timing" / MINI.case, tuple(MINI.quality))
 
 
 def tell(root: Path, law: str, **figures: float) -> None:
     """Let a law tell of its analysis, and its tests of more figures."""
     path = root / "work" / MINI.case / "validation" / law / "metrics.json"
     metrics = json.loads(path.read_text())
-    metrics["analysis"] = ANALYSIS
-    for block in (*metrics["scenarios"].values(), *metrics["noise"].values()):
+    for form, analysis in ANALYSIS.items():
+        metrics["forms"][form]["analysis"] = analysis
+    for block in metrics["forms"]["base"]["tests"].values():
         for how in ("median", "min", "max"):
             block[how] |= figures
     path.write_text(json.dumps(metrics))
@@ -107,6 +108,10 @@ def draw(evidence: Evidence) -> Canvas:
     canvas = Canvas()
     canvas.subplots().plot([0, len(evidence.laws)])
     return canvas
+
+
+def draw_nothing(evidence: Evidence) -> Canvas:
+    raise NotMeasuredError
 
 
 @pytest.fixture(scope="module")
@@ -121,15 +126,14 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def out(root: Path) -> Path:
     folder = root / "artifacts" / MINI.case
-    pictures = (CasePicture("basin", "Where every start ends", draw), CasePicture("none", "Nothing", lambda _: None))
-    write_report(load(root), replace(PLAIN, pictures=pictures), root / "none", folder)
+    pictures = (CasePicture("basin", "Where every start ends", draw), CasePicture("none", "Nothing", draw_nothing))
+    write_report(load(root), PLAIN, pictures, folder)
     return folder
 
 
 def test_every_mv_has_its_panel_and_a_discrete_one_its_allowed_values(root: Path) -> None:
     evidence = load(root)
     canvas = overview_picture(evidence, "fuzzy")
-    assert canvas is not None
     cv, throttle, mode = canvas.axes
     assert [axes.get_ylabel() for axes in canvas.axes] == ["$T$ [°C]", "$k_{M}$", "mode"]
     assert mode.get_yticks().tolist() == [1.0, 2.0]
@@ -185,10 +189,10 @@ def test_where_some_tests_have_no_bound_the_others_keep_theirs(root: Path, out: 
     tree = json.loads((out / "validation.json").read_text())
     assert tree["gate"]["laws"]["fuzzy"]["score"] == pytest.approx(1.2)
     assert set(tree["bounds"]) == {"levels"}
-    assert "No bounds were computed" not in (out / "report.html").read_text()
+    assert "This case has no bounds" not in (out / "report.html").read_text()
     unbounded = replace(evidence, bounds={})
-    made_up.report(unbounded, root / "none", root / "unbounded")
-    assert "No bounds were computed" in (root / "unbounded" / "report.html").read_text()
+    made_up.report(unbounded, root / "unbounded")
+    assert "This case has no bounds" in (root / "unbounded" / "report.html").read_text()
 
 
 def test_programs_get_the_analysis_and_the_verdicts(out: Path) -> None:
@@ -217,14 +221,14 @@ def test_a_case_names_its_figures(root: Path) -> None:
     assert TwoValves((9,)).label("tracking") == "tracking RMS [°C]"
     assert TwoValves((9,)).label("nrmse_free.run") == "nrmse free"
     evidence = load(root)
-    row = statement(requirement(Requirement("fuzzy", "levels", "switches", 3.0), evidence), evidence)
+    row = requirement(Requirement("fuzzy", "levels", "switches", 3.0), evidence)
     assert (row.limit, row.measured, row.holds) == ("switches of the mode ≤ 3", "4", False)
 
 
 def test_a_picture_does_not_overwrite_another(root: Path, tmp_path: Path) -> None:
     twice = CasePicture("closed_loop_pid", "x", draw)
     with pytest.raises(ReportError, match=r"'closed_loop_pid'.*give another name"):
-        draw_all(load(root), tmp_path / "figures", tmp_path, (twice,))
+        draw_all(load(root), tmp_path / "figures", (twice,))
 
 
 def test_arrays_of_an_analysis_belong_to_a_form(root: Path) -> None:
@@ -234,5 +238,5 @@ def test_arrays_of_an_analysis_belong_to_a_form(root: Path) -> None:
     assert law.analysis_arrays({})["radius"].tolist() == [1.0, 1.0, 1.0]
     assert law.analysis_arrays({"gain": 2})["radius"].tolist() == [0.0, 0.0]
     assert law.analysis_arrays({"gain": 3}) == {}
-    assert law.analysis({"gain": 2})["figures"] == {"radius": 1.02}
-    assert law.analysis({"gain": 3}) == {}
+    assert law.analyses["gain=2"] == Analysis({"radius": 1.02}, ("Stable around each point.",))
+    assert law.form({"gain": 3}) is None

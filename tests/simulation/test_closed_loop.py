@@ -1,7 +1,5 @@
 """Simulation: open loop, batches and closed loops tell the same story, by the same convention."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import pytest
 from made_up_plant import Lag
@@ -9,15 +7,8 @@ from made_up_plant import Lag
 from pipeline.cases import PLANTS
 from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from pipeline.errors import PlantError
+from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_batch, simulate_closed, simulate_open
-
-
-@dataclass(frozen=True)
-class Demand:
-    sp: np.ndarray
-    x0: np.ndarray
-    mv0: np.ndarray
-    changes: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +21,8 @@ def middle(cstr) -> np.ndarray:
     return cstr.steady_states(250.0)[1]
 
 
-def demand(cstr, n: int, **changes: np.ndarray) -> Demand:
-    return Demand(np.full((n, 1), 0.4), cstr.steady_states(250.0)[2], np.array([250.0]), changes)
+def demand(cstr, n: int, **changes: np.ndarray) -> Scenario:
+    return Scenario("made", "made", np.full((n, 1), 0.4), cstr.steady_states(250.0)[2], np.array([250.0]), changes)
 
 
 def nothing(_sp, _pv, mv_applied):
@@ -72,14 +63,12 @@ def test_steady_state_stays(cstr):
 def test_changed_parameters_act_from_their_period_on(cstr, middle):
     mv = np.full((10, 1), 250.0)
     ua = np.where(np.arange(10) < 4, cstr.UA, 10_000.0)
-    plain, changed = simulate_open(cstr, middle, mv), simulate_open(cstr, middle, mv, {"UA": ua})
+    plain = simulate_open(cstr, middle, mv)
+    changed = simulate_closed(cstr, nothing, Scenario("made", "made", mv, middle, mv[0], {"UA": ua})).x
     assert np.array_equal(plain[:5], changed[:5])
     assert not np.allclose(plain[5], changed[5], rtol=1e-6)
     weak = cstr.with_parameters({"UA": 10_000.0})
-    assert np.allclose(simulate_open(cstr, middle, mv, {"UA": 10_000.0}), simulate_open(weak, middle, mv), rtol=1e-13)
-    assert simulate_batch(cstr, middle[None], mv[None], {"UA": 10_000.0})[0] == pytest.approx(
-        simulate_open(weak, middle, mv), rel=1e-12
-    )
+    assert np.allclose(changed[4:], simulate_open(weak, changed[4], mv[4:])[:-1], rtol=1e-13)
 
 
 def test_closed_loop_convention(cstr):
@@ -103,11 +92,12 @@ def test_closed_loop_convention(cstr):
     assert np.array_equal([sp for sp, _, _ in seen], loop.sp)
 
 
-def test_closed_loop_disturbance_is_that_of_open_loop(cstr):
+def test_closed_loop_disturbance_is_a_plant_with_other_parameters(cstr):
     ua = np.linspace(20_000.0, 10_000.0, 30)
     loop = simulate_closed(cstr, nothing, demand(cstr, 30, UA=ua))
-    x = simulate_open(cstr, loop.x[0], loop.mv, {"UA": ua})
-    assert loop.x == pytest.approx(x[:-1], rel=1e-13)
+    for k in range(29):
+        x = simulate_open(cstr.with_parameters({"UA": ua[k]}), loop.x[k], loop.mv[[k]])
+        assert loop.x[k + 1] == pytest.approx(x[1], rel=1e-13)
     assert loop.info.shape == (30, 0)
 
 
@@ -132,11 +122,11 @@ def test_a_state_that_is_lost_names_its_sample(cstr, middle):
     flow = np.where(np.arange(5) < 3, cstr.F, np.nan)
     mv = np.full((5, 1), 250.0)
     with pytest.raises(PlantError, match="the state at sample 4 is"):
-        simulate_open(cstr, middle, mv, {"F": flow})
+        simulate_open(cstr, middle, np.where(np.isnan(flow)[:, None], np.nan, mv))
     with pytest.raises(PlantError, match="the state at sample 4 is"):
         simulate_closed(cstr, nothing, demand(cstr, 5, F=flow))
-    with pytest.raises(PlantError, match="the state at sample 1 is"):
-        simulate_batch(cstr, np.array([middle, [np.inf, 300.0]]), np.full((2, 2, 1), 250.0), {"F": np.nan})
+    with pytest.raises(PlantError, match="the state at sample 0 is"):
+        simulate_batch(cstr, np.array([middle, [np.inf, 300.0]]), np.full((2, 2, 1), 250.0))
     with pytest.raises(PlantError, match=r"MV is \[nan\] at sample 0; it must be finite"):
         simulate_closed(cstr, lambda *_: (np.array([np.nan]), ()), demand(cstr, 5))
 
@@ -148,8 +138,8 @@ def test_wrong_shapes_and_names_are_plant_errors(cstr, middle):
     with pytest.raises(PlantError, match="mv has shape"):
         simulate_open(cstr, middle, np.zeros((5, 2)))
     with pytest.raises(PlantError, match="no parameter 'U'"):
-        simulate_open(cstr, middle, mv, {"U": 1.0})
-    with pytest.raises(PlantError, match=r"UA has shape \(4,\); give one number or 5"):
-        simulate_open(cstr, middle, mv, {"UA": np.ones(4)})
+        simulate_closed(cstr, nothing, demand(cstr, 5, U=np.ones(5)))
+    with pytest.raises(PlantError, match=r"UA has shape \(4,\); give one value a period, \(5,\)"):
+        demand(cstr, 5, UA=np.ones(4))
     with pytest.raises(PlantError, match="one standard deviation >= 0 for each"):
         simulate_closed(cstr, nothing, demand(cstr, 5), noise=[0.1])

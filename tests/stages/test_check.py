@@ -42,7 +42,7 @@ def test_the_repositorys_own_has_none(params: dict[str, Any], capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("where", "value", "said"),
     [
-        (("cases", "batch_reactor", "held_out_seeds"), [11, 12], "which serve the development"),
+        (("cases", "batch_reactor", "held_out_seeds"), [11, 12], "none of the development seeds"),
         (("records", "ph_neutralization-aprbs", "kind"), "aprb", "did you mean 'aprbs'"),
         (("records", "ph_neutralization-aprbs", "samples"), "many", "samples"),
         (("models", "batch_reactor-nnarx", "data"), "work/batch_reactor/records/batch", "which no record makes"),

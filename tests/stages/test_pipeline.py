@@ -19,6 +19,7 @@ from reduced import reduced
 
 ROOT = Path(__file__).parents[2]
 CASE = "thiosulfate_cstr"
+PID = f"{CASE}-pid"
 ENVIRONMENT = {
     **os.environ,
     "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
@@ -71,12 +72,14 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
     keep = {
         "records": ["random_steps"],
         "models": ["inverse", "linearized"],
-        "controllers": ["incad", "pid"],
+        "controllers": ["inc", "pid"],
     }
     tree["cases"] = {CASE: tree["cases"][CASE]}
     for section, names in keep.items():
         tree[section] = {f"{CASE}-{name}": tree[section][f"{CASE}-{name}"] for name in names}
     tree["records"][f"{CASE}-random_steps"]["seeds"] = [0]
+    tree["controllers"][PID] |= {"tuning": "imc", "lambda_s": 1.5}
+    tree["cases"][CASE]["held_out_seeds"] = tree["cases"][CASE]["held_out_seeds"][:1]
     (path / "params.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     repository = Copy(path)
     repository.run("git", "init", "--quiet")
@@ -88,12 +91,12 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
 
 def test_every_output_is_there(copy: Copy) -> None:
     artifacts = copy.path / "artifacts" / CASE
-    for name in ("incad.onnx", "incad.json", "pid.onnx", "pid.json", "validation.json", "report.html", "report.md"):
+    for name in ("inc.onnx", "inc.json", "pid.onnx", "pid.json", "validation.json", "report.html", "report.md"):
         assert (artifacts / name).is_file(), name
     assert (copy.path / "published.json").is_file()
     for name in ("report.html", "report.md"):
-        assert f"{CASE}-incad" in (copy.path / "artifacts" / name).read_text(), name
-    assert "incad" in copy.run("python", "-m", "pipeline", "results")
+        assert PID in (copy.path / "artifacts" / name).read_text(), name
+    assert "inc" in copy.run("python", "-m", "pipeline", "results")
     assert "held_out / NMPC" in copy.run("python", "-m", "pipeline", "results", CASE)
 
 
@@ -102,19 +105,19 @@ def test_a_second_run_does_nothing(copy: Copy) -> None:
     assert "up to date" in copy.run("dvc", "status")
 
 
-def test_another_r_reruns_its_own_design_and_validation_only(copy: Copy) -> None:
-    copy.edit(("controllers", f"{CASE}-incad", "r"), 2.0)
+def test_another_number_reruns_its_own_design_and_validation_only(copy: Copy) -> None:
+    copy.edit(("controllers", PID, "lambda_s"), 2.0)
     ran = copy.repro()
-    assert {f"design@{CASE}-incad", f"validate@{CASE}-incad"} <= ran
-    assert ran <= {f"design@{CASE}-incad", f"validate@{CASE}-incad", f"report@{CASE}", "overview", "publish"}
+    assert {f"design@{PID}", f"validate@{PID}"} <= ran
+    assert ran <= {f"design@{PID}", f"validate@{PID}", f"report@{CASE}", "overview", "publish"}
     # Back again: DVC's cache has it, nothing is computed twice.
-    copy.edit(("controllers", f"{CASE}-incad", "r"), 1.5)
+    copy.edit(("controllers", PID, "lambda_s"), 1.5)
     assert not {s for s in copy.repro() if s.startswith(("excite", "fit", "design"))}
 
 
 def test_a_run_killed_in_the_middle_loses_nothing(copy: Copy) -> None:
-    before = (copy.path / "artifacts" / CASE / "pid.onnx").read_bytes()
-    copy.edit(("models", f"{CASE}-inverse", "parts", "inverse", "partitions"), 9)
+    before = (copy.path / "artifacts" / CASE / "inc.onnx").read_bytes()
+    copy.edit(("models", f"{CASE}-linearized", "parts", "linearized", "at"), 0.6)
     process = subprocess.Popen(
         ["dvc", "repro"],
         cwd=copy.path,
@@ -132,15 +135,15 @@ def test_a_run_killed_in_the_middle_loses_nothing(copy: Copy) -> None:
     process.stdout.close()
     process.wait()
     ran = copy.repro()
-    assert f"fit@{CASE}-inverse" in ran
-    assert not {s for s in ran if s.startswith("excite") or s.endswith("-pid")}
+    assert {f"fit@{CASE}-linearized", f"design@{PID}"} <= ran
+    assert not {s for s in ran if s.startswith("excite") or s.endswith(("-inverse", "-inc"))}
     assert "up to date" in copy.run("dvc", "status")
-    assert (copy.path / "artifacts" / CASE / "pid.onnx").read_bytes() == before
+    assert (copy.path / "artifacts" / CASE / "inc.onnx").read_bytes() == before
 
 
 def test_a_mistake_in_the_parameters_is_one_line(copy: Copy) -> None:
-    copy.edit(("controllers", f"{CASE}-incad", "narowing"), 2.0)
-    said = copy.run("python", "-m", "pipeline.stages.design", f"{CASE}-incad", check=False)
+    copy.edit(("controllers", PID, "narowing"), 2.0)
+    said = copy.run("python", "-m", "pipeline.stages.design", PID, check=False)
     assert said.count("\n") == 1
-    assert f"controllers.{CASE}-incad: unknown key 'narowing'" in said
+    assert f"controllers.{PID}: unknown key 'narowing'" in said
     assert "Traceback" not in said

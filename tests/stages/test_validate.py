@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from pipeline.cases import CASES
 from pipeline.cases.thiosulfate_cstr.case import TJ, ThiosulfateCstrCase
 from pipeline.engine.command import run_stage
 from pipeline.errors import LawError
+from pipeline.evaluation.law_evidence import LawMetrics
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.stages import validate as stage
 from serving import Controller
@@ -48,14 +50,15 @@ class ShortCase(ThiosulfateCstrCase):
 def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Puts a designed controller, of two data seeds, and its section of params.yaml into a folder of its own."""
 
-    def make(hard: bool, **section: object) -> None:
+    def make(hard: bool, **section: Any) -> None:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setitem(CASES, CASE, ShortCase(hard=hard))
         monkeypatch.setattr(stage, "parallel_map", lambda run, work, _: list(map(run, work)))
         designed = tmp_path / "work" / CASE / "controllers" / LAW
-        (designed / "base").mkdir(parents=True)
-        for seed in (0, 4):
-            shutil.copy(FILE, designed / "base" / f"seed{seed}.onnx")
+        for form in ("base", *section.get("variants", {})):
+            (designed / form).mkdir(parents=True)
+            for seed in (0, 4):
+                shutil.copy(FILE, designed / form / f"seed{seed}.onnx")
         (designed / "metrics.json").write_text(json.dumps({"title": "PID", "controllers": []}))
         tree = {
             "cases": {CASE: {"held_out_seeds": [9001], "noise_seed": 0}},
@@ -89,9 +92,21 @@ def test_a_reproduction_is_shipped_and_says_so(made: Callable[..., None]) -> Non
     assert evidence["lock_ups"] == 4
     assert evidence["locked_up"] == {"beyond": {"0": 1, "4": 1}, "beyond_noise": {"0": 1, "4": 1}}
     assert evidence["as_printed"] is True
-    measured = json.loads(MEASURED.read_text())
-    assert (measured["lock_ups"], measured["as_printed"]) == (4, True)
-    assert measured["locked_up"] == evidence["locked_up"]
+    measured = LawMetrics.read(MEASURED)
+    assert (measured.lock_ups, measured.as_printed) == (4, True)
+    assert measured.locked_up == evidence["locked_up"]
+
+
+def test_settings_of_variants_are_kept_as_data(made: Callable[..., None]) -> None:
+    variants = {"slow": {"kc": 0.5, "tuning": "manual", "examined_cv": [0.1, 0.2]}}
+    made(hard=False, ti_s=3.0, variants=variants)
+    stage.validate(f"{CASE}-{LAW}")
+    forms = LawMetrics.read(MEASURED).forms
+    assert {name: form.setting for name, form in forms.items()} == {
+        "base": {"ti_s": 3.0},
+        "slow": {"kc": 0.5, "tuning": "manual"},  # a list names no form
+    }
+    assert list(forms["slow"].tests) == ["step"]
 
 
 def test_a_sound_law_is_shipped_without_a_word(made: Callable[..., None]) -> None:
@@ -100,9 +115,9 @@ def test_a_sound_law_is_shipped_without_a_word(made: Callable[..., None]) -> Non
     evidence = Controller(SHIPPED).manifest.evidence
     assert evidence["lock_ups"] == 0
     assert not {"locked_up", "as_printed"} & set(evidence)
-    measured = json.loads(MEASURED.read_text())
-    assert measured["locked_up"] == {}
+    measured = LawMetrics.read(MEASURED)
+    assert measured.locked_up == {}
     # What is not scored leaves its curve, and no figure.
-    assert list(measured["scenarios"]) == ["step"]
+    assert list(measured.forms["base"].tests) == ["step", "step_noise"]
     with np.load(MEASURED.with_name("trajectories.npz")) as curves:
-        assert curves[f"longer/base/{measured['shipped_seed']}/pv"].shape == (160, 2)
+        assert curves[f"longer/base/{measured.shipped_seed}/pv"].shape == (160, 2)

@@ -24,13 +24,12 @@ from pipeline.commands.registry import CHAMPIONS
 from pipeline.engine.start import VARIABLE, receipt_path
 from pipeline.errors import TrackingError
 from pipeline.evaluation.validation import Validation
+from pipeline.files import sha256
 from pipeline.tracking.gate import Gate
-from pipeline.tracking.lock import StageResult, dataset_hash, datasets, is_current, read_lock
-from pipeline.tracking.notes import item_of
 from pipeline.tracking.publish import publish
-from pipeline.tracking.registry import REQUIREMENTS, file_digest, versions
+from pipeline.tracking.registry import REQUIREMENTS, versions
+from pipeline.tracking.stage_results import StageResult, Times, dataset_hash, datasets, read_lock
 from pipeline.tracking.store import store
-from pipeline.tracking.times import Times
 
 pytestmark = [
     # SQLAlchemy's complaint about a loader that mlflow's own tables use
@@ -191,7 +190,7 @@ def test_the_best_version_falls_only_to_better_evidence(root, capsys):
     capsys.readouterr()
     assert main(["fetch", f"{name}/6", "out"]) == 0
     assert main(["fetch", CASE, "best"]) == 0
-    assert file_digest(root / "out" / "inverse_dob.onnx") == file_digest(root / "artifacts" / CASE / "inverse_dob.onnx")
+    assert sha256(root / "out" / "inverse_dob.onnx") == sha256(root / "artifacts" / CASE / "inverse_dob.onnx")
     assert json.loads((root / "out" / "inverse_dob.json").read_text())["law"] == "inverse_dob"
     assert (root / "best" / "inverse_dob.onnx").exists()
     assert main(["list"]) == 0
@@ -246,13 +245,14 @@ def test_a_result_is_known_by_its_inputs_only(root):
     (root / "work" / CASE / "records" / "steps" / "seed0.csv").write_text("other")
     made_up.write_lock(root, LAWS)
     results = read_lock(root)
-    assert dataset_hash(next(s for s in results if s.name == fit.name), results) != dataset_hash(fit, after.values())
+    now = next(s for s in results if s.name == fit.name)
+    assert dataset_hash(datasets(now, results)) != dataset_hash(datasets(fit, after.values()))
 
 
 def test_files_that_are_not_the_locks_are_left_out(root, capsys):
     (root / "work" / CASE / "validation" / "inverse_dob" / "metrics.json").write_text("{half")
     stage = next(s for s in read_lock(root) if s.name.endswith("inverse_dob"))
-    assert not is_current(stage, root)
+    assert not stage.is_current(root)
     receipt = publish(root)
     assert stage.name not in receipt["stages"]
     assert f"left out {stage.name}" in capsys.readouterr().err
@@ -268,9 +268,9 @@ def test_outputs_are_hashed_as_dvc_does(tmp_path):
         subprocess.run([sys.executable, "-m", "dvc", *command], cwd=tmp_path, check=True, timeout=120)
     (result,) = read_lock(tmp_path)
     assert set(result.outs) == {"out", "single"}
-    assert is_current(result, tmp_path)
+    assert result.is_current(tmp_path)
     (tmp_path / "out" / "b" / "x").write_text("5")
-    assert not is_current(result, tmp_path)
+    assert not result.is_current(tmp_path)
 
 
 def test_what_is_wrong_with_the_store_takes_one_line_and_seconds(root, monkeypatch):
@@ -355,7 +355,7 @@ def test_a_run_shows_the_figures_that_matter_and_keeps_all(root):
         assert shown["ratio_to_bound"] == SCORES["inverse_dob"]
         rows = dict(json.loads(Path(client.download_artifacts(run.info.run_id, "figures.json")).read_text())["data"])
         stored = made_up.spread(0.064 * made_up.QUALITY["inverse_dob"])
-        assert rows["scenarios.sp_a.per_seed.2.masse"] == stored["per_seed"]["2"]["masse"]
+        assert rows["forms.base.tests.sp_a.per_seed.2.masse"] == stored["per_seed"]["2"]["masse"]
         assert json.loads(run.data.tags["mlflow.loggedArtifacts"]) == [{"path": "figures.json", "type": "table"}]
 
         note = run.data.tags["mlflow.note.content"]
@@ -384,7 +384,7 @@ def test_a_run_names_the_data_it_learnt_from(root):
 def test_a_run_is_named_by_its_stage_whatever_the_order_of_its_outputs():
     outs = {"artifacts/plant/pid_2.json": "1", "artifacts/plant/pid_2.onnx": "2", "work/plant/validation/pid_2": "3"}
     for order in (outs, dict(reversed(outs.items()))):
-        assert item_of(StageResult("validate@plant-pid_2", "", {}, {}, order)) == "pid_2"
+        assert StageResult("validate@plant-pid_2", "", {}, {}, order).item == "pid_2"
 
 
 def test_a_stage_that_depends_on_a_folder_descends_from_what_was_made_inside():
@@ -431,27 +431,12 @@ def test_a_case_has_one_champion_and_every_controller_says_where_it_stands(root,
         assert "champion_by" not in client.get_model_version(inverse, "1").tags
 
 
-def test_the_aliases_of_an_earlier_release_are_renamed(root):
-    publish(root)
-    pid, inverse = f"{CASE}-pid", f"{CASE}-inverse_dob"
-    with store() as client:
-        for name in (pid, inverse):
-            client.delete_registered_model_alias(name, "best")
-            client.set_registered_model_alias(name, "champion", "1")
-        client.set_registered_model_alias(inverse, "case_champion", "1")
-    publish(root)
-    with store() as client:
-        assert holders(client, "best") == {pid: 1, inverse: 1}
-        assert holders(client, "champion") == {inverse: 1}
-        assert not holders(client, "case_champion")
-
-
 def test_a_store_whose_folder_was_moved_or_copied_still_gives_its_files(root, monkeypatch, capsys):
     publish(root)
     copy, moved = root.parent / "a copy", root.parent / "moved"
     shutil.copytree(root, copy)
     first = next((copy / "mlruns").rglob("inverse_dob.onnx"))
-    digest = file_digest(first)
+    digest = sha256(first)
     next((root / "mlruns").rglob("inverse_dob.onnx")).write_bytes(b"of the original alone")
 
     def work_in(folder: Path) -> None:
@@ -460,7 +445,7 @@ def test_a_store_whose_folder_was_moved_or_copied_still_gives_its_files(root, mo
 
     work_in(copy)
     assert main(["fetch", CASE, "out"]) == 0
-    assert file_digest(copy / "out" / "inverse_dob.onnx") == digest
+    assert sha256(copy / "out" / "inverse_dob.onnx") == digest
     copy.rename(moved)
     work_in(moved)
     assert main(["fetch", CASE, "again"]) == 0

@@ -8,7 +8,7 @@ import pytest
 from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from pipeline.errors import LawError, PlantError
 from pipeline.laws.pid.pid import PID
-from pipeline.tuning.recovery import Starts, other_rests, recover
+from pipeline.tuning.development import Starts, other_rests, recover
 from pipeline.tuning.rules import PidSettings, sampled_loop
 from pipeline.tuning.stability import (
     LARGEST_MARGIN,

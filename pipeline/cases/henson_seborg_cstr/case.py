@@ -25,18 +25,20 @@ T_F = (350.0, 360.0, 340.0)  # [K] feed temperature, at a set point where the pl
 C_F = (1.0, 1.1, 0.9)  # [mol/l] feed concentration, at one where it does
 
 GAINS, OUTPUTS, VELOCITY = (Curve("local_pid_network", {"blending": b}) for b in ("gains", "outputs", "velocity"))
-AUTO, PID_1 = Curve("auto_pid_network"), Curve("pid")
-# By its bandwidth, whatever params.yaml ships.
-FIVE, SLOW = (Curve("auto_pid_network", {"wc": wc}) for wc in (5.0, 3.0))
-ALONE = tuple(Curve("pid", {"printed": float(i)}) for i in (2, 3, 4, 5))
+AUTO, FAST = Curve("auto_pid_network"), Curve("auto_pid_network", {"wc": 7.0})
+PID_1 = Curve("pid")
+ALONE = tuple(  # PIDs 2 to 5 of the paper
+    Curve("pid", {"kc": kc, "ti_s": ti_s, "td_s": 0.0, "filter_s": 0.0})
+    for kc, ti_s in ((331.0, 30.72), (404.2, 16.02), (2080.0, 26.04), (20100.0, 32.1))
+)
+TUNED = Curve("pid", {"tuning": "optimized", "development_hold": 250, "development_set_points": 8})
 
-
-POINTS = (  # as printed, C [mol/l], T [K] and q_c [l/min]; beside them what an independent implementation found
-    (("0.12980", 0.129825), ("432.95", 432.949), ("110", 110.0)),
-    (("0.085060", 0.08506), ("442", 442.0), ("98.899", 98.984)),
-    (("0.05854", 0.05854), ("450", 450.0), ("88.291", 88.324)),
-    (("0.029468", 0.02947), ("465", 465.0), ("68.788", 68.791)),
-    (("0.014630", 0.01463), ("481", 481.0), ("50.438", 50.438)),
+POINTS = (  # as printed, C [mol/l], T [K] and q_c [l/min]
+    ("0.12980", "432.95", "110"),
+    ("0.085060", "442", "98.899"),
+    ("0.05854", "450", "88.291"),
+    ("0.029468", "465", "68.788"),
+    ("0.014630", "481", "50.438"),
 )
 
 
@@ -49,35 +51,11 @@ def _operating_points() -> tuple[PaperFigure, ...]:
             "",
             f"operating_points.{i}.{signal}",
             float(printed),
-            {},
-            other,
             within=0.5 * 10.0 ** -len(printed.partition(".")[2]),
         )
         for i, row in enumerate(POINTS, start=1)
-        for signal, (printed, other) in zip(("C", "T", "q_c"), row, strict=True)
+        for signal, printed in zip(("C", "T", "q_c"), row, strict=True)
     )
-
-
-def _iae(label: str, curve: Curve, *found: float) -> tuple[PaperFigure, ...]:
-    """Rows of IAE up, down and after the jump; the figures are those of an independent implementation."""
-    tests = zip(("up", "down", "jump"), found, strict=False)
-    return tuple(
-        PaperFigure(f"{label}, {t}", curve.law, t, "iae", v, curve.setting, v, printed=False) for t, v in tests
-    )
-
-
-def _overshoot(label: str, curve: Curve, *found: float) -> tuple[PaperFigure, ...]:
-    """Rows of the largest overshoot up and down, of the same implementation."""
-    tests = zip(("up", "down"), found, strict=True)
-    return tuple(
-        PaperFigure(f"{label}, {t}", curve.law, t, "overshoot_max", v, curve.setting, v, printed=False)
-        for t, v in tests
-    )
-
-
-def _margin(label: str, curve: Curve, found: float) -> PaperFigure:
-    """A row of the upper gain margin, of the same implementation, to its last digit."""
-    return PaperFigure(label, curve.law, "", "gain_margin", found, curve.setting, found, printed=False, within=0.05)
 
 
 @dataclass(frozen=True)
@@ -97,9 +75,9 @@ class HensonSeborgCstrCase(Case):
     plant_class: ClassVar[type[EquationPlant]] = HensonSeborgCstr
     development_seeds: ClassVar[tuple[int, ...]] = (11, 12, 13, 14, 15)
     noise: ClassVar[Mapping[str, float]] = {"C": 2e-4, "T": 0.2}
-    seen: ClassVar[str] = (
-        "the gains are the paper's, the bandwidth is a round number; the feed's changes were enlarged "
-        "after their errors had turned out to be less than noise hides. No number was chosen on held_out."
+    disclosure: ClassVar[str] = (
+        "The gains are the paper's, and the bandwidth is a round number. The feed changes were first so small that "
+        "noise hid their errors; they were enlarged. `held_out` influenced no setting."
     )
     data_seeds: ClassVar[int] = 1
     unforeseen: ClassVar[bool] = True  # nobody measures the feed
@@ -134,42 +112,14 @@ class HensonSeborgCstrCase(Case):
         Metric("states_of_no_return", "states from which it does not return"),
     )
     tables: ClassVar[tuple[PaperTable, ...]] = (
-        PaperTable(
-            1,
-            "Operating points as printed, to their last digit",
-            _operating_points(),
-        ),
-        PaperTable(
-            2,
-            "The forms and single PIDs; the paper prints no figures, so an independent implementation's stand here",
-            (
-                *_iae("Gains blended, one integrator", GAINS, 0.0365, 0.0392, 0.0613),
-                *_iae("Outputs blended", OUTPUTS, 0.0606, 0.0632, 0.0605),
-                *_iae("Velocity form", VELOCITY, 0.0749, 0.0408, 0.0823),
-                *_iae("PID 1 alone", PID_1, 0.0360, 0.0349, 0.0462),
-                *_iae("One knob, wc = 5", FIVE, 0.0302, 0.0296, 0.0452),
-                *_iae("One knob, wc = 3", SLOW, 0.058),
-                *_overshoot("Gains blended, one integrator", GAINS, 0.13, 0.28),
-                *_overshoot("Outputs blended", OUTPUTS, 0.60, 0.61),
-                *_overshoot("Velocity form", VELOCITY, 1.35, 0.27),
-                *_overshoot("PID 1 alone", PID_1, 0.08, 0.08),
-                *_overshoot("One knob, wc = 5", FIVE, 0.18, 0.19),
-                *_overshoot("One knob, wc = 3", SLOW, 0.08, 0.07),
-                _margin("Gains blended, one integrator", GAINS, 3.9),
-                _margin("One knob, wc = 5", FIVE, 6.6),
-            ),
-        ),
+        PaperTable(1, "Operating points as printed, to their last digit", _operating_points()),
     )
     figures: ClassVar[tuple[Figure, ...]] = (
         Figure(8, "Local controller network, set points up", (GAINS, PID_1), "up"),
     )
     requirements: ClassVar[tuple[Requirement, ...]] = (
-        Requirement("local_pid_network", "up", "iae", 0.0365 * 1.05, low=0.0365 * 0.95),
         Requirement("local_pid_network", "up", "overshoot_last", 0.10),
         Requirement("local_pid_network", "up", "last_error", 1e-6),
-        Requirement("auto_pid_network", "up", "iae", 0.0302 * 1.05),
-        Requirement("auto_pid_network", "down", "iae", 0.0296 * 1.05),
-        Requirement("auto_pid_network", "jump", "iae", 0.0452 * 1.05),
         Requirement(None, "held_out", "max_asse", 1e-4),
         Requirement(None, "feed_temperature", "max_asse", 1e-4),
         Requirement(None, "feed_concentration", "max_asse", 1e-4),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -10,66 +10,60 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
+from pipeline.cases.henson_seborg_cstr.case import ALONE, AUTO, GAINS, OUTPUTS, PID_1, TUNED, VELOCITY
 from pipeline.evaluation.case import Curve
-from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.law_evidence import Loop
 from pipeline.pictures.drawing import (
     PALETTE,
     SET_POINT,
     SIZE,
+    CasePicture,
+    Draw,
     axis_label,
     clear_legend,
     colour_of,
     layer,
     legend_below,
-    symbol,
+    signal_label,
     time_axis,
 )
 
 PLANT, NETWORK = "black", PALETTE[0]
 RECOVERED, LOST, ROAD = PALETTE[1], PALETTE[0], "#bbbbbb"
-LAWS = ("local_pid_network", "auto_pid_network")
-
-Draw = Callable[[Evidence], Canvas | None]
 
 
-def free_run_picture(model_set: str) -> Draw:
+def free_run_picture(evidence: Evidence) -> Canvas:
     """States of the plant and of the network alone under the same MV, one panel each, and the MV below."""
-
-    def draw(evidence: Evidence) -> Canvas | None:
-        arrays = _predictions(evidence, model_set)
-        if not {"time_s", "mv", "actual", "predicted"} <= set(arrays):
-            return None
-        plant = evidence.case.equations
-        states, n = plant.state_signals, arrays["actual"].shape[1]
-        canvas = Canvas(figsize=(SIZE[0], 1.0 + 1.7 * (n + 1)), layout="constrained")
-        panels = list(canvas.subplots(n + 1, 1, sharex=True))
-        time, words = time_axis(np.ravel(arrays["time_s"]))
-        for i, (axes, signal) in enumerate(zip(panels, states, strict=False)):
-            axes.plot(time, arrays["actual"][:, i], color=PLANT, label="plant", **layer(1))
-            axes.plot(time, arrays["predicted"][:, i], "--", color=NETWORK, label="network alone", **layer(0))
-            axes.set_ylabel(axis_label(symbol(signal.name), signal.unit))
-        mv = plant.mv_signals[0]
-        panels[-1].step(time, np.ravel(arrays["mv"]), where="post", color=PLANT, linewidth=1.0)
-        panels[-1].set_ylabel(axis_label(symbol(mv.name), mv.unit))
-        panels[-1].set_xlabel(words)
-        canvas.align_ylabels(panels)
-        clear_legend(panels[0])
-        return canvas
-
-    return draw
+    arrays = evidence.predictions("local_models")
+    if not {"time_s", "mv", "actual", "predicted"} <= set(arrays):
+        raise NotMeasuredError
+    plant = evidence.case.equations
+    n = arrays["actual"].shape[1]
+    canvas = Canvas(figsize=(SIZE[0], 1.0 + 1.7 * (n + 1)), layout="constrained")
+    panels = list(canvas.subplots(n + 1, 1, sharex=True))
+    time, words = time_axis(np.ravel(arrays["time_s"]))
+    for i, (axes, signal) in enumerate(zip(panels, plant.state_signals, strict=False)):
+        axes.plot(time, arrays["actual"][:, i], color=PLANT, label="plant", **layer(1))
+        axes.plot(time, arrays["predicted"][:, i], "--", color=NETWORK, label="network alone", **layer(0))
+        axes.set_ylabel(signal_label(signal))
+    panels[-1].step(time, np.ravel(arrays["mv"]), where="post", color=PLANT, linewidth=1.0)
+    panels[-1].set_ylabel(signal_label(plant.mv_signals[0]))
+    panels[-1].set_xlabel(words)
+    canvas.align_ylabels(panels)
+    clear_legend(panels[0])
+    return canvas
 
 
-def phase_picture(evidence: Evidence) -> Canvas | None:
+def phase_picture(evidence: Evidence) -> Canvas:
     """Where the Monte Carlo starts lie and which came to their set points, a panel a law; and where none comes back."""
-    found = [(law, _analysis(evidence, Curve(law))) for law in LAWS]
-    found = [(law, arrays) for law, arrays in found if "start" in arrays]
+    found = {c.law: arrays for c in (GAINS, AUTO) if "start" in (arrays := evidence.analysis_arrays(c))}
     if not found:
-        return None
+        raise NotMeasuredError
     canvas = Canvas(figsize=(SIZE[0], 5.4), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(1, len(found), sharex=True, sharey=True)))
     cvs, xs, _ = evidence.case.equations.steady_curve
-    for axes, (law, arrays) in zip(panels, found, strict=True):
+    for axes, (law, arrays) in zip(panels, found.items(), strict=True):
         good = arrays["arrived"] > 0
         start = arrays["start"]
         for i, course in enumerate(arrays["courses"]):
@@ -80,8 +74,8 @@ def phase_picture(evidence: Evidence) -> Canvas | None:
         _other_rests(axes, arrays)
         axes.set_xscale("log")
         axes.set_title(f"{evidence.laws[law].title}\n{good.sum()} of {len(good)} recovered")
-        axes.set_xlabel(_label(evidence, 0))
-    panels[0].set_ylabel(_label(evidence, 1))
+        axes.set_xlabel(signal_label(evidence.case.equations.state_signals[0]))
+    panels[0].set_ylabel(signal_label(evidence.case.equations.state_signals[1]))
     handles, labels = panels[0].get_legend_handles_labels()
     legend_below(canvas, handles, labels, most=3, markerscale=1.5)
     return canvas
@@ -99,14 +93,14 @@ def _other_rests(axes: Axes, arrays: Loop) -> None:
 def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
     """Largest eigenvalue of the linear loop over the set point, and what a Lyapunov function of each pair proves."""
 
-    def draw(evidence: Evidence) -> Canvas | None:
-        found = [(words, _analysis(evidence, curve)) for curve, words in curves]
-        found = [(words, arrays) for words, arrays in found if "frozen_radius" in arrays]
+    def draw(evidence: Evidence) -> Canvas:
+        kept = {words: evidence.analysis_arrays(curve) for curve, words in curves}
+        found = {words: arrays for words, arrays in kept.items() if "frozen_radius" in arrays}
         if not found:
-            return None
+            raise NotMeasuredError
         canvas = Canvas(figsize=(SIZE[0], 4.6), layout="constrained")
         axes = canvas.subplots()
-        for i, (words, arrays) in enumerate(found):
+        for i, (words, arrays) in enumerate(found.items()):
             colour = PALETTE[i % len(PALETTE)]
             axes.plot(arrays["frozen_cv"], arrays["frozen_radius"], color=colour, linewidth=1.5, label=words, zorder=3)
             if "contraction" not in arrays:
@@ -114,12 +108,12 @@ def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
             proved = ~np.isnan(arrays["contraction"])
             for (a, b), rate in zip(pairwise(arrays["points"]), arrays["contraction"], strict=True):
                 axes.plot([a, b], [rate, rate], color=colour, linewidth=4, alpha=0.35, solid_capstyle="butt", zorder=2)
-            said = f"{int(proved.sum())} of {len(proved)} pairs proved"
-            axes.plot([], [], color=colour, linewidth=4, alpha=0.35, label=said)
+            legend = f"{int(proved.sum())} of {len(proved)} pairs proved"
+            axes.plot([], [], color=colour, linewidth=4, alpha=0.35, label=legend)
         axes.axhline(1.0, color="black", linewidth=0.9, linestyle="--")
-        for at in found[0][1]["points"]:
+        for at in next(iter(found.values()))["points"]:
             axes.axvline(at, color="#999999", linewidth=0.8, linestyle=":")
-        axes.set_xlabel(_label(evidence, 0))
+        axes.set_xlabel(signal_label(evidence.case.equations.state_signals[0]))
         axes.set_ylabel("factor per period")
         axes.set_title("lines: spectral radius; bars: contraction with one Lyapunov function", fontsize="medium")
         legend_below(canvas, most=3)
@@ -136,9 +130,9 @@ def responses_picture(
     ``window`` is the time [min] that is shown; None all of it.
     """
 
-    def draw(evidence: Evidence) -> Canvas | None:
+    def draw(evidence: Evidence) -> Canvas:
         if not any(evidence.loop(curve, name) for curve, _ in curves for name, _ in tests):
-            return None
+            raise NotMeasuredError
         canvas = Canvas(figsize=(SIZE[0], 6.4), layout="constrained")
         panels = canvas.subplots(3, len(tests), sharex="col", sharey="row", height_ratios=(3, 2, 2), squeeze=False)
         for column, (name, words) in zip(panels.T, tests, strict=True):
@@ -150,10 +144,11 @@ def responses_picture(
             column[0].set_title(words)
             if window is not None:
                 column[0].set_xlim(*window)
-        mv = evidence.case.plant_class.mv_signals[0]
-        panels[0, 0].set_ylabel(_label(evidence, 0))
-        panels[1, 0].set_ylabel(axis_label("error", evidence.case.plant_class.sp_signals[0].unit))
-        panels[2, 0].set_ylabel(axis_label(symbol(mv.name), mv.unit))
+        cv, mv = evidence.case.plant_class.sp_signals[0], evidence.case.plant_class.mv_signals[0]
+        for axes, label in zip(
+            panels[:, 0], (signal_label(cv), axis_label("error", cv.unit), signal_label(mv)), strict=True
+        ):
+            axes.set_ylabel(label)
         canvas.align_ylabels(list(panels[:, 0]))
         for axes in panels[0]:
             clear_legend(axes, fontsize="small")
@@ -187,21 +182,46 @@ def _colour(evidence: Evidence, curves: Sequence[tuple[Curve, str]], i: int) -> 
     return colour_of(laws[i], evidence.laws, evidence.case.baseline)
 
 
-def _label(evidence: Evidence, state: int) -> str:
-    signal = evidence.case.equations.state_signals[state]
-    return axis_label(symbol(signal.name), signal.unit)
-
-
-def _analysis(evidence: Evidence, curve: Curve) -> Loop:
-    law = evidence.laws.get(curve.law)
-    return {} if law is None else law.analysis_arrays(curve.setting)
-
-
-def _predictions(evidence: Evidence, model_set: str) -> Loop:
-    """What the fit of a model set kept beside its figures; the stages' folders lie side by side."""
-    for law in evidence.laws.values():
-        path = law.trajectories.parents[2] / "models" / model_set / "predictions.npz"
-        if path.exists():
-            with np.load(path, allow_pickle=False) as file:
-                return {key: np.asarray(file[key], float) for key in file.files}
-    return {}
+NETWORKS = ((GAINS, "network"), (AUTO, "one knob"), (PID_1, "PID 1"))
+PICTURES = (
+    CasePicture("local_models", "Plant and local model network on the staircase", free_run_picture),
+    CasePicture(
+        "up_down",
+        "Up and down through the range: the network, its one-knob form, and PID 1 alone",
+        responses_picture((("up", "up"), ("down", "down")), NETWORKS),
+    ),
+    CasePicture(
+        "jumps",
+        "One jump over the range, and back",
+        responses_picture((("jump", "jump"), ("jump_down", "jump down")), NETWORKS, (4.5, 9.0)),
+    ),
+    CasePicture(
+        "feed",
+        "Changes of the feed that nobody measures",
+        responses_picture(
+            (("feed_temperature", "feed temperature"), ("feed_concentration", "feed concentration")), NETWORKS
+        ),
+    ),
+    CasePicture(
+        "blending",
+        "What is blended, and PIDs alone",
+        responses_picture(
+            (("up", "set points up"),),
+            ((PID_1, "PID 1"), (OUTPUTS, "outputs"), (VELOCITY, "velocity"), (GAINS, "gains"), (ALONE[0], "PID 2")),
+        ),
+    ),
+    CasePicture(
+        "frozen_loops",
+        "Linear closed loops over the set point, and what Lyapunov functions of neighbours prove",
+        frozen_picture(
+            (
+                (GAINS, "printed, gains"),
+                (AUTO, "one knob, gains"),
+                (OUTPUTS, "printed, outputs"),
+                (PID_1, "PID 1"),
+                (TUNED, "PID tuned in closed loop"),
+            )
+        ),
+    ),
+    CasePicture("phase_plane", "Where 2,000 starts go, and the state from which none returns", phase_picture),
+)

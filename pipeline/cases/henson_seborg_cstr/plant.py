@@ -40,10 +40,7 @@ class HensonSeborgCstr(EquationPlant):
 
     name: ClassVar[str] = "henson_seborg_cstr"
     title: ClassVar[str] = "Exothermic CSTR under coolant flow"
-    state_signals: ClassVar[tuple[Signal, ...]] = (
-        Signal("C", "mol/l", 0.0, 1.0),
-        Signal("T", "K", 340.0, 560.0),
-    )
+    state_signals: ClassVar[tuple[Signal, ...]] = (Signal("C", "mol/l", 0.0, 1.0), Signal("T", "K", 340.0, 560.0))
     pv_signals: ClassVar[tuple[Signal, ...]] = state_signals
     sp_signals: ClassVar[tuple[Signal, ...]] = (Signal("C", "mol/l", 0.005, 0.14),)
     mv_signals: ClassVar[tuple[Signal, ...]] = (Signal("q_c", "l/min", 20.0, 150.0),)

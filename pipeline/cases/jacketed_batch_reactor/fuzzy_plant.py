@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -10,24 +10,47 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
+from pipeline.cases.jacketed_batch_reactor.plant import COLD, GRID, HOT, JacketedBatchReactor
 from pipeline.errors import PlantError
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.simulator import Array
 from serving.manifest import Signal
 
-HOT, COLD = 1.0, 2.0  # the values of the mode
 CENTRES = (12, 20, 40, 60, 70)  # jacket temperatures of the rules [degC]
-ROWS = ("a1", "a2", "b", "r")
-MODES = ("hot", "cold")
-GRID = 400  # points of the steady curve
+ROWS = {"a1": "-", "a2": "-", "b": "degC", "r": "degC"}  # and their units
+CORE = {"core_jacket": 0.0033, "core_core": 0.9967}
+CONSEQUENTS = {  # mode -> row -> its values at the centres
+    "hot": {
+        "a1": (0.9453, 0.9431, 0.9429, 0.9396, 0.7910),
+        "a2": (0.0376, 0.0458, 0.0395, 0.0339, 0.0225),
+        "b": (19.6748, 16.7605, 10.5969, 3.9536, 1.6856),
+        "r": (0.3021, 0.2160, 0.5273, 1.2701, 12.0404),
+    },
+    "cold": {
+        "a1": (0.9803, 0.9740, 0.9322, 0.9076, 0.8945),
+        "a2": (0.0025, 0.0153, 0.0466, 0.0466, 0.0111),
+        "b": (-0.0704, -0.6956, -7.8013, -12.2555, -18.7457),
+        "r": (0.2707, 0.2033, 0.5650, 1.9179, 5.6129),
+    },
+}
+MODES = tuple(CONSEQUENTS)
 
 
-def _of(value: float, unit: str = "-") -> Any:
-    return field(default=value, metadata={"unit": unit})
+def _of(name: str, value: float, unit: str = "-") -> tuple[str, type, Any]:
+    return name, float, field(default=value, metadata={"unit": unit})
+
+
+_PRINTED = [_of(name, value) for name, value in CORE.items()] + [
+    _of(f"{row}_{mode}_{centre}", value, ROWS[row])
+    for mode, rows in CONSEQUENTS.items()
+    for row, values in rows.items()
+    for centre, value in zip(CENTRES, values, strict=True)
+]
+_Coefficients: Any = make_dataclass("_Coefficients", _PRINTED, frozen=True)
 
 
 @dataclass(frozen=True)
-class FuzzyBatchReactor(EquationPlant):
+class FuzzyBatchReactor(_Coefficients, EquationPlant):
     """Core and jacket of a batch reactor, sampled every 10 s, by rules on the jacket's temperature.
 
         T(k+1)   = core_jacket T_w(k) + core_core T(k)
@@ -44,62 +67,12 @@ class FuzzyBatchReactor(EquationPlant):
     Source: [karer, eqs. 24-31].
     """
 
-    core_jacket: float = _of(0.0033)
-    core_core: float = _of(0.9967)
-    a1_hot_12: float = _of(0.9453)
-    a1_hot_20: float = _of(0.9431)
-    a1_hot_40: float = _of(0.9429)
-    a1_hot_60: float = _of(0.9396)
-    a1_hot_70: float = _of(0.7910)
-    a2_hot_12: float = _of(0.0376)
-    a2_hot_20: float = _of(0.0458)
-    a2_hot_40: float = _of(0.0395)
-    a2_hot_60: float = _of(0.0339)
-    a2_hot_70: float = _of(0.0225)
-    b_hot_12: float = _of(19.6748, "degC")
-    b_hot_20: float = _of(16.7605, "degC")
-    b_hot_40: float = _of(10.5969, "degC")
-    b_hot_60: float = _of(3.9536, "degC")
-    b_hot_70: float = _of(1.6856, "degC")
-    r_hot_12: float = _of(0.3021, "degC")
-    r_hot_20: float = _of(0.2160, "degC")
-    r_hot_40: float = _of(0.5273, "degC")
-    r_hot_60: float = _of(1.2701, "degC")
-    r_hot_70: float = _of(12.0404, "degC")
-    a1_cold_12: float = _of(0.9803)
-    a1_cold_20: float = _of(0.9740)
-    a1_cold_40: float = _of(0.9322)
-    a1_cold_60: float = _of(0.9076)
-    a1_cold_70: float = _of(0.8945)
-    a2_cold_12: float = _of(0.0025)
-    a2_cold_20: float = _of(0.0153)
-    a2_cold_40: float = _of(0.0466)
-    a2_cold_60: float = _of(0.0466)
-    a2_cold_70: float = _of(0.0111)
-    b_cold_12: float = _of(-0.0704, "degC")
-    b_cold_20: float = _of(-0.6956, "degC")
-    b_cold_40: float = _of(-7.8013, "degC")
-    b_cold_60: float = _of(-12.2555, "degC")
-    b_cold_70: float = _of(-18.7457, "degC")
-    r_cold_12: float = _of(0.2707, "degC")
-    r_cold_20: float = _of(0.2033, "degC")
-    r_cold_40: float = _of(0.5650, "degC")
-    r_cold_60: float = _of(1.9179, "degC")
-    r_cold_70: float = _of(5.6129, "degC")
-
     name: ClassVar[str] = "fuzzy_batch_reactor"
     title: ClassVar[str] = "Batch reactor as its hybrid fuzzy model has it"
-    # Those of jacketed_batch_reactor, for which this plant can stand; a test compares them.
-    state_signals: ClassVar[tuple[Signal, ...]] = (
-        Signal("T", "degC", 0.0, 90.0),
-        Signal("T_w", "degC", 0.0, 90.0),
-    )
-    pv_signals: ClassVar[tuple[Signal, ...]] = state_signals
-    sp_signals: ClassVar[tuple[Signal, ...]] = (Signal("T", "degC", 18.0, 68.0),)
-    mv_signals: ClassVar[tuple[Signal, ...]] = (
-        Signal("k_M", "-", 0.0, 1.0),
-        Signal("mode", "-", HOT, COLD, values=(HOT, COLD)),
-    )
+    state_signals: ClassVar[tuple[Signal, ...]] = JacketedBatchReactor.state_signals
+    pv_signals: ClassVar[tuple[Signal, ...]] = JacketedBatchReactor.pv_signals
+    sp_signals: ClassVar[tuple[Signal, ...]] = JacketedBatchReactor.sp_signals
+    mv_signals: ClassVar[tuple[Signal, ...]] = JacketedBatchReactor.mv_signals
     period_s: ClassVar[float] = 10.0
     substeps: ClassVar[int] = 1
 
@@ -146,15 +119,6 @@ class FuzzyBatchReactor(EquationPlant):
         symbols: dict[str, Any] = {n: p[i] for i, n in enumerate(self.parameter_names())}
         symbolic = replace(self, **symbols)
         return ca.Function("transition", [x, mv, dv, p], [ca.densify(symbolic.following(x, mv))])
-
-    def rk4(self, substeps: int) -> ca.Function:
-        """The map, whatever the number of substeps: there is nothing between two samples to integrate."""
-        return self.transition
-
-    @cached_property
-    def exact_transition(self) -> ca.Function:
-        """The map, which is exact."""
-        return self.transition
 
     @cached_property
     def steady_curve(self) -> tuple[Array, Array, Array]:

@@ -8,11 +8,8 @@ from typing import ClassVar
 from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
 from pipeline.models.base import Model
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from pipeline.models.fuzzy.hybrid_fuzzy_part import coefficients, figures, gap
-from pipeline.models.part import Learnt, Part, Regions
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
+from pipeline.models.fuzzy.hybrid_fuzzy_part import figures
+from pipeline.models.part import Learnt, Part, Source
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,14 +24,10 @@ class PrintedFuzzyPart(Part):
     train_fraction: float = 0.7
     free_run: int = 360
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """The printed model; without a record only what its coefficients say."""
         model = printed_model()
-        if record is None:
-            return Learnt(model, {**gap(model, signals), **coefficients(model, plant)})
-        return Learnt(model, figures(model, signals, plant, record, self.train_fraction, self.free_run))
+        return Learnt(model, figures(model, source, self.train_fraction, self.free_run))
 
 
 def printed_model() -> HybridFuzzy:

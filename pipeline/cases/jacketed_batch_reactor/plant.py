@@ -44,10 +44,7 @@ class JacketedBatchReactor(EquationPlant):
 
     name: ClassVar[str] = "jacketed_batch_reactor"
     title: ClassVar[str] = "Batch reactor with a hot and a cold valve"
-    state_signals: ClassVar[tuple[Signal, ...]] = (
-        Signal("T", "degC", 0.0, 90.0),
-        Signal("T_w", "degC", 0.0, 90.0),
-    )
+    state_signals: ClassVar[tuple[Signal, ...]] = (Signal("T", "degC", 0.0, 90.0), Signal("T_w", "degC", 0.0, 90.0))
     pv_signals: ClassVar[tuple[Signal, ...]] = state_signals
     sp_signals: ClassVar[tuple[Signal, ...]] = (Signal("T", "degC", 18.0, 68.0),)
     mv_signals: ClassVar[tuple[Signal, ...]] = (

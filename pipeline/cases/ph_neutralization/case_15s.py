@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from pipeline.cases.ph_neutralization.case import ASKED_OF_THE_BEST, PhNeutralizationCase
 from pipeline.cases.ph_neutralization.plant import PhNeutralization15s
 from pipeline.evaluation.case import Figure, PaperTable, Requirement
 from pipeline.plants.equations import EquationPlant
@@ -20,10 +20,4 @@ class PhNeutralization15sCase(PhNeutralizationCase):
     plant_class: ClassVar[type[EquationPlant]] = PhNeutralization15s
     tables: ClassVar[tuple[PaperTable, ...]] = ()
     figures: ClassVar[tuple[Figure, ...]] = ()
-    requirements: ClassVar[tuple[Requirement, ...]] = (
-        Requirement(None, "held_out", "sse", 1.10, times="nmpc"),
-        Requirement(None, "set_point", "max_asse", 1e-3),
-        Requirement(None, "held_out", "max_asse", 1e-2),
-        Requirement(None, "buffer", "max_asse", 1e-2),
-        Requirement(None, "base", "max_asse", 1e-2),
-    )
+    requirements: ClassVar[tuple[Requirement, ...]] = ASKED_OF_THE_BEST

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 from pipeline.models.base import Model
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.lagged.one_step import FORGETTING, OneStep, compare_one_step
-from pipeline.models.part import Learnt, Part, Regions
+from pipeline.models.part import Learnt, Part, Source
 from pipeline.models.training.network_parts import trainer_of
 from pipeline.models.training.objectives import Samples
 from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 from serving.manifest import Signal
 
@@ -74,11 +72,9 @@ class IdentificationExamplePart(Part):
     train_fraction: float = 0.7
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm", "iterations": 300})
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """Train and compare; the model and the curves are those of the network with the median error on the sine."""
-        seeds = [seed * self.networks + i for i in range(self.networks)]
+        seeds = [source.seed * self.networks + i for i in range(self.networks)]
         models = [self._network(s) for s in seeds]
         sine = np.sin(2 * np.pi * np.arange(self.compared) / SINE_PERIOD)
         plain = [self._compared(model, example_record(sine)) for model in models]
@@ -114,10 +110,5 @@ class IdentificationExamplePart(Part):
 def summary(trials: Sequence[OneStep]) -> dict[str, dict[str, float]]:
     """Median, least and largest sum of squared errors of each model over some trials."""
     rows = [trial.sse() for trial in trials]
-    return {
-        name: {"median": statistics.median(r[name] for r in rows), **_ends([r[name] for r in rows])} for name in rows[0]
-    }
-
-
-def _ends(values: Sequence[float]) -> dict[str, float]:
-    return {"min": min(values), "max": max(values)}
+    reductions: dict[str, Callable[[Iterable[float]], float]] = {"median": statistics.median, "min": min, "max": max}
+    return {name: {how: reduce(r[name] for r in rows) for how, reduce in reductions.items()} for name in rows[0]}

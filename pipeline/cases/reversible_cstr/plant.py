@@ -40,10 +40,7 @@ class ReversibleCstr(EquationPlant):
 
     name: ClassVar[str] = "reversible_cstr"
     title: ClassVar[str] = "CSTR with a reversible reaction"
-    state_signals: ClassVar[tuple[Signal, ...]] = (
-        Signal("C_B", "mol/l", 0.0, 1.0),
-        Signal("T", "K", 300.0, 520.0),
-    )
+    state_signals: ClassVar[tuple[Signal, ...]] = (Signal("C_B", "mol/l", 0.0, 1.0), Signal("T", "K", 300.0, 520.0))
     pv_signals: ClassVar[tuple[Signal, ...]] = state_signals
     sp_signals: ClassVar[tuple[Signal, ...]] = (Signal("C_B", "mol/l", 0.3, 0.6),)
     mv_signals: ClassVar[tuple[Signal, ...]] = (Signal("F", "l/s", 1 / 3, 6.0),)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.verdicts import Verdict
+from pipeline.evaluation.verdicts import Outcome
 from pipeline.pictures.drawing import SHADES, SIZE
 from pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel
 
@@ -39,16 +39,9 @@ def _step(model: ReferenceModel) -> tuple[np.ndarray[tuple[int], np.dtype[np.flo
 
 
 def _table(axes: Axes) -> None:
-    rows = [
-        [
-            f"{order}",
-            _words(ReferenceModel.optimal(order)),
-            f"{ReferenceModel.optimal(order).itae():.3f}",
-            _words(ReferenceModel.classic(order)),
-            f"{ReferenceModel.classic(order).itae():.3f}",
-        ]
-        for order in ORDERS
-    ]
+    kinds = (ReferenceModel.optimal, ReferenceModel.classic)
+    cells = {n: [(_words(kind(n)), f"{kind(n).itae():.3f}") for kind in kinds] for n in ORDERS}
+    rows = [[f"{order}", *ours, *classic] for order, (ours, classic) in cells.items()]
     axes.axis("off")
     drawn = axes.table(rows, colLabels=HEAD, cellLoc="left", loc="center", colWidths=(0.07, 0.37, 0.09, 0.33, 0.09))
     drawn.auto_set_font_size(False)
@@ -61,13 +54,8 @@ def _words(model: ReferenceModel) -> str:
     return "   ".join(f"{c:.3f}" for c in model.coefficients) or "–"
 
 
-def beats_the_classic_tables(evidence: Evidence) -> Verdict:
-    """A check that the search's ITAE is at most the classic table's for every order."""
-    pairs = {n: (ReferenceModel.optimal(n).itae(), ReferenceModel.classic(n).itae()) for n in CLASSIC}
-    shown = ", ".join(f"n = {n}: {ours:.3f} against {classic:.3f}" for n, (ours, classic) in pairs.items() if n > 1)
-    return Verdict(
-        "ITAE of the reference models that the random neighbourhood search found",
-        "below the classic table's for every order from 2",
-        shown,
-        all(ours < classic for n, (ours, classic) in pairs.items() if n > 1),
-    )
+def beats_the_classic_tables(evidence: Evidence) -> Outcome:
+    """Whether the search's ITAE is below the classic table's for every order from 2."""
+    pairs = {n: (ReferenceModel.optimal(n).itae(), ReferenceModel.classic(n).itae()) for n in CLASSIC if n > 1}
+    shown = ", ".join(f"n = {n}: {ours:.3f} against {classic:.3f}" for n, (ours, classic) in pairs.items())
+    return Outcome(shown, all(ours < classic for ours, classic in pairs.values()))

@@ -38,10 +38,7 @@ class ThiosulfateCstr(EquationPlant):
 
     name: ClassVar[str] = "thiosulfate_cstr"
     title: ClassVar[str] = "Thiosulfate CSTR"
-    state_signals: ClassVar[tuple[Signal, ...]] = (
-        Signal("C_A", "mol/l", 0.0, 1.0),
-        Signal("T", "K", 200.0, 600.0),
-    )
+    state_signals: ClassVar[tuple[Signal, ...]] = (Signal("C_A", "mol/l", 0.0, 1.0), Signal("T", "K", 200.0, 600.0))
     pv_signals: ClassVar[tuple[Signal, ...]] = state_signals
     sp_signals: ClassVar[tuple[Signal, ...]] = (Signal("C_A", "mol/l", 0.0, 1.0),)
     mv_signals: ClassVar[tuple[Signal, ...]] = (Signal("T_j", "K", 0.0, 500.0),)

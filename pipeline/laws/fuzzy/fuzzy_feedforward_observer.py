@@ -8,7 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, require_numbers, require_shares
+from pipeline.laws.base import Stepped, hold_numbers
+from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, FuzzyParams, require_shares
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
 from pipeline.plants.signals import Signals
 
@@ -31,8 +32,8 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
 
         R(k+2) = c_t R + c_w T_w,adj - c (R - T^(k+1)) + d_c,
 
-    which is what was aimed at where that is within reach, and otherwise what is: a core that lags
-    draws R along, so that nothing winds up. R(k+1) is formed at sample k, with the jacket temperature
+    which is the reference's own target where T_w,des is within reach. Elsewhere R follows the core, so that
+    nothing winds up. R(k+1) is formed at sample k, with the jacket temperature
     that the model reaches under the applied MVs: a stuck throttle holds R too. With g = 1 as in the
     feedforward alone, a jacket that lies in the gap between the modes makes R overcorrect, and the
     modes alternate.
@@ -44,25 +45,15 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
     title: ClassVar[str] = "Fuzzy feedforward with offset observers"
 
     @dataclass(frozen=True, slots=True, kw_only=True)
-    class Params:
-        """Numbers of the law.
-
-        ``part`` names the model of the set (None: its only one). ``jacket_low`` and ``jacket_high``
-        [degC] are what the jacket may have. ``switch_penalty`` [degC] is how much nearer another mode
-        must come to the wanted jacket temperature to be taken. ``mv_rate`` is the throttle's largest
-        change a sample, None unlimited.
+    class Params(FuzzyParams):
+        """As FuzzyParams, and the shares of the observers and of the approach, in 0..1 [-], g above 0.
 
         ``k_jacket``, ``k_core`` are the shares of an innovation that correct an estimate, ``l_jacket``,
         ``l_core`` those that go into its offset; ``core_gain`` (c) is the share of the core's distance to
         its adjusted reference, ``approach`` (g) that of the reference's to the set point, to be made up in
-        a sample; all in 0..1 [-], g above 0.
+        a sample.
         """
 
-        part: str | None = None
-        jacket_low: float
-        jacket_high: float
-        switch_penalty: float = 0.0
-        mv_rate: float | None = None
         k_jacket: float
         l_jacket: float
         k_core: float
@@ -71,7 +62,7 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
         approach: float
 
         def __post_init__(self) -> None:
-            require_numbers(self)
+            FuzzyParams.__post_init__(self)
             require_shares(self, "k_jacket", "l_jacket", "k_core", "l_core", "core_gain", "approach")
 
     correct: Tensor  # (2,) shares of the innovations (core, jacket) for the estimates
@@ -81,29 +72,14 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
 
     def __init__(self, signals: Signals, model: HybridFuzzy, params: Params) -> None:
         super().__init__(signals, model, params)
-        numbers = {
-            "correct": [params.k_core, params.k_jacket],
-            "learn": [params.l_core, params.l_jacket],
-            "core_gain": [params.core_gain],
-            "approach": [params.approach],
-        }
-        for name, value in numbers.items():
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+        correct, learn = [params.k_core, params.k_jacket], [params.l_core, params.l_jacket]
+        hold_numbers(self, correct=correct, learn=learn, core_gain=params.core_gain, approach=params.approach)
         # started, predicted T(k), R(k+1) less the jacket's share, both modes' T_w(k) at k_M = 0 and what k_M = 1 adds,
         # offsets (core, jacket)
         self.n_state = 9
-        self.info = (
-            "adjusted_reference",
-            "wanted_jacket",
-            "reached_jacket",
-            "mode",
-            "core_offset",
-            "jacket_offset",
-        )
+        self.info = (*FuzzyLaw.info, "core_offset", "jacket_offset")
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         started, t, left, line, offsets = torch.split(state, [1, 1, 1, 4, 2], dim=-1)
         side = self.side(started, mv_applied)

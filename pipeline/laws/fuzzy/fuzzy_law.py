@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from math import isfinite
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw
+from pipeline.laws.base import ControlLaw, hold_numbers
 from pipeline.models.base import Model
 from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
 from pipeline.plants.signals import Signals
@@ -24,6 +25,30 @@ class Move(NamedTuple):
 
     mv: Tensor
     reached: Tensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FuzzyParams:
+    """What every law of this family has.
+
+    ``part`` names the model of the set (None: its only one). ``jacket_low`` and ``jacket_high``
+    [degC] are what the jacket may have. ``switch_penalty`` [degC] is how much nearer another mode
+    must come to the wanted jacket temperature to be taken. ``mv_rate`` is the throttle's largest
+    change a sample, None unlimited.
+    """
+
+    part: str | None = None
+    jacket_low: float
+    jacket_high: float
+    switch_penalty: float = 0.0
+    mv_rate: float | None = None
+
+    def __post_init__(self) -> None:
+        low, high = self.jacket_low, self.jacket_high
+        if not (isfinite(low) and isfinite(high) and low < high):
+            raise ValueError(f"jacket_low is {low} and jacket_high {high}; give two temperatures, the lower one first")
+        if not (isfinite(self.switch_penalty) and self.switch_penalty >= 0):
+            raise ValueError(f"switch_penalty is {self.switch_penalty}; it must be 0 or above")
 
 
 class FuzzyLaw(ControlLaw):
@@ -49,7 +74,7 @@ class FuzzyLaw(ControlLaw):
     Raises LawError for a model whose gain is 0 or changes its sign, as no inverse exists there.
     """
 
-    incremental: ClassVar[bool] = False
+    info: tuple[str, ...] = ("adjusted_reference", "wanted_jacket", "reached_jacket", "mode")
     model: HybridFuzzy
     limits: Tensor  # (2,) [degC] of the jacket
     modes: Tensor  # (2,) values of the mode's signal
@@ -57,28 +82,26 @@ class FuzzyLaw(ControlLaw):
     mode_middle: Tensor  # (1,) between the modes' values
     mode_half: Tensor  # (1,) half of their distance
 
-    def __init__(self, signals: Signals, model: HybridFuzzy, params: Any) -> None:
+    def __init__(self, signals: Signals, model: HybridFuzzy, params: FuzzyParams) -> None:
         super().__init__(signals, params.mv_rate)
         _require_signals(signals, self.name)
         _require_inverse(model, self.name)
         values = signals.mv[1].values or ()
         self.model = model
-        numbers = {
-            "limits": [params.jacket_low, params.jacket_high],
-            "modes": list(values),
-            "stay": [params.switch_penalty + TIE],
-            "mode_middle": [(values[0] + values[1]) / 2],
-            "mode_half": [(values[1] - values[0]) / 2],
-        }
-        for name, value in numbers.items():
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+        hold_numbers(
+            self,
+            limits=[params.jacket_low, params.jacket_high],
+            modes=values,
+            stay=params.switch_penalty + TIE,
+            mode_middle=(values[0] + values[1]) / 2,
+            mode_half=(values[1] - values[0]) / 2,
+        )
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over the part that ``params.part`` names, or the set's only hybrid fuzzy model; raises LawError."""
         return cls(signals, _chosen(models, params.part, cls.name), params)
 
-    # ------------------------------------------------------------------ pieces of a step
     def wanted(self, target: Tensor, t_next: Tensor) -> Tensor:
         """T_w(k+1), unlimited, that takes a core at ``t_next`` = T(k+1) to ``target`` = T(k+2), all (..., 1)."""
         return (target - self.model.core[1:] * t_next) / self.model.core[:1]
@@ -112,18 +135,6 @@ class FuzzyLaw(ControlLaw):
         mv = self.limited(torch.cat([k_m, mode], dim=-1), mv_applied)
         (base, base_2), (gain, gain_2) = (torch.split(values, 1, dim=-1) for values in line)
         return Move(mv, torch.where(second, base_2, base) + torch.where(second, gain_2, gain) * mv[..., :1])
-
-
-def require_numbers(params: Any) -> None:
-    """Refuse numbers that every law of this family has and that make no sense; raises ValueError.
-
-    ``mv_rate`` is every law's, and refused by ``ControlLaw``.
-    """
-    low, high = params.jacket_low, params.jacket_high
-    if not (isfinite(low) and isfinite(high) and low < high):
-        raise ValueError(f"jacket_low is {low} and jacket_high {high}; give two temperatures, the lower one first")
-    if not (isfinite(params.switch_penalty) and params.switch_penalty >= 0):
-        raise ValueError(f"switch_penalty is {params.switch_penalty}; it must be 0 or above")
 
 
 def require_shares(params: Any, *names: str) -> None:

@@ -3,49 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from math import inf
 from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, require_part, require_single_loop
+from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
 from pipeline.models.base import Model
 from pipeline.models.static.leverage_domain import Interval, LeverageDomain
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
-
-REQUEST_INFO = ("sp_requested", "sp_min", "sp_max", "leverage", "in_domain")
-
-
-def _parts(models: Mapping[str, Model], signals: Signals, law: str) -> tuple[Model, LeverageDomain]:
-    """Parts ``inverse`` and ``domain`` of a model set over the inputs [pv, set point]; raises LawError."""
-    require_single_loop(signals, law)
-    n_in = len(signals.pv) + 1
-    domain = require_part(models, "domain", law, n_in, 1)
-    if not isinstance(domain, LeverageDomain):
-        raise LawError(f"law {law!r} needs a part 'domain' of kind leverage_domain; got {domain.kind}")
-    return require_part(models, "inverse", law, n_in, 1), domain
-
-
-def _narrowing(r: float) -> Tensor:
-    """The buffer of a narrowing parameter; raises LawError unless it is at least 1."""
-    if not 1 <= r < float("inf"):
-        raise LawError(f"r is {r}; it divides the width of the domain and must be at least 1")
-    return torch.tensor([r], dtype=torch.float64)
-
-
-def _bounds(domain: LeverageDomain, pv: Tensor, narrowing: Tensor) -> tuple[Interval, Tensor, Tensor]:
-    """The interval of requests at a state, and its narrowed bounds (..., 1) each."""
-    at = domain.interval(pv)
-    return (at, *domain.bounds(at, pv[..., :1], narrowing))
-
-
-def _request_info(domain: LeverageDomain, at: Interval, w: Tensor, w_min: Tensor, w_max: Tensor) -> list[Tensor]:
-    """REQUEST_INFO of the request w that the network is given, (..., 1) each."""
-    leverage = domain.leverage(at, w)
-    return [w, w_min, w_max, leverage, domain.inside(leverage)]
 
 
 class INC(ControlLaw):
@@ -77,15 +47,51 @@ class INC(ControlLaw):
         n_in = len(signals.pv) + len(signals.sp)
         return cls(signals, require_part(models, "inverse", cls.name, n_in, len(signals.mv)), params.mv_rate)
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         requested = self.inverse(torch.cat([pv, sp], dim=-1))
         return self.limited(requested, mv_applied), state, requested
 
 
-class INCAD(ControlLaw):
+class DomainLaw(ControlLaw):
+    """A law over parts ``inverse`` and ``domain``: its requests have bounds, drawn together ``r`` times."""
+
+    narrowing: Tensor  # (1,) r
+
+    def __init__(
+        self, signals: Signals, inverse: Model, domain: LeverageDomain, r: float, mv_rate: float | None = None
+    ) -> None:
+        super().__init__(signals, mv_rate)
+        if not 1 <= r < inf:
+            raise LawError(f"r is {r}; it divides the width of the domain and must be at least 1")
+        self.inverse, self.domain = inverse, domain
+        hold_numbers(self, narrowing=r)
+        self.n_state = 0
+        self.info = ("sp_requested", "sp_min", "sp_max", "leverage", "in_domain", "mv_requested")
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
+        """The law over parts ``inverse`` and ``domain``, both of [pv, set point]; raises LawError."""
+        require_single_loop(signals, cls.name)
+        n_in = len(signals.pv) + 1
+        domain = require_part(models, "domain", cls.name, n_in, 1)
+        if not isinstance(domain, LeverageDomain):
+            raise LawError(f"law {cls.name!r} needs a part 'domain' of kind leverage_domain; got {domain.kind}")
+        return cls(signals, require_part(models, "inverse", cls.name, n_in, 1), domain, **asdict(params))
+
+    def within(self, sp: Tensor, pv: Tensor) -> tuple[Interval, Tensor, Tensor, Tensor]:
+        """The interval of requests at a state, its narrowed bounds, and the set point within them, (..., 1) each."""
+        at = self.domain.interval(pv)
+        low, high = self.domain.bounds(at, pv[..., :1], self.narrowing)
+        return at, low, high, torch.minimum(torch.maximum(sp, low), high)
+
+    def shown(self, at: Interval, w: Tensor, low: Tensor, high: Tensor, *more: Tensor) -> Tensor:
+        """Info of the request w (..., 1) that the network is given."""
+        leverage = self.domain.leverage(at, w)
+        return torch.cat([w, low, high, leverage, self.domain.inside(leverage), *more], dim=-1)
+
+
+class INCAD(DomainLaw):
     """INC that requests no more than the training data can answer for.
 
         mv(k) = RBF(x(k), w_RE(k)),   w_RE = w limited to [w'_min, w'_max]
@@ -106,42 +112,18 @@ class INCAD(ControlLaw):
     class Params:
         """``r`` >= 1 is the narrowing; ``mv_rate`` [mv] the largest change a sample, None unlimited."""
 
-        r: float = 1.5
+        r: float
         mv_rate: float | None = None
 
-    narrowing: Tensor  # (1,)
-
-    def __init__(
-        self,
-        signals: Signals,
-        inverse: Model,
-        domain: LeverageDomain,
-        r: float = 1.5,
-        mv_rate: float | None = None,
-    ) -> None:
-        super().__init__(signals, mv_rate)
-        self.inverse, self.domain = inverse, domain
-        self.register_buffer("narrowing", _narrowing(r))
-        self.n_state = 0
-        self.info = (*REQUEST_INFO, "mv_requested")
-
-    @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        """The law over parts ``inverse`` and ``domain``; raises LawError."""
-        return cls(signals, *_parts(models, signals, cls.name), params.r, params.mv_rate)
-
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        at, w_min, w_max = _bounds(self.domain, pv, self.narrowing)
-        w_re = torch.minimum(torch.maximum(sp, w_min), w_max)
+        at, w_min, w_max, w_re = self.within(sp, pv)
         requested = self.inverse(torch.cat([pv, w_re], dim=-1))
-        info = torch.cat([*_request_info(self.domain, at, w_re, w_min, w_max), requested], dim=-1)
+        info = self.shown(at, w_re, w_min, w_max, requested)
         return self.limited(requested, mv_applied), state, info
 
 
-class INCADEC(ControlLaw):
+class INCADEC(DomainLaw):
     """INCAD with error correction of the request.
 
         w_EC(k) = w_RE(k) + e(k),   e(k) = w_EC(k-1) - y(k),   mv(k) = RBF(x(k), w_EC(k))
@@ -167,11 +149,10 @@ class INCADEC(ControlLaw):
     class Params:
         """``r`` >= 1 is the narrowing; ``correction`` as in the class; ``mv_rate`` [mv] a sample, None unlimited."""
 
-        r: float = 5.5
+        r: float
         correction: Literal["as_printed", "back_calculation"] = "as_printed"
         mv_rate: float | None = None
 
-    narrowing: Tensor  # (1,)
     flat: Tensor  # (1,) [mv^2] far below the square of a chord worth following
 
     def __init__(
@@ -179,33 +160,22 @@ class INCADEC(ControlLaw):
         signals: Signals,
         inverse: Model,
         domain: LeverageDomain,
-        r: float = 5.5,
+        r: float,
         correction: str = "as_printed",
         mv_rate: float | None = None,
     ) -> None:
-        super().__init__(signals, mv_rate)
+        super().__init__(signals, inverse, domain, r, mv_rate)
         if correction not in {"as_printed", "back_calculation"}:
             raise LawError(f"correction is {correction!r}; allowed are 'as_printed' and 'back_calculation'")
-        self.inverse, self.domain = inverse, domain
-        self.register_buffer("narrowing", _narrowing(r))
         self.register_buffer("flat", ((self.high - self.low) * 1e-6) ** 2)
         self.back_calculation = correction == "back_calculation"
         # started, w_EC; for back-calculation also m_EC, w_a, m_a
         self.n_state = 5 if self.back_calculation else 2
-        self.info = (*REQUEST_INFO, "error_correction", "mv_requested")
+        self.info = (*self.info[:-1], "error_correction", "mv_requested")
 
-    @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        """The law over parts ``inverse`` and ``domain``; raises LawError."""
-        parts = _parts(models, signals, cls.name)
-        return cls(signals, *parts, params.r, params.correction, params.mv_rate)
-
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        at, w_min, w_max = _bounds(self.domain, pv, self.narrowing)
-        w_re = torch.minimum(torch.maximum(sp, w_min), w_max)
+        at, w_min, w_max, w_re = self.within(sp, pv)
         error = torch.where(state[..., :1] > 0, self._remembered(mv_applied, state) - pv[..., :1], 0 * w_re)
         w_ec = w_re + error
         started = torch.ones_like(w_ec)
@@ -218,7 +188,7 @@ class INCADEC(ControlLaw):
         else:
             requested = self.inverse(torch.cat([pv, w_ec], dim=-1))
             state_next = torch.cat([started, w_ec], dim=-1)
-        info = torch.cat([*_request_info(self.domain, at, w_ec, w_min, w_max), error, requested], dim=-1)
+        info = self.shown(at, w_ec, w_min, w_max, error, requested)
         return self.limited(requested, mv_applied), state_next, info
 
     def _remembered(self, mv_applied: Tensor, state: Tensor) -> Tensor:

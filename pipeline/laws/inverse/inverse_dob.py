@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, require_part, require_single_loop
+from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
 from pipeline.models.base import Model
 from pipeline.models.static.pair import Layout, Pair, candidates
 from pipeline.plants.signals import Signals
@@ -19,10 +19,6 @@ from pipeline.plants.simulator import Simulator
 
 # Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
 FOLLOWED = 1e-3
-
-
-def _column(value: float) -> Tensor:
-    return torch.tensor([value], dtype=torch.float64)
 
 
 def _rising(forward: Model, signals: Signals) -> bool:
@@ -55,7 +51,7 @@ class ObserverLaw(ControlLaw):
     Source: the remedy is ours; it replaces [inverse_rbf, eqs 12 and 21-23].
     """
 
-    @dataclass(frozen=True, slots=True)
+    @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
         """Numbers of the law.
 
@@ -64,9 +60,9 @@ class ObserverLaw(ControlLaw):
         last; ``mv_rate`` [mv] the largest change a sample, None unlimited.
         """
 
-        observer_gain: float = 0.7
-        integral_gain: float = 0.03
-        band: float = 0.03
+        observer_gain: float
+        integral_gain: float
+        band: float
         observed: str | None = None
         mv_rate: float | None = None
 
@@ -78,6 +74,7 @@ class ObserverLaw(ControlLaw):
                     f"integral_gain is {self.integral_gain} and band {self.band}; they must be >= 0 and > 0"
                 )
 
+    parts: ClassVar[tuple[str, ...]]  # of the model set, in the order of the constructor
     span: Tensor
     band: Tensor
     least: Tensor  # (1,) share of the set point's range below which a reach is nothing but the models' errors
@@ -94,7 +91,7 @@ class ObserverLaw(ControlLaw):
         self.info = ("sp_requested", "sp_min", "sp_max", "disturbance", "integral")
         self.rising = _rising(forward, signals)
         self.register_buffer("span", self.high - self.low)
-        self.register_buffer("band", _column(params.band))
+        hold_numbers(self, band=params.band)
         self.register_buffer("least", 1e-3 * (signals.sp[0].high - signals.sp[0].low) / self.span)
         grid = self.low + self.span * torch.linspace(0, 1, sections + 1, dtype=torch.float64)
         layout = Layout(n_z=2 * n + 6, n=n, first=1, second=n + 4, mv=2 * n + 4)
@@ -127,16 +124,22 @@ class ObserverLaw(ControlLaw):
         ]
         return torch.cat(rows, dim=-1)
 
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
+        """The law over its ``parts``, each of the PVs and one more input; raises LawError."""
+        require_single_loop(signals, cls.name)
+        networks = [require_part(models, part, cls.name, len(signals.pv) + 1, 1) for part in cls.parts]
+        law: Any = cls  # a final class, with as many networks as it has parts
+        return law(signals, *networks, params)
+
     @abstractmethod
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
         """The MV v (..., 1) for a request w (..., 1) within reach, given g (..., n_grid) over the grid."""
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        found = self.models(torch.cat([state, pv, mv_applied, sp], dim=-1))
-        parts = torch.split(found, [1, 1, 1, 1, 1, 1, 1, 1, 2, 1, 1, found.shape[-1] - 12], dim=-1)
+        rows = self.models(torch.cat([state, pv, mv_applied, sp], dim=-1))
+        parts = torch.split(rows, [1, 1, 1, 1, 1, 1, 1, 1, 2, 1, 1, rows.shape[-1] - 12], dim=-1)
         started, kept, surprise, slope, w_min, w_max, width, request, acts, integral, moved, g = parts
         # More than the whole actuator can never be acted on, and a bad sample must not be remembered for long.
         disturbance = torch.minimum(torch.maximum(kept + surprise / slope, -self.span), self.span)
@@ -145,10 +148,10 @@ class ObserverLaw(ControlLaw):
         # Where the plant hardly answers, the reach is the model's error and may have the wrong sign: the way to
         # go on comes from the plant as a whole, or the loop would lock at the wrong end.
         beyond = (request - within if self.rising else within - request) / torch.maximum(width, self.least)
-        wanted = self.invert(pv, within, g) + beyond - disturbance
-        mv = self.limited(wanted, mv_applied)
+        requested = self.invert(pv, within, g) + beyond - disturbance
+        mv = self.limited(requested, mv_applied)
         # Acting on an error that someone else's MV leaves would be winding up, in manual as at a limit.
-        free = (mv == wanted) & (acts.abs().amax(dim=-1, keepdim=True) < 1)
+        free = (mv == requested) & (acts.abs().amax(dim=-1, keepdim=True) < 1)
         # The integral takes what the observer leaves: no more than the band in which it acts.
         integral_next = torch.where(free, torch.minimum(torch.maximum(moved, -self.band), self.band), integral)
         state_next = torch.cat([torch.ones_like(integral), pv, disturbance, integral_next, mv], dim=-1)
@@ -167,22 +170,13 @@ class InverseDob(ObserverLaw):
 
     name: ClassVar[str] = "inverse_dob"
     title: ClassVar[str] = "RBF inverse over several periods, disturbance observer, integral"
+    parts: ClassVar[tuple[str, ...]] = ("inverse", "forward", "observer")
 
     def __init__(
         self, signals: Signals, inverse: Model, forward: Model, observer: Model, params: ObserverLaw.Params
     ) -> None:
         super().__init__(signals, forward, observer, params)
         self.inverse = inverse
-
-    @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        """The law over parts ``inverse``, ``forward`` and ``observer``; raises LawError."""
-        require_single_loop(signals, cls.name)
-        n = len(signals.pv) + 1
-        inverse, forward, observer = (
-            require_part(models, p, cls.name, n, 1) for p in ("inverse", "forward", "observer")
-        )
-        return cls(signals, inverse, forward, observer, params)
 
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
         """As in ObserverLaw."""
@@ -200,6 +194,7 @@ class ForwardDob(ObserverLaw):
 
     name: ClassVar[str] = "forward_dob"
     title: ClassVar[str] = "Forward network inverted online, disturbance observer, integral"
+    parts: ClassVar[tuple[str, ...]] = ("forward", "observer")
     SECTIONS: ClassVar[int] = 16
 
     cuts: Tensor  # (SECTIONS + 1,) [mv] cuts of one part, from its start
@@ -213,15 +208,7 @@ class ForwardDob(ObserverLaw):
         self.register_buffer("part", self.span / self.SECTIONS)
         self.register_buffer("chord", self.part / self.SECTIONS)
         self.register_buffer("cuts", self.part * torch.linspace(0, 1, self.SECTIONS + 1, dtype=torch.float64))
-        self.register_buffer("flat", _column(1e-12))
-
-    @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        """The law over parts ``forward`` and ``observer``; raises LawError."""
-        require_single_loop(signals, cls.name)
-        n = len(signals.pv) + 1
-        forward, observer = (require_part(models, p, cls.name, n, 1) for p in ("forward", "observer"))
-        return cls(signals, forward, observer, params)
+        hold_numbers(self, flat=1e-12)
 
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
         """As in ObserverLaw."""

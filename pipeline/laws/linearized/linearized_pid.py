@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import require_kind
+from pipeline.laws.base import Stepped, hold_numbers
 from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
-from pipeline.models.base import Model
 from pipeline.models.lagged.next_output import Ahead
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.memory import Named, Slot, constant
 from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
 
 DOUBLINGS = 12
 
@@ -42,28 +39,34 @@ class LinearizedPid(NnarxPid):
 
     @dataclass(frozen=True, slots=True)
     class Params(NnarxParams):
-        """As NnarxParams, and the adaptive penalty, in whose place ``penalty`` then is not used.
+        """As NnarxParams, and the penalty that ``adaptive`` puts in the place of ``penalty``.
 
-        ``penalty_start`` and ``penalty_low`` [pv^2]: its first and its least value; ``eps_high`` and
-        ``eps_low`` [pv]: linearization errors above which it doubles and below which it halves.
+        ``penalty_start`` and ``penalty_low`` [pv^2]: its first and its least value, None as ``penalty``;
+        ``eps_high`` and ``eps_low`` [pv]: linearization errors above which it doubles and below which it
+        halves; ``adaptive`` needs an ``eps_high`` above 0.
         """
 
         adaptive: bool = False
-        penalty_start: float = 20.0
-        penalty_low: float = 0.1
-        eps_high: float = 0.2
-        eps_low: float = 0.05
+        penalty_start: float | None = None
+        penalty_low: float | None = None
+        eps_high: float = 0.0
+        eps_low: float = 0.0
 
         def __post_init__(self) -> None:
             NnarxParams.__post_init__(self)
-            if not 0 < self.penalty_low <= self.penalty_start:
-                raise ValueError(
-                    f"penalty_low is {self.penalty_low} and penalty_start {self.penalty_start}; "
-                    "0 < penalty_low <= penalty_start must hold"
-                )
-            if not 0 <= self.eps_low < self.eps_high:
+            start, low = self.penalties
+            if not 0 < low <= start:
+                raise ValueError(f"penalty_low is {low} and penalty_start {start}; give 0 < low <= start")
+            if not (0 <= self.eps_low < self.eps_high or (self.eps_low == self.eps_high == 0 and not self.adaptive)):
                 raise ValueError(f"eps_low is {self.eps_low} and eps_high {self.eps_high}; give 0 <= low < high")
 
+        @property
+        def penalties(self) -> tuple[float, float]:
+            """The first and the least penalty."""
+            start = self.penalty if self.penalty_start is None else self.penalty_start
+            return start, self.penalty if self.penalty_low is None else self.penalty_low
+
+    params: Params
     penalty: Tensor  # (1,) fixed
     doubled: Tensor  # (DOUBLINGS + 1, 1) 1, 2, 4, ..
     allowed: Tensor  # (DOUBLINGS + 1, 1) linearization error of each; the last candidate has no choice
@@ -72,30 +75,25 @@ class LinearizedPid(NnarxPid):
     none: Tensor  # (1,) larger than any penalty
 
     def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
-        start = torch.tensor([params.penalty_start], dtype=torch.float64)
-        more = {"penalty": Slot(1, constant(start))} if params.adaptive else {}
-        told = ("linearization_error", *more)
-        super().__init__(signals, model, params, more=more, told=told)
+        start, low = params.penalties
+        more = {"penalty": Slot(1, constant(torch.tensor([start], dtype=torch.float64)))} if params.adaptive else {}
+        super().__init__(signals, model, params, more, ("linearization_error", *more))
         self.adaptive = params.adaptive
-        numbers = {
-            "penalty": [params.penalty],
-            "doubled": [[2.0**j] for j in range(DOUBLINGS + 1)],
-            "penalty_low": [params.penalty_low],
-            "allowed": [[params.eps_high]] * DOUBLINGS + [[math.inf]],
-            "eps_low": [params.eps_low],
-            "none": [math.inf],
-        }
-        for name, values in numbers.items():
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
+        hold_numbers(
+            self,
+            penalty=params.penalty,
+            doubled=[[2.0**j] for j in range(DOUBLINGS + 1)],
+            penalty_low=low,
+            allowed=[[params.eps_high]] * DOUBLINGS + [[math.inf]],
+            eps_low=params.eps_low,
+            none=math.inf,
+        )
 
-    @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        """The law over part ``nnarx``; raises LawError."""
-        return cls(signals, require_kind(models, NNARX, cls.name), params)
+    def formulas(self, p: Named) -> Named:
+        """Those of the model, and the penalty so far where it adapts."""
+        return {**super().formulas(p), **({"penalty": p["penalty"]} if self.params.adaptive else {})}
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         past = self.memory.recall(sp, pv, mv_applied, state)
         if self.adaptive:
@@ -109,13 +107,13 @@ class LinearizedPid(NnarxPid):
             z = self._gains(now, ahead, self.penalty)
         z, changed = self.gains.settled(now, z, free)
         mv, moved = self.commanded(now, self.gains.step(now, z))
-        told = [self.gains.told(z, ahead.slope, free), ahead.offset]
+        shown = [self.gains.info_of(z, ahead.slope, free), ahead.offset]
         given = {**ahead.kept, **loud, **changed}
         if self.adaptive:
-            told, given = [*told, error, penalty], {**given, "penalty": following}
+            shown, given = [*shown, error, penalty], {**given, "penalty": following}
         else:
-            told.append(self.linearization_error(ahead, moved))
-        state_next, info = self.memory.stored(now["known"], given), torch.cat(told, dim=-1)
+            shown.append(self.linearization_error(ahead, moved))
+        state_next, info = self.memory.stored(now["known"], given), torch.cat(shown, dim=-1)
         if self.adaptive:
             return mv.squeeze(-2), state_next.squeeze(-2), info.squeeze(-2)
         return mv, state_next, info

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Self
 
 from torch import Tensor
 
 from pipeline.errors import LawError, ModelError
-from pipeline.laws.adaptive import (
-    AdaptiveGains,
-    AdaptiveParams,
-    minimum_variance_gains,
-    signed_unit,
-    target,
-    target_slots,
-)
-from pipeline.laws.base import ControlLaw, require_single_loop
+from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, target
+from pipeline.laws.base import require_kind
+from pipeline.models.base import Model
 from pipeline.models.lagged.instantaneous import Arx, arx
 from pipeline.models.lagged.next_output import Ahead, NextOutput
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Memory, Named, Slot, Stage
+from pipeline.models.memory import Named, Slot
 from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,53 +50,34 @@ def next_output(law: str, model: NNARX, unit: float, offset_filter: float, trust
         raise LawError(f"law {law!r}: {error}") from error
 
 
-def room(p: Named, low: Tensor, high: Tensor, unit: float) -> dict[str, Tensor]:
-    """Formulas of the least and the largest move that the actuator can make, in units."""
-    ends = [(low - p["u"]) / unit, (high - p["u"]) / unit]
-    return dict(zip(("down", "up"), ends if unit > 0 else reversed(ends), strict=True))
+class NnarxPid(AdaptivePid):
+    """A PID law over part ``nnarx``. ``more`` are slots of the law's own, ``info`` the names of its own info."""
 
-
-class NnarxPid(ControlLaw):
-    """A PID law over part ``nnarx``: model, gains, and the memory and formulas of both. ``forward`` is the law's.
-
-    ``more`` are slots of the law's own; ``told`` the names of its info after those of the gains;
-    ``bounded`` asks for the formulas of ``room``.
-    """
-
-    incremental = True
+    params: NnarxParams
 
     def __init__(
         self,
         signals: Signals,
         model: NNARX,
         params: NnarxParams,
-        *,
         more: Mapping[str, Slot] | None = None,
-        told: tuple[str, ...] = (),
-        bounded: bool = False,
+        info: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(signals, params.mv_rate)
-        require_single_loop(signals, self.name)
+        def predictor(unit: float) -> NextOutput:
+            return next_output(self.name, model, unit, params.offset_filter, params.trust)
+
         centre = central_model(model)
-        slope = float(centre.b[0])
-        unit = signed_unit(signals, params.plant_gain, slope)
-        start = params.gains or minimum_variance_gains(centre.a, slope * unit, params)
-        self.model = next_output(self.name, model, unit, params.offset_filter, params.trust)
-        self.gains = AdaptiveGains(params, signals, unit, start)
-        more = more or {}
-        self.memory = Memory({**target_slots(params.preview), **self.model.slots, **self.gains.slots, **more})
-        self.stage = Stage(
-            self.memory.layout,
-            lambda p: {
-                "known": self.memory.then(p),
-                **self.gains.terms(p),
-                **self.model.terms(p, target(p, params.preview)),
-                **{name: p[name] for name in more},
-                **(room(p, self.low, self.high, unit) if bounded else {}),
-            },
-        )
-        self.n_state = self.memory.n_state
-        self.info = (*AdaptiveGains.info, "offset", *told)
+        super().__init__(signals, params, centre.a, float(centre.b[0]), predictor, more or {}, ("offset", *info))
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
+        """The law over part ``nnarx``; raises LawError."""
+        return cls(signals, require_kind(models, NNARX, cls.name), params)
+
+    def formulas(self, p: Named) -> Named:
+        """Those of the model."""
+        terms: Named = self.model.terms(p, target(p, self.params.preview))
+        return terms
 
     def commanded(self, now: Named, step: Tensor) -> tuple[Tensor, Tensor]:
         """The MV (..., 1) after a move of ``step`` units, within its limits, and the move that they leave, in units."""

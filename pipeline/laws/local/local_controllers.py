@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, ControlLaw, require_single_loop
+from pipeline.laws.base import Analysis, ControlLaw, Stepped, hold_numbers, require_single_loop
 from pipeline.laws.local.local_stability import StabilityTest, stability_analysis
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.local.local_models import LocalModels
@@ -105,9 +105,9 @@ class LocalControllers(ControlLaw):
         for pid, bias in zip(pids, models.mv[:, 0].tolist(), strict=True):
             filter_s = pid.kd / pid.kp / derivative_limit if pid.kp else 0.0
             rows.append([pid.kp, h * pid.ki, pid.kd / h, filter_s / (filter_s + h), bias])
-        self.register_buffer("table", torch.tensor(rows, dtype=torch.float64))
+        hold_numbers(self, table=rows)
         self.register_buffer("near", 1e-3 * (self.high - self.low))
-        self.register_buffer("period", torch.tensor([h], dtype=torch.float64))
+        hold_numbers(self, period=h)
         self.validity = models.validity()
         self.blending, self.pids = blending, tuple(pids)
         self.stability = stability or StabilityTest()
@@ -135,9 +135,7 @@ class LocalControllers(ControlLaw):
             mv_rate=params.mv_rate,
         )
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         y = pv[..., :1]
         error = sp - y

@@ -1,9 +1,10 @@
-"""What is said of the stability of a law that is blended over operating points: design time, not run time."""
+"""Stability analysis, at design time, of a law that is blended over operating points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from pipeline.laws.base import Analysis, ControlLaw
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.simulator import Array
-from pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
+from pipeline.tuning.development import Starts, other_rests, recover
 from pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
 
 SAME = 1e-3  # relative difference of two states that count as one
@@ -70,7 +71,7 @@ def stability_analysis(law: ControlLaw, plant: EquationPlant, points: Sequence[f
     loops = FrozenLoops.of(plant, law, law.n_state, cvs)
     matrices = loops.matrices()
     contraction = pairwise_contraction(matrices, cvs, list(edges))
-    found = ~np.isnan(contraction)
+    proven = ~np.isnan(contraction)
     sp = plant.sp_signals[0]
     # Beyond the outer points too, where one controller is alone.
     wide = np.linspace(sp.low, sp.high, 4 * len(cvs))[1:-1]
@@ -79,32 +80,31 @@ def stability_analysis(law: ControlLaw, plant: EquationPlant, points: Sequence[f
         "frozen_radius": float(spectral_radius(matrices).max()),
         "frozen_radius_over_range": float(radius.max()),
         "gain_margin": loops.gain_margin(),
-        "lyapunov_pairs": float(found.sum()),
+        "lyapunov_pairs": float(proven.sum()),
         "neighbour_pairs": float(len(contraction)),
     }
-    if found.all():
+    if proven.all():
         figures["lyapunov_contraction"] = float(contraction.max())
     arrays = {"frozen_cv": wide, "frozen_radius": radius, "points": edges, "contraction": contraction}
-    notes = [_lyapunov_note(edges, found)]
+    notes = [_lyapunov_note(edges, proven)]
     if test.starts:
-        more, courses, told = _recoveries(law, plant, edges, test)
-        figures, arrays, notes = figures | more, arrays | courses, [*notes, *told]
+        recovered = _recoveries(law, plant, edges, test)
+        figures, arrays = {**figures, **recovered.figures}, {**arrays, **recovered.arrays}
+        notes += recovered.notes
     return Analysis(figures, arrays, tuple(notes))
 
 
-def _lyapunov_note(edges: Array, found: Array) -> str:
+def _lyapunov_note(edges: Array, proven: Array) -> str:
     words = (
         "A quadratic Lyapunov function shared by the linear loops from one operating point to the next, checked after "
         "the solver, proves that they stay stable however the operating point moves among them; it says nothing of "
         "steps so large that no linear loop describes them."
     )
-    missing = [f"{a:.4g} to {b:.4g}" for a, b, ok in zip(edges, edges[1:], found, strict=False) if not ok]
+    missing = [f"{a:.4g} to {b:.4g}" for a, b, ok in zip(edges, edges[1:], proven, strict=False) if not ok]
     return words + (f" None was found from {', '.join(missing)}." if missing else "")
 
 
-def _recoveries(
-    law: ControlLaw, plant: EquationPlant, edges: Array, test: StabilityTest
-) -> tuple[dict[str, float], dict[str, Array], list[str]]:
+def _recoveries(law: ControlLaw, plant: EquationPlant, edges: Array, test: StabilityTest) -> Analysis:
     rng, sp, mv = np.random.default_rng(test.seed), plant.sp_signals[0], plant.mv_signals[0]
     n, (low, high) = test.starts, test.box(plant)
     band = 0.01 * (sp.high - sp.low) if test.band is None else test.band
@@ -114,11 +114,8 @@ def _recoveries(
         rng.uniform(mv.low, mv.high, (n, 1)),
     )
 
-    def run(begun: Starts, watched: int) -> Recovery:
-        options = {"samples": test.samples, "holding": test.holding, "watched": watched}
-        return recover(plant, law, law.n_state, begun, band=band, **options)
-
-    ended = run(starts, test.watched)
+    run = partial(recover, plant, law, law.n_state, samples=test.samples, band=band, holding=test.holding)
+    ended = run(starts, watched=test.watched)
     minutes = plant.period_s / 60.0
     out = plant.measured(ended.end)[:, 0] > sp.high + 0.5 * (sp.high - sp.low)
     figures = {
@@ -137,11 +134,12 @@ def _recoveries(
     }
     rests = other_rests(plant)
     if not len(rests):
-        return figures, arrays, []
+        return Analysis(figures, arrays)
     middle = 0.5 * (edges[0] + edges[-1])
-    back = run(Starts(rests, np.full((len(rests), 1), middle), np.full((len(rests), 1), mv.low)), len(rests))
-    arrays |= {"other_rest": rests, "other_rest_arrived": back.arrived.astype(float)}
-    arrays["other_rest_courses"] = back.courses
+    ends = np.full((len(rests), 1), middle), np.full((len(rests), 1), mv.low)
+    back = run(Starts(rests, *ends), watched=len(rests))
+    arrays |= {"other_rest": rests, "other_rest_courses": back.courses}
+    arrays["other_rest_arrived"] = back.arrived.astype(float)
     # Several of them may lead to one: a reactor that has gone out rests elsewhere under another MV.
     kept: list[Array] = []
     cv = plant.measured(back.end)[:, 0]
@@ -152,7 +150,5 @@ def _recoveries(
     figures["states_of_no_return"] = float(len(kept))
     names = ", ".join(s.name for s in plant.state_signals)
     where = "; ".join(", ".join(f"{v:.4g}" for v in state) for state in kept)
-    told = (
-        f"Beyond the set point's range the plant has a state from which the law does not return: ({names}) = {where}."
-    )
-    return figures, arrays, [told] if kept else []
+    note = "Beyond the set point's range the plant has a state from which the law does not return"
+    return Analysis(figures, arrays, (f"{note}: ({names}) = {where}.",) if kept else ())

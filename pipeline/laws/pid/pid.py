@@ -1,4 +1,4 @@
-"""The PID controller: the yardstick of every other law."""
+"""The PID controller, the baseline of the other laws."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, ControlLaw, require_single_loop
+from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.base import Model
 from pipeline.plants.equations import EquationPlant, equations
@@ -20,10 +20,9 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning import rules as tuning
 from pipeline.tuning.development import DevelopmentLoops
-from pipeline.tuning.reduction import LagWithDeadTime
+from pipeline.tuning.reduction import LagWithDeadTime, start_lag
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
-from pipeline.tuning.start_lag import start_lag
 
 EXAMINED = 40  # linear closed loops over a range of the CV
 
@@ -41,16 +40,16 @@ class PID(ControlLaw):
 
         mv(k) = mv(k-1) + Kc [ p(k) - p(k-1) + (h/Ti) (r - y) - (d(k) - d(k-1)) ],   p = b r - y
         d(k)  = (Tf d(k-1) + Td (y(k) - y(k-1))) / (Tf + h)
-        mv(k-1) = mv_applied + (1 - h/Tt) (what the actuator could not give of the last request)
+        mv(k-1) = mv_applied + (1 - h/Tt) (last request - last limited request)
 
-    d is the filtered derivative, h the period. Adding to the MV that the actuator really holds is
-    the anti-windup, and makes the transfer from manual to auto bumpless. Of a request beyond the
-    law's own limits a share is remembered, fading with the tracking time Tt: without it
+    d is the filtered derivative, h the period. The law adds its move to the MV that the actuator
+    holds. This is the anti-windup, and makes the transfer from manual to auto bumpless. The law keeps
+    the part of a request beyond its limits; this part decays with the tracking time Tt. Without it
     (Tt = h, the plain velocity form) one saturated sample erases the proportional and derivative
-    kicks, whose end then pulls the MV the wrong way. An actuator that did not follow the limited
-    request (manual, stuck) is believed at once. Where it stood still, a set point that moves to the
-    process variable does not take back the proportional action that the actuator never received
-    (``never_given``).
+    kicks, and their end then moves the MV in the wrong direction. If the actuator did not follow the
+    limited request (manual, stuck), the law starts from the applied MV alone. If the actuator did not
+    move and the set point then returns to the process variable, the law does not subtract a
+    proportional action that the actuator never received (``never_given``).
 
     Source: the PID that [inverse_rbf, section 4.3] compares with; the tracking
     is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
@@ -62,22 +61,20 @@ class PID(ControlLaw):
 
     @dataclass(frozen=True, slots=True)
     class Params:
-        """How the PID is tuned.
+        """The tuning of the PID.
 
-        ``tuning``: ``optimized`` (IMC, its filter and the set-point weight chosen in closed loop, by the
-        ``criterion`` mean absolute error or integral of the time-weighted one),
-        ``imc`` or ``simc`` with ``lambda_s`` [s] (None: a robust one), ``itae`` (the rule for the
-        least ITAE after a set-point step), ``manual`` with ``kc`` [mv/pv], ``ti_s``, ``td_s``
-        and the derivative's filter ``filter_s`` [s].
-        ``tracking_s`` [s] None is sqrt(Ti Td). ``set_point_weight`` None is 1, or optimized with the
-        filter.
-        ``operating_cv`` [pv] is the steady state to linearize where the model set has no part
-        ``linearized``; None is the middle of the set point's range. The development set points
-        are drawn for the optimization alone, ``development_set_points`` of them for each of the ``development_seeds``,
-        each held for ``development_hold`` samples. ``sampling`` is what ``itae`` counts of a period as
-        dead time: 0.5 is the textbook's, 1 more cautious. ``examined_cv`` [pv] is the range over which
-        the linear closed loops are examined; None: not at all. ``mv_rate`` [mv] is the largest change
-        a sample, None unlimited.
+        ``tuning``: ``optimized`` chooses the IMC filter and the set-point weight in closed loop, by the
+        ``criterion``, ``mae`` (mean absolute error) or ``itae`` (time-weighted); ``imc`` and ``simc`` use
+        ``lambda_s`` [s] (None: a robust value); ``itae`` is the minimum-ITAE rule for a set-point step;
+        ``manual`` uses ``kc`` [mv/pv], ``ti_s`` [s], ``td_s`` [s] and the derivative filter ``filter_s`` [s].
+        ``tracking_s`` [s]: tracking time; None is sqrt(Ti Td). ``set_point_weight``: None is 1, or
+        optimized with the filter. ``operating_cv`` [pv]: steady state of the linearization if the model
+        set has no part ``linearized``; None is the middle of the set-point range.
+        ``development_seeds``, ``development_set_points``, ``development_hold``: random set points for
+        ``optimized``; each seed gives so many, each held for so many samples. ``sampling``: share of a
+        period that ``itae`` counts as dead time; 0.5 is the textbook value, 1 is more cautious.
+        ``examined_cv`` [pv]: range of the stability analysis; None: no analysis. ``mv_rate`` [mv]:
+        largest MV change per sample; None: unlimited.
         """
 
         tuning: Literal["optimized", "imc", "simc", "itae", "manual"] = "optimized"
@@ -92,7 +89,7 @@ class PID(ControlLaw):
         operating_cv: float | None = None
         development_seeds: tuple[int, ...] = (1, 2, 3)
         development_set_points: int = 12
-        development_hold: int = 60
+        development_hold: int = 100
         sampling: float = 0.5
         examined_cv: tuple[float, float] | None = None
         mv_rate: float | None = None
@@ -186,20 +183,19 @@ class PID(ControlLaw):
             raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
         return cls(signals, replace(settings, **rest), p.mv_rate)
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         y = pv[..., :1]
         p = self.weight * sp - y
         fresh = torch.cat([p, y, torch.zeros_like(p), mv_applied, mv_applied, mv_applied], dim=-1)
         past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
-        p1, y1, d1, asked, given, applied1 = (past[..., i : i + 1] for i in range(6))
-        # Where the actuator is not at the limited request, someone else moved it: nothing was unmet.
-        unmet = torch.where((mv_applied - given).abs() <= self.near, asked - given, torch.zeros_like(asked))
+        p1, y1, d1, requested1, limited1, applied1 = (past[..., i : i + 1] for i in range(6))
+        # An actuator that is not at the limited request was moved by something else: no part is unmet.
+        followed = (mv_applied - limited1).abs() <= self.near
+        unmet = torch.where(followed, requested1 - limited1, torch.zeros_like(requested1))
         d = self.keep * d1 + self.derivative * (y - y1)
-        still = stood_still(mv_applied, applied1, given, self.near)
-        # p alone tells b (r - r1) and b (r1 - y1): the state holds no set point.
+        still = stood_still(mv_applied, applied1, limited1, self.near)
+        # The state holds no set point; b (r - r1) and b (r1 - y1) follow from p.
         spared = never_given(p - p1 + (y - y1), p1 + (1 - self.weight) * y1)
         move = p - p1 + torch.where(still, spared, torch.zeros_like(p)) + self.integral * (sp - y) - (d - d1)
         requested = mv_applied + self.fade * unmet + self.kc * move
@@ -207,7 +203,7 @@ class PID(ControlLaw):
         return mv, torch.cat([torch.ones_like(p), p, y, d, requested, mv, mv_applied], dim=-1), requested
 
     def analysis(self, plant: Simulator | None) -> Analysis:
-        """Stability and gain margin of the linear closed loops over ``examined_cv``; nothing where that is None."""
+        """Stability and gain margin of the linear closed loops over ``examined_cv``; empty if that is None."""
         if self.examined_cv is None:
             return Analysis()
         known = equations(plant, "law 'pid' with `examined_cv`")
@@ -218,9 +214,9 @@ class PID(ControlLaw):
 
 
 def _linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:
-    """Of the part ``linearized`` where the model set has one, else of the plant at ``operating_cv``.
+    """The linearization of the part ``linearized`` if there is one, else of the plant at ``operating_cv``.
 
-    A plant without equations counts as one or two lags, those near its start.
+    A plant without equations is approximated by one or two lags near its start.
     """
     if "linearized" in models:
         part = models["linearized"]

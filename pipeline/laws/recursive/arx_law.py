@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pipeline.errors import LawError, ModelError
 from pipeline.laws.base import require_kind
@@ -25,19 +26,14 @@ def require_arx(models: Mapping[str, Model], law: str) -> ARX:
 
 
 def estimator(
-    law: str,
-    signals: Signals,
-    model: ARX,
-    unit: float,
-    *,
-    forgetting: float,
-    covariance: float,
-    prefilter: Sequence[float] = (),
-    n_y: int | None = None,
+    law: str, signals: Signals, model: ARX, unit: float, params: Any, prefilter: Sequence[float] = (), lags: int = 0
 ) -> RecursiveArx:
-    """The model as a law learns it on, with ``unit`` [mv] from ``signed_unit``; raises LawError for wrong numbers."""
+    """The model as a law learns it on, of at least ``lags`` of y, with ``unit`` [mv] from ``signed_unit``.
+
+    Raises LawError for wrong numbers.
+    """
     try:
-        rls = RecursiveLeastSquares(forgetting, covariance)
+        rls = RecursiveLeastSquares(params.forgetting, params.covariance)
     except ModelError as error:
         raise LawError(f"law {law!r}: {error}") from error
-    return RecursiveArx(model, signals.sp[0], signals.mv[0], unit, rls, prefilter, n_y)
+    return RecursiveArx(model, signals.sp[0], signals.mv[0], unit, rls, prefilter, max(lags, model.n_y))

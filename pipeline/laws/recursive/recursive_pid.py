@@ -9,46 +9,39 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.adaptive import (
-    AdaptiveGains,
-    AdaptiveParams,
-    minimum_variance_gains,
-    signed_unit,
-    target,
-    target_slots,
-)
-from pipeline.laws.base import ControlLaw, require_single_loop
+from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, target
+from pipeline.laws.base import Stepped, hold_numbers
 from pipeline.laws.recursive.arx_law import estimator, require_arx
 from pipeline.models.base import Model
 from pipeline.models.lagged.arx import ARX
-from pipeline.models.memory import Memory, Named, Slot, Stage, constant
+from pipeline.models.lagged.recursive_arx import RecursiveArx
+from pipeline.models.memory import Named, Slot, constant
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
 
-class RecursivePid(ControlLaw):
+class RecursivePid(AdaptivePid):
     """PID whose gains give, within bounds, the minimum-variance move of a recursively estimated ARX model.
 
         min_du  (r - y0 - b du)^2 + mu du^2   ->   v = b (r - y0)/c,   c = b^2 + mu
         y0 = theta' x(t+1) with u(t) = u(t-1), plus d;   d = (1 - alpha) d1 + alpha (y - theta' x(t))
 
-    with theta after this sample's update by recursive least squares with forgetting, begun from
-    part ``arx``; parameters and covariance are in the state. It knows only what the recent past
-    has shown, where ``linearized_pid`` knows the plant at the point it is at.
+    Recursive least squares with forgetting updates theta at this sample; part ``arx`` gives the
+    first estimate. Parameters and covariance are in the state. The estimate follows recent data
+    only, whereas ``linearized_pid`` has a model of the plant at the present operating point.
 
     Source: REC-LINPID of [chen2004, section 5], with eqs 16-28 as its control law.
     """
 
     name: ClassVar[str] = "recursive_pid"
     title: ClassVar[str] = "PID from a recursive linear model"
-    incremental: ClassVar[bool] = True
 
     @dataclass(frozen=True, slots=True)
     class Params(AdaptiveParams):
-        """As AdaptiveParams, and the estimator.
+        """The settings of AdaptiveParams, and those of the estimator.
 
-        ``forgetting`` in (0, 1]; ``covariance`` the first and largest one, of parameters and signals
-        scaled to the order of one; ``offset_filter`` alpha in [0, 1], 0 to leave d out.
+        ``forgetting``: in (0, 1]. ``covariance``: its first and largest value, for scaled parameters
+        and signals. ``offset_filter``: alpha in [0, 1]; 0 means no offset d.
         """
 
         forgetting: float = 0.98
@@ -60,53 +53,31 @@ class RecursivePid(ControlLaw):
             if not 0 <= self.offset_filter <= 1:
                 raise ValueError(f"offset_filter is {self.offset_filter}; it must lie in [0, 1]")
 
+    params: Params
     penalty: Tensor  # (1,)
     alpha: Tensor  # (1,) [pv]
 
     def __init__(self, signals: Signals, model: ARX, params: Params) -> None:
-        super().__init__(signals, params.mv_rate)
-        require_single_loop(signals, self.name)
-        b = float(model.weight[model.n_y])
-        unit = signed_unit(signals, params.plant_gain, b)
-        start = params.gains or minimum_variance_gains(-model.weight[: model.n_y], b * unit, params)
-        self.model = estimator(
-            self.name, signals, model, unit, forgetting=params.forgetting, covariance=params.covariance
-        )
-        self.gains = AdaptiveGains(params, signals, unit, start)
-        numbers = {
-            "penalty": [params.penalty],
-            "alpha": [self.model.half_y * params.offset_filter],
-        }
-        for name, values in numbers.items():
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
-        nothing = constant(torch.zeros(1, dtype=torch.float64))
-        self.memory = Memory(
-            {**target_slots(params.preview), **self.model.slots, **self.gains.slots, "offset": Slot(1, nothing)}
-        )
-        keep = 1 - params.offset_filter
+        def model_for(unit: float) -> RecursiveArx:
+            return estimator(self.name, signals, model, unit, params)
 
-        def terms(p: Named) -> Named:
-            goal = target(p, params.preview) - self.model.middle_y - keep * p["offset"]
-            return {
-                "known": self.memory.then(p),
-                **self.gains.terms(p),
-                **self.model.terms(p),
-                "goal": goal,
-                "kept": keep * p["offset"],
-            }
+        more = {"offset": Slot(1, constant(torch.zeros(1, dtype=torch.float64)))}
+        slopes = model.weight[: model.n_y], float(model.weight[model.n_y])
+        super().__init__(signals, params, -slopes[0], slopes[1], model_for, more, ("offset",))
+        hold_numbers(self, penalty=params.penalty, alpha=self.model.half_y * params.offset_filter)
 
-        self.stage = Stage(self.memory.layout, terms)
-        self.n_state = self.memory.n_state
-        self.info = (*AdaptiveGains.info, "offset")
+    def formulas(self, p: Named) -> Named:
+        """The model's terms, r(t+1) less the known part of y(t+1), and (1 - alpha) d1."""
+        kept = (1 - self.params.offset_filter) * p["offset"]
+        goal = target(p, self.params.preview) - self.model.middle_y - kept
+        return {**self.model.terms(p), "goal": goal, "kept": kept}
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with part ``arx`` as its first estimate; raises LawError."""
         return cls(signals, require_arx(models, cls.name), params)
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
         estimate = self.model(now)
@@ -120,4 +91,5 @@ class RecursivePid(ControlLaw):
         mv = self.limited(now["mv"] + self.gains.step(now, z) * self.gains.unit, now["mv"])
         offset = now["kept"] + missed
         kept = {**estimate.kept, **loud, **changed, "offset": offset}
-        return mv, self.memory.stored(now["known"], kept), torch.cat([self.gains.told(z, slope, free), offset], dim=-1)
+        state_next = self.memory.stored(now["known"], kept)
+        return mv, state_next, torch.cat([self.gains.info_of(z, slope, free), offset], dim=-1)

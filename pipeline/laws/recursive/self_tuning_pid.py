@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.adaptive import signed_unit
-from pipeline.laws.base import ControlLaw, require_single_loop
+from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_single_loop
 from pipeline.laws.gain_update import PidForm
 from pipeline.laws.recursive.arx_law import estimator, require_arx
 from pipeline.models.base import Model
@@ -52,24 +52,12 @@ class SelfTuningPid(ControlLaw):
     class Params:
         """Numbers of the law; MVs count in units of half the MV's range, PVs in their own.
 
-        Parameters
-        ----------
-        prefilter
-            p_1, p_2, p_3 of P; fewer are followed by zeros.
-        integral
-            Integral action constant nu > 0 [1/pv].
-        forgetting
-            Forgetting factor of the estimator in (0, 1].
-        covariance
-            Its first and largest covariance, of parameters and signals scaled to the order of one.
-        gain_high
-            Upper bounds of kc, Ki = kc dt/tau_i and Kd = kc tau_d/dt [1/pv]; the lower are 0.
-        plant_gain
-            Sign of dPV/dMV; ``auto`` takes that of part ``arx``.
-        slope_min
-            The estimate is acted on where its slope, in that sign, is above this [pv].
-        mv_rate
-            Largest change of the MV a sample [mv]; None is unlimited.
+        ``prefilter``: p_1, p_2, p_3 of P, fewer are followed by zeros; ``integral``: the integral action
+        constant nu > 0 [1/pv]. ``forgetting`` in (0, 1] and ``covariance``, the first and largest one of
+        parameters and signals scaled to the order of one, are the estimator's. ``gain_high``: upper bounds of
+        kc, Ki = kc dt/tau_i and Kd = kc tau_d/dt [1/pv]; the lower are 0. ``plant_gain``: sign of dPV/dMV,
+        ``auto`` takes that of part ``arx``. The estimate is acted on where its slope, in that sign, is above
+        ``slope_min`` [pv]. ``mv_rate``: largest change of the MV a sample [mv]; None is unlimited.
         """
 
         prefilter: tuple[float, ...]
@@ -101,28 +89,18 @@ class SelfTuningPid(ControlLaw):
         super().__init__(signals, params.mv_rate)
         require_single_loop(signals, self.name)
         unit = signed_unit(signals, params.plant_gain, float(model.weight[model.n_y]))
-        self.model = estimator(
-            self.name,
-            signals,
-            model,
-            unit,
-            forgetting=params.forgetting,
-            covariance=params.covariance,
-            prefilter=params.prefilter,
-            n_y=max(TERMS, model.n_y),
-        )
+        self.model = estimator(self.name, signals, model, unit, params, params.prefilter, TERMS)
         n, nu = self.model.size, params.integral
         self.form = PidForm(signals.period_s, unit, params.gain_high)
         of_f = [[0.0, nu, 0.0], [-nu, nu, 0.0], [-2 * nu, nu, nu]]
-        numbers = {
-            "unit": [unit],
-            "to_gains": of_f + [[0.0] * 3] * (n - TERMS),
-            "slope_min": [params.slope_min],
-            "hi": params.gain_high,
-            "by_unit": [1 / unit],
-        }
-        for name, values in numbers.items():
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float64))
+        hold_numbers(
+            self,
+            unit=unit,
+            to_gains=of_f + [[0.0] * 3] * (n - TERMS),
+            slope_min=params.slope_min,
+            hi=params.gain_high,
+            by_unit=1 / unit,
+        )
         start = self._limited_gains(self.model.first)
         self.memory = Memory({**self.model.slots, "gains": Slot(3, constant(start))})
         self.stage = Stage(
@@ -146,16 +124,14 @@ class SelfTuningPid(ControlLaw):
     def _limited_gains(self, theta: Tensor) -> Tensor:
         return torch.minimum(torch.relu(theta @ self.to_gains), self.hi)
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
         estimate = self.model(now)
         slope = estimate.slope
-        told = slope > self.slope_min
-        z = torch.where(told, self._limited_gains(estimate.theta), now["gains"])
+        clear = slope > self.slope_min
+        z = torch.where(clear, self._limited_gains(estimate.theta), now["gains"])
         move = (now["rho"] * z).sum(dim=-1, keepdim=True)
         mv = self.limited(now["mv"] + move * self.unit, now["mv"])
-        info = torch.cat([self.form(z), slope * self.by_unit, told.to(z.dtype)], dim=-1)
+        info = torch.cat([self.form(z), slope * self.by_unit, clear.to(z.dtype)], dim=-1)
         return mv, self.memory.stored(now["known"], {**estimate.kept, "gains": z}), info

@@ -1,23 +1,21 @@
-"""A network trained through time so that the loop follows a reference model, in incremental form."""
+"""Networks trained through time so that the loop follows a reference model: incremental, and as printed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import Analysis, require_kind, require_single_loop
+from pipeline.laws.base import Analysis, Stepped
 from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
-from pipeline.laws.reference.reference_loops import Training
-from pipeline.laws.reference.reference_networks import BEFORE, COURSE, IncrementalNetwork, R, U, Y
-from pipeline.laws.reference.reference_training import Trained, gain_sign, story, train
+from pipeline.laws.reference.reference_networks import BEFORE, COURSE, IncrementalNetwork, R, TwoErrorNetwork, U, Y
+from pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
 from pipeline.models.base import Model
 from pipeline.models.memory import Named
-from pipeline.models.state_space.state_space import StateSpace
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning.reference_model import ReferenceModel
@@ -26,7 +24,34 @@ POINTS = 21  # of MV and CV each, at which the roots are looked for
 ERRORS = np.geomspace(1e-4, 1.0, 41)  # of the CV's range
 
 
-class ModelReference(ReferenceLaw):
+class NetworkLaw(ReferenceLaw):
+    """A law whose MV a network gives that is trained through the plant's state-space network."""
+
+    Params: ClassVar[type[Any]] = ReferenceParams
+    Network: ClassVar[type[Any]]
+
+    def __init__(
+        self, signals: Signals, model: ReferenceModel, network: Any, trained: Trained, mv_rate: float | None = None
+    ) -> None:
+        super().__init__(signals, model, mv_rate)
+        self.network, self.trained = network, trained
+        self.stage = self.prepared(self.formulas(*network.weights(trained.theta)))
+
+    @abstractmethod
+    def formulas(self, *weights: Any) -> Callable[[Named], Named]:
+        """The stage's formulas up to the hidden units; keeps what follows them in buffers."""
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
+        """The law trained through part ``state_space``; raises LawError without it."""
+
+        def network(sign: float) -> Any:
+            return cls.Network(signals, params.order, sign, params.training.hidden)
+
+        return cls(signals, *trained_policy(network, params, models, signals, cls.name), params.mv_rate)
+
+
+class ModelReference(NetworkLaw):
     """u = u_applied + (c0 + c1 u_applied) [g(z, E) - g(z, 0)], limited; ``IncrementalNetwork`` has g, z and E.
 
     The errors E vanish where the loop rests on the reference model, and so does the move: there is no
@@ -41,46 +66,23 @@ class ModelReference(ReferenceLaw):
     title: ClassVar[str] = "Model-reference network"
     incremental: ClassVar[bool] = True
 
-    @dataclass(frozen=True, slots=True, kw_only=True)
-    class Params(ReferenceParams):
-        """The reference model, and in ``training`` how the network is trained to follow it."""
-
-        training: Training = field(default_factory=Training)
-
+    Network: ClassVar[type[Any]] = IncrementalNetwork
     readout: Tensor  # (2 hidden, 1)
 
-    def __init__(
-        self,
-        signals: Signals,
-        model: ReferenceModel,
-        network: IncrementalNetwork,
-        trained: Trained,
-        mv_rate: float | None = None,
-    ) -> None:
-        super().__init__(signals, model, mv_rate)
-        self.network, self.trained = network, trained
-        table, bias, out = (torch.from_numpy(a) for a in network.weights(trained.theta))
-
-        def formulas(p: Named) -> Named:
-            f = network.features(p)
-            still = f[..., :2] @ table[:2] + bias
-            return {"units": torch.cat([still + f[..., 2:] @ table[2:], still], dim=-1), "reach": network.reach(p)}
-
-        self.stage = self.prepared(formulas)
+    def formulas(self, *weights: Array) -> Callable[[Named], Named]:
+        """As in NetworkLaw; the units are those of g(z, E), then those of g(z, 0)."""
+        table, bias, out = (torch.from_numpy(a) for a in weights)
         self.register_buffer("readout", torch.cat([out, -out])[:, None].contiguous())
 
-    @classmethod
-    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        """The law trained through part ``state_space``; raises LawError without it."""
-        require_single_loop(signals, cls.name)
-        network = require_kind(models, StateSpace, cls.name)
-        reference = params.model(cls.name)
-        policy = IncrementalNetwork(signals, params.order, gain_sign(network, signals), params.training.hidden)
-        return cls(signals, reference, policy, train(policy, network, reference, params.training), params.mv_rate)
+        def formulas(p: Named) -> Named:
+            f = self.network.features(p)
+            still = f[..., :2] @ table[:2] + bias
+            units = torch.cat([still + f[..., 2:] @ table[2:], still], dim=-1)
+            return {"units": units, "reach": self.network.reach(p)}
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        return formulas
+
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         x = self.recalled(sp, pv, mv_applied, state)
         done = self.stage(x)
@@ -91,17 +93,22 @@ class ModelReference(ReferenceLaw):
         """How the training went, and whether the move has another root than zero error anywhere in the law's domain."""
         gains = self.resting_gains()
         wrong = int(np.sum(gains * self.network.sign <= 0))
-        told = story(self.trained, self.signals)
+        training = training_analysis(self.trained, self.signals)
         low, high = np.sort(np.abs([gains.min(), gains.max()]))
-        figures = {**told.figures, "other_roots": float(wrong), "least_gain": float(low), "largest_gain": float(high)}
-        said = (
-            f"At rest the move has no root but zero error: over {gains.size:,} points (MV and CV over their ranges, "
-            f"errors of {ERRORS[0]:g} to {ERRORS[-1]:g} of the CV's range, either sign) it is {low:.3g} to "
-            f"{high:.3g} MV units a CV unit of error, always of the sign that closes it."
+        figures = {
+            **training.figures,
+            "other_roots": float(wrong),
+            "least_gain": float(low),
+            "largest_gain": float(high),
+        }
+        note = (
+            f"In steady state only zero error gives zero move. On {gains.size:,} points (MV and CV in their ranges, "
+            f"errors of {ERRORS[0]:g} to {ERRORS[-1]:g} of the CV's range, both signs) the move is {low:.3g} to "
+            f"{high:.3g} MV units per CV unit of error and always reduces the error."
             if not wrong
-            else f"At rest the move has the wrong sign at {wrong} of {gains.size:,} points."
+            else f"In steady state the move has the wrong sign at {wrong} of {gains.size:,} points."
         )
-        return Analysis(figures, {**told.arrays, "gains": gains}, (*told.notes, said))
+        return Analysis(figures, {**training.arrays, "gains": gains}, (*training.notes, note))
 
     def resting_gains(self) -> Array:
         """Move over error [mv/pv] with a constant error, (u, y, e): where it is zero the loop could rest with it."""
@@ -114,8 +121,50 @@ class ModelReference(ReferenceLaw):
             indexing="ij",
         )
         u, y, e = (a.ravel() for a in grid)
-        seen = np.zeros((u.size, 4 + self.model.order))
-        seen[:, R] = seen[:, COURSE] = y + e
-        seen[:, Y], seen[:, U], seen[:, BEFORE] = y, u, e
-        found: Array = ((self.network.act(self.trained.theta, seen).mv - u) / e).reshape(grid[0].shape)
-        return found
+        inputs = np.zeros((u.size, 4 + self.model.order))
+        inputs[:, R] = inputs[:, COURSE] = y + e
+        inputs[:, Y], inputs[:, U], inputs[:, BEFORE] = y, u, e
+        gains: Array = ((self.network.act(self.trained.theta, inputs).mv - u) / e).reshape(grid[0].shape)
+        return gains
+
+
+class ModelReferenceTwoError(NetworkLaw):
+    """u = N(y_m - y, r - y), limited: the controller network of the paper, whose only inputs are two errors.
+
+    A loop without offset has both errors zero, and then one MV, N(0, 0), for every set point: but each set
+    point needs another. So it rests with an offset at all set points except one, however it is trained.
+
+    Source: [reference_ann, section "ANN Controller Design" and figure 4].
+    """
+
+    name: ClassVar[str] = "model_reference_two_error"
+    title: ClassVar[str] = "Model-reference network, two errors"
+    Network: ClassVar[type[Any]] = TwoErrorNetwork
+    readout: Tensor  # (hidden, 1) [mv]
+    level: Tensor  # (1,) [mv]
+
+    def formulas(self, *weights: Any) -> Callable[[Named], Named]:
+        """As in NetworkLaw."""
+        table, bias, out = (torch.from_numpy(a) for a in weights[:3])
+        span = self.high - self.low
+        self.register_buffer("readout", out[:, None] * span)
+        self.register_buffer("level", self.low + span * weights[3])
+        return lambda p: {"units": self.network.features(p) @ table + bias}
+
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
+        """One step; shapes as in ControlLaw."""
+        x = self.recalled(sp, pv, mv_applied, state)
+        done = self.stage(x)
+        mv = torch.tanh(done["units"]) @ self.readout + self.level
+        return self.stepped(x, done, self.limited(mv, mv_applied))
+
+    def analysis(self, plant: Simulator | None) -> Analysis:
+        """How the training went, and the one set point that the law can hold without offset."""
+        training = training_analysis(self.trained, self.signals)
+        units = self.stage(torch.zeros(sum(self.layout.values()), dtype=torch.float64))["units"]
+        at_rest = float(self.level + torch.tanh(units) @ self.readout)
+        note = (
+            f"With both errors at zero the MV is {at_rest:.4g} {self.signals.mv[0].unit}, whatever the set point. The "
+            "loop has an offset wherever the steady MV differs."
+        )
+        return Analysis({**training.figures, "mv_at_zero_errors": at_rest}, training.arrays, (*training.notes, note))

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
 
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, require_kind, require_single_loop
+from pipeline.laws.base import Analysis, Stepped, require_single_loop
 from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
-from pipeline.laws.reference.reference_loops import Training
 from pipeline.laws.reference.reference_networks import TrainablePi
-from pipeline.laws.reference.reference_training import Trained, gain_sign, story, train
+from pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
 from pipeline.models.base import Model
 from pipeline.models.memory import Named
-from pipeline.models.state_space.state_space import StateSpace
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.tuning.reference_model import ReferenceModel
@@ -35,12 +33,11 @@ class PiReference(ReferenceLaw):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):
-        """The reference model; ``tuning`` trained as ``training`` says, or manual with ``kc`` [mv/pv] and ``ti_s``."""
+        """``tuning``: trained as ``training`` says, or manual with ``kc`` [mv/pv] and ``ti_s`` [s]."""
 
         tuning: Literal["trained", "manual"] = "trained"
         kc: float | None = None
         ti_s: float | None = None
-        training: Training = field(default_factory=Training)
 
     def __init__(
         self,
@@ -67,19 +64,18 @@ class PiReference(ReferenceLaw):
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with the numbers of ``params``, or trained through part ``state_space``; raises LawError."""
         require_single_loop(signals, cls.name)
-        reference = params.model(cls.name)
         if params.tuning == "manual":
             if params.kc is None or params.ti_s is None:
                 raise LawError(f"law {cls.name!r} with tuning `manual` needs kc and ti_s; give both or take trained")
-            return cls(signals, reference, params.kc, params.ti_s, mv_rate=params.mv_rate)
-        network = require_kind(models, StateSpace, cls.name)
-        policy = TrainablePi(signals, params.order, gain_sign(network, signals))
-        trained = train(policy, network, reference, params.training)
+            return cls(signals, params.model(cls.name), params.kc, params.ti_s, mv_rate=params.mv_rate)
+
+        def pi(sign: float) -> TrainablePi:
+            return TrainablePi(signals, params.order, sign)
+
+        reference, policy, trained = trained_policy(pi, params, models, signals, cls.name)
         return cls(signals, reference, *policy.settings(trained.theta), trained, params.mv_rate)
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         x = self.recalled(sp, pv, mv_applied, state)
         done = self.stage(x)
@@ -90,5 +86,5 @@ class PiReference(ReferenceLaw):
         own = {"kc": self.kc, "ti_s": self.ti_s}
         if self.trained is None:
             return Analysis(own)
-        told = story(self.trained, self.signals)
-        return Analysis({**told.figures, **own}, told.arrays, told.notes)
+        training = training_analysis(self.trained, self.signals)
+        return Analysis({**training.figures, **own}, training.arrays, training.notes)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, require_single_loop
+from pipeline.laws.base import ControlLaw, Stepped, require_single_loop
+from pipeline.laws.reference.reference_loops import Training
 from pipeline.models.memory import Named, Stage
 from pipeline.plants.signals import Signals
 from pipeline.tuning.reference_model import ReferenceModel
@@ -20,7 +20,7 @@ FOLLOWED = 0.01  # of the MV's range: an applied MV this close to the last reque
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReferenceParams:
-    """Which reference model to follow.
+    """The reference model, and in ``training`` how a controller is trained to follow it.
 
     ``order`` n of the ITAE-optimal model, 1..6, and ``wn`` its natural frequency [rad/s]; ``mv_rate`` [mv]
     the largest change a sample, None unlimited.
@@ -28,6 +28,7 @@ class ReferenceParams:
 
     order: int = 2
     wn: float
+    training: Training = field(default_factory=Training)
     mv_rate: float | None = None
 
     def model(self, law: str) -> ReferenceModel:
@@ -45,10 +46,9 @@ class ReferenceLaw(ControlLaw):
     rest at the measured CV: without a past, and whenever the applied MV is not the one that was asked for
     (manual, another controller). So a transfer to automatic begins a new course from where the plant is.
 
-    A law gives ``formulas``, affine in the sample and the past, and computes its MV of their values in ``moved``.
+    A law gives ``formulas``, affine in the sample and the past, to ``prepared`` and computes its MV of their values.
     """
 
-    info_names: ClassVar[tuple[str, ...]] = ("reference",)
     followed: Tensor  # (1,) [mv]
 
     def __init__(self, signals: Signals, model: ReferenceModel, mv_rate: float | None = None) -> None:
@@ -58,14 +58,14 @@ class ReferenceLaw(ControlLaw):
         self.layout = {"r": 1, "y": 1, "u": 1, "course": model.order, "before": 1, "asked": 1}
         self.register_buffer("followed", FOLLOWED * (self.high - self.low))
         self.n_state = 3 + model.order
-        self.info = self.info_names
+        self.info = ("reference",)
 
     def prepared(self, formulas: Callable[[Named], Named]) -> Stage:
         """The stage of the law's own formulas, the next state of the reference model, and e(k).
 
         ``formulas`` takes r, y, u, course (n), before: all (..., 1) but the course.
         """
-        phi, gamma, _ = self.model.sampled(self.signals.period_s)
+        phi, gamma = self.model.sampled(self.signals.period_s)
         forward, pushed = torch.from_numpy(phi.T.copy()), torch.from_numpy(gamma.T.copy())
         return Stage(
             self.layout,
@@ -84,7 +84,7 @@ class ReferenceLaw(ControlLaw):
         known = state[..., :1] - (mv_applied - state[..., -1:]).abs() / self.followed
         return torch.cat([sp, y, mv_applied, torch.where(known > 0, state[..., 1:], at_rest)], dim=-1)
 
-    def stepped(self, x: Tensor, done: Named, mv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def stepped(self, x: Tensor, done: Named, mv: Tensor) -> Stepped:
         """What ``forward`` returns, from ``recalled``'s vector, the stage's results and the MV."""
         state = torch.cat([torch.ones_like(mv), done["next"], done["error"], mv], dim=-1)
         return mv, state, x[..., 3:4]

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import LawError
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.models.static.mlp import scaled_layers
 from pipeline.plants.signals import Signals
-
-Array = NDArray[np.float64]
+from pipeline.plants.simulator import Array
 
 LONGEST, AT_REST = 20_000, 1e-10  # periods until a free run rests, and the relative change of a period that is rest
 CURVE = 200  # steady states, between which are drawn

@@ -1,28 +1,25 @@
-"""Controllers that can be trained through time: their MV, and its derivatives by weights and by what they see.
+"""Controllers that can be trained through time: their MV, and its derivatives by weights and by inputs.
 
 Each is written twice, as a training needs it (batches, derivatives) and as a law's stage needs it (affine
-formulas); a test holds the two to each other. What they see at sample k, in columns: r, y, u(k-1), e(k-1),
+formulas); a test holds the two to each other. Its inputs at sample k, in columns, are r, y, u(k-1), e(k-1),
 and the reference model's state x_m (n), with e = y_m - y.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pipeline.models.memory import Named, Stage
 from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
 
-Array = NDArray[np.float64]
-
-R, Y, U, BEFORE, COURSE = 0, 1, 2, 3, 4  # columns of what is seen
+R, Y, U, BEFORE, COURSE = 0, 1, 2, 3, 4  # columns of the inputs
 RANGE = 20.0  # of an exponent: beyond it a weight is nothing, or far too large
 NEAR, STEP, SPEED = 0.07, 0.3, 0.15  # of the CV's range: usual e, r - y_m and x_m,i, i >= 2
 REACH = (0.15, 0.35)  # of the MV's range: a move's scale at its low end, and what is added up to its high end
@@ -56,8 +53,8 @@ class Trainable(ABC):
         """Weights to start from."""
 
     @abstractmethod
-    def act(self, theta: Array, seen: Array) -> Action:
-        """The action at ``seen`` (B, 4 + order)."""
+    def act(self, theta: Array, inputs: Array) -> Action:
+        """The action at ``inputs`` (B, 4 + order)."""
 
     @property
     def _mv(self) -> tuple[float, float]:
@@ -69,40 +66,46 @@ class Trainable(ABC):
         signal = self.signals.sp[0]
         return (signal.low + signal.high) / 2, signal.high - signal.low
 
-    def _affine(self, formula: Callable[[Named], torch.Tensor]) -> tuple[Array, Array]:
-        """(matrix (4 + order, k), offset (k,)) of a formula of r, y, u, before, course."""
+
+@dataclass(frozen=True)
+class Network(Trainable):
+    """A controller that scales its inputs to features, and has ``hidden`` units."""
+
+    hidden: int
+
+    @abstractmethod
+    def features(self, p: Named) -> torch.Tensor:
+        """The features (..., k), affine in r, y, u, before and course."""
+
+    @cached_property
+    def _scaling(self) -> tuple[Array, Array]:
+        """(matrix (4 + order, k), offset (k,)) from the inputs to the features."""
         layout = {"r": 1, "y": 1, "u": 1, "before": 1, "course": self.order}
-        stage = Stage(layout, lambda p: {"all": formula(p)})
+        stage = Stage(layout, lambda p: {"all": self.features(p)})
         return stage.matrix.numpy(), stage.offset.numpy()
 
 
 @dataclass(frozen=True)
-class IncrementalNetwork(Trainable):
+class IncrementalNetwork(Network):
     """Adds to the MV a move that is zero where all errors are.
 
         u = u(k-1) + (c0 + c1 u(k-1)) [g(z, E) - g(z, 0)],   g(z, E) = sum_j w_j tanh(z Wz_j + E We_j + b_j)
 
-    In scaled units, with z = [u(k-1), y], E = [e, e - e(k-1), r - y_m, x_m,2 .. x_m,n], and ``hidden``
+    In scaled units, with z = [u(k-1), y], E = [e, e - e(k-1), r - y_m, x_m,2 .. x_m,n], and the hidden
     units j. Where all errors are zero the move is zero, whatever the weights. At rest E = [e, 0, .., 0], and
     w_j = exp(.) > 0 with the weights of e = sign exp(.): the move then has the sign of sign e and no other
     root. What is trained are the exponents.
     """
 
-    hidden: int
-
     @property
     def size(self) -> int:
         """P."""
-        return self.hidden * (2 + self._errors + 2)
-
-    @property
-    def _errors(self) -> int:
-        return 2 + self.order
+        return self.hidden * (self.order + 6)
 
     def drawn(self, rng: np.random.Generator) -> Array:
         """Weights of about a slow PI controller: any loop is stable with it, and so is the first free run."""
         h = self.hidden
-        by_state, by_other = rng.uniform(-0.3, 0.3, (2, h)), rng.uniform(-0.03, 0.03, (self._errors - 2, h))
+        by_state, by_other = rng.uniform(-0.3, 0.3, (2, h)), rng.uniform(-0.03, 0.03, (self.order, h))
         by_error = np.log(0.03) + rng.uniform(-0.5, 0.5, (1, h))
         by_change = self.sign * 0.15 + rng.uniform(-0.05, 0.05, (1, h))
         bias, out = rng.uniform(-0.5, 0.5, h), np.log(2.4 / h) + rng.uniform(-0.3, 0.3, h)
@@ -136,45 +139,39 @@ class IncrementalNetwork(Trainable):
         low, span = self._mv
         return REACH[0] * span + REACH[1] * (p["u"] - low)
 
-    def act(self, theta: Array, seen: Array) -> Action:
+    def act(self, theta: Array, inputs: Array) -> Action:
         """The MV before its limits."""
         table, bias, out = self.weights(theta)
         matrix, offset = self._scaling
-        f = seen @ matrix + offset
+        f = inputs @ matrix + offset
         z, errors = f[:, :2], f[:, 2:]
         still = z @ table[:2] + bias
         h0, h1 = np.tanh(still), np.tanh(still + errors @ table[2:])
         move = (h1 - h0) @ out
         low, span = self._mv
-        reach = REACH[0] * span + REACH[1] * (seen[:, U] - low)
+        reach = REACH[0] * span + REACH[1] * (inputs[:, U] - low)
         slope = (1 - h1 * h1) * out
         both = slope - (1 - h0 * h0) * out
         by_table = np.concatenate([z[:, :, None] * both[:, None, :], errors[:, :, None] * slope[:, None, :]], axis=1)
         by_table[:, 2] *= table[2]
-        by_theta = np.concatenate([by_table.reshape(len(seen), -1), both, (h1 - h0) * out], axis=1)
-        by_seen = np.concatenate([both @ table[:2].T, slope @ table[2:].T], axis=1) @ matrix.T * reach[:, None]
+        by_theta = np.concatenate([by_table.reshape(len(inputs), -1), both, (h1 - h0) * out], axis=1)
+        by_input = np.concatenate([both @ table[:2].T, slope @ table[2:].T], axis=1) @ matrix.T * reach[:, None]
         return Action(
-            seen[:, U] + reach * move,
+            inputs[:, U] + reach * move,
             by_theta * reach[:, None],
-            by_seen[:, Y],
-            1 + REACH[1] * move + by_seen[:, U],
-            by_seen[:, BEFORE],
+            by_input[:, Y],
+            1 + REACH[1] * move + by_input[:, U],
+            by_input[:, BEFORE],
         )
-
-    @cached_property
-    def _scaling(self) -> tuple[Array, Array]:
-        return self._affine(self.features)
 
 
 @dataclass(frozen=True)
-class TwoErrorNetwork(Trainable):
+class TwoErrorNetwork(Network):
     """Two errors and no memory, as printed: u = sum_j w_j tanh(e W1_j + (r - y) W2_j + b_j) + d in scaled units.
 
     Where it is at rest both errors are constant; a set point that is held without offset makes both zero,
     and then there is one MV for all set points. So it cannot be free of offset at more than one.
     """
-
-    hidden: int
 
     @property
     def size(self) -> int:
@@ -198,23 +195,19 @@ class TwoErrorNetwork(Trainable):
         span = self._cv[1]
         return torch.cat([p["course"][..., :1] - p["y"], p["r"] - p["y"]], dim=-1) / (NEAR * span)
 
-    def act(self, theta: Array, seen: Array) -> Action:
+    def act(self, theta: Array, inputs: Array) -> Action:
         """The MV before its limits."""
         table, bias, out, level = self.weights(theta)
         matrix, offset = self._scaling
         low, span = self._mv
-        f = seen @ matrix + offset
+        f = inputs @ matrix + offset
         h = np.tanh(f @ table + bias)
         slope = (1 - h * h) * out
-        by_table = (f[:, :, None] * slope[:, None, :]).reshape(len(seen), -1)
-        by_theta = np.concatenate([by_table, slope, h, np.ones((len(seen), 1))], axis=1)
-        by_seen = slope @ table.T @ matrix.T * span
+        by_table = (f[:, :, None] * slope[:, None, :]).reshape(len(inputs), -1)
+        by_theta = np.concatenate([by_table, slope, h, np.ones((len(inputs), 1))], axis=1)
+        by_input = slope @ table.T @ matrix.T * span
         mv = low + span * (h @ out + level)
-        return Action(mv, span * by_theta, by_seen[:, Y], by_seen[:, U], by_seen[:, BEFORE])
-
-    @cached_property
-    def _scaling(self) -> tuple[Array, Array]:
-        return self._affine(self.features)
+        return Action(mv, span * by_theta, by_input[:, Y], by_input[:, U], by_input[:, BEFORE])
 
 
 @dataclass(frozen=True)
@@ -236,12 +229,12 @@ class TrainablePi(Trainable):
         kc, share = np.exp(np.clip(theta, -RANGE, RANGE))
         return self.sign * float(kc), self.signals.period_s / float(share)
 
-    def act(self, theta: Array, seen: Array) -> Action:
+    def act(self, theta: Array, inputs: Array) -> Action:
         """The MV before its limits."""
         kc, ti = self.settings(theta)
         share = self.signals.period_s / ti
-        e = seen[:, COURSE] - seen[:, Y]
-        move = kc * (e - seen[:, BEFORE] + share * e)
+        e = inputs[:, COURSE] - inputs[:, Y]
+        move = kc * (e - inputs[:, BEFORE] + share * e)
         by_theta = np.stack([move, kc * share * e], axis=1)
-        ones = np.ones(len(seen))
-        return Action(seen[:, U] + move, by_theta, -kc * (1 + share) * ones, ones, -kc * ones)
+        ones = np.ones(len(inputs))
+        return Action(inputs[:, U] + move, by_theta, -kc * (1 + share) * ones, ones, -kc * ones)

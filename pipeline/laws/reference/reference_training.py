@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pipeline.errors import LawError
-from pipeline.laws.base import Analysis
+from pipeline.laws.base import Analysis, require_kind, require_single_loop
+from pipeline.laws.reference.reference_law import ReferenceParams
 from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
 from pipeline.laws.reference.reference_networks import Trainable
+from pipeline.models.base import Model
 from pipeline.models.state_space.state_space import StateSpace
 from pipeline.models.training.jacobian import input_jacobian
 from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
 from pipeline.tuning.reference_model import ReferenceModel
 
-Array = NDArray[np.float64]
+P = TypeVar("P", bound=Trainable)
 
 DAMPINGS = 8  # tries an iteration
 
@@ -64,7 +67,7 @@ def follow(
     signals = policy.signals
     mv, cv = signals.mv[0], signals.sp[0]
     weight = move_weight * (cv.high - cv.low) / (mv.high - mv.low)
-    phi, gamma, _ = model.sampled(signals.period_s)
+    phi, gamma = model.sampled(signals.period_s)
     n, lanes = loops.sp.shape
     x, u, before = loops.x0.copy(), loops.u0.copy(), np.zeros(lanes)
     course = np.zeros((lanes, model.order))
@@ -77,8 +80,7 @@ def follow(
         distance = course[:, 0] - x[:, 0]
         tracking += float(distance @ distance)
         y = x[:, 0] + loops.noise[k]
-        seen = np.column_stack([loops.sp[k], y, u[:, 0], before, course])
-        action = policy.act(theta, seen)
+        action = policy.act(theta, np.column_stack([loops.sp[k], y, u[:, 0], before, course]))
         before = course[:, 0] - y
         given = np.clip(action.mv, mv.low, mv.high)[:, None]
         change = weight * (given - u)[:, 0]
@@ -106,6 +108,19 @@ def follow(
     return Sums((tracking + moves) / count, tracking / count, square, slope)
 
 
+def trained_policy(
+    make: Callable[[float], P], params: ReferenceParams, models: Mapping[str, Model], signals: Signals, law: str
+) -> tuple[ReferenceModel, P, Trained]:
+    """The reference model, the controller that ``make`` gives for the sign of the plant's gain, and its weights.
+
+    It is trained through part ``state_space``. Raises LawError without that part, and as ``train`` does.
+    """
+    require_single_loop(signals, law)
+    plant, reference = require_kind(models, StateSpace, law), params.model(law)
+    policy = make(gain_sign(plant, signals))
+    return reference, policy, train(policy, plant, reference, params.training)
+
+
 def train(policy: Trainable, model: StateSpace, reference: ReferenceModel, options: Training) -> Trained:
     """Levenberg-Marquardt on the loops of ``options``, stopped early by its validation loops; the best restart.
 
@@ -113,12 +128,12 @@ def train(policy: Trainable, model: StateSpace, reference: ReferenceModel, optio
     """
     plant = PlantNetwork(model)
     held = [Loops.drawn(plant, policy.signals, options, np.random.default_rng([options.seed, i])) for i in range(2)]
-    found = []
+    restarts = []
     for restart in range(options.restarts):
         start = policy.drawn(np.random.default_rng([options.seed, 2 + restart]))
         with np.errstate(all="ignore"):
-            found.append(_descend(policy, start, plant, reference, held, options))
-    best = min(found, key=lambda t: t.history[t.best, 1])
+            restarts.append(_descend(policy, start, plant, reference, held, options))
+    best = min(restarts, key=lambda t: t.history[t.best, 1])
     if not np.isfinite(best.history[best.best, 1]):
         raise LawError("the training found no loop with finite states; check the plant's network, or its range")
     return best
@@ -136,15 +151,15 @@ def _descend(
     pull = (options.decay * (cv.high - cv.low)) ** 2
 
     def sums(at: Array, which: int) -> Sums:
-        found = follow(policy, at, plant, reference, held[which], options.move_weight, derivatives=which == 0)
+        of_loops = follow(policy, at, plant, reference, held[which], options.move_weight, derivatives=which == 0)
         if which:
-            return found
+            return of_loops
         # Weights stay near those of a slow controller where the loops do not ask for others.
         count, moved = held[which].sp.size, at - start
-        return found._replace(
-            cost=found.cost + pull * float(moved @ moved),
-            square=found.square + count * pull * np.eye(policy.size),
-            slope=found.slope - count * pull * moved,
+        return of_loops._replace(
+            cost=of_loops.cost + pull * float(moved @ moved),
+            square=of_loops.square + count * pull * np.eye(policy.size),
+            slope=of_loops.slope - count * pull * moved,
         )
 
     now, judged = sums(theta, 0), sums(theta, 1)
@@ -181,14 +196,14 @@ def gain_sign(model: StateSpace, signals: Signals) -> float:
     return 1.0 if slope > 0 else -1.0
 
 
-def story(trained: Trained, signals: Signals) -> Analysis:
+def training_analysis(trained: Trained, signals: Signals) -> Analysis:
     """How a training went, for people and pictures."""
     training, validation = trained.history[trained.best]
     unit = signals.sp[0].unit
     figures = {"training_rms": training, "validation_rms": validation, "iterations": float(len(trained.history) - 1)}
-    said = (
-        f"Trained through the plant's network in {len(trained.history) - 1} iterations, the best of them number "
-        f"{trained.best}: {training:.3g} {unit} RMS from the reference model on the training loops, {validation:.3g} "
-        "on the validation loops; both have noise and loads."
+    note = (
+        f"The law is trained through the plant's network: {len(trained.history) - 1} iterations, the best is number "
+        f"{trained.best}. The RMS distance from the reference model is {training:.3g} {unit} on the training loops "
+        f"and {validation:.3g} {unit} on the validation loops. Both have noise and loads."
     )
-    return Analysis(figures, {"history": trained.history, "best": np.array([float(trained.best)])}, (said,))
+    return Analysis(figures, {"history": trained.history, "best": np.array([float(trained.best)])}, (note,))

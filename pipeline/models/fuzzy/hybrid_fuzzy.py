@@ -37,28 +37,17 @@ class HybridFuzzy(Model):
     The jacket's temperature is affine in k_M in every mode, which is what an inverse needs:
     ``jacket`` gives both modes' lines, ``core_next`` the core, ``forward`` one whole step.
 
-    Parameters
-    ----------
-    centres
-        Jacket temperatures of the rules, ascending, at least two [degC], shape (K,).
-    consequents
-        Theta_w of every mode, shape (n_modes, 4, K); rows a1 [-], a2 [-], b [degC], r [degC]; the first
-        mode has the value 1, the next 2, ...
-    core
-        (c_w, c_t), the weights of T_w and of T in the next core temperature [-].
+    ``consequents`` hold Theta_w of every mode, the first of which has the value 1, the next 2, ...
 
-    Raises
-    ------
-    ModelError
-        Shapes that do not fit, centres that do not ascend, a number that is not finite.
+    Raises ModelError for shapes that do not fit, centres that do not ascend, a number that is not finite.
 
     Source: [karer, eqs. 24-31].
     """
 
     kind: ClassVar[str] = "hybrid_fuzzy"
-    centres: Tensor  # (K,)
-    consequents: Tensor  # (n_modes, 4, K)
-    core: Tensor  # (2,) c_w, c_t
+    centres: Tensor  # (K,) [degC] jacket temperatures of the rules, ascending, at least two
+    consequents: Tensor  # (n_modes, 4, K) rows a1 [-], a2 [-], b [degC], r [degC]
+    core: Tensor  # (2,) [-] c_w, c_t
     low: Tensor  # (K-1,) where each straight piece begins
     width: Tensor  # (K-1,)
     first: Tensor  # (4 n_modes,) coefficients at the lowest centre: a1 of all modes, a2 of all modes, b, r
@@ -99,12 +88,6 @@ class HybridFuzzy(Model):
         """JSON-ready arguments of the constructor."""
         return {k: getattr(self, k).tolist() for k in ("centres", "consequents", "core")}
 
-    def memberships(self, t_w: Tensor) -> Tensor:
-        """Degrees of fulfilment beta, shape (..., K), of jacket temperatures (..., 1); they sum to 1."""
-        into = self._into(t_w)
-        one = torch.ones_like(t_w)
-        return torch.cat([one, into], dim=-1) - torch.cat([into, torch.zeros_like(t_w)], dim=-1)
-
     def core_next(self, t: Tensor, t_w: Tensor) -> Tensor:
         """T(k+1), shape (..., 1), from T(k) and T_w(k), each (..., 1) [degC]; the MVs do not act on it yet."""
         return self.core[:1] * t_w + self.core[1:] * t
@@ -123,15 +106,6 @@ class HybridFuzzy(Model):
         chosen = (1 - (mode - self.mode_values).abs()).clamp(min=0)
         t_w_next = (chosen * (line.base + line.gain * k_m)).sum(dim=-1, keepdim=True)
         return torch.cat([self.core_next(t, t_w), t_w_next], dim=-1)
-
-    def simulate(self, x0: Tensor, mv: Tensor) -> Tensor:
-        """Free run: [T, T_w], shape (..., n, 2), after each of the moves [k_M, mode] (..., n, 2) from x0 (..., 2)."""
-        states = []
-        x = x0
-        for move in mv.unbind(dim=-2):
-            x = self(torch.cat([x, move], dim=-1))
-            states.append(x)
-        return torch.stack(states, dim=-2)
 
     def _into(self, t_w: Tensor) -> Tensor:
         """How far T_w has come through each piece between two centres, 0 to 1, shape (..., K-1)."""

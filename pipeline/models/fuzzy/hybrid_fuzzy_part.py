@@ -8,13 +8,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 
-from pipeline.errors import ModelError
 from pipeline.metrics import r2, rmse
-from pipeline.models.base import Model
+from pipeline.models.base import Model, simulate
 from pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
 from pipeline.models.fuzzy.hybrid_fuzzy_identification import MODES, Transitions, identify
-from pipeline.models.part import Learnt, Part, Regions, predict
-from pipeline.models.training.time_split import split_in_time
+from pipeline.models.part import Learnt, Part, Source, predict
+from pipeline.models.training.regressors import split_in_time
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.records.record import Record
@@ -42,28 +41,20 @@ class HybridFuzzyPart(Part):
         if self.free_run < 1:
             raise ValueError(f"free_run is {self.free_run}; it must be at least 1")
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """The model; its figures are over the last part of the record, which no identification saw."""
-        if record is None:
-            raise ModelError("a hybrid fuzzy model learns from a record; point `data:` of its set at one")
-        train, _ = split_in_time(record, self.train_fraction)
+        train, _ = split_in_time(source.data(self.model.kind), self.train_fraction)
         model = identify(Transitions.of(train), self.centres, self.identification)
-        return Learnt(model, figures(model, signals, plant, record, self.train_fraction, self.free_run))
+        return Learnt(model, figures(model, source, self.train_fraction, self.free_run))
 
 
-def figures(
-    model: HybridFuzzy, signals: Signals, plant: Simulator | None, record: Record, train_fraction: float, free_run: int
-) -> dict[str, Any]:
-    """What is reported of a model: errors over the record's last part, gap and coefficients."""
-    train, validation = split_in_time(record, train_fraction)
-    return {
-        **_scored(model, validation, free_run),
-        "n_train": len(Transitions.of(train).row),
-        **gap(model, signals),
-        **coefficients(model, plant),
-    }
+def figures(model: HybridFuzzy, source: Source, train_fraction: float, free_run: int) -> dict[str, Any]:
+    """What is reported of a model: gap and coefficients, and with a record the errors over its last part."""
+    own = {**gap(model, source.signals), **coefficients(model, source.plant)}
+    if source.record is None:
+        return own
+    train, validation = split_in_time(source.record, train_fraction)
+    return {**_scored(model, validation, free_run), "n_train": len(Transitions.of(train).row), **own}
 
 
 def _scored(model: HybridFuzzy, validation: Record, free_run: int) -> dict[str, float]:
@@ -90,7 +81,7 @@ def _free(model: HybridFuzzy, record: Record, samples: int) -> tuple[Array, Arra
             first.append(int(start))
     window = np.array(first)[:, None] + np.arange(samples)
     with torch.no_grad():
-        run = model.simulate(torch.from_numpy(record.pv[window[:, 0]]), torch.from_numpy(record.mv[window]))
+        run = simulate(model, torch.from_numpy(record.pv[window[:, 0]]), torch.from_numpy(record.mv[window]))
     return run.numpy(), record.pv[window + 1]
 
 

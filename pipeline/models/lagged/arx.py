@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from pipeline.config.params import choose
 from pipeline.errors import ModelError
 from pipeline.metrics import fit_percent, r2, rmse
-from pipeline.models.lagged.lagged import Array, LaggedModel
-from pipeline.models.part import Learnt, Part, Regions, predict
+from pipeline.models.lagged.lagged import LaggedModel, mvs_of
+from pipeline.models.part import Learnt, Part, Source, predict
 from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
+from pipeline.plants.simulator import Array
 
 
 class ARX(LaggedModel):
     """y(t) = c - a_1 y(t-1) - .. - a_ny y(t-n_y) + b_1 u(t-d) + .. + b_nu u(t-d-n_u+1), for each MV u.
 
-    ``forward`` maps phi(t), as in LaggedModel, to y(t) = phi(t)' weight + bias in engineering units.
+    ``forward`` maps phi(t), as in LaggedModel, to y(t) = phi(t)' weight + bias.
 
     Source: [chen2004, eqs. 10-13] (the form of its linearized and its recursive model).
     """
@@ -34,12 +30,7 @@ class ARX(LaggedModel):
 
     def __init__(self, n_y: int, n_u: int, n_mv: int = 1, delay: int = 1) -> None:
         super().__init__(n_y, n_u, n_mv, delay)
-        self.register_buffer("weight", torch.zeros(n_y + n_u * n_mv, dtype=torch.float64))
-        self.register_buffer("bias", torch.zeros(1, dtype=torch.float64))
-
-    def config(self) -> dict[str, Any]:
-        """JSON-ready arguments of the constructor."""
-        return {"n_y": self.n_y, "n_u": self.n_u, "n_mv": self.n_mv, "delay": self.delay}
+        self.reserve(weight=(n_y + n_u * n_mv,), bias=(1,))
 
     @classmethod
     def fit(cls, x: Array, y: Array, *, n_y: int, n_u: int, delay: int = 1) -> Self:
@@ -48,10 +39,7 @@ class ARX(LaggedModel):
         Raises ModelError where the lags do not explain the width, or the data leave a coefficient
         undetermined: fewer rows than coefficients, or columns that depend on each other.
         """
-        n_mv, rest = divmod(x.shape[1] - n_y, n_u)
-        if rest:
-            raise ModelError(f"{x.shape[1]} regressor columns are not n_y + n_u n_mv with n_y={n_y}, n_u={n_u}")
-        model = cls(n_y, n_u, n_mv, delay)
+        arguments = {"n_y": n_y, "n_u": n_u, "n_mv": mvs_of(x, n_y, n_u), "delay": delay}
         middle, scale = x.mean(axis=0), x.std(axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         # Standardized, so that the rank is judged alike for flows of hundreds and for pH.
@@ -63,9 +51,7 @@ class ARX(LaggedModel):
                 "ask for fewer lags or record richer moves"
             )
         weight = solution[:-1] / scale
-        model.weight.copy_(torch.from_numpy(weight))
-        model.bias.fill_(float(solution[-1] - middle @ weight))
-        return model.eval()
+        return cls.from_arrays(arguments, {"weight": weight, "bias": solution[-1:] - middle @ weight})
 
     def forward(self, x: Tensor) -> Tensor:
         """y(t), shape (..., 1), for phi(t), shape (..., n_y + n_u n_mv)."""
@@ -89,25 +75,20 @@ class ArxPart(Part):
     steps: int = 10
     train_fraction: float = 0.7
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """Fit; the figures are of one step and of a free run, over the rows that did not train."""
-        if record is None:
-            raise ModelError("a part of kind 'arx' learns from a record; point `data:` of its set at one")
-        names = {s.name: i for i, s in enumerate(signals.pv)}
-        target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
+        record, target = source.data(self.model.kind), source.pv_index(self.target)
         pairs = nnarx_pairs(record, self.n_y, self.n_u, target, self.delay)
-        train, validation = pairs.split(self.train_fraction, "time", seed)
+        train, validation = pairs.split(self.train_fraction, "time")
         model = ARX.fit(train.x, train.y, n_y=self.n_y, n_u=self.n_u, delay=self.delay)
         predicted = predict(model, validation.x)
-        ahead, measured = model.k_step(record, self.steps, target)
-        late = slice(round(self.train_fraction * len(ahead)), None)
+        cut = model.windows(record, self.steps, target)
+        late = slice(round(self.train_fraction * len(cut)), None)
         metrics = {
             "rmse": rmse(validation.y, predicted),
             "r2": r2(validation.y, predicted),
             "fit_percent": fit_percent(validation.y, predicted),
-            "free_run_rmse": rmse(measured[late], ahead[late]),
+            "free_run_rmse": rmse(cut.future[late, -1], model.free_run(cut)[late, -1]),
             "n_train": len(train),
             "weight": model.weight.tolist(),
             "bias": float(model.bias),

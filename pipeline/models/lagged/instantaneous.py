@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -63,17 +64,8 @@ class AlongMv(nn.Module):
     are affine in phi, so that a law can fold them into its own arithmetic. g is the rest of the
     network. The slope comes forward through the layers along d alone, a fraction of all slopes.
 
-    Parameters
-    ----------
-    model
-        An NNARX of one MV whose newest is u(t-1): delay 1.
-    unit
-        What one unit of ``step`` means [mv]; its sign too.
-
-    Raises
-    ------
-    ModelError
-        Several MVs, or a delay above 1: the newest MV would not act on y(t).
+    ``unit`` is what one unit of ``step`` means [mv]; its sign too. Raises ModelError for a model of several MVs,
+    or of a delay above 1: its newest MV would not act on y(t).
     """
 
     first: Tensor  # (n_phi, H)
@@ -91,21 +83,16 @@ class AlongMv(nn.Module):
                 f"an NNARX of {model.n_mv} MVs and delay {model.delay} has no newest MV that acts on the next sample "
                 "alone; take one MV and delay 1 (more MV lags n_u stand for a dead time)"
             )
-        layers = scaled_layers(model.net)
-        self.depth = len(layers) - 1
-        weight, bias = layers[0]
-        base = torch.zeros(len(weight), 1, dtype=torch.float64)
+        (first, first_bias), *hidden, (out, offset) = scaled_layers(model.net)
+        base = torch.zeros(len(first), 1, dtype=torch.float64)
         for column in model.net.residual:
             base[column] = 1.0
-        self.register_buffer("first", weight)
-        self.register_buffer("first_bias", bias)
-        self.register_buffer("direction", unit * weight[model.n_y])
-        for i in range(1, self.depth):
-            self.register_buffer(f"weight{i}", layers[i][0])
-            self.register_buffer(f"bias{i}", layers[i][1])
-        self.register_buffer("out", layers[-1][0])
-        self.register_buffer("base_slope", base)
-        self.register_buffer("base_offset", layers[-1][1])
+        self.depth = len(hidden)
+        buffers = {"first": first, "first_bias": first_bias, "direction": unit * first[model.n_y]}
+        for i, (weight, bias) in enumerate(hidden, start=1):
+            buffers |= {f"weight{i}": weight, f"bias{i}": bias}
+        for name, value in {**buffers, "out": out, "base_slope": base, "base_offset": offset}.items():
+            self.register_buffer(name, value)
 
     def preactivation(self, phi: Tensor) -> Tensor:
         """The preactivation m, shape (..., H), at phi (..., n_phi)."""
@@ -119,19 +106,22 @@ class AlongMv(nn.Module):
         """The preactivation after a step (..., 1) of the newest MV."""
         return m + step * self.direction
 
+    def _hidden(self) -> Iterator[tuple[Tensor, Tensor]]:
+        """Weight (H, H') and bias (H',) of each hidden layer after the first."""
+        return ((getattr(self, f"weight{i}"), getattr(self, f"bias{i}")) for i in range(1, self.depth + 1))
+
     def rest(self, m: Tensor) -> Tensor:
         """The rest of the network g(m), shape (..., 1)."""
         a = torch.tanh(m)
-        for i in range(1, self.depth):
-            a = torch.tanh(a @ getattr(self, f"weight{i}") + getattr(self, f"bias{i}"))
+        for weight, bias in self._hidden():
+            a = torch.tanh(a @ weight + bias)
         return a @ self.out
 
     def rest_and_slope(self, m: Tensor) -> tuple[Tensor, Tensor]:
         """The rest of the network g(m) and its derivative by the step, (..., 1) each."""
         a = torch.tanh(m)
         tangent = (1 - a * a) * self.direction
-        for i in range(1, self.depth):
-            weight = getattr(self, f"weight{i}")
-            a = torch.tanh(a @ weight + getattr(self, f"bias{i}"))
+        for weight, bias in self._hidden():
+            a = torch.tanh(a @ weight + bias)
             tangent = (1 - a * a) * (tangent @ weight)
         return a @ self.out, tangent @ self.out

@@ -1,21 +1,17 @@
-"""What predictors from lags share: their regressor, and running free."""
+"""What predictors from lags share: their regressor, their training data, and running free."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.errors import ModelError
 from pipeline.models.base import Model
-from pipeline.models.training.objectives import Windows
+from pipeline.models.training.objectives import Windows, free_run
+from pipeline.models.training.regressors import Pairs, nnarx_pairs
+from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
-
-Array = NDArray[np.float64]
 
 
 class LaggedModel(Model):
@@ -24,21 +20,10 @@ class LaggedModel(Model):
         phi(t) = [y(t-1), .., y(t-n_y), u(t-d), .., u(t-d-n_u+1)]
 
     with the lags of the first MV before those of the next, as ``regressors.nnarx_pairs`` gives
-    them. ``forward`` maps phi (..., n_y + n_u n_mv) to y (..., 1).
+    them. ``forward`` maps phi (..., n_y + n_u n_mv) to y (..., 1), in engineering units.
 
-    Parameters
-    ----------
-    n_y, n_u
-        Numbers of past PVs and past MVs.
-    n_mv
-        Number of manipulated variables.
-    delay
-        Periods from a move to its first effect, d >= 1.
-
-    Raises
-    ------
-    ModelError
-        A lag, the delay or ``n_mv`` below 1.
+    ``n_y`` and ``n_u`` are the numbers of past PVs and past MVs, ``n_mv`` that of manipulated variables, ``delay``
+    the periods d from a move to its first effect. Raises ModelError where one of them is below 1.
     """
 
     def __init__(self, n_y: int, n_u: int, n_mv: int = 1, delay: int = 1) -> None:
@@ -48,34 +33,29 @@ class LaggedModel(Model):
             raise ModelError(f"{name} has n_y={n_y}, n_u={n_u}, n_mv={n_mv}, delay={delay}; each must be at least 1")
         self.n_y, self.n_u, self.n_mv, self.delay = n_y, n_u, n_mv, delay
 
-    @abstractmethod
-    def config(self) -> dict[str, Any]:
-        """JSON-ready arguments of the constructor."""
+    def pairs(self, record: Record, target: int = 0) -> Pairs:
+        """Pairs (phi(t), y(t)) of a record, y the PV ``target``; raises RecordError."""
+        return nnarx_pairs(record, self.n_y, self.n_u, target, self.delay)
 
-    @abstractmethod
-    def forward(self, x: Tensor) -> Tensor:
-        """y(t), shape (..., 1), for phi(t), shape (..., n_y + n_u n_mv)."""
+    def windows(self, record: Record, steps: int, target: int = 0, *, every: int = 1, least_back: int = 0) -> Windows:
+        """``Windows.of`` the record for this model's lags; raises RecordError."""
+        return Windows.of(
+            record, self.n_y, self.n_u, steps, target=target, delay=self.delay, every=every, least_back=least_back
+        )
 
     def simulate(self, past: Tensor, u: Tensor) -> Tensor:
-        """Free run: predictions (..., k) fed back in place of measurements.
-
-        ``past`` (..., n_y) holds the last measured PVs, oldest first; ``u`` (..., n_u - 1 + k, n_mv)
-        the MVs that the k predictions use, oldest first: its last row is u(t - d) of the last one.
-        """
-        ys = list(past.unbind(-1))
-        for step in range(u.shape[-2] - self.n_u + 1):
-            recent = u[..., step : step + self.n_u, :].flip(-2).transpose(-1, -2).flatten(-2)
-            phi = torch.cat([torch.stack(ys[-1 : -1 - self.n_y : -1], dim=-1), recent], dim=-1)
-            ys.append(self(phi)[..., 0])
-        return torch.stack(ys[self.n_y :], dim=-1)
-
-    def windows(self, record: Record, steps: int, target: int = 0) -> Windows:
-        """The record cut into windows of ``steps`` samples for this model's lags; raises RecordError."""
-        return Windows.of(record, self.n_y, self.n_u, steps, target=target, delay=self.delay)
+        """Free run (..., k) from measured PVs ``past`` (..., n_y) under MVs ``u`` (..., n_u - 1 + k, n_mv)."""
+        return free_run(self, past, u, self.n_u)
 
     @torch.no_grad()
-    def k_step(self, record: Record, steps: int, target: int = 0) -> tuple[Array, Array]:
-        """(predicted, measured) PV ``steps`` samples ahead over a record, each (N,); raises RecordError."""
-        cut = self.windows(record, steps, target)
-        ahead = self.simulate(torch.from_numpy(cut.past), torch.from_numpy(cut.u))[:, -1]
-        return ahead.numpy(), cut.future[:, -1]
+    def free_run(self, cut: Windows) -> Array:
+        """The free run over windows, shape (N, k)."""
+        return np.asarray(self.simulate(torch.from_numpy(cut.past), torch.from_numpy(cut.u)).numpy())
+
+
+def mvs_of(x: Array, n_y: int, n_u: int) -> int:
+    """Number of MVs in regressors x (N, n_y + n_u n_mv); ModelError where the lags do not explain the width."""
+    n_mv, rest = divmod(x.shape[1] - n_y, n_u)
+    if rest:
+        raise ModelError(f"{x.shape[1]} regressor columns are not n_y + n_u n_mv with n_y={n_y}, n_u={n_u}")
+    return n_mv

@@ -40,18 +40,10 @@ class NextOutput(nn.Module):
     and with ``trust`` below 1 out of the lags, which then hold NN(phi) + trust (y - NN(phi)), an
     observer of the output. The first sample is believed as it is.
 
-    A law gives ``slots`` to its Memory and ``terms`` to its Stage.
+    ``model`` has one MV and delay 1, or ModelError is raised; ``unit`` [mv] is one unit of move, with its sign; alpha
+    and ``trust`` lie in (0, 1]. A law gives ``slots`` to its Memory and ``terms`` to its Stage.
 
     Source: [chen2004, eqs 9 and 18], which linearize at phi(t) and have no filter.
-
-    Parameters
-    ----------
-    model
-        An NNARX of one MV with delay 1; ModelError otherwise.
-    unit
-        One unit of move [mv], with its sign.
-    offset_filter, trust
-        alpha and trust, in (0, 1].
     """
 
     doubt: Tensor  # (1,) 1 - trust

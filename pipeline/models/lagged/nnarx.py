@@ -3,41 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.lagged.lagged import LaggedModel
+from pipeline.models.lagged.lagged import LaggedModel, mvs_of
 from pipeline.models.static.mlp import MLP
-
-Array = NDArray[np.float64]
+from pipeline.plants.simulator import Array
 
 
 class NNARX(LaggedModel):
-    """One-step predictor of one PV from lags, y(t) = NN(phi(t)), phi as in LaggedModel. Training goes through ``net``.
+    """One-step predictor of one PV from lags, y(t) = NN(phi(t)). Training goes through ``net``.
+
+    phi, its lags and the errors are those of LaggedModel. ``hidden`` are the widths of the hidden layers; with
+    ``residual`` the network predicts y(t) - y(t-1).
 
     Source: [chen2004, section on the NNARX model].
-
-    Parameters
-    ----------
-    n_y, n_u
-        Numbers of past PVs and past MVs.
-    n_mv
-        Number of manipulated variables.
-    delay
-        Periods from a move to its first effect, d >= 1.
-    hidden
-        Width of each hidden layer.
-    residual
-        Whether the network predicts y(t) - y(t-1).
-
-    Raises
-    ------
-    ModelError
-        A lag, the delay or ``n_mv`` below 1.
     """
 
     kind: ClassVar[str] = "nnarx"
@@ -52,18 +33,8 @@ class NNARX(LaggedModel):
         residual: bool = False,
     ) -> None:
         super().__init__(n_y, n_u, n_mv, delay)
+        self.hidden, self.residual = tuple(hidden), residual
         self.net = MLP(n_y + n_u * n_mv, 1, hidden, (0,) if residual else ())
-
-    def config(self) -> dict[str, Any]:
-        """JSON-ready arguments of the constructor."""
-        return {
-            "n_y": self.n_y,
-            "n_u": self.n_u,
-            "n_mv": self.n_mv,
-            "delay": self.delay,
-            "hidden": list(self.net.hidden),
-            "residual": bool(self.net.residual),
-        }
 
     @classmethod
     def scaled_to(
@@ -81,11 +52,8 @@ class NNARX(LaggedModel):
 
         Raises ModelError for a column that does not vary, or a width that the lags do not explain.
         """
-        n_mv, rest = divmod(x.shape[1] - n_y, n_u)
-        if rest:
-            raise ModelError(f"{x.shape[1]} regressor columns are not n_y + n_u n_mv with n_y={n_y}, n_u={n_u}")
-        model = cls(n_y, n_u, n_mv, delay, hidden, residual)
-        model.net = MLP.scaled_to(x, y, hidden=hidden, residual=(0,) if residual else ())
+        model = cls(n_y, n_u, mvs_of(x, n_y, n_u), delay, hidden, residual)
+        model.net = MLP.scaled_to(x, y, hidden=hidden, residual=model.net.residual)
         return model
 
     def forward(self, x: Tensor) -> Tensor:

@@ -2,29 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
 
-from pipeline.config.params import choose
 from pipeline.errors import ModelError
-from pipeline.metrics import fit_percent, per_region, r2, rmse
+from pipeline.metrics import fit_percent, rmse
 from pipeline.models.base import Model
-from pipeline.models.lagged.lag_search import SLACK, Candidate, Size, parsimonious
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.lagged.one_step import FORGETTING, compare_one_step
-from pipeline.models.part import Learnt, Part, Regions, predict
-from pipeline.models.training.fit import FitHistory, Trainer
-from pipeline.models.training.long_run import TRAINED, LongRun, curves
-from pipeline.models.training.network_parts import going_on, story, trainer_of
-from pipeline.models.training.objectives import Samples, Windows
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.models.training.time_split import longest_run, split_in_time
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from pipeline.models.part import Learnt, Part, Source, accuracy, predict
+from pipeline.models.training.fit import FitHistory
+from pipeline.models.training.network_parts import LongRun, curves, fit_figures, fit_in_two, trainer_of
+from pipeline.models.training.objectives import Samples
+from pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
 from pipeline.records.record import Record
+
+SLACK = 0.05
+"""Relative free-run error above the best one that a smaller model may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """What a candidate changes of a part: lags and hidden widths; None leaves the part's own."""
+
+    n_y: int | None = None
+    n_u: int | None = None
+    hidden: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One row of the search: the model's size and its validation errors [unit of the PV].
+
+    ``rmse`` is of one step, ``free_run_rmse`` of all steps of free runs over validation data.
+    """
+
+    n_y: int
+    n_u: int
+    hidden: tuple[int, ...]
+    parameters: int
+    rmse: float
+    free_run_rmse: float
+
+
+def parsimonious(candidates: Sequence[Candidate], slack: float = SLACK) -> int:
+    """Index of the one with the fewest parameters among those within ``slack`` of the best free run.
+
+    Differences of a few per cent between free-run errors lie within what another draw of the
+    initial weights changes, and each parameter less is one less to mislead the model's slopes,
+    by which controllers are tuned. Of equal sizes the better free run wins.
+    Raises ModelError without a candidate.
+    """
+    if not candidates:
+        raise ModelError("a search over no candidates: list at least one size, or leave `search` out")
+    limit = (1 + slack) * min(c.free_run_rmse for c in candidates)
+    near = [i for i, c in enumerate(candidates) if c.free_run_rmse <= limit]
+    return min(near, key=lambda i: (candidates[i].parameters, candidates[i].free_run_rmse))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,11 +72,11 @@ class NnarxPart(Part):
     ``search`` lists sizes, e.g. [{n_y: 2, n_u: 2}, {n_y: 3, n_u: 3, hidden: [15]}], each trained alike;
     the smallest of those whose free run over ``free_run`` periods errs at most ``slack`` (relative) more
     than the best one's stays. Measurement noise counts in that error: where it dominates, take less slack.
-    ``long_run`` periods of free runs, end to end over the validation data, whose fit is told for the network
+    ``long_run`` periods of free runs, end to end over the validation data, whose fit is reported for the network
     trained on one step and for the one that is kept; 0 for none. ``free_run_iterations`` limit the second
     training; None: as the first.
     ``residual`` has the network learn the change from one sample to the next instead of the level. ``train_fraction``
-    of the record train, the rest validates. ``trainer`` names a trainer by ``kind`` (lm, lbfgs, adam) and its numbers.
+    of the record trains, the rest validates. ``trainer`` names a trainer by ``kind`` (lm, lbfgs, adam) and its numbers.
     ``forgetting`` are the factors of the recursive linear models that the one-step predictions are compared with.
     ``compared`` validation samples show the one-step predictions beside those of linear models; 0 none, which
     leaves the picture to the free runs.
@@ -69,105 +105,72 @@ class NnarxPart(Part):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least:g}")
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """Train each size with early stopping on the last part of the record; the figures are of the one that stays.
 
         They are of one step (by the region of the target, too) and of a free run. Validation data stop the
         training and choose the size, so they flatter both a little.
         """
-        if record is None:
-            raise ModelError("a part of kind 'nnarx' learns from a record; point `data:` of its set at one")
-        names = {s.name: i for i, s in enumerate(signals.pv)}
-        target = 0 if self.target is None else choose(names, self.target, "process variable", "target")
-        halves = split_in_time(record, self.train_fraction)
+        target = source.pv_index(self.target)
+        train, validation = split_in_time(source.data(self.model.kind), self.train_fraction)
         sizes = [self._sized(size) for size in self.search or (Size(),)]
         back = max(max(s.n_y - 1, s.n_u + s.delay - 2) for s in sizes)
-        trials = [size._trial(*halves, target, back, seed) for size in sizes]
+        trials = [size._trial(train, validation, target, back, source.seed) for size in sizes]
         best = parsimonious([candidate for *_, candidate in trials], self.slack)
         model, history, runs, candidate = trials[best]
+        pairs = model.pairs(validation, target)
+        predicted = predict(model, pairs.x)
         metrics = {
             "free_run_rmse": candidate.free_run_rmse,
-            **self._scored(model, halves[1], target, regions),
-            "n_train": len(halves[0]),
+            **accuracy(pairs.y, predicted, pairs.x[:, 0], source.regions),
+            "fit_percent": fit_percent(pairs.y, predicted),
+            "n_train": len(train),
             "n_y": candidate.n_y,
             "n_u": candidate.n_u,
-            **story(model, history),
+            **fit_figures(model, history),
         }
         if self.search:
-            metrics["candidates"] = [c.row(i == best) for i, (*_, c) in enumerate(trials)]
+            metrics["candidates"] = [{**asdict(c), "chosen": i == best} for i, (*_, c) in enumerate(trials)]
         if runs:
-            metrics["nnarx"] = {name: run.figures([signals.pv[target].name]) for name, run in runs.items()}
+            metrics["nnarx"] = {name: run.figures([source.signals.pv[target].name]) for name, run in runs.items()}
         if not self.compared:
-            return Learnt(model, metrics, predictions=curves(runs, signals.period_s) if runs else None)
+            return Learnt(model, metrics, predictions=curves(runs, source.signals.period_s) if runs else None)
         shown = compare_one_step(
-            model, longest_run(halves[1], self.compared), target=target, forgetting=self.forgetting
+            model, longest_run(validation, self.compared), target=target, forgetting=self.forgetting
         )
         return Learnt(model, metrics | {"one_step": shown.sse()}, predictions=shown.curves())
 
     def _sized(self, size: Size) -> NnarxPart:
-        changed = {"n_y": size.n_y, "n_u": size.n_u, "hidden": size.hidden}
-        return replace(self, search=(), **{k: v for k, v in changed.items() if v is not None})  # type: ignore[arg-type]
+        return replace(self, search=(), **{k: v for k, v in asdict(size).items() if v is not None})
 
     def _trial(
         self, train: Record, validation: Record, target: int, back: int, seed: int
     ) -> tuple[NNARX, FitHistory, dict[str, LongRun], Candidate]:
-        lags = (self.n_y, self.n_u, target, self.delay)
-        fitted, held = nnarx_pairs(train, *lags), nnarx_pairs(validation, *lags)
-        model = NNARX.scaled_to(
-            fitted.x,
-            fitted.y,
-            n_y=self.n_y,
-            n_u=self.n_u,
-            delay=self.delay,
-            hidden=self.hidden,
-            residual=self.residual,
+        lags = {"n_y": self.n_y, "n_u": self.n_u, "delay": self.delay}
+        fitted, held = (nnarx_pairs(r, target=target, **lags) for r in (train, validation))
+        model = NNARX.scaled_to(fitted.x, fitted.y, hidden=self.hidden, residual=self.residual, **lags)
+
+        def long_run() -> LongRun:
+            cut = model.windows(validation, self.long_run, target, every=self.long_run)
+            free = model.free_run(cut)
+            return LongRun((held.y, predict(model, held.x)), cut.future[..., None], free[..., None])
+
+        one_step = [Samples(p.x, p.y) for p in (fitted, held)]
+        # End to end, each sample once: all windows cost ``steps`` times as much and validate no better.
+        free_run = [model.windows(r, self.steps, target, every=self.steps) for r in (train, validation)]
+        history, runs = fit_in_two(
+            model.net,
+            trainer_of(self.trainer),
+            one_step=one_step,
+            free_run=free_run if self.steps > 1 else None,
+            free_run_iterations=self.free_run_iterations,
+            seed=seed,
+            long_run=long_run if self.long_run else None,
         )
-        trainer = trainer_of(self.trainer)
-        history = trainer.fit(model.net, Samples(fitted.x, fitted.y), Samples(held.x, held.y), seed=seed)
-        runs = {TRAINED[0]: self._long(model, validation, target)} if self.long_run else {}
-        if self.steps > 1:
-            history = self._run_free(model, trainer, train, validation, target, seed)
-            if self.long_run:
-                runs[TRAINED[1]] = self._long(model, validation, target)
         model.eval()
-        free = Windows.of(
-            validation, self.n_y, self.n_u, self.free_run, target=target, delay=self.delay, least_back=back
-        )
+        free = model.windows(validation, self.free_run, target, least_back=back)
         with torch.no_grad():
             error = float(free.loss(model.net).sqrt() * model.net.y_scale)
         size = sum(p.numel() for p in model.parameters())
-        one_step = rmse(held.y, predict(model, held.x))
-        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step, error)
-
-    def _run_free(
-        self, model: NNARX, trainer: Trainer, train: Record, validation: Record, target: int, seed: int
-    ) -> FitHistory:
-        """Go on from the one-step fit: a free run of random weights leads nowhere."""
-        # End to end, each sample once: all windows cost ``steps`` times as much and validate no better.
-        before, after = (
-            Windows.of(r, self.n_y, self.n_u, self.steps, target=target, delay=self.delay, every=self.steps)
-            for r in (train, validation)
-        )
-        return going_on(trainer, self.free_run_iterations).fit(model.net, before, after, seed=seed)
-
-    def _long(self, model: NNARX, validation: Record, target: int) -> LongRun:
-        pairs = nnarx_pairs(validation, model.n_y, model.n_u, target, model.delay)
-        cut = Windows.of(
-            validation, model.n_y, model.n_u, self.long_run, target=target, delay=model.delay, every=self.long_run
-        )
-        with torch.no_grad():
-            free = model.simulate(torch.from_numpy(cut.past), torch.from_numpy(cut.u))
-        return LongRun((pairs.y, predict(model, pairs.x)), cut.future[..., None], free[..., None].numpy())
-
-    def _scored(self, model: NNARX, validation: Record, target: int, regions: Regions) -> dict[str, Any]:
-        pairs = nnarx_pairs(validation, model.n_y, model.n_u, target, model.delay)
-        predicted = predict(model, pairs.x)
-        by_region = per_region(rmse, pairs.y, predicted, pairs.x[:, 0], regions)
-        return {
-            "rmse": rmse(pairs.y, predicted),
-            "r2": r2(pairs.y, predicted),
-            "fit_percent": fit_percent(pairs.y, predicted),
-            "regions": {name: {"rmse": error} for name, error in by_region.items()},
-        }
+        one_step_error = rmse(held.y, predict(model, held.x))
+        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step_error, error)

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pipeline.errors import ModelError
 from pipeline.models.lagged.instantaneous import linearize
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.lagged.recursive import RecursiveLeastSquares
 from pipeline.models.training.regressors import nnarx_pairs
+from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
-
-Array = NDArray[np.float64]
 
 FORGETTING = (0.8, 0.5)
 VARIANCE = 100.0
@@ -62,34 +60,17 @@ def compare_one_step(
     error is what a controller meets that tunes itself by it. The recursive models learn along the
     run from nothing. All are compared over the same samples.
 
-    Parameters
-    ----------
-    model
-        The network.
-    record
-        One run.
-    target
-        Index of the PV.
-    forgetting
-        Forgetting factors of the recursive models.
-    n_y, n_u
-        Lags of the recursive models; None takes the network's.
-    scaled
-        Whether these see phi and y in the network's scaling; otherwise in engineering units.
-
-    Raises
-    ------
-    ModelError
-        A record of several runs.
-    RecordError
-        One that is too short for the lags.
+    ``record`` holds one run, y is its PV ``target``. ``forgetting`` are the factors f of the recursive models and
+    ``n_y``, ``n_u`` their lags, None for the network's; they take phi and y in the network's scaling where
+    ``scaled``, otherwise in engineering units. Raises ModelError for a record of several runs, RecordError for one
+    that is too short for the lags.
 
     Source: [chen2004, eqs. 9-11, figure 3 and Table 1]; the bias of eq. 12 has
     a wrong sign there, and here the linear model goes through the network's own value.
     """
     if (record.run != record.run[0]).any():
         raise ModelError("the one-step comparison follows one run, and this record holds several; pick one of them")
-    own = nnarx_pairs(record, model.n_y, model.n_u, target, model.delay)
+    own = model.pairs(record, target)
     phi = torch.from_numpy(own.x)
     linear = linearize(model, phi)
     ahead = linear.predict(torch.roll(phi, -1, dims=0) - phi)[:-1, 0].numpy()

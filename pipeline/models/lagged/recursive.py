@@ -35,24 +35,15 @@ class RecursiveLeastSquares(nn.Module):
         theta, root, error = rls(theta, root, phi, y)     # error: of the prediction before the update
         predicted, theta, root = rls.run(phi, y, theta, root)      # a whole record, one step ahead each
 
-    phi, theta and y should be of the order of one (scale them before): ``largest`` holds for every
-    direction alike.
+    ``forgetting`` is f in (0, 1]; 1 forgets nothing. ``largest`` is the largest eigenvalue that P keeps; None is no
+    bound, and P then grows without excitation. It holds for every direction alike, so phi, theta and y should be of
+    the order of one (scale them before).
 
     Source: Astrom and Wittenmark, Adaptive Control, ch. 2 (recursion); Bierman, Factorization
     Methods for Discrete Sequential Estimation, ch. 2 (Potter's form); the bound follows Salgado,
     Goodwin and Middleton, Int. J. Control 47 (1988), 477, here taken on the root.
 
-    Parameters
-    ----------
-    forgetting
-        Forgetting factor f in (0, 1]; 1 forgets nothing.
-    largest
-        Largest eigenvalue that P keeps; None is no bound, and P then grows without excitation.
-
-    Raises
-    ------
-    ModelError
-        A forgetting factor outside (0, 1], or below 0.45 with a bound, or a bound not above 0.
+    Raises ModelError for a forgetting factor outside (0, 1], or below 0.45 with a bound, or a bound not above 0.
     """
 
     # float64 numbers in buffers: the exporter rounds plain floats to float32

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -11,12 +11,10 @@ from torch import Tensor
 
 from pipeline.errors import ModelError
 from pipeline.models.base import Model
-from pipeline.models.part import Learnt, Part, Regions
+from pipeline.models.part import Learnt, Part, Source
 from pipeline.plants.equations import EquationPlant, equations
 from pipeline.plants.linearization import Linearization
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
+from pipeline.plants.simulator import Array
 
 
 class Linearized(Model):
@@ -25,15 +23,8 @@ class Linearized(Model):
         x' = A (x - x0) + B (u - u0),   pv = pv0 + C (x - x0)
         pv(k+1) = pv0 + C (Phi (x(k) - x0) + Gamma (u(k) - u0))
 
-    ``forward`` maps [x, mv] (..., n_x + n_mv) to the PVs one period later (..., n_pv). The
-    matrices of the continuous model stay inside for laws that are tuned from them.
-
-    Parameters
-    ----------
-    n_x, n_mv, n_pv
-        Numbers of states, manipulated variables and process variables.
-    period_s
-        Sampling period [s].
+    ``forward`` maps [x, mv] (..., n_x + n_mv) to the PVs one sampling period ``period_s`` [s] later (..., n_pv).
+    The matrices of the continuous model stay inside for laws that are tuned from them.
     """
 
     kind: ClassVar[str] = "linearized"
@@ -52,21 +43,8 @@ class Linearized(Model):
                 f"a linearized model has n_x={n_x}, n_mv={n_mv}, n_pv={n_pv}, period_s={period_s}; all must be above 0"
             )
         self.n_x, self.n_mv, self.n_pv, self.period_s = n_x, n_mv, n_pv, period_s
-        shapes: dict[str, tuple[int, ...]] = {
-            "x": (n_x,),
-            "mv": (n_mv,),
-            "pv": (n_pv,),
-            "a": (n_x, n_x),
-            "b": (n_x, n_mv),
-            "c": (n_pv, n_x),
-            "one_period": (n_x + n_mv, n_pv),
-        }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
-
-    def config(self) -> dict[str, Any]:
-        """JSON-ready arguments of the constructor."""
-        return {"n_x": self.n_x, "n_mv": self.n_mv, "n_pv": self.n_pv, "period_s": self.period_s}
+        self.reserve(x=(n_x,), mv=(n_mv,), pv=(n_pv,), a=(n_x, n_x), b=(n_x, n_mv), c=(n_pv, n_x))
+        self.reserve(one_period=(n_x + n_mv, n_pv))
 
     @classmethod
     def of(cls, at: Linearization, period_s: float, *, pv: Array | None = None) -> Self:
@@ -75,20 +53,10 @@ class Linearized(Model):
         ``pv`` (n_pv,) is the steady PV; None takes C x0, right where the PVs are linear in the state.
         """
         (n_x, n_mv), n_pv = at.b.shape, at.c.shape[0]
-        model = cls(n_x, n_mv, n_pv, period_s)
-        phi, gamma = at.sampled(period_s)
-        values = {
-            "x": at.x,
-            "mv": at.mv,
-            "pv": at.c @ at.x if pv is None else pv,
-            "a": at.a,
-            "b": at.b,
-            "c": at.c,
-            "one_period": (at.c @ np.hstack([phi, gamma])).T,
-        }
-        for name, value in values.items():
-            getattr(model, name).copy_(torch.from_numpy(np.ascontiguousarray(value)))
-        return model
+        arguments = {"n_x": n_x, "n_mv": n_mv, "n_pv": n_pv, "period_s": period_s}
+        buffers = {"x": at.x, "mv": at.mv, "pv": at.c @ at.x if pv is None else pv, "a": at.a, "b": at.b, "c": at.c}
+        one_period = at.c @ np.hstack(at.sampled(period_s))
+        return cls.from_arrays(arguments, buffers | {"one_period": one_period.T})
 
     @classmethod
     def at_set_point(cls, plant: EquationPlant, cv: float) -> Self:
@@ -112,17 +80,13 @@ class LinearizedPart(Part):
     model: ClassVar[type[Model]] = Linearized
     at: float
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """The linearization; needs no data."""
-        known = equations(plant, "a part of kind 'linearized'")
-        x, mv = known.steady_state_at(self.at)
-        lin = known.linearize(x, mv)
-        zeros = lin.sampled_zeros(signals.period_s)
+        model = Linearized.at_set_point(equations(source.plant, "a part of kind 'linearized'"), self.at)
+        lin = model.linearization()
         metrics = {
             "eigenvalues": [[float(v.real), float(v.imag)] for v in lin.eigenvalues],
-            "sampled_zeros": [[float(v.real), float(v.imag)] for v in zeros],
-            "mv": [float(v) for v in mv],
+            "sampled_zeros": [[float(v.real), float(v.imag)] for v in lin.sampled_zeros(source.signals.period_s)],
+            "mv": lin.mv.tolist(),
         }
-        return Learnt(Linearized.at_set_point(known, self.at), metrics)
+        return Learnt(model, metrics)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -52,20 +52,13 @@ class LocalModels(Model):
 
         x(k+1) = sum_i rho_i(x_1(k)) [ x_i + Phi_i (x(k) - x_i) + Gamma_i (u(k) - u_i) ]
 
-    with (Phi_i, Gamma_i) the zero-order-hold discretization of the local (A_i, B_i). ``forward``
+    with (Phi_i, Gamma_i) the zero-order-hold discretization of the local (A_i, B_i) over ``period_s`` [s]. ``forward``
     maps [x, u] (..., n_x + 1) to the states one period later (..., n_x); fed with its own result it
     is a simulation that never sees the plant. The continuous matrices stay inside for laws that
     are tuned from them. The first state is the controlled variable, and every state is measured.
 
     Source: [gao2002, eq. 2], which blends the derivatives; blended are here
     their exact integrals over a period, in which the weights stay as they are.
-
-    Parameters
-    ----------
-    n_models, n_x
-        Numbers of local models and of states.
-    period_s
-        Sampling period [s].
     """
 
     kind: ClassVar[str] = "local_models"
@@ -84,39 +77,21 @@ class LocalModels(Model):
                 f"a local model network has n_models={n_models}, n_x={n_x}, period_s={period_s}; all must be above 0"
             )
         self.n_models, self.n_x, self.period_s = n_models, n_x, period_s
-        shapes: dict[str, tuple[int, ...]] = {
-            "x": (n_models, n_x),
-            "mv": (n_models, 1),
-            "width": (n_models,),
-            "a": (n_models, n_x, n_x),
-            "b": (n_models, n_x, 1),
-            "one_period": (n_x + 1, n_models * n_x),
-            "offset": (n_models * n_x,),
-        }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.ones(shape, dtype=torch.float64))
-
-    def config(self) -> dict[str, Any]:
-        """JSON-ready arguments of the constructor."""
-        return {"n_models": self.n_models, "n_x": self.n_x, "period_s": self.period_s}
+        self.reserve(x=(n_models, n_x), mv=(n_models, 1), width=(n_models,))
+        self.reserve(a=(n_models, n_x, n_x), b=(n_models, n_x, 1))
+        self.reserve(one_period=(n_x + 1, n_models * n_x), offset=(n_models * n_x,))
 
     @classmethod
     def of(cls, points: list[Linearization], width: Array, period_s: float) -> Self:
         """The network of some linearizations, with the widths (m,) of their validity functions."""
-        model = cls(len(points), len(points[0].x), period_s)
         sampled = [np.hstack(p.sampled(period_s)) for p in points]  # (n_x, n_x + 1) each
-        values = {
-            "x": np.array([p.x for p in points]),
-            "mv": np.array([p.mv for p in points]),
+        buffers = {name: np.array([getattr(p, name) for p in points]) for name in ("x", "mv", "a", "b")}
+        buffers |= {
             "width": np.asarray(width, dtype=np.float64),
-            "a": np.array([p.a for p in points]),
-            "b": np.array([p.b for p in points]),
             "one_period": np.vstack(sampled).T,
             "offset": np.concatenate([p.x - s @ np.append(p.x, p.mv) for p, s in zip(points, sampled, strict=True)]),
         }
-        for name, value in values.items():
-            getattr(model, name).copy_(torch.from_numpy(np.ascontiguousarray(value)))
-        return model.eval()
+        return cls.from_arrays({"n_models": len(points), "n_x": len(points[0].x), "period_s": period_s}, buffers)
 
     @classmethod
     def at_set_points(cls, plant: EquationPlant, cvs: list[float], overlap: float) -> Self:

@@ -12,14 +12,12 @@ from scipy import optimize
 
 from pipeline.errors import ModelError
 from pipeline.metrics import fit_percent
-from pipeline.models.base import Model
+from pipeline.models.base import Model, simulate
 from pipeline.models.local.local_models import LocalModels
-from pipeline.models.part import Learnt, Part, Regions
+from pipeline.models.part import Learnt, Part, Source
 from pipeline.plants.equations import EquationPlant, equations
 from pipeline.plants.linearization import Linearization
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
+from pipeline.plants.simulator import Array
 from pipeline.simulation.simulate import simulate_open
 
 STEADY_POINTS = 121  # MVs at which the network's steady state is compared with the plant's
@@ -61,13 +59,11 @@ class LocalModelsPart(Part):
                 "every size must be at least 2, and there must be a random step"
             )
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
-        """The network and its free runs; ``seed`` draws the random course."""
-        known = equations(plant, "a part of kind 'local_models'")
+    def learn(self, source: Source) -> Learnt:
+        """The network and its free runs; the seed draws the random course."""
+        known = equations(source.plant, "a part of kind 'local_models'")
         model = LocalModels.at_set_points(known, [operating_cv(known, p) for p in self.points], self.overlap)
-        courses = {name: (mv, _plant_run(known, mv)) for name, mv in self._courses(seed).items()}
+        courses = {name: (mv, _plant_run(known, mv)) for name, mv in self._courses(source.seed).items()}
         runs = {name: free_run(model, x[0], mv) for name, (mv, x) in courses.items()}
         metrics: dict[str, Any] = {
             "operating_points": {str(i): _point(known, p) for i, p in enumerate(model.linearizations(), start=1)},
@@ -78,7 +74,7 @@ class LocalModelsPart(Part):
         mv, x = courses["staircase"]
         if self.sizes:
             metrics["sizes"] = {str(n): self._of_size(known, n, x, mv) for n in self.sizes}
-        time_s = np.arange(len(mv), dtype=np.float64) * signals.period_s
+        time_s = np.arange(len(mv), dtype=np.float64) * source.signals.period_s
         curves = {"time_s": time_s, "mv": mv, "actual": x, "predicted": runs["staircase"]}
         return Learnt(model, metrics, predictions=curves)
 
@@ -139,13 +135,9 @@ def operating_cv(plant: EquationPlant, point: Mapping[str, float]) -> float:
 
 def free_run(model: LocalModels, x0: Array, mv: Array) -> Array:
     """States (n, n_x) of the network alone, from x0 (n_x,) under mv (n, 1)."""
-    x, u = torch.from_numpy(x0), torch.from_numpy(mv)
-    found = torch.empty(len(mv), len(x0), dtype=torch.float64)
     with torch.no_grad():
-        for k in range(len(mv)):
-            found[k] = x
-            x = model(torch.cat([x, u[k]]))
-    return found.numpy()
+        later = simulate(model, torch.from_numpy(x0), torch.from_numpy(mv[:-1]))
+    return np.vstack([x0, later.numpy()])
 
 
 def _rest(plant: EquationPlant, mv: float) -> Array:

@@ -1,16 +1,25 @@
-"""State-space network: a plant whose whole state is measured, one period later."""
+"""State-space network: a plant whose whole state is measured, one period later; learnt one step ahead, then free."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pipeline.errors import ModelError
-from pipeline.models.base import Model
-from pipeline.models.static.mlp import MLP, Array
+from pipeline.models.base import Model, simulate
+from pipeline.models.part import Learnt, Part, Source, accuracy, predict
+from pipeline.models.state_space.state_windows import StateWindows
+from pipeline.models.static.mlp import MLP
+from pipeline.models.training.network_parts import LongRun, fit_figures, fit_in_two, trainer_of
+from pipeline.models.training.objectives import Samples
+from pipeline.models.training.regressors import split_in_time
+from pipeline.plants.simulator import Array
+from pipeline.records.record import Record
 
 
 class StateSpace(Model):
@@ -20,19 +29,9 @@ class StateSpace(Model):
 
     with x the process variables, u the manipulated ones held over [k, k+1). It needs no lags, so a free
     run forgets its start as the plant does. ``forward`` maps [x, u] (..., n_pv + n_mv) to x one period
-    later (..., n_pv). Training goes through ``net``.
+    later (..., n_pv). Training goes through ``net``, whose hidden layers have the widths ``hidden``.
 
-    Parameters
-    ----------
-    n_pv, n_mv
-        Numbers of process variables and of manipulated variables.
-    hidden
-        Width of each hidden layer.
-
-    Raises
-    ------
-    ModelError
-        ``n_pv`` or ``n_mv`` below 1, or no hidden unit.
+    Raises ModelError for ``n_pv`` or ``n_mv`` below 1, or no hidden unit.
     """
 
     kind: ClassVar[str] = "state_space"
@@ -41,12 +40,8 @@ class StateSpace(Model):
         super().__init__()
         if min(n_pv, n_mv) < 1:
             raise ModelError(f"a state-space network has n_pv={n_pv}, n_mv={n_mv}; each must be at least 1")
-        self.n_pv, self.n_mv = n_pv, n_mv
+        self.n_pv, self.n_mv, self.hidden = n_pv, n_mv, tuple(hidden)
         self.net = MLP(n_pv + n_mv, n_pv, hidden, tuple(range(n_pv)))
-
-    def config(self) -> dict[str, Any]:
-        """JSON-ready arguments of the constructor."""
-        return {"n_pv": self.n_pv, "n_mv": self.n_mv, "hidden": list(self.net.hidden)}
 
     @classmethod
     def scaled_to(cls, x: Array, y: Array, *, hidden: Sequence[int] = (20,)) -> Self:
@@ -56,7 +51,7 @@ class StateSpace(Model):
         """
         n_pv = y.shape[1]
         model = cls(n_pv, x.shape[1] - n_pv, hidden)
-        model.net = MLP.scaled_to(x, y, hidden=hidden, residual=tuple(range(n_pv)))
+        model.net = MLP.scaled_to(x, y, hidden=hidden, residual=model.net.residual)
         return model
 
     def forward(self, x: Tensor) -> Tensor:
@@ -64,9 +59,72 @@ class StateSpace(Model):
         y: Tensor = self.net(x)
         return y
 
-    def simulate(self, start: Tensor, mv: Tensor) -> Tensor:
-        """Free run from measured PVs ``start`` (..., n_pv) under MVs (..., k, n_mv): the next PVs (..., k, n_pv)."""
-        states = [start]
-        for u in mv.unbind(-2):
-            states.append(self(torch.cat([states[-1], u], dim=-1)))
-        return torch.stack(states[1:], dim=-2)
+
+@dataclass(frozen=True, kw_only=True)
+class StateSpacePart(Part):
+    """A state-space network over all process variables, which must be the plant's whole state.
+
+    ``hidden`` widths. ``steps`` the periods of the free runs that are trained on after the fit of one step;
+    1 leaves it at that. ``free_run_iterations`` limit the second training; None: as the first. ``long_run``
+    the periods of the free runs, end to end over the validation data, by whose fit the networks are judged
+    before and after. ``train_fraction`` of the record trains, the rest validates.
+    ``trainer`` {kind: lm | lbfgs | adam, and its options}.
+    """
+
+    model: ClassVar[type[Model]] = StateSpace
+    hidden: tuple[int, ...] = (20,)
+    steps: int = 50
+    free_run_iterations: int | None = None
+    long_run: int = 1000
+    train_fraction: float = 0.7
+    trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "long_run"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
+
+    def learn(self, source: Source) -> Learnt:
+        """Train with early stopping on the last part of the record, which the figures are of.
+
+        ``state_space`` of the metrics holds, of each PV, the one-step RMSE and the fit of a long free run,
+        for the network trained on one step and for the one that is kept.
+        """
+        train, validation = split_in_time(source.data(self.model.kind), self.train_fraction)
+        (x, y), (x_held, y_held) = one_step_pairs(train), one_step_pairs(validation)
+        model = StateSpace.scaled_to(x, y, hidden=self.hidden)
+
+        def long_run() -> LongRun:
+            cut = StateWindows.of(validation, self.long_run, every=self.long_run)
+            with torch.no_grad():
+                free = simulate(model, torch.from_numpy(cut.start), torch.from_numpy(cut.mv))
+            return LongRun((y_held, predict(model, x_held)), cut.future, free.numpy())
+
+        free_run = [StateWindows.of(r, self.steps, every=self.steps) for r in (train, validation)]
+        history, runs = fit_in_two(
+            model.net,
+            trainer_of(self.trainer),
+            one_step=(Samples(x, y), Samples(x_held, y_held)),
+            free_run=free_run if self.steps > 1 else None,
+            free_run_iterations=self.free_run_iterations,
+            seed=source.seed,
+            long_run=long_run,
+        )
+        model.eval()
+        names = [s.name for s in source.signals.pv]
+        figures = {trained: run.figures(names) for trained, run in runs.items()}
+        cv, predicted = y_held[:, 0], predict(model, x_held)[:, 0]
+        metrics = {
+            **accuracy(cv, predicted, x_held[:, 0], source.regions),
+            "free_run_rmse": figures[list(figures)[-1]][names[0]]["free_run_rmse"],
+            "state_space": figures,
+            "n_train": len(train),
+            **fit_figures(model, history),
+        }
+        return Learnt(model, metrics)
+
+
+def one_step_pairs(record: Record) -> tuple[Array, Array]:
+    """(x (N, n_pv + n_mv), y (N, n_pv)): PVs and MVs of a sample, and the PVs one period later in the same run."""
+    k = record.starts(1)
+    return np.hstack([record.pv[k], record.mv[k]]), record.pv[k + 1]

@@ -7,18 +7,18 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.errors import ModelError
-from pipeline.models.static.mlp import MLP, Array
+from pipeline.models.static.mlp import MLP
 from pipeline.models.training.jacobian import input_jacobian, parameter_jacobian
-from pipeline.models.training.objectives import Sums, chunks
+from pipeline.models.training.objectives import Rows, Sums, check_finite, chunks
+from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StateWindows:
+class StateWindows(Rows):
     """Free-run error of a state-space network over k steps: mean over windows, steps and PVs of (x - x*)^2 / s^2.
 
     Each window starts from what was measured and is then fed its own predictions; s is the network's
@@ -26,32 +26,19 @@ class StateWindows:
 
         dx(t+1)/dtheta = dNN/dtheta(x(t), u(t)) + dNN/dx(x(t), u(t)) dx(t)/dtheta,   dx(0)/dtheta = 0
 
-    Parameters
-    ----------
-    start
-        Measured PVs at the start of each window, shape (N, n_pv).
-    mv
-        MVs held over the window's periods, shape (N, k, n_mv).
-    future
-        Measured PVs at their ends, shape (N, k, n_pv).
-
-    Raises
-    ------
-    ModelError
-        Shapes that do not match, no window, or a value that is not finite.
+    Raises ModelError for shapes that do not match, no window, or a value that is not finite.
     """
 
-    start: Array
-    mv: Array
-    future: Array
+    start: Array  # (N, n_pv) measured PVs at the start of each window
+    mv: Array  # (N, k, n_mv) MVs held over the window's periods
+    future: Array  # (N, k, n_pv) measured PVs at the periods' ends
 
     def __post_init__(self) -> None:
         shapes = self.start.shape, self.mv.shape, self.future.shape
         fits = [len(s) for s in shapes] == [2, 3, 3] and shapes[1][:2] == shapes[2][:2] and self.future.size > 0
         if not fits or shapes[0] != (shapes[2][0], shapes[2][2]):
             raise ModelError(f"windows have shapes {shapes}; give (N, n_pv), (N, k, n_mv), (N, k, n_pv) with N, k > 0")
-        if not all(np.all(np.isfinite(a)) for a in (self.start, self.mv, self.future)):
-            raise ModelError("windows hold a value that is not finite; drop those rows of the record")
+        check_finite("windows", self.start, self.mv, self.future)
 
     @classmethod
     def of(cls, record: Record, steps: int, *, every: int = 1) -> Self:
@@ -63,24 +50,17 @@ class StateWindows:
         after = k[:, None] + np.arange(steps)
         return cls(record.pv[k], record.mv[after], record.pv[after + 1])
 
-    def __len__(self) -> int:
-        return len(self.start)
-
     @property
     def steps(self) -> int:
         """Periods per window, k."""
         return int(self.future.shape[1])
-
-    def part(self, rows: NDArray[np.int64]) -> StateWindows:
-        """Some of the windows."""
-        return StateWindows(self.start[rows], self.mv[rows], self.future[rows])
 
     def loss(self, net: MLP) -> Tensor:
         """Mean squared error of the free run, scaled."""
         x, mv, future = (torch.from_numpy(a) for a in (self.start, self.mv, self.future))
         total = x.new_zeros(())
         for step in range(self.steps):
-            x = net.unlimited(torch.cat([x, mv[:, step]], dim=1))
+            x = net(torch.cat([x, mv[:, step]], dim=1))
             total = total + (((x - future[:, step]) / net.y_scale) ** 2).sum()
         return total / self.future.size
 

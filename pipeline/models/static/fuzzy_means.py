@@ -15,8 +15,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from pipeline.errors import ModelError
 from pipeline.models.static.least_squares import solve_qr
 from pipeline.models.static.rbf import BASES, CHUNK, RBF, Basis, design_matrix
-
-Array = NDArray[np.float64]
+from pipeline.plants.simulator import Array
 
 
 def scaling(x: Array) -> tuple[Array, Array]:
@@ -152,12 +151,10 @@ class FuzzyMeansRBF(RegressorMixin, BaseEstimator):
             y = torch.cat([net(x[i : i + CHUNK]) for i in range(0, len(x), CHUNK)]).numpy()
         return y[:, 0] if self._single_output else y
 
-    def to_torch(self, limits: tuple[float, float] | None = None) -> RBF:
-        """The fitted network as a float64 torch module; ``limits`` (low, high) bounds its output."""
+    def to_torch(self) -> RBF:
+        """The fitted network as a float64 torch module."""
         check_is_fitted(self)
-        return RBF.of(
-            self.centres_, self.weights_, self.low_, self.span_, basis=self.basis, width=self.width, limits=limits
-        )
+        return RBF.of(self.centres_, self.weights_, self.low_, self.span_, basis=self.basis, width=self.width)
 
 
 def check_parameters(partitions: Any, basis: Any, width: Any, ridge: Any) -> None:

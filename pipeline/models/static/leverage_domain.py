@@ -1,21 +1,21 @@
-"""The leverage domain as a model: a part of a model set, and of the law that holds it."""
+"""The applicability domain of a model, where its training data lie, by leverage."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.models.applicability import Leverage
+from pipeline.errors import ModelError
 from pipeline.models.base import Model
-from pipeline.models.part import Learnt, Regions, StaticPart, predict
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
+from pipeline.models.part import Learnt, Source, StaticPart, predict
+from pipeline.plants.simulator import Array
+
+# Where QR leaves a column with less than this share of its spread, the column follows from the others.
+COLLINEAR = 1e-10
 
 
 class Interval(NamedTuple):
@@ -27,14 +27,22 @@ class Interval(NamedTuple):
 
 
 class LeverageDomain(Model):
-    """Leverage of u = [x; w] and the interval of w that keeps it below the threshold.
+    """Leverage of an input u = [x; w] in a data set of K rows, and the interval of w that keeps it below h*.
 
-        h(u) = 1/K + |(x - mean_x) W|^2 + ((w - centre)/scale)^2 <= h*
-        w    = centre(x) +- scale sqrt(h* - 1/K - |(x - mean_x) W|^2)
+        h(u) = z' (sum z z')^-1 z,  z = [1; u]
+             = 1/K + |(x - mean_x) W|^2 + ((w - centre(x)) / scale)^2
+        centre(x) = mean_w + (x - mean_x) slope
+        w = centre(x) +- scale sqrt(h* - 1/K - |(x - mean_x) W|^2)
 
-    As a model: ``(..., N) -> (..., 1)``, the leverage. See ``pipeline.models.applicability.Leverage``.
+    The second form follows from QR of the centred, scaled data: with Q R = U and the last column
+    being w, R^-T is lower triangular, so that only its last row holds w. ``centre`` is the linear
+    regression of w on [1, x]. Nothing is squared before it is factored, and the bounds on w need
+    no difference of large numbers.
 
-    Source: [inverse_rbf, eqs 13-20].
+    An input is inside where h(u) <= h* = 3 (N+1)/K, three times the mean leverage of the data.
+    As a model: ``(..., N) -> (..., 1)``, the leverage.
+
+    Source: [inverse_rbf, eqs 13-20], with the intercept that centring stands for.
     """
 
     kind: ClassVar[str] = "leverage_domain"
@@ -42,7 +50,7 @@ class LeverageDomain(Model):
     mean_x: Tensor  # (N-1,)
     mean_w: Tensor  # (1,)
     project: Tensor  # (N-1, N): W, and the slope of the centre in the last column
-    scale: Tensor  # (1,)
+    scale: Tensor  # (1,) [w] root of the sum of squared residuals of the regression of w on x
     free: Tensor  # (1,) h* - 1/K
     threshold: Tensor  # (1,) h*
     edge: Tensor  # (1,) h* and a little: a value of w at its bound lies on either side of h* by rounding
@@ -50,29 +58,53 @@ class LeverageDomain(Model):
     def __init__(self, n_in: int) -> None:
         super().__init__()
         self.n_in = n_in
-        shapes = {"mean_x": (n_in - 1,), "mean_w": (1,), "project": (n_in - 1, n_in)}
-        shapes |= {"scale": (1,), "free": (1,), "threshold": (1,), "edge": (1,)}
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.ones(shape, dtype=torch.float64))
+        self.reserve(mean_x=(n_in - 1,), mean_w=(1,), project=(n_in - 1, n_in))
+        self.reserve(scale=(1,), free=(1,), threshold=(1,), edge=(1,))
 
     @classmethod
-    def fit(cls, u: NDArray[np.float64]) -> Self:
-        """The domain of training inputs ``u``, shape (K, N), w last; raises ModelError."""
-        fitted = Leverage.fit(u)
-        numbers = {
-            "mean_x": fitted.mean[:-1],
-            "mean_w": fitted.mean[-1:],
-            "project": np.column_stack([fitted.whiten, fitted.slope]),
-            "scale": np.array([fitted.scale]),
-            "free": np.array([fitted.threshold - fitted.offset]),
-            "threshold": np.array([fitted.threshold]),
-            "edge": np.array([fitted.threshold * (1 + 1e-9)]),
-        }
-        return cls.from_arrays({"n_in": u.shape[1]}, numbers)
+    def fit(cls, u: Array) -> Self:
+        """The domain of training inputs ``u``, shape (K, N), K > N + 1, w last.
 
-    def config(self) -> dict[str, Any]:
-        """The number of inputs."""
-        return {"n_in": self.n_in}
+        Raises ModelError for data that are too few, not finite, constant in a column or collinear.
+        """
+        u = np.asarray(u, dtype=np.float64)
+        if u.ndim != 2 or u.shape[1] < 2:
+            raise ModelError(f"a leverage domain needs data of shape (K, N >= 2), states then w; got {u.shape}")
+        k, n = u.shape
+        if k <= n + 1:
+            raise ModelError(f"a leverage domain over {n} inputs needs more than {n + 1} rows of data; got {k}")
+        if not np.all(np.isfinite(u)):
+            row, column = np.argwhere(~np.isfinite(u))[0]
+            raise ModelError(f"data of the leverage domain are not finite in row {row}, column {column}: {u[row]}")
+        mean = u.mean(axis=0)
+        spread = u.std(axis=0)
+        constant = np.nonzero(spread <= COLLINEAR * np.abs(mean))[0]
+        if constant.size:
+            raise ModelError(
+                f"column {constant[0]} of the leverage domain's data is constant at {mean[constant[0]]:g}; "
+                "excite it or leave it out of the model's inputs"
+            )
+        factor = np.linalg.qr((u - mean) / spread, mode="r")
+        kept = np.abs(np.diag(factor)) / np.sqrt(k)
+        if kept.min() < COLLINEAR:
+            raise ModelError(
+                f"column {int(kept.argmin())} of the leverage domain's data is a linear function of those before it; "
+                "excite it independently or leave it out of the model's inputs"
+            )
+        # Columns of R^-1 are the rows of R^-T: all but the last hold x only.
+        inverse = np.linalg.solve(factor, np.eye(n)) / spread[:, None]
+        slope = -inverse[:-1, -1] / inverse[-1, -1]
+        threshold = 3 * (n + 1) / k
+        numbers = {
+            "mean_x": mean[:-1],
+            "mean_w": mean[-1:],
+            "project": np.column_stack([inverse[:-1, :-1], slope]),
+            "scale": 1 / np.abs(inverse[-1, -1:]),
+            "free": np.array([threshold - 1 / k]),
+            "threshold": np.array([threshold]),
+            "edge": np.array([threshold * (1 + 1e-9)]),
+        }
+        return cls.from_arrays({"n_in": n}, numbers)
 
     def interval(self, x: Tensor) -> Interval:
         """The interval of w at states ``x``, shape (..., N-1)."""
@@ -112,11 +144,9 @@ class DomainPart(StaticPart):
     model: ClassVar[type[Model]] = LeverageDomain
     task: Literal["inverse", "forward"] = "inverse"
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """The domain of the training pairs' inputs."""
-        train, validation = self.pairs(record, signals).split(self.train_fraction, self.split, seed)
+        train, validation = self.pairs(source).split(self.train_fraction, self.split, source.seed)
         domain = LeverageDomain.fit(train.x)
         inside = predict(domain, validation.x) <= domain.threshold.numpy()
         return Learnt(domain, {"threshold": float(domain.threshold), "inside": float(inside.mean())})

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from pipeline.errors import ModelError
 from pipeline.models.base import Model
-
-Array = NDArray[np.float64]
+from pipeline.plants.simulator import Array
 
 
 class MLP(Model):
@@ -24,25 +22,11 @@ class MLP(Model):
         a_0 = (x - x_center) / x_scale,   a_l = tanh(a_{l-1} W_l + b_l),   l = 1..L
         y   = y_center + y_scale (a_L W_{L+1} + b_{L+1})  [+ x_residual]
 
-    With ``residual`` the network predicts the change of one input column per output, which is what
-    a model of one or a few sampling periods needs: its error is then relative to the change.
-    ``bounded`` limits the output to [y_low, y_high].
+    for x (..., n_in) and y (..., n_out); ``hidden`` are the widths of the hidden layers. ``residual`` names for
+    each output the input column to which the network adds, or is empty: predicting the change is what a model of
+    one or a few sampling periods needs, as its error is then relative to the change.
 
-    Parameters
-    ----------
-    n_in, n_out
-        Number of inputs and outputs.
-    hidden
-        Width of each hidden layer.
-    residual
-        For each output, the input column to which the network adds; empty for none.
-    bounded
-        Whether ``forward`` limits the output.
-
-    Raises
-    ------
-    ModelError
-        No hidden unit, or ``residual`` does not name one input column per output.
+    Raises ModelError without a hidden unit, or where ``residual`` does not name one input column per output.
     """
 
     kind: ClassVar[str] = "mlp"
@@ -50,17 +34,8 @@ class MLP(Model):
     x_scale: Tensor  # (n_in,)
     y_center: Tensor  # (n_out,)
     y_scale: Tensor  # (n_out,)
-    y_low: Tensor  # (n_out,)
-    y_high: Tensor  # (n_out,)
 
-    def __init__(
-        self,
-        n_in: int,
-        n_out: int = 1,
-        hidden: Sequence[int] = (20,),
-        residual: Sequence[int] = (),
-        bounded: bool = False,
-    ) -> None:
+    def __init__(self, n_in: int, n_out: int = 1, hidden: Sequence[int] = (20,), residual: Sequence[int] = ()) -> None:
         super().__init__()
         if not hidden or min(hidden) < 1:
             raise ModelError(f"hidden layers {tuple(hidden)} of an MLP: give at least one, each of at least one unit")
@@ -69,54 +44,28 @@ class MLP(Model):
                 f"residual columns {tuple(residual)} of an MLP with {n_in} inputs and {n_out} outputs: "
                 f"give one column of 0..{n_in - 1} per output, or none"
             )
-        self.n_in, self.n_out, self.hidden = n_in, n_out, tuple(hidden)
-        self.residual, self.bounded = tuple(residual), bounded
-        widths = (n_in, *hidden, n_out)
+        self.n_in, self.n_out, self.hidden, self.residual = n_in, n_out, tuple(hidden), tuple(residual)
         # Weights are (n_in, n_out) and used as x @ W: onnxruntime 1.31.1 computes wrong results
         # where a transposed 2-D constant meets a 1-D MatMul (its MatmulTransposeFusion).
-        shapes = list(pairwise(widths))
+        shapes = list(pairwise((n_in, *hidden, n_out)))
         self.weights = nn.ParameterList([nn.Parameter(torch.zeros(i, o, dtype=torch.float64)) for i, o in shapes])
         self.biases = nn.ParameterList([nn.Parameter(torch.zeros(o, dtype=torch.float64)) for _, o in shapes])
-        for name, size, value in (
-            ("x_center", n_in, 0.0),
-            ("x_scale", n_in, 1.0),
-            ("y_center", n_out, 0.0),
-            ("y_scale", n_out, 1.0),
-            ("y_low", n_out, -math.inf),
-            ("y_high", n_out, math.inf),
-        ):
-            self.register_buffer(name, torch.full((size,), value, dtype=torch.float64))
-
-    def config(self) -> dict[str, Any]:
-        """JSON-ready arguments of the constructor."""
-        return {
-            "n_in": self.n_in,
-            "n_out": self.n_out,
-            "hidden": list(self.hidden),
-            "residual": list(self.residual),
-            "bounded": self.bounded,
-        }
+        self.reserve(x_center=(n_in,), x_scale=(n_in,), y_center=(n_out,), y_scale=(n_out,))
+        self.x_scale.fill_(1.0)
+        self.y_scale.fill_(1.0)
 
     @classmethod
-    def scaled_to(
-        cls,
-        x: Array,
-        y: Array,
-        *,
-        hidden: Sequence[int] = (20,),
-        residual: Sequence[int] = (),
-        bounds: tuple[Sequence[float], Sequence[float]] | None = None,
-    ) -> Self:
+    def scaled_to(cls, x: Array, y: Array, *, hidden: Sequence[int] = (20,), residual: Sequence[int] = ()) -> Self:
         """An untrained network whose scaling is taken from data x (N, n_in), y (N, n_out).
 
         Inputs go to [-1, 1], outputs (changes, with ``residual``) to mean 0 and deviation 1.
-        ``bounds`` gives low and high of every output. Raises ModelError for a constant column.
+        Raises ModelError for a constant column.
         """
         if x.ndim != 2 or y.ndim != 2 or len(x) != len(y):
             raise ModelError(
                 f"training data of an MLP have shapes {x.shape} and {y.shape}; give (N, n_in) and (N, n_out)"
             )
-        model = cls(x.shape[1], y.shape[1], hidden, residual, bounds is not None)
+        model = cls(x.shape[1], y.shape[1], hidden, residual)
         change = y - x[:, list(residual)] if residual else y
         spans = {"input": np.ptp(x, axis=0) / 2, "output": change.std(axis=0)}
         for what, span in spans.items():
@@ -131,9 +80,6 @@ class MLP(Model):
             model.x_scale.copy_(torch.from_numpy(spans["input"]))
             model.y_center.copy_(torch.from_numpy(change.mean(axis=0)))
             model.y_scale.copy_(torch.from_numpy(spans["output"]))
-            if bounds is not None:
-                model.y_low.copy_(torch.tensor(bounds[0], dtype=torch.float64))
-                model.y_high.copy_(torch.tensor(bounds[1], dtype=torch.float64))
         return model
 
     @torch.no_grad()
@@ -151,14 +97,10 @@ class MLP(Model):
             weight.copy_(draw / draw.norm(dim=0) * length)
             bias.copy_(length * (2 * torch.rand(n_out, generator=generator, dtype=torch.float64) - 1))
 
-    def unlimited(self, x: Tensor) -> Tensor:
-        """Prediction (..., n_out) without the output's bounds: what training fits."""
-        slope, offset = self._first_layer()
-        return self._after_first_layer(x, x @ slope + offset)
-
     def forward(self, x: Tensor) -> Tensor:
         """Prediction, shape (..., n_out), for inputs of shape (..., n_in)."""
-        return self._limited(self.unlimited(x))
+        slope, offset = self._first_layer()
+        return self._after_first_layer(x, x @ slope + offset)
 
     def sections(self, x: Tensor, candidates: Tensor) -> Tensor:
         """Prediction (..., K, n_out) at one point x (..., n) for K candidates (..., K, n_in - n) of the last inputs.
@@ -169,7 +111,7 @@ class MLP(Model):
         n = x.shape[-1]
         slope, offset = self._first_layer()
         known = x @ slope[:n] + offset
-        return self._limited(self._after_first_layer(x.unsqueeze(-2), known.unsqueeze(-2) + candidates @ slope[n:]))
+        return self._after_first_layer(x.unsqueeze(-2), known.unsqueeze(-2) + candidates @ slope[n:])
 
     # The scaling is multiplied into the first and last weights: all constants, which onnxruntime
     # folds when it loads the graph. Left as a node of its own, a scalar factor beside a MatMul
@@ -187,9 +129,6 @@ class MLP(Model):
             # A narrow instead of a gather: one cheap node in the exported graph.
             y = y + torch.cat([x[..., i : i + 1] for i in self.residual], dim=-1)
         return y
-
-    def _limited(self, y: Tensor) -> Tensor:
-        return torch.minimum(torch.maximum(y, self.y_low), self.y_high) if self.bounded else y
 
 
 def scaled_layers(net: MLP) -> list[tuple[Tensor, Tensor]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import ClassVar, Literal, Self, get_args
 
 import numpy as np
 import torch
@@ -27,15 +27,14 @@ class RBF(Model):
         y = sum_l w_l h(|u - c_l|),   u = 2 (x - low) / span - 1
         thin_plate: h(d) = d^2 log d = d^2 log(d^2) / 2      gaussian: h(d) = exp(-d^2 / (2 width^2))
 
-    ``x`` is in engineering units, shape (..., n_in); ``y`` too, shape (..., n_out). With
-    ``limited`` the output is kept within ``out_low .. out_high``. There is no affine tail.
+    ``x`` is in engineering units, shape (..., n_in); ``y`` too, shape (..., n_out). There is no affine tail.
 
     The squared distance is written |u|^2 + (|c|^2 - 2 u c): three small nodes and one product in
     onnxruntime. Its cancellation costs about 1e-16 of the unit cube, no more than the rounding of
     the weighted sum itself, whose terms exceed the output a million times; so float64 throughout.
 
     Buffers: low, span (n_in,); centres (n_in, n_centres), one column each so that no constant is
-    transposed in the graph; weights (n_out, n_centres); out_low, out_high (n_out,).
+    transposed in the graph; weights (n_out, n_centres); width (1,).
 
     Source: [inverse_rbf, eqs. 1-3].
     """
@@ -45,29 +44,15 @@ class RBF(Model):
     span: Tensor
     centres: Tensor
     weights: Tensor
-    out_low: Tensor
-    out_high: Tensor
     width: Tensor
     tiny: Tensor
 
-    def __init__(
-        self, n_in: int, n_centres: int, n_out: int = 1, *, basis: Basis = "thin_plate", limited: bool = False
-    ) -> None:
+    def __init__(self, n_in: int, n_centres: int, n_out: int = 1, *, basis: Basis = "thin_plate") -> None:
         super().__init__()
         if basis not in BASES:
             raise ModelError(f"basis {basis!r} is unknown; choose one of {', '.join(BASES)}")
-        self.basis, self.limited = basis, limited
-        shapes = {
-            "low": (n_in,),
-            "span": (n_in,),
-            "centres": (n_in, n_centres),
-            "weights": (n_out, n_centres),
-            "out_low": (n_out,),
-            "out_high": (n_out,),
-            "width": (1,),
-        }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.ones(shape, dtype=torch.float64))
+        self.n_in, self.n_centres, self.n_out, self.basis = n_in, n_centres, n_out, basis
+        self.reserve(low=(n_in,), span=(n_in,), centres=(n_in, n_centres), weights=(n_out, n_centres), width=(1,))
         # A Python float would reach the graph through float32, where it is a denormal or zero.
         self.register_buffer("tiny", torch.tensor([TINY], dtype=torch.float64), persistent=False)
 
@@ -81,42 +66,15 @@ class RBF(Model):
         *,
         basis: Basis = "thin_plate",
         width: float = 1.0,
-        limits: tuple[float, float] | None = None,
     ) -> Self:
-        """The network with these scaled centres (n_centres, n_in) and weights (n_out, n_centres).
-
-        ``limits`` (low, high) bounds every output, in its engineering unit.
-        """
+        """The network with these scaled centres (n_centres, n_in) and weights (n_out, n_centres)."""
         centres, weights = np.asarray(centres, np.float64), np.asarray(weights, np.float64)
         (n_centres, n_in), n_out = centres.shape, weights.shape[0]
         if weights.shape != (n_out, n_centres):
             raise ModelError(f"weights have shape {weights.shape} for {n_centres} centres; give (n_out, {n_centres})")
-        net = cls(n_in, n_centres, n_out, basis=basis, limited=limits is not None)
-        out_low, out_high = (0.0, 0.0) if limits is None else limits
-        if limits is not None and not out_low < out_high:
-            raise ModelError(f"output limits {limits} are not in order; give (low, high) with low < high")
-        values = {
-            "low": low,
-            "span": span,
-            "centres": centres.T,
-            "weights": weights,
-            "out_low": np.full(n_out, out_low),
-            "out_high": np.full(n_out, out_high),
-            "width": np.array([width]),
-        }
-        net.load_state_dict({k: torch.tensor(np.array(v), dtype=torch.float64) for k, v in values.items()})
-        return net.eval()
-
-    def config(self) -> dict[str, Any]:
-        """Arguments of the constructor."""
-        n_in, n_centres = self.centres.shape
-        return {
-            "n_in": n_in,
-            "n_centres": n_centres,
-            "n_out": self.weights.shape[0],
-            "basis": self.basis,
-            "limited": self.limited,
-        }
+        arguments = {"n_in": n_in, "n_centres": n_centres, "n_out": n_out, "basis": basis}
+        buffers = {"low": low, "span": span, "centres": centres.T, "weights": weights, "width": np.array([width])}
+        return cls.from_arrays(arguments, buffers)
 
     def forward(self, x: Tensor) -> Tensor:
         """Output (..., n_out) [engineering units] for x (..., n_in) [engineering units]."""
@@ -132,10 +90,7 @@ class RBF(Model):
         # An elementwise product and sum: twice as fast here as a product with an (n, 1) matrix, and out of
         # reach of onnxruntime's fusion of transposed constants, which is wrong for vectors.
         one = weights.shape[0] == 1  # saves two nodes
-        y = (h * weights[0]).sum(-1, keepdim=True) if one else (h.unsqueeze(-2) * weights).sum(-1)
-        if self.limited:
-            y = torch.minimum(torch.maximum(y, self.out_low), self.out_high)
-        return y
+        return (h * weights[0]).sum(-1, keepdim=True) if one else (h.unsqueeze(-2) * weights).sum(-1)
 
 
 def design_matrix(

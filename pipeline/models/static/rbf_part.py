@@ -7,14 +7,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from pipeline.errors import ParamsError
 from pipeline.models.base import Model
-from pipeline.models.part import Learnt, Regions, StaticPart, predict
+from pipeline.models.part import Learnt, Source, StaticPart, predict
 from pipeline.models.static.rbf import RBF, Basis
 from pipeline.models.training.regressors import Pairs
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
 
 if TYPE_CHECKING:
     from pipeline.models.static.sweep import SweepResult
@@ -29,61 +25,55 @@ class RbfPart(StaticPart):
     """
 
     model: ClassVar[type[Model]] = RBF
-    partitions: int = 88
+    partitions: int = 10
     basis: Basis = "thin_plate"
     width: float = 0.5
     ridge: float = 0.0
     sweep: tuple[int, ...] = ()
     sweep_seed: int = 0
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def __post_init__(self) -> None:
+        if self.sweep and (len(self.sweep) != 2 or not 2 <= self.sweep[0] <= self.sweep[1]):
+            raise ValueError(f"sweep is {list(self.sweep)}; give [first, last] partitions, 2 <= first <= last")
+
+    def learn(self, source: Source) -> Learnt:
         """Train by one least-squares fit, and sweep the partitions where asked to."""
-        pairs = self.pairs(record, signals)
-        train, validation = pairs.split(self.train_fraction, self.split, seed)
-        model, metrics = self._fit(train, validation, signals, regions)
+        pairs = self.pairs(source)
+        train, validation = pairs.split(self.train_fraction, self.split, source.seed)
+        model, metrics = self._fit(train, validation, source)
         if self.split == "random":
             # Neighbours in time on both sides flatter a random split: the honest figure stands beside it.
-            _, chronological = self._fit(*pairs.split(self.train_fraction, "time", seed), signals, regions)
+            _, chronological = self._fit(*pairs.split(self.train_fraction, "time", source.seed), source)
             metrics["time_split"] = {k: chronological[k] for k in ("rmse", "r2", "centres")}
-        found = None
-        if self.sweep and seed == self.sweep_seed:
-            if len(self.sweep) != 2 or not 2 <= self.sweep[0] <= self.sweep[1]:
-                raise ParamsError(f"sweep is {list(self.sweep)}; give [first, last] partitions, 2 <= first <= last")
-            found = self._sweep(train, validation, signals, regions)
+        swept = self._swept(train, validation, source) if self.sweep and source.seed == self.sweep_seed else None
         shown = validation.take(np.arange(min(400, len(validation))))
-        assert record is not None
         predictions = {
-            "time_s": record.time_s[shown.row],
+            "time_s": source.data(self.model.kind).time_s[shown.row],
             "actual": shown.y[:, 0],
-            "predicted": self.limited(predict(model, shown.x), signals)[:, 0],
+            "predicted": self.limited(predict(model, shown.x), source.signals)[:, 0],
         }
-        return Learnt(model, metrics, found, predictions)
+        return Learnt(model, metrics, swept, predictions)
 
-    def _fit(self, train: Pairs, validation: Pairs, signals: Signals, regions: Regions) -> tuple[Model, dict[str, Any]]:
-        from pipeline.models.static.fuzzy_means import (
-            FuzzyMeansRBF,  # here: scikit-learn is slow to import, and few need it
-        )
+    def _fit(self, train: Pairs, validation: Pairs, source: Source) -> tuple[Model, dict[str, Any]]:
+        from pipeline.models.static.fuzzy_means import FuzzyMeansRBF  # scikit-learn is slow to import, few need it
 
         estimator = FuzzyMeansRBF(self.partitions, basis=self.basis, width=self.width, ridge=self.ridge)
         model = estimator.fit(train.x, train.y).to_torch()
-        metrics = self.scored(model, validation, signals, regions)
+        metrics = self.scored(model, validation, source)
         return model, metrics | {"centres": len(estimator.centres_), "c": self.partitions, "n_train": len(train)}
 
-    def _sweep(self, train: Pairs, validation: Pairs, signals: Signals, regions: Regions) -> SweepResult:
+    def _swept(self, train: Pairs, validation: Pairs, source: Source) -> SweepResult:
         from pipeline.models.static.sweep import sweep  # here, as above
 
+        signals = source.signals
+        data = train.x, train.y, validation.x, validation.y
         return sweep(
-            train.x,
-            train.y,
-            validation.x,
-            validation.y,
+            *data,
             partitions=range(self.sweep[0], self.sweep[1] + 1),
             limits=self.limits(signals),
-            regions=regions,
+            regions=source.regions,
             basis=self.basis,
             width=self.width,
             ridge=self.ridge,
-            unit=self.unit(signals),
+            unit=(signals.mv[0] if self.task == "inverse" else signals.pv[source.pv_index(self.target)]).unit,
         )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from pipeline.metrics import per_region, r2, rmse
 from pipeline.models.static.fuzzy_means import check_parameters, grid_points, scaling, select_centres, to_grid
 from pipeline.models.static.least_squares import solve_iterative
 from pipeline.models.static.rbf import CHUNK, Basis, design_matrix
+from pipeline.plants.simulator import Array
 
-Array = NDArray[np.float64]
 Regions = Mapping[str, tuple[float, float]]
 
 
@@ -64,21 +63,6 @@ class SweepResult:
         """Write the result as JSON."""
         write_json(path, self.to_dict())
 
-    @classmethod
-    def load(cls, path: Path) -> Self:
-        """The result that ``save`` wrote; raises ModelError for another file."""
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            rows = tuple(
-                SweepRow(**{**row, "train": Score(**row["train"]), "validation": Score(**row["validation"])})
-                for row in content["rows"]
-            )
-            return cls(rows, content["unit"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ModelError(
-                f"{path} is not a sweep that this pipeline wrote ({error}); run the sweep again"
-            ) from error
-
 
 def sweep(
     x_train: Array,
@@ -89,7 +73,6 @@ def sweep(
     partitions: Iterable[int] = range(4, 101),
     limits: tuple[float, float] | None = None,
     regions: Regions | None = None,
-    region_input: int = 0,
     basis: Basis = "thin_plate",
     width: float = 0.5,
     ridge: float = 0.0,
@@ -99,7 +82,7 @@ def sweep(
 
     ``x_*`` (K, n_in) and ``y_*`` (K,) or (K, n_out) in engineering units; ``limits`` bounds every
     prediction before it is scored; ``regions`` (name -> (low, high), as ``plant.regions``) are ranges
-    [low, high) of the input ``region_input``.
+    [low, high) of the first input.
 
     The weights come from ``solve_iterative``, whose predictions differ from those of the full QR by
     1e-5 of the residual: far below what tells two partitions apart. All large arrays are written
@@ -126,7 +109,7 @@ def sweep(
 
     def score(x: Array, target: Array, prediction: Array) -> Score:
         limited = prediction if limits is None else prediction.clip(*limits)
-        by_region = per_region(rmse, target, limited, x[:, region_input], regions or {})
+        by_region = per_region(rmse, target, limited, x[:, 0], regions or {})
         return Score(rmse(target, limited), r2(target, limited), by_region)
 
     begun = time.perf_counter()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,17 +24,12 @@ Progress = Callable[[int, float, float], None]  # iteration, train RMSE, validat
 class FitHistory:
     """One fit: RMSE of the scaled outputs after every iteration of the best restart.
 
-    ``best`` is the iteration whose parameters the network was left with; ``mu`` is the damping
-    (Levenberg-Marquardt) and empty for the other trainers; ``seconds`` counts from the start of
-    that restart; ``stopped`` says why it ended.
+    ``best`` is the iteration whose parameters the network was left with; ``stopped`` says why the restart ended.
     """
 
     train: tuple[float, ...]
     validation: tuple[float, ...]
-    mu: tuple[float, ...]
-    seconds: tuple[float, ...]
     best: int
-    restart: int
     stopped: str
 
 
@@ -43,37 +37,19 @@ class FitHistory:
 class Trainer(ABC):
     """Options shared by all trainers.
 
-    Parameters
-    ----------
-    iterations
-        At most so many per restart (epochs, for Adam).
-    patience
-        Stop after so many iterations without a validation RMSE lower by ``gain`` relative.
-    gain
-        Relative improvement that counts as one.
-    restarts
-        Fits from new random weights, of which the best by validation stays; 0 continues from the
-        network's present weights.
-    rows
-        Train on so many rows drawn at random, 0 for all: a smooth map of few inputs learns nothing
-        more from 100,000 rows than from 10,000, and the time is proportional to the rows.
+    A smooth map of few inputs learns nothing more from 100,000 rows than from 10,000, and the time is proportional
+    to the rows: ``rows`` limits them.
     """
 
-    iterations: int = 200
-    patience: int = 20
-    gain: float = 1e-3
-    restarts: int = 1
-    rows: int = 0
+    iterations: int = 200  # at most so many per restart (epochs, for Adam)
+    patience: int = 20  # stop after so many iterations without a validation RMSE lower by ``gain``
+    gain: float = 1e-3  # relative improvement that counts as one
+    restarts: int = 1  # fits from new random weights, the best by validation stays; 0 continues from the present ones
+    rows: int = 0  # train on so many rows drawn at random; 0 for all
     name: ClassVar[str]
 
     def fit(
-        self,
-        net: MLP,
-        train: Objective,
-        validation: Objective,
-        *,
-        seed: int,
-        progress: Progress | None = None,
+        self, net: MLP, train: Objective, validation: Objective, *, seed: int, progress: Progress | None = None
     ) -> FitHistory:
         """Train ``net`` in place and leave it with the parameters that were best on ``validation``.
 
@@ -87,7 +63,7 @@ class Trainer(ABC):
             generator = torch.Generator().manual_seed(seed * 1_000 + restart)
             if self.restarts:
                 net.reset(generator)
-            error, theta, history = self._one(net, train, validation, generator, restart, progress)
+            error, theta, history = self._one(net, train, validation, generator, progress)
             if math.isfinite(error) and (best is None or error < best[0]):
                 best = (error, theta, history)
         if best is None:
@@ -104,18 +80,16 @@ class Trainer(ABC):
         train: Objective,
         validation: Objective,
         generator: torch.Generator,
-        restart: int,
         progress: Progress | None,
     ) -> tuple[float, Tensor, FitHistory]:
-        start = time.perf_counter()
-        rows: list[tuple[float, float, float, float]] = []  # train, validation, mu, seconds
+        rows: list[tuple[float, float]] = []  # train, validation
         best, best_at, mark, mark_at = math.inf, 0, math.inf, 0
         theta = parameters_to_vector(net.parameters()).detach().clone()
         stopped = "converged"
-        for i, (loss, mu) in enumerate(self._iterate(net, train, generator)):
+        for i, loss in enumerate(self._iterate(net, train, generator)):
             with torch.no_grad():
                 error = math.sqrt(float(validation.loss(net)))
-            rows.append((math.sqrt(loss), error, mu, time.perf_counter() - start))
+            rows.append((math.sqrt(loss), error))
             if progress is not None:
                 progress(i, rows[-1][0], error)
             if error < best:
@@ -129,13 +103,12 @@ class Trainer(ABC):
             if i + 1 == self.iterations:
                 stopped = "iterations"
                 break
-        columns = list(zip(*rows, strict=True)) or [(), (), (), ()]
-        mus = columns[2] if any(columns[2]) else ()
-        return best, theta, FitHistory(columns[0], columns[1], mus, columns[3], best_at, restart, stopped)
+        losses, errors = zip(*rows, strict=True) if rows else ((), ())
+        return best, theta, FitHistory(losses, errors, best_at, stopped)
 
     @abstractmethod
-    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[tuple[float, float]]:
-        """Improve ``net`` in place; yield (training loss, mu) after every iteration."""
+    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[float]:
+        """Improve ``net`` in place; yield the training loss after every iteration."""
 
 
 @dataclass(frozen=True)
@@ -152,20 +125,13 @@ class LevenbergMarquardt(Trainer):
 
     Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems,
     2nd ed., DTU 2004, algorithm 3.16.
-
-    Parameters
-    ----------
-    mu
-        Damping of the first iteration, relative to the largest entry of diag(J'J).
-    chunk
-        Rows whose Jacobian is held at a time.
     """
 
-    mu: float = 1e-3
-    chunk: int = 1024
+    mu: float = 1e-3  # damping of the first iteration, relative to the largest entry of diag(J'J)
+    chunk: int = 1024  # rows whose Jacobian is held at a time
     name: ClassVar[str] = "lm"
 
-    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[tuple[float, float]]:
+    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[float]:
         theta = parameters_to_vector(net.parameters()).detach().clone()
         unit = torch.eye(len(theta), dtype=theta.dtype)
         mu, grow = math.nan, 2.0
@@ -190,24 +156,18 @@ class LevenbergMarquardt(Trainer):
                     vector_to_parameters(theta, net.parameters())
                     return
             theta = theta + step
-            yield trial, mu
+            yield trial
             mu, grow = mu * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
 
 
 @dataclass(frozen=True)
 class LBFGS(Trainer):
-    """Limited-memory BFGS with a strong Wolfe line search on the whole training set.
+    """Limited-memory BFGS with a strong Wolfe line search on the whole training set."""
 
-    Parameters
-    ----------
-    memory
-        Number of past steps that stand for the curvature.
-    """
-
-    memory: int = 30
+    memory: int = 30  # past steps that stand for the curvature
     name: ClassVar[str] = "lbfgs"
 
-    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[tuple[float, float]]:
+    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[float]:
         optimizer = torch.optim.LBFGS(
             net.parameters(),
             max_iter=1,
@@ -230,28 +190,20 @@ class LBFGS(Trainer):
             if not start < before:
                 return
             before = start
-            yield start, 0.0
+            yield start
 
 
 @dataclass(frozen=True)
 class Adam(Trainer):
-    """Adam on shuffled batches, its learning rate falling to zero along a cosine.
-
-    Parameters
-    ----------
-    rate
-        Learning rate at the start.
-    batch
-        Rows a step.
-    """
+    """Adam on shuffled batches, its learning rate falling to zero along a cosine."""
 
     iterations: int = 400
     patience: int = 400
-    rate: float = 1e-2
-    batch: int = 256
+    rate: float = 1e-2  # learning rate at the start
+    batch: int = 256  # rows a step
     name: ClassVar[str] = "adam"
 
-    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[tuple[float, float]]:
+    def _iterate(self, net: MLP, train: Objective, generator: torch.Generator) -> Iterator[float]:
         optimizer = torch.optim.Adam(net.parameters(), lr=self.rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.iterations)
         n = len(train)
@@ -266,7 +218,7 @@ class Adam(Trainer):
                 optimizer.step()
                 total += float(loss.detach()) * len(rows) / n
             schedule.step()
-            yield total, 0.0
+            yield total
 
 
 TRAINERS: dict[str, type[Trainer]] = {t.name: t for t in (LevenbergMarquardt, LBFGS, Adam)}

@@ -51,7 +51,7 @@ def parameter_jacobian(net: MLP, x: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def input_jacobian(net: MLP, x: Tensor) -> Tensor:
-    """dy/dx of the unlimited prediction, shape (N, n_out, n_in), in engineering units."""
+    """dy/dx of the prediction, shape (N, n_out, n_in), in engineering units."""
     a = (x - net.x_center) / net.x_scale
     chain = torch.diag(1 / net.x_scale).expand(len(x), -1, -1)  # da_l/dx, (N, n_in, width)
     for weight, bias in zip(list(net.weights)[:-1], list(net.biases)[:-1], strict=True):

@@ -2,21 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from pipeline.config.params import choose, parse
+from pipeline.metrics import fit_percent, rmse
 from pipeline.models.base import Model
-from pipeline.models.part import Array, Learnt, Regions, StaticPart
+from pipeline.models.part import Learnt, Regions, Source, StaticPart
 from pipeline.models.static.mlp import MLP
 from pipeline.models.training.fit import TRAINERS, FitHistory, Trainer
-from pipeline.models.training.objectives import Samples
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
+from pipeline.models.training.objectives import Objective, Samples
+from pipeline.plants.simulator import Array
+
+TRAINED = ("one_step_trained", "free_run_trained")
+"""Names of the network after the first training and after the second, in metrics and curves."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LongRun:
+    """Free runs of a network beside the measurement: (N, k, n_pv) each, N runs of k periods.
+
+    ``one_step`` holds (measured, predicted) one period ahead, (M, n_pv) each.
+    """
+
+    one_step: tuple[Array, Array]
+    measured: Array
+    predicted: Array
+
+    def figures(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """Of each PV: RMSE one step ahead, RMSE [unit of the PV] and fit [%] of the free runs."""
+        return {
+            name: {
+                "one_step_rmse": rmse(*(side[:, i] for side in self.one_step)),
+                "free_run_rmse": rmse(self.measured[..., i], self.predicted[..., i]),
+                "free_run_fit": fit_percent(self.measured[..., i].ravel(), self.predicted[..., i].ravel()),
+            }
+            for i, name in enumerate(names)
+        }
+
+
+def curves(runs: Mapping[str, LongRun], period_s: float) -> dict[str, Array]:
+    """The first PV over the first of the runs: ``time_s``, ``measured``, and each network's course by its name."""
+    measured = next(iter(runs.values())).measured[0, :, 0]
+    time_s: Array = period_s * np.arange(1, len(measured) + 1, dtype=np.float64)
+    return {"time_s": time_s, "measured": measured, **{name: run.predicted[0, :, 0] for name, run in runs.items()}}
 
 
 def trainer_of(options: Mapping[str, Any]) -> Trainer:
@@ -25,12 +57,33 @@ def trainer_of(options: Mapping[str, Any]) -> Trainer:
     return parse(choose(TRAINERS, rest.pop("kind", "lm"), "trainer", "trainer.kind"), rest, "trainer")
 
 
-def going_on(trainer: Trainer, iterations: int | None) -> Trainer:
-    """The same trainer, continuing from the weights that are there, for at most ``iterations``; None: as many."""
-    return replace(trainer, restarts=0, iterations=trainer.iterations if iterations is None else iterations)
+def fit_in_two(
+    net: MLP,
+    trainer: Trainer,
+    *,
+    one_step: Sequence[Objective],
+    free_run: Sequence[Objective] | None,
+    free_run_iterations: int | None,
+    seed: int,
+    long_run: Callable[[], LongRun] | None,
+) -> tuple[FitHistory, dict[str, LongRun]]:
+    """Train one step ahead, then go on from those weights with a free run: one of random weights leads nowhere.
+
+    ``one_step`` and ``free_run`` hold the objectives of training and validation; without ``free_run`` the one-step
+    fit is the last. ``free_run_iterations`` limit the second training; None: as the first. ``long_run`` judges the
+    network after each of the two; its results have the names TRAINED.
+    """
+    history = trainer.fit(net, *one_step, seed=seed)
+    runs = {TRAINED[0]: long_run()} if long_run else {}
+    if free_run:
+        iterations = trainer.iterations if free_run_iterations is None else free_run_iterations
+        history = replace(trainer, restarts=0, iterations=iterations).fit(net, *free_run, seed=seed)
+        if long_run:
+            runs[TRAINED[1]] = long_run()
+    return history, runs
 
 
-def story(model: Model, history: FitHistory) -> dict[str, Any]:
+def fit_figures(model: Model, history: FitHistory) -> dict[str, Any]:
     """How a fit went, for the metrics: the model's size, its iterations and their validation errors."""
     return {
         "parameters": sum(p.numel() for p in model.parameters()),
@@ -56,24 +109,15 @@ class MlpPart(StaticPart):
     train_fraction: float = 0.85
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 
-    def learn(
-        self, record: Record | None, signals: Signals, regions: Regions, seed: int, plant: Simulator | None = None
-    ) -> Learnt:
+    def learn(self, source: Source) -> Learnt:
         """Train with early stopping on the validation pairs."""
-        pairs = self.pairs(record, signals)
-        train, validation = pairs.split(self.train_fraction, self.split, seed)
-        residual = (self._column(signals),) if self.residual and self.task == "forward" else ()
+        train, validation = self.pairs(source).split(self.train_fraction, self.split, source.seed)
+        residual = (source.pv_index(self.target),) if self.residual and self.task == "forward" else ()
         net = MLP.scaled_to(train.x, train.y, hidden=self.hidden, residual=residual)
-        weights = [self._weights(p.x[:, 0], regions) for p in (train, validation)]
-        sets = [Samples(p.x, p.y, w) for p, w in zip((train, validation), weights, strict=True)]
-        history = trainer_of(self.trainer).fit(net, sets[0], sets[1], seed=seed)
-        metrics = self.scored(net.eval(), validation, signals, regions)
-        metrics |= {"n_train": len(train), **story(net, history)}
-        return Learnt(net, metrics)
-
-    def _column(self, signals: Signals) -> int:
-        names = [s.name for s in signals.pv]
-        return names.index(self.target) if self.target is not None else 0
+        sets = [Samples(p.x, p.y, self._weights(p.x[:, 0], source.regions)) for p in (train, validation)]
+        history = trainer_of(self.trainer).fit(net, *sets, seed=source.seed)
+        metrics = self.scored(net.eval(), validation, source)
+        return Learnt(net, metrics | {"n_train": len(train), **fit_figures(net, history)})
 
     def _weights(self, cv: Array, regions: Regions) -> Array | None:
         if self.balance == 0:

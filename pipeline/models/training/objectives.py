@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 from typing import Protocol, Self
 
 import numpy as np
@@ -14,9 +15,8 @@ from torch import Tensor
 from pipeline.errors import ModelError
 from pipeline.models.static.mlp import MLP
 from pipeline.models.training.jacobian import input_jacobian, parameter_jacobian, scaled_output
+from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
-
-Array = NDArray[np.float64]
 
 
 class Objective(Protocol):
@@ -35,55 +35,57 @@ class Objective(Protocol):
         """Number of rows."""
 
 
-def _weights(weight: Array | None, n: int, n_terms: int) -> Tensor:
-    """Square roots of the row weights, normalized so that the sum of squares is a mean."""
-    w = np.ones(n) if weight is None else np.asarray(weight, float)
-    if w.shape != (n,) or not np.all(np.isfinite(w)) or np.any(w < 0) or w.sum() <= 0:
-        raise ModelError(f"weights of training data: give {n} finite numbers >= 0, not all zero; got shape {w.shape}")
-    return torch.from_numpy(np.sqrt(w / (w.sum() * n_terms)))
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Arrays with a row for each sample or window, of which an objective is the mean."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def part(self, rows: NDArray[np.int64]) -> Self:
+        """The same objective over some of its rows."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: None if v is None else v[rows] for name, v in values.items()})
+
+
+def check_finite(what: str, *arrays: Array) -> None:
+    """Raise ModelError where a value is not finite."""
+    if not all(np.all(np.isfinite(a)) for a in arrays):
+        raise ModelError(f"{what} hold a value that is not finite; drop those rows of the record")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class Samples(Rows):
     """One-step error: mean over rows of w |s(x) - s*|^2, s the output scaled to deviation 1.
 
-    Parameters
-    ----------
-    x, y
-        Inputs (N, n_in) and outputs (N, n_out), engineering units.
-    weight
-        Importance of each row (N,); None for equal ones. Rows of a rare region want more.
-
-    Raises
-    ------
-    ModelError
-        Shapes that do not match, no row, a value that is not finite, or a negative weight.
+    Raises ModelError for shapes that do not match, no row, a value that is not finite, or a negative weight.
     """
 
-    x: Array
-    y: Array
-    weight: Array | None = None
+    x: Array  # (N, n_in) inputs, engineering units
+    y: Array  # (N, n_out) outputs, engineering units
+    weight: Array | None = None  # (N,) importance of each row; None for equal ones. Rows of a rare region want more.
 
     def __post_init__(self) -> None:
-        if self.x.ndim != 2 or self.y.ndim != 2 or len(self.x) != len(self.y) or not len(self.x):
+        x, y = self.x, self.y
+        if x.ndim != 2 or y.ndim != 2 or len(x) != len(y) or not len(x):
+            raise ModelError(f"training data have shapes {x.shape} and {y.shape}; give (N, n_in), (N, n_out), N > 0")
+        check_finite("training data", x, y)
+        self._root()
+
+    def _root(self) -> Tensor:
+        """Square roots of the rows' weights, normalized so that the sum of squares is a mean, shape (N,)."""
+        n = len(self)
+        w = np.ones(n) if self.weight is None else np.asarray(self.weight, float)
+        if w.shape != (n,) or not np.all(np.isfinite(w)) or np.any(w < 0) or w.sum() <= 0:
             raise ModelError(
-                f"samples have shapes {self.x.shape}, {self.y.shape}; give (N, n_in), (N, n_out) with N > 0"
+                f"weights of training data: give {n} finite numbers >= 0, not all zero; got shape {w.shape}"
             )
-        if not (np.all(np.isfinite(self.x)) and np.all(np.isfinite(self.y))):
-            raise ModelError("samples hold a value that is not finite; drop those rows of the record")
-        _weights(self.weight, len(self.x), self.y.shape[1])
-
-    def __len__(self) -> int:
-        return len(self.x)
-
-    def part(self, rows: NDArray[np.int64]) -> Samples:
-        """The samples of some rows."""
-        return Samples(self.x[rows], self.y[rows], None if self.weight is None else self.weight[rows])
+        return torch.from_numpy(np.sqrt(w / (w.sum() * self.y.shape[1])))
 
     def _tensors(self, net: MLP) -> tuple[Tensor, Tensor, Tensor]:
         x, y = torch.from_numpy(self.x), torch.from_numpy(self.y)
         target = (y - net.y_center - (x[:, list(net.residual)] if net.residual else 0.0)) / net.y_scale
-        return x, target, _weights(self.weight, len(self), net.n_out)
+        return x, target, self._root()
 
     def loss(self, net: MLP) -> Tensor:
         """Weighted mean squared error of the scaled output."""
@@ -101,35 +103,20 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Windows:
-    """Free-run error of an NNARX over k steps: mean over windows and steps of w (s_t - s*_t)^2.
+class Windows(Rows):
+    """Free-run error of an NNARX over k steps: mean over windows and steps of (s_t - s*_t)^2.
 
     Inside a window the model is fed its own predictions; k = 1 is the one-step error. The Jacobian
     follows the recursion, with phi(t) the regressor:
 
         dy(t)/dtheta = dNN/dtheta(phi(t)) + sum_i dNN/dy(t-i)(phi(t)) dy(t-i)/dtheta
 
-    Parameters
-    ----------
-    past
-        The last n_y measured PVs before each window, oldest first, shape (N, n_y).
-    u
-        MVs that the window's predictions use, oldest first, shape (N, n_u - 1 + k, n_mv).
-    future
-        Measured PVs of the window, shape (N, k).
-    weight
-        Importance of each window (N,); None for equal ones.
-
-    Raises
-    ------
-    ModelError
-        Shapes that do not match, no window, a value that is not finite, or a negative weight.
+    Raises ModelError for shapes that do not match, no window, or a value that is not finite.
     """
 
-    past: Array
-    u: Array
-    future: Array
-    weight: Array | None = None
+    past: Array  # (N, n_y) the last measured PVs before each window, oldest first
+    u: Array  # (N, n_u - 1 + k, n_mv) MVs that the window's predictions use, oldest first
+    future: Array  # (N, k) measured PVs of the window
 
     def __post_init__(self) -> None:
         shapes = self.past.shape, self.u.shape, self.future.shape
@@ -138,9 +125,7 @@ class Windows:
             raise ModelError(
                 f"windows have shapes {shapes}; give (N, n_y), (N, n_u - 1 + k, n_mv), (N, k) with N, k > 0"
             )
-        if not all(np.all(np.isfinite(a)) for a in (self.past, self.u, self.future)):
-            raise ModelError("windows hold a value that is not finite; drop those rows of the record")
-        _weights(self.weight, len(self.past), self.steps)
+        check_finite("windows", self.past, self.u, self.future)
 
     @classmethod
     def of(
@@ -170,46 +155,32 @@ class Windows:
             y[k[:, None] + np.arange(1, steps + 1)],
         )
 
-    def __len__(self) -> int:
-        return len(self.past)
-
     @property
     def steps(self) -> int:
         """Samples per window, k."""
         return int(self.future.shape[1])
 
-    def part(self, rows: NDArray[np.int64]) -> Windows:
-        """Some of the windows."""
-        weight = None if self.weight is None else self.weight[rows]
-        return Windows(self.past[rows], self.u[rows], self.future[rows], weight)
-
-    def _regressor(self, ys: list[Tensor], u: Tensor, step: int) -> Tensor:
-        n_u = self.u.shape[1] - self.steps + 1
-        recent = u[:, step : step + n_u].flip(1).transpose(1, 2).flatten(1)
-        return torch.cat([torch.stack(ys[-1 : -1 - self.past.shape[1] : -1], dim=1), recent], dim=1)
+    def _root(self, net: MLP) -> Tensor:
+        """What an error is multiplied by, so that the sum of squares is a mean of scaled ones, shape (1,)."""
+        return math.sqrt(1 / self.future.size) / net.y_scale
 
     def loss(self, net: MLP) -> Tensor:
-        """Weighted mean squared error of the scaled free run."""
+        """Mean squared error of the scaled free run."""
         past, u, future = (torch.from_numpy(a) for a in (self.past, self.u, self.future))
-        root = _weights(self.weight, len(self), self.steps) / net.y_scale
-        ys = list(past.unbind(1))
-        for step in range(self.steps):
-            ys.append(net.unlimited(self._regressor(ys, u, step))[:, 0])
-        free_run = torch.stack(ys[-self.steps :], dim=1)
-        return ((root[:, None] * (free_run - future)) ** 2).sum()
+        predicted = free_run(net, past, u, self.u.shape[1] - self.steps + 1)
+        return ((self._root(net) * (predicted - future)) ** 2).sum()
 
     @torch.no_grad()
     def normal_equations(self, net: MLP, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, J'r, J'J)."""
         past, u, future = (torch.from_numpy(a) for a in (self.past, self.u, self.future))
-        root = _weights(self.weight, len(self), self.steps) / net.y_scale
+        root, n_y, n_u = self._root(net), self.past.shape[1], self.u.shape[1] - self.steps + 1
         sums = Sums(net)
-        n_y = self.past.shape[1]
         for rows in chunks(len(self), chunk):
             ys = list(past[rows].unbind(1))
             sensitivities: list[Tensor] = []  # dy/dtheta of the predictions; measured PVs have none
             for step in range(self.steps):
-                phi = self._regressor(ys, u[rows], step)
+                phi = regressor(ys, u[rows], step, n_y, n_u)
                 s, jac = parameter_jacobian(net, phi)
                 jac = jac[:, 0].mul_(net.y_scale)
                 slope = input_jacobian(net, phi)[:, 0]
@@ -218,8 +189,30 @@ class Windows:
                 y = net.y_center + net.y_scale * s[:, 0]
                 ys.append(y + phi[:, net.residual[0]] if net.residual else y)
                 sensitivities.append(jac)
-                sums.add(root[rows] * (ys[-1] - future[rows, step]), jac * root[rows, None])
+                sums.add(root * (ys[-1] - future[rows, step]), jac * root)
         return sums.result
+
+
+def regressor(ys: list[Tensor], u: Tensor, step: int, n_y: int, n_u: int) -> Tensor:
+    """Phi (..., n_y + n_u n_mv) of prediction ``step``, as ``nnarx_pairs`` has it.
+
+    ``ys`` are the PVs (...,) up to the sample before, ``u`` (..., k, n_mv) the MVs, both oldest first.
+    """
+    recent = u[..., step : step + n_u, :].flip(-2).transpose(-1, -2).flatten(-2)
+    return torch.cat([torch.stack(ys[-1 : -1 - n_y : -1], dim=-1), recent], dim=-1)
+
+
+def free_run(predictor: Callable[[Tensor], Tensor], past: Tensor, u: Tensor, n_u: int) -> Tensor:
+    """Predictions (..., k) of ``predictor`` (phi -> (..., 1)), fed back in place of measurements.
+
+    ``past`` (..., n_y) holds the last measured PVs, oldest first; ``u`` (..., n_u - 1 + k, n_mv)
+    the MVs that the k predictions use, oldest first: its last row is u(t - d) of the last one.
+    """
+    n_y = past.shape[-1]
+    ys = list(past.unbind(-1))
+    for step in range(u.shape[-2] - n_u + 1):
+        ys.append(predictor(regressor(ys, u, step, n_y, n_u))[..., 0])
+    return torch.stack(ys[n_y:], dim=-1)
 
 
 class Sums:

@@ -1,8 +1,8 @@
-"""Training pairs of models, taken from a record; no pair reaches over the end of a run."""
+"""A record split in time, and training pairs taken from one; no pair reaches over the end of a run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 
 HELD = 1e-9  # of an MV's span: what still counts as the same value
+NEAR = 0.1  # of the record's rows: how far the cut may move to come between two runs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,9 +46,7 @@ class Pairs:
         Raises ParamsError for a fraction outside (0, 1) or an unknown way, RecordError where one
         side stays empty.
         """
-        if not 0.0 < fraction < 1.0:
-            raise ParamsError(f"the training fraction is {fraction}; it must lie between 0 and 1")
-        n = round(fraction * len(self))
+        n = _training_rows(fraction, len(self))
         if how == "time":
             first = self.row[n] if n < len(self) else np.iinfo(np.int64).max
             before = self.row[:n] + self.ahead <= first - self.back
@@ -124,3 +123,45 @@ def _held(record: Record, horizon: int) -> NDArray[np.int64]:
             f"excite with a hold of at least {horizon} or take a shorter horizon"
         )
     return k
+
+
+def _training_rows(fraction: float, n: int) -> int:
+    """How many of n rows train; raises ParamsError for a fraction outside (0, 1)."""
+    if not 0.0 < fraction < 1.0:
+        raise ParamsError(f"the training fraction is {fraction}; it must lie between 0 and 1")
+    return round(fraction * n)
+
+
+def split_in_time(record: Record, fraction: float) -> tuple[Record, Record]:
+    """(training, validation): the first ``fraction`` of the rows, and the rest.
+
+    Where runs are short (batches, restarts) the cut moves to the nearest boundary between two of
+    them, so that each run is whole on one side; a long run is cut inside, its times go on. No window
+    of one part reaches into the other.
+
+    Raises ParamsError for a fraction outside (0, 1), RecordError where one side would stay empty.
+    """
+    n, cut = len(record), _training_rows(fraction, len(record))
+    starts = np.flatnonzero(record.run[1:] != record.run[:-1]) + 1
+    if starts.size:
+        nearest = int(starts[np.argmin(np.abs(starts - cut))])
+        if abs(nearest - cut) <= NEAR * n:
+            cut = nearest
+    if not 0 < cut < n:
+        raise RecordError(
+            f"record: {n} rows split at {fraction:g} leave {cut} for training and {n - cut} for validation; "
+            "both need some: record more samples"
+        )
+    return rows_of(record, slice(0, cut)), rows_of(record, slice(cut, n))
+
+
+def rows_of(record: Record, rows: slice) -> Record:
+    """Some neighbouring rows of a record, with the runs and times that they had."""
+    return replace(record, **{name: getattr(record, name)[rows] for name in ("run", "time_s", "pv", "mv", "dv")})
+
+
+def longest_run(record: Record, most: int) -> Record:
+    """The longest run, or its first ``most`` rows."""
+    _, start, length = np.unique(record.run, return_index=True, return_counts=True)
+    i = int(np.argmax(length))
+    return rows_of(record, slice(int(start[i]), int(start[i] + min(length[i], most))))

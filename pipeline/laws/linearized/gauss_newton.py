@@ -1,4 +1,4 @@
-"""The minimum-variance move of an NNARX without a PID around it: shows what the PID's structure costs."""
+"""Laws that relinearize an NNARX within the sample: PID gains, and the move itself without a PID around it."""
 
 from __future__ import annotations
 
@@ -10,14 +10,69 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.adaptive import signed_unit, target, target_slots
-from pipeline.laws.base import ControlLaw, require_kind, require_single_loop
-from pipeline.laws.linearized.nnarx_law import central_model, next_output, room
+from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
+from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid, central_model, next_output
 from pipeline.models.base import Model
 from pipeline.models.lagged.next_output import GaussNewton
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Memory, Stage
+from pipeline.models.memory import Memory, Named, Stage
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
+
+
+def room(p: Named, low: Tensor, high: Tensor, unit: float) -> dict[str, Tensor]:
+    """Formulas of the least and the largest move that the actuator can make, in units."""
+    ends = [(low - p["u"]) / unit, (high - p["u"]) / unit]
+    return dict(zip(("down", "up"), ends if unit > 0 else reversed(ends), strict=True))
+
+
+class GaussNewtonPid(NnarxPid):
+    """PID whose gains give, within bounds, the minimum-variance move of the network itself.
+
+        min_du  (r - y(t+1))^2 + mu du^2,   y(t+1) by the network
+
+    solved by a few Gauss-Newton steps, each a linearization at the move so far, and limited to what
+    the actuator can do; the gains are then updated towards that move. Where a single linearization
+    needs a large penalty not to overshoot a curved plant, this needs next to none.
+
+    Source: not in [chen2004], which linearizes once and adapts the penalty instead
+    (eqs 16-29).
+    """
+
+    name: ClassVar[str] = "gauss_newton_pid"
+    title: ClassVar[str] = "PID from the NNARX, relinearized within the sample"
+
+    @dataclass(frozen=True, slots=True)
+    class Params(NnarxParams):
+        """As NnarxParams, with a smaller penalty; ``relinearize`` is the number of linearizations, 1 or more."""
+
+        penalty: float = 0.1
+        relinearize: int = 5
+
+        def __post_init__(self) -> None:
+            NnarxParams.__post_init__(self)
+            if self.relinearize < 1:
+                raise ValueError(f"relinearize is {self.relinearize}; give 1 or more linearizations a sample")
+
+    def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
+        super().__init__(signals, model, params, info=("linearization_error",))
+        self.search = GaussNewton(self.model, params.relinearize, params.penalty, params.slope_min)
+
+    def formulas(self, p: Named) -> Named:
+        """Those of the model, and the moves that the actuator can make."""
+        return {**super().formulas(p), **room(p, self.low, self.high, float(self.gains.unit))}
+
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
+        """One step; shapes as in ControlLaw."""
+        now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
+        ahead = self.model(now)
+        free, loud = self.gains.free(now, ahead.slope)
+        move, curvature = self.search(ahead, now["down"], now["up"])
+        z, changed = self.gains.settled(now, self.gains.update(now, move, curvature), free)
+        mv, moved = self.commanded(now, self.gains.step(now, z))
+        info = [self.gains.info_of(z, ahead.slope, free), ahead.offset, self.linearization_error(ahead, moved)]
+        state_next = self.memory.stored(now["known"], {**ahead.kept, **loud, **changed})
+        return mv, state_next, torch.cat(info, dim=-1)
 
 
 class MinimumVariance(ControlLaw):
@@ -26,7 +81,7 @@ class MinimumVariance(ControlLaw):
         min_du  (r - y(t+1))^2 + mu du^2,   y(t+1) = NN(phi(t+1)) + d(t),   mv(t) = mv(t-1) + du
 
     by Gauss-Newton steps within the actuator's range; one of them is the minimum-variance law of
-    the linearized network.
+    the linearized network. Beside ``GaussNewtonPid`` it shows what the PID's structure costs.
 
     Source: [chen2004, eqs 16 and 17], without the PID form of du.
     """
@@ -69,8 +124,7 @@ class MinimumVariance(ControlLaw):
         unit = signed_unit(signals, params.plant_gain, float(central_model(model).b[0]))
         self.model = next_output(self.name, model, unit, params.offset_filter)
         self.search = GaussNewton(self.model, params.relinearize, params.penalty, params.slope_min)
-        self.register_buffer("unit", torch.tensor([unit], dtype=torch.float64))
-        self.register_buffer("by_unit", 1 / self.unit)
+        hold_numbers(self, unit=unit, by_unit=1 / unit)
         self.memory = Memory({**target_slots(params.preview), **self.model.slots})
         self.stage = Stage(
             self.memory.layout,
@@ -89,9 +143,7 @@ class MinimumVariance(ControlLaw):
         """The law over part ``nnarx``; raises LawError."""
         return cls(signals, require_kind(models, NNARX, cls.name), params)
 
-    def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
         now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
         ahead = self.model(now)

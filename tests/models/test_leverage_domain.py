@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ModelError
-from pipeline.models.applicability import Leverage, narrowed
 from pipeline.models.base import load_model
 from pipeline.models.static.leverage_domain import LeverageDomain
 
@@ -70,7 +69,8 @@ def test_narrowing_is_equations_18_and_19(seed: int, r: float) -> None:
     at = domain.interval(torch.from_numpy(u[:5, :-1]))
     y = at.centre  # so that states outside the domain agree too
     wide, narrow = domain.bounds(at, y), domain.bounds(at, y, r)
-    expected = narrowed(wide[0].numpy(), wide[1].numpy(), r)
+    low, high = (w.numpy() for w in wide)
+    expected = ((r + 1) * low + (r - 1) * high) / (2 * r), ((r + 1) * high + (r - 1) * low) / (2 * r)
     tolerance = 1e-12 * float(np.abs(u[:, -1]).max())
     for got, want in zip(narrow, expected, strict=True):
         np.testing.assert_allclose(got.numpy(), want, rtol=1e-12, atol=tolerance)
@@ -131,4 +131,4 @@ def test_domain_survives_its_file(tmp_path) -> None:
 )
 def test_unusable_data_are_named(broken, message: str) -> None:
     with pytest.raises(ModelError, match=message):
-        Leverage.fit(broken(np.random.default_rng(0).normal(size=(50, 3))))
+        LeverageDomain.fit(broken(np.random.default_rng(0).normal(size=(50, 3))))
