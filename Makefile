@@ -27,7 +27,7 @@ run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, 
 
 test: check ## formatting, lint, types, import rules, tests
 	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
-	python -m pytest -n logical --dist loadfile
+	python -m pytest -n logical --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP) ## the static part of make test
 	ruff format --check .
@@ -37,7 +37,7 @@ check: $(STAMP) ## the static part of make test
 
 coverage: $(STAMP) ## branch coverage of the tests, by file
 	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
-	python -m pytest -n logical --dist loadfile --cov=serving --cov=pipeline --cov-branch --cov-report=term:skip-covered
+	python -m pytest -n logical --dist loadfile --no-loadscope-reorder --cov=serving --cov=pipeline --cov-branch --cov-report=term:skip-covered
 
 registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes first what the store lacks
 	loopwright registry publish

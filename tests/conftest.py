@@ -68,9 +68,14 @@ HORIZON = 3
 LawFactory = Callable[..., ControlLaw]
 
 
+# By their time. Taken first, so that with several workers none is waited for alone at the end.
+LONG_FILES = ("test_pipeline.py", "test_laws_contract.py", "test_tracking.py", "test_rbf.py", "test_report.py")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The file that takes longest comes first: with several workers nobody waits for it alone at the end."""
-    items.sort(key=lambda item: item.path.name != "test_pipeline.py")
+    """The long files first; xdist must be told to keep the order (``--no-loadscope-reorder``)."""
+    rank = {name: i for i, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 
 
 @pytest.fixture(autouse=True, scope="session")

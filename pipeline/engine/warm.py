@@ -80,6 +80,8 @@ class _Server:
     def run(self) -> int:
         """Serve until the command ends."""
         for name in LIBRARIES:  # while the command starts; stages that come meanwhile wait at the door
+            if self.command.poll() is not None:
+                break  # nothing was to be done
             with contextlib.suppress(Exception):
                 importlib.import_module(name)
         try:

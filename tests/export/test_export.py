@@ -32,14 +32,6 @@ def loop_signals(**changed: Any) -> Signals:
     return Signals(**values)
 
 
-def test_every_law_becomes_a_controller_that_equals_it(law: ControlLaw, tmp_path: Path) -> None:
-    manifest = export(law, tmp_path / "law.onnx", case="thiosulfate_cstr", provenance={})
-    controller = Controller(tmp_path / "law.onnx")
-    assert controller.manifest == manifest
-    assert set(manifest.inputs) <= {"sp", "pv", "mv_applied", "state"}
-    assert parity_gate(law, controller, steps=50) <= GATE_TOLERANCE
-
-
 def test_true_plant_may_drive_the_gate(pi_law: ControlLaw, pi_file: Path) -> None:
     level = np.array([0.5])
     seen: list[float] = []

@@ -253,6 +253,7 @@ def test_exported_graph_equals_the_module(law: ControlLaw, tmp_path) -> None:
     manifest = export(law, tmp_path / "law.onnx", case="contract", provenance={})
     assert (manifest.law, manifest.n_state, manifest.info) == (law.name, law.n_state, law.info)
     controller = Controller(tmp_path / "law.onnx")
+    assert controller.manifest == manifest
     rng = np.random.default_rng(7)
     state, mv = torch.zeros(law.n_state, dtype=torch.float64), 0.5 * (law.low + law.high)
     served, served_mv = controller.cold_state(), mv.numpy()

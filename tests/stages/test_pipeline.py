@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -30,21 +30,35 @@ ENVIRONMENT = {
 
 
 class Copy:
-    """A copy of the repository in which DVC runs."""
+    """A copy of the repository in which DVC runs, in a shell whose stages all start warm."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, shell: subprocess.Popen[str]) -> None:
+        self.path, self.shell = path, shell
 
-    def run(self, *command: str, check: bool = True) -> str:
+    def run(self, *command: str) -> str:
         found = subprocess.run(
             command, cwd=self.path, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
-        assert not check or found.returncode == 0, found.stdout
+        assert found.returncode == 0, found.stdout
         return found.stdout
+
+    def warm(self, command: str) -> tuple[str, int]:
+        """Run a command in the shell; what it printed and its exit status."""
+        assert self.shell.stdin is not None
+        assert self.shell.stdout is not None
+        self.shell.stdin.write(f"{command} 2>&1; echo ended with $?\n")
+        self.shell.stdin.flush()
+        said = ""
+        while not (end := re.search(r"^ended with (\d+)$", said, re.MULTILINE)):
+            line = self.shell.stdout.readline()
+            assert line, f"the shell ended: {said}"
+            said += line
+        return said[: end.start()], int(end[1])
 
     def repro(self) -> set[str]:
         """Run the pipeline; the stages that ran, by name."""
-        said = self.run("python", "-m", "pipeline.engine.warm", "dvc", "repro")
+        said, code = self.warm("dvc repro")
+        assert code == 0, said
         return set(re.findall(r"Running stage '([^']+)'", said))
 
     def edit(self, keys: Sequence[str], value: object) -> None:
@@ -58,7 +72,7 @@ class Copy:
 
 
 @pytest.fixture(scope="module")
-def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
     """The pipeline run once: one record, two model sets, two controllers, one data seed."""
     path = tmp_path_factory.mktemp("repository")
     listed = subprocess.run(
@@ -81,12 +95,18 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Copy:
     tree["controllers"][PID] |= {"tuning": "imc", "lambda_s": 1.5}
     tree["cases"][CASE]["held_out_seeds"] = tree["cases"][CASE]["held_out_seeds"][:1]
     (path / "params.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
-    repository = Copy(path)
-    repository.run("git", "init", "--quiet")
-    stages = repository.repro()
-    kinds = {"code", "excite", "fit", "design", "validate", "report", "overview", "publish"}
-    assert {s.split("@")[0] for s in stages} == kinds
-    return repository
+    subprocess.run(["git", "init", "--quiet"], cwd=path, check=True)
+    warm = [sys.executable, "-m", "pipeline.engine.warm", "bash"]
+    with subprocess.Popen(
+        warm, cwd=path, env=ENVIRONMENT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as shell:
+        repository = Copy(path, shell)
+        stages = repository.repro()
+        kinds = {"code", "excite", "fit", "design", "validate", "report", "overview", "publish"}
+        assert {s.split("@")[0] for s in stages} == kinds
+        yield repository
+        assert shell.stdin is not None
+        shell.stdin.close()
 
 
 def test_every_output_is_there(copy: Copy) -> None:
@@ -143,7 +163,8 @@ def test_a_run_killed_in_the_middle_loses_nothing(copy: Copy) -> None:
 
 def test_a_mistake_in_the_parameters_is_one_line(copy: Copy) -> None:
     copy.edit(("controllers", PID, "narowing"), 2.0)
-    said = copy.run("python", "-m", "pipeline.stages.design", PID, check=False)
+    said, code = copy.warm(f"python -m pipeline.engine.start design {PID}")
+    assert code == 2
     assert said.count("\n") == 1
     assert f"controllers.{PID}: unknown key 'narowing'" in said
     assert "Traceback" not in said
