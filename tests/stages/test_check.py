@@ -45,6 +45,7 @@ def test_the_repositorys_own_has_none(params: dict[str, Any], capsys: pytest.Cap
         (("cases", "batch_reactor", "held_out_seeds"), [11, 12], "none of the development seeds"),
         (("records", "ph_neutralization-aprbs", "kind"), "aprb", "did you mean 'aprbs'"),
         (("records", "ph_neutralization-aprbs", "samples"), "many", "samples"),
+        (("records", "ph_neutralization-aprbs", "samples"), 0, "samples is 0; it must be at least 1"),
         (("models", "batch_reactor-nnarx", "data"), "work/batch_reactor/records/batch", "which no record makes"),
         (("models", "batch_reactor-nnarx", "data"), "mine.csv", "which is not there"),
         (("models", "batch_reactor-nnarx", "parts", "arx", "kind"), "arxx", "did you mean 'arx'"),
