@@ -54,6 +54,8 @@ def test_the_repositorys_own_has_none(params: dict[str, Any], capsys: pytest.Cap
         (("controllers", "batch_reactor-pid", "name"), "fast", "so give `name: pid`"),
         (("controllers", "batch_reactor-pid", "model"), "linear", "has the model sets"),
         (("controllers", "batch_reactor-pid", "case"), "batch", "known: batch_reactor"),
+        (("controllers", "thiosulfate_cstr-incad", "model"), "three_periods", "needs a part 'domain'"),
+        (("controllers", "jacketed_batch_reactor-fuzzy_feedforward_pi", "part"), "tide", "needs a part 'tide'"),
         (("controllers", "reversible_cstr-pid", "kc"), 0, "kc of the PID is 0.0; it must be finite and not 0"),
         (("controllers", "batch_reactor-pid", "tunings"), "imc", "unknown key 'tunings'"),
         (("controllers", "thiosulfate_cstr-incad", "variants", "r=1"), {"q": 1.0}, "variants.r=1: unknown key 'q'"),

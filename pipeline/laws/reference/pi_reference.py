@@ -65,6 +65,11 @@ class PiReference(ReferenceLaw):
         self.stage = self.prepared(formulas)
 
     @classmethod
+    def needs(cls, params: Any) -> tuple[str, ...]:
+        """No part where ``kc`` and ``ti_s`` are given."""
+        return () if params.tuning == "manual" else tuple(cls.parts)
+
+    @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with the numbers of ``params``, or trained through part ``state_space``; raises LawError."""
         require_single_loop(signals, cls.name)
