@@ -230,7 +230,7 @@ def _read(path: Path, pinned: str | None) -> bytes:
             _check_kind(info)
             data = file.read(info.st_size)
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
-        raise ArtifactError(f"the file cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise ArtifactError(f"the file cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if pinned is not None and file_digest(data) != pinned.lower():
         raise ArtifactError(f"the file's SHA-256 is {file_digest(data)}, not the pinned {pinned}")
     unseal(data)

@@ -10,9 +10,16 @@ from pipeline.laws import LAWS
 
 def options(parser: argparse.ArgumentParser) -> None:
     """What the command takes."""
-    parser.add_argument("name", metavar="NAME", nargs="?", help="a law: show its parameters (default: list the laws)")
+    parser.add_argument(
+        "name", metavar="NAME", nargs="?", help="a law: show its parameters and model parts (default: list)"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the list or one law."""
+    """Print the list, or one law with its parameters and the parts of a model set that it needs."""
     list_or_show({name: (law.title, law.Params) for name, law in LAWS.items()}, options.name, "law", "laws")
+    if options.name is not None:
+        parts = LAWS[options.name].parts
+        print("\nparts of the model set:" + " none needed" * (not parts))
+        for part, words in parts.items():
+            print(f"  {part:12}  {words}")

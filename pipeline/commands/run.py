@@ -11,15 +11,18 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from pipeline.config.params import sections
 from pipeline.engine.lifeline import end_with_parent
 from pipeline.errors import ParamsError, PipelineError, nearest
 from pipeline.report.results import show_results
 from pipeline.stages.check import mistakes
+from pipeline.stages.code import code as list_files
 
 ARTIFACTS = Path("artifacts")
 MANY = 25  # stages that a person does not read line by line
+ABSENT = {"deleted", "not in cache"}  # DVC's words for a file that is not there, whether or not it ever was
 KINDS = {"records": "excite", "models": "fit", "controllers": "validate"}  # a section of params.yaml -> its stage
 
 
@@ -28,7 +31,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "targets", metavar="TARGET", nargs="*", help="cases, controllers, models or records of params.yaml (all)"
     )
-    parser.add_argument("--dry", action="store_true", help="say what would run and why, and run nothing")
+    parser.add_argument("--dry", action="store_true", help="say what would run and why, and run no stage")
     parser.add_argument("--keep-going", action="store_true", help="after a failure, run what does not depend on it")
 
 
@@ -40,7 +43,10 @@ def run(options: argparse.Namespace) -> int:
         rest = f"; params.yaml has {len(wrong)} mistakes, `loopwright check` lists them" if wrong[1:] else ""
         raise ParamsError(f"{wrong[0]}{rest}")
     # The list of files that each stage runs comes first: what has changed shows only after it.
-    _dvc("repro", "--quiet", "code")
+    if options.dry:
+        list_files()  # not by DVC, which would change dvc.lock
+    else:
+        _dvc("repro", "--quiet", "code")
     changed = status(targets)
     print("\n".join(plan(changed)), flush=True)
     if options.dry:
@@ -88,18 +94,23 @@ def status(targets: Iterable[str]) -> Mapping[str, list[str]]:
     """Stage -> why it runs, of the stages whose own files or parameters have changed (``dvc status``)."""
     upstream = [] if not targets else ["--with-deps"]
     tree = json.loads(_dvc("status", "--json", *upstream, *targets) or "{}")
-    return {stage: [reason for entry in entries for reason in reasons(entry)] for stage, entries in tree.items()}
+    return {stage: reasons(entries) for stage, entries in tree.items() if stage != "code"}
 
 
-def reasons(entry: Mapping[str, object] | str) -> list[str]:
-    """What DVC says of a stage, in words: ``{"changed deps": {"params.yaml": {"x.y": "modified"}}}``."""
-    if isinstance(entry, str):  # "changed command", "always changed"
-        return [entry]
+def reasons(entries: Iterable[Mapping[str, Mapping[str, Any]] | str]) -> list[str]:
+    """What DVC says of a stage, in words: ``[{"changed deps": {"params.yaml": {"x.y": "modified"}}}]``."""
     lines = []
-    for items in entry.values():
-        for name, how in items.items() if isinstance(items, Mapping) else ():
-            verbs = how if isinstance(how, Mapping) else {name: how}  # parameters of a file have one each
-            lines += [f"{key} is {verb}" for key, verb in verbs.items()]
+    for entry in entries:
+        if isinstance(entry, str):  # "changed command", "always changed"
+            lines.append(entry)
+            continue
+        if ABSENT.intersection(entry.get("changed outs", {}).values()):
+            return ["never run here, or its results were removed"]
+        for items in entry.values():
+            for name, how in items.items():
+                # Parameters of a file have a word each.
+                words = how if isinstance(how, Mapping) else {name: "not there" if how in ABSENT else how}
+                lines += [f"{key} is {word}" for key, word in words.items()]
     return lines
 
 

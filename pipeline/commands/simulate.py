@@ -37,16 +37,19 @@ T = TypeVar("T")
 
 def options(parser: argparse.ArgumentParser) -> None:
     """What the command takes."""
-    event = partial(_argument, partial(parse_event, named=False))
-    named = partial(_argument, partial(parse_event, named=True))
+
+    def events(option: str, form: str, words: str) -> None:
+        parse = partial(_argument, partial(parse_event, form=form))
+        add(option, metavar=form, type=parse, action="append", default=[], help=words)
+
     positive = partial(_number, above=0)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
-    add("--sp", metavar="VALUE[@S]", type=event, action="append", default=[], help="set point from time S on")
+    events("--sp", "VALUE[@S]", "set point from time S on")
     add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
     add("--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this CV")
-    add("--disturbance", metavar="NAME=VALUE[@S]", type=named, action="append", default=[], help="plant parameter")
-    add("--noise", metavar="PV=STD", type=named, action="append", default=[], help="measurement noise")
+    events("--disturbance", "NAME=VALUE[@S]", "plant parameter from time S on")
+    events("--noise", "PV=STD", "standard deviation of a measurement's noise, over the whole run")
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
     add("--duration", metavar="S", type=positive, help="length of the run")

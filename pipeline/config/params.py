@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from pipeline.errors import ParamsError, nearest
+from pipeline.errors import ParamsError, PipelineError, nearest
 
 T = TypeVar("T")
 PARAMS_FILE = Path("params.yaml")
@@ -74,8 +74,8 @@ def choose(table: Mapping[str, T], word: object, what: str, where: str) -> T:
 def parse(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     """``values`` as the dataclass ``cls``, types checked, nested dataclasses too.
 
-    Raises ParamsError that names ``where`` for an unknown or missing key or a wrong type, and
-    passes on a ValueError of the dataclass's own checks.
+    Raises ParamsError that names ``where`` for an unknown or missing key, a wrong type, and what the
+    dataclass's own checks refuse.
     """
     if not isinstance(values, Mapping):
         raise ParamsError(f"{where} is {values!r}; it must be a mapping")
@@ -91,7 +91,7 @@ def parse(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     read = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in values.items()}
     try:
         return cls(**read)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, PipelineError) as error:
         raise ParamsError(f"{where}: {error}") from None
 
 

@@ -100,6 +100,7 @@ class ControlLaw(nn.Module, ABC):
     # True if the law adds a move to the applied MV: its transfer from manual is bumpless, and a start at the set
     # point does not move the actuator. Other laws compute the MV without the applied one.
     incremental: ClassVar[bool] = False
+    parts: ClassVar[Mapping[str, str]] = {}  # what `design` needs of the model set: part name -> what it must be
     n_state: int
     info: tuple[str, ...]
     low: Tensor  # (n_mv,)
@@ -129,6 +130,11 @@ class ControlLaw(nn.Module, ABC):
     @abstractmethod
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step."""
+
+    @classmethod
+    def needs(cls, params: Any) -> tuple[str, ...]:
+        """Names of the parts that ``design`` needs with these parameters."""
+        return tuple(cls.parts)
 
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:

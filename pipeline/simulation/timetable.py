@@ -56,12 +56,12 @@ class Timetable:
         return next((s for s in self.manual if s.start_s <= time_s < s.end_s), None)
 
 
-def parse_event(text: str, *, named: bool) -> Event:
-    """``VALUE[@TIME]``, or ``NAME=VALUE[@TIME]`` where ``named``; ParamsError shows the form."""
-    form = "NAME=VALUE@TIME_S" if named else "VALUE or VALUE@TIME_S"
+def parse_event(text: str, form: str) -> Event:
+    """An event with a name where the form has ``=``, and with a time where it allows ``@``; ParamsError shows it."""
+    named = "=" in form
     name, equals, rest = text.partition("=") if named else ("", "=", text)
     value, at, time_s = rest.partition("@")
-    if not equals or (named and not name):
+    if not equals or (named and not name) or (at and "@" not in form):
         raise ParamsError(f"{text!r} is not of the form {form}")
     event = Event(_number(value, text, form), _number(time_s, text, form) if at else 0.0, name)
     if event.time_s < 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,10 @@ LONGEST_FILTER = 40.0  # periods; an IMC filter is looked for between half a per
 
 @dataclass(frozen=True, slots=True)
 class PidSettings:
-    """Settings of the ideal PID  Kc (b r - y + 1/(Ti s) (r - y) - Td s/(Tf s + 1) y)."""
+    """Settings of the ideal PID  Kc (b r - y + 1/(Ti s) (r - y) - Td s/(Tf s + 1) y).
+
+    Raises LawError for numbers with which it would not act, or act wrongly.
+    """
 
     kc: float  # [mv/pv]
     ti_s: float
@@ -26,6 +30,18 @@ class PidSettings:
     filter_s: float = 0.0  # Tf
     set_point_weight: float = 1.0  # b
     tracking_s: float | None = None  # time constant of the anti-windup; None: see ``tracking_time_s``
+
+    def __post_init__(self) -> None:
+        for name, allowed, words in (
+            ("kc", 0 < abs(self.kc) < inf, "finite and not 0, or the PID does nothing"),
+            ("ti_s", self.ti_s > 0, "above 0 s"),
+            ("td_s", 0 <= self.td_s < inf, "0 s or above, and finite"),
+            ("filter_s", 0 <= self.filter_s < inf, "0 s or above, and finite"),
+            ("set_point_weight", 0 <= self.set_point_weight < inf, "0 or above, and finite"),
+            ("tracking_s", self.tracking_s is None or self.tracking_s > 0, "above 0 s"),
+        ):
+            if not allowed:
+                raise LawError(f"{name} of the PID is {getattr(self, name)}; it must be {words}")
 
     @property
     def tracking_time_s(self) -> float:

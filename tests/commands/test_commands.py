@@ -93,6 +93,9 @@ def test_every_parameter_of_a_law_is_shown_and_explained(law: str, capsys: pytes
     for field in dataclasses.fields(params):
         assert f"\n{field.name} " in told, field.name
         assert field.name in words, f"{law}: the docstring of its parameters says nothing of {field.name}"
+    shown = told.partition("parts of the model set:")[2]
+    assert [line.split()[0] for line in shown.splitlines()[1:]] == list(LAWS[law].parts)
+    assert LAWS[law].parts or "none" in shown
 
 
 @pytest.mark.parametrize("kind", MODELS)

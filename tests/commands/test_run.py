@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.__main__ import main
+from pipeline.commands import run
 from pipeline.commands.run import plan, reasons, stages_of
 from pipeline.errors import ParamsError
 
@@ -23,12 +25,33 @@ def test_a_name_asks_for_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_reasons_are_words_for_what_dvc_says() -> None:
-    told = [
-        {"changed deps": {"params.yaml": {"controllers.x.kc": "modified"}, "work/a": "deleted"}},
-        "changed command",
-    ]
-    said = [reason for entry in told for reason in reasons(entry)]
-    assert said == ["controllers.x.kc is modified", "work/a is deleted", "changed command"]
+    deps = {"changed deps": {"params.yaml": {"controllers.x.kc": "modified"}, "work/a": "deleted"}}
+    said = reasons([deps, {"changed outs": {"work/b": "modified"}}, "changed command"])
+    assert said == ["controllers.x.kc is modified", "work/a is not there", "work/b is modified", "changed command"]
+
+
+@pytest.mark.parametrize("how", ["deleted", "not in cache"])  # of a new section; of a fresh clone
+def test_a_stage_that_never_ran_is_not_said_to_be_deleted(how: str) -> None:
+    said = reasons([{"changed deps": {"work/a": "deleted"}}, {"changed outs": {"work/b": how, "c.onnx": "modified"}}])
+    assert said == ["never run here, or its results were removed"]
+
+
+def test_a_dry_run_leaves_the_stages_to_a_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """DVC is asked for its status alone: a stage that it runs would change dvc.lock."""
+    asked: list[tuple[str, ...]] = []
+
+    def dvc(*arguments: str) -> str:
+        asked.append(arguments)
+        return '{"code": ["changed command"]}'
+
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(run, "_dvc", dvc)
+    monkeypatch.setattr(run, "list_files", lambda: None)
+    assert main(["run", "--dry"]) == 0
+    assert asked == [("status", "--json")]
+    assert capsys.readouterr().out == "nothing has changed; everything is up to date\n"
 
 
 def test_the_plan_names_every_stage_or_counts_many() -> None:

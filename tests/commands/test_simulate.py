@@ -127,7 +127,7 @@ def test_real_time_takes_its_time_and_gives_the_same(pid_file: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--sp", "high"], "'high' is no number; the form is VALUE or VALUE@TIME_S"),
+        (["--sp", "high"], "'high' is no number; the form is VALUE[@S]"),
         (["--sp", "0.5@-1"], "must not be negative"),
         (["--sp", "1.5"], "set point C_A = 1.5 mol/l is outside [0, 1] mol/l"),
         (["--sp", "0.5@900", "--duration", "10"], "time 900 s lies beyond the run, which ends at 10 s"),
@@ -135,9 +135,11 @@ def test_real_time_takes_its_time_and_gives_the_same(pid_file: Path) -> None:
         (["--scenario", "sp_c"], "did you mean 'sp_"),
         (["--sp", "0.5", "--from", "1.2"], "a start at C_A = 1.2 mol/l is outside [0, 1] mol/l"),
         (["--sp", "0.5", "--manual", "20..30", "--duration", "10"], "manual from 20 s lies beyond the run"),
-        (["--disturbance", "UA"], "'UA' is not of the form NAME=VALUE@TIME_S"),
+        (["--disturbance", "UA"], "'UA' is not of the form NAME=VALUE[@S]"),
         (["--disturbance", "T_inn=3"], "has no parameter 'T_inn'; did you mean 'T_in'?"),
         (["--noise", "CA=1"], "has no process variable 'CA'; did you mean 'C_A'?"),
+        (["--noise", "T"], "'T' is not of the form PV=STD"),
+        (["--noise", "T=0.1@30"], "'T=0.1@30' is not of the form PV=STD"),
         (["--noise", "C_A=-1"], "the noise of C_A is -1; a standard deviation is 0 or above"),
         (["--noise", "C_A=nan"], "not finite"),
         (["--manual", "9..3"], "end after that"),

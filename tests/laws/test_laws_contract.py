@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from conftest import QUICK, plant_of, rest_points
+from conftest import QUICK, plant_of, quick_parts, rest_points
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shipped import required
@@ -232,20 +232,19 @@ def test_nan_never_becomes_a_number(law: ControlLaw, group: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(LAWS))
-def test_a_law_without_models_names_the_part_it_lacks_or_needs_none(
-    name: str,
-) -> None:
+def test_the_parts_that_a_law_declares_are_enough_and_each_is_needed(name: str) -> None:
     cls, plant = LAWS[name], plant_of(name)
-    signals = plant.signals
-    try:
-        law = cls.design(cls.Params(**QUICK[name]), {}, signals, plant).eval()
-    except LawError as error:
-        said = str(error)
-    else:
-        inputs = drawn(law, np.random.default_rng(9))
-        assert torch.isfinite(step(law, inputs).mv).all()
-        return
-    assert f"law '{name}' needs a part" in said
+    parts, given = quick_parts(plant.name), cls.Params(**QUICK[name])
+    if hasattr(given, "part"):
+        given = dataclasses.replace(given, part=next(iter(parts)))
+    declared = {part: parts[part] for part in cls.needs(given)}
+    law = cls.design(given, declared, plant.signals, plant).eval()
+    assert torch.isfinite(step(law, drawn(law, np.random.default_rng(9))).mv).all()
+    assert len(declared) == len(cls.parts)
+    for part in declared:
+        rest = {name: model for name, model in declared.items() if name != part}
+        with pytest.raises(LawError, match=f"law '{name}' needs a part.* '{part}'"):
+            cls.design(given, rest, plant.signals, plant)
 
 
 def test_exported_graph_equals_the_module(law: ControlLaw, tmp_path) -> None:

@@ -141,13 +141,23 @@ def test_part_linearized_comes_before_the_plant(plant: EquationPlant, signals: S
     ("params", "message"),
     [
         (PID.Params(tuning="manual", kc=1.0), "needs kc and ti_s"),
-        (PID.Params(tuning="manual", kc=1.0, ti_s=-2.0), "ti_s > 0"),
         (PID.Params(tuning="magic"), "allowed are optimized, imc, simc, itae, manual"),  # type: ignore[arg-type]
     ],
 )
 def test_wrong_params_are_named(plant: EquationPlant, signals: Signals, params: PID.Params, message: str) -> None:
     with pytest.raises(LawError, match=message):
         PID.design(params, {}, signals, plant)
+
+
+@pytest.mark.parametrize("tuning", ["manual", "optimized"])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, value) for name in ("kc", "ti_s", "tracking_s") for value in (0.0, float("nan"))]
+    + [(name, value) for name in ("td_s", "filter_s", "set_point_weight") for value in (-1.0, float("inf"))],
+)
+def test_numbers_that_make_no_pid_are_refused_in_words(tuning: str, name: str, value: float) -> None:
+    with pytest.raises(LawError, match=rf"^{name} of the PID is {value}; it must be .*(finite|above 0 s)"):
+        PID.Params(**{"tuning": tuning, "kc": -2.0, "ti_s": 5.0, name: value})
 
 
 def test_a_plant_written_in_minutes_is_tuned_in_seconds() -> None:

@@ -269,9 +269,11 @@ def test_clear_errors(network: StateSpace, signals: Signals, reactor: EquationPl
     with pytest.raises(LawError, match="part 'state_space'"):
         ModelReference.design(ModelReference.Params(wn=0.05), {}, signals, reactor)
     with pytest.raises(LawError, match="needs kc and ti_s"):
-        PiReference.design(PiReference.Params(wn=0.05, tuning="manual", kc=-4.0), {}, signals, reactor)
-    with pytest.raises(LawError, match="ti_s = 0"):
-        PiReference.design(PiReference.Params(wn=0.05, tuning="manual", kc=-4.0, ti_s=0.0), {}, signals, reactor)
+        PiReference.Params(wn=0.05, tuning="manual", kc=-4.0)
+    with pytest.raises(LawError, match=r"ti_s of the PID is 0\.0"):
+        PiReference.Params(wn=0.05, tuning="manual", kc=-4.0, ti_s=0.0)
+    with pytest.raises(LawError, match=r"kc of the PID is 0\.0"):
+        PiReference.Params(wn=0.05, tuning="manual", kc=0.0, ti_s=1.0)
     with pytest.raises(LawError, match="natural frequency"):
         PiReference.design(PiReference.Params(tuning="manual", kc=-4.0, ti_s=1.0, wn=0.0), {}, signals, reactor)
     for name in ("lanes", "iterations", "hold"):

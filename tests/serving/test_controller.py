@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -260,9 +261,13 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
         assert kind in line
 
 
-def test_a_path_with_a_nul_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ArtifactError, match="cannot be read"):
-        Controller(tmp_path / "a\0b")
+@pytest.mark.parametrize("name", ["missing.onnx", "a\0b"])
+def test_a_file_that_cannot_be_read_is_one_error_of_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ArtifactError, match="cannot be read") as caught:
+        Controller(tmp_path / name)
+    shown = "".join(traceback.format_exception(caught.value))
+    assert shown.count("Traceback") == 1
+    assert "\n" not in str(caught.value)
 
 
 def test_a_pinned_digest_refuses_another_file(pi_file: Path, controller: Controller) -> None:

@@ -221,7 +221,7 @@ def test_optimized_imc_finds_the_cheapest(middle: Linearization) -> None:
         wanted = imc_pid(process, 1.5)
         return np.array([abs(np.log(r.kc / wanted.kc)) + 0.1 * abs(r.set_point_weight - 0.55) for r in rows])
 
-    base = PidSettings(0.0, 1.0, filter_s=0.1, tracking_s=3.0, set_point_weight=0.7)
+    base = PidSettings(1.0, 1.0, filter_s=0.1, tracking_s=3.0, set_point_weight=0.7)
     found = optimized_imc(process, 0.5, cost, base)
     assert found.kc == pytest.approx(imc_pid(process, 1.5).kc, rel=0.15)
     assert abs(found.set_point_weight - 0.55) < 0.06

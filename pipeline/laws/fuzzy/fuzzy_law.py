@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -74,6 +74,7 @@ class FuzzyLaw(ControlLaw):
     Raises LawError for a model whose gain is 0 or changes its sign, as no inverse exists there.
     """
 
+    parts: ClassVar[Mapping[str, str]] = {"PART": "kind hybrid_fuzzy, of the name that `part` gives"}
     info: tuple[str, ...] = ("adjusted_reference", "wanted_jacket", "reached_jacket", "mode")
     model: HybridFuzzy
     limits: Tensor  # (2,) [degC] of the jacket
@@ -96,6 +97,11 @@ class FuzzyLaw(ControlLaw):
             mode_middle=(values[0] + values[1]) / 2,
             mode_half=(values[1] - values[0]) / 2,
         )
+
+    @classmethod
+    def needs(cls, params: Any) -> tuple[str, ...]:
+        """The part that ``params.part`` names, if it does."""
+        return () if params.part is None else (params.part,)
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:

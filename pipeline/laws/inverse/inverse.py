@@ -28,6 +28,7 @@ class INC(ControlLaw):
 
     name: ClassVar[str] = "inc"
     title: ClassVar[str] = "Inverse neural controller"
+    parts: ClassVar[Mapping[str, str]] = {"inverse": "a network of task inverse"}
 
     @dataclass(frozen=True, slots=True)
     class Params:
@@ -56,6 +57,7 @@ class INC(ControlLaw):
 class DomainLaw(ControlLaw):
     """A law over parts ``inverse`` and ``domain``: its requests have bounds, drawn together ``r`` times."""
 
+    parts: ClassVar[Mapping[str, str]] = {"inverse": "a network of task inverse", "domain": "kind leverage_domain"}
     narrowing: Tensor  # (1,) r
 
     def __init__(

@@ -19,6 +19,7 @@ from pipeline.plants.simulator import Simulator
 
 # Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
 FOLLOWED = 1e-3
+ONE_PERIOD = "a network of task forward over one period, its target the observed PV"
 
 
 def _rising(forward: Model, signals: Signals) -> bool:
@@ -74,7 +75,8 @@ class ObserverLaw(ControlLaw):
                     f"integral_gain is {self.integral_gain} and band {self.band}; they must be >= 0 and > 0"
                 )
 
-    parts: ClassVar[tuple[str, ...]]  # of the model set, in the order of the constructor
+    # In the order of the constructor's arguments.
+    parts: ClassVar[Mapping[str, str]] = {"forward": "a network of task forward", "observer": ONE_PERIOD}
     span: Tensor
     band: Tensor
     least: Tensor  # (1,) share of the set point's range below which a reach is nothing but the models' errors
@@ -170,7 +172,7 @@ class InverseDob(ObserverLaw):
 
     name: ClassVar[str] = "inverse_dob"
     title: ClassVar[str] = "RBF inverse over several periods, disturbance observer, integral"
-    parts: ClassVar[tuple[str, ...]] = ("inverse", "forward", "observer")
+    parts: ClassVar[Mapping[str, str]] = {"inverse": "a network of task inverse", **ObserverLaw.parts}
 
     def __init__(
         self, signals: Signals, inverse: Model, forward: Model, observer: Model, params: ObserverLaw.Params
@@ -194,7 +196,6 @@ class ForwardDob(ObserverLaw):
 
     name: ClassVar[str] = "forward_dob"
     title: ClassVar[str] = "Forward network inverted online, disturbance observer, integral"
-    parts: ClassVar[tuple[str, ...]] = ("forward", "observer")
     SECTIONS: ClassVar[int] = 16
 
     cuts: Tensor  # (SECTIONS + 1,) [mv] cuts of one part, from its start

@@ -88,6 +88,7 @@ class MinimumVariance(ControlLaw):
 
     name: ClassVar[str] = "minimum_variance"
     title: ClassVar[str] = "Minimum variance by the NNARX, no PID"
+    parts: ClassVar[Mapping[str, str]] = {"nnarx": "kind nnarx"}
     incremental: ClassVar[bool] = True
 
     @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
@@ -53,6 +53,7 @@ def next_output(law: str, model: NNARX, unit: float, offset_filter: float, trust
 class NnarxPid(AdaptivePid):
     """A PID law over part ``nnarx``. ``more`` are slots of the law's own, ``info`` the names of its own info."""
 
+    parts: ClassVar[Mapping[str, str]] = {"nnarx": "kind nnarx"}
     params: NnarxParams
 
     def __init__(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -76,6 +76,7 @@ class LocalControllers(ControlLaw):
     """
 
     incremental = True
+    parts: ClassVar[Mapping[str, str]] = {"local_models": "kind local_models"}
 
     table: Tensor  # (m, 5): Kp_i, h Ki_i, Kd_i/h, a_i, u_i
     period: Tensor  # (1,) [s]

@@ -94,6 +94,14 @@ class PID(ControlLaw):
         examined_cv: tuple[float, float] | None = None
         mv_rate: float | None = None
 
+        def __post_init__(self) -> None:
+            self.given()
+
+        def given(self) -> PidSettings:
+            """The settings that stand here, 1 for those that a tuning finds; raises LawError for wrong numbers."""
+            kc, ti_s, weight = (1.0 if v is None else v for v in (self.kc, self.ti_s, self.set_point_weight))
+            return PidSettings(kc, ti_s, self.td_s, self.filter_s, weight, self.tracking_s)
+
     kc: Tensor  # (..., 1)
     integral: Tensor  # h/Ti
     keep: Tensor  # Tf/(Tf + h)
@@ -112,9 +120,6 @@ class PID(ControlLaw):
         # Several settings are candidates in one module: they broadcast over a leading dimension.
         rows = [settings] if isinstance(settings, PidSettings) else list(settings)
         h = signals.period_s
-        for s in rows:
-            if not (s.ti_s > 0 and s.td_s >= 0 and s.filter_s >= 0 and s.tracking_time_s > 0):
-                raise LawError(f"PID settings {s} need ti_s > 0, td_s >= 0, filter_s >= 0 and tracking_s > 0")
         numbers = {
             "kc": [s.kc for s in rows],
             "integral": [h / s.ti_s for s in rows],
@@ -150,13 +155,11 @@ class PID(ControlLaw):
     @classmethod
     def _tuned(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         require_single_loop(signals, cls.name)
-        p = params
-        weight = 1.0 if p.set_point_weight is None else p.set_point_weight
-        rest = {"filter_s": p.filter_s, "tracking_s": p.tracking_s, "set_point_weight": weight}
+        p, given = params, params.given()
         if p.tuning == "manual":
             if p.kc is None or p.ti_s is None:
                 raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
-            return cls(signals, PidSettings(p.kc, p.ti_s, p.td_s, **rest), p.mv_rate)
+            return cls(signals, given, p.mv_rate)
         lin = _linearization(params, models, plant)
         if p.tuning == "itae":
             settings = tuning.itae_pid(LagWithDeadTime.of(lin), signals.period_s, p.sampling)
@@ -176,11 +179,11 @@ class PID(ControlLaw):
                 law = cls(signals, rows, p.mv_rate)
                 return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
 
-            base = PidSettings(0.0, 1.0, **rest)
-            settings = tuning.optimized_imc(AllPole.near(lin), signals.period_s, cost, base, optimize_weight=free)
+            settings = tuning.optimized_imc(AllPole.near(lin), signals.period_s, cost, given, optimize_weight=free)
             return cls(signals, settings, p.mv_rate)
         else:
             raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
+        rest = {name: getattr(given, name) for name in ("filter_s", "tracking_s", "set_point_weight")}
         return cls(signals, replace(settings, **rest), p.mv_rate)
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:

@@ -35,6 +35,7 @@ class RecursivePid(AdaptivePid):
 
     name: ClassVar[str] = "recursive_pid"
     title: ClassVar[str] = "PID from a recursive linear model"
+    parts: ClassVar[Mapping[str, str]] = {"arx": "kind arx"}
 
     @dataclass(frozen=True, slots=True)
     class Params(AdaptiveParams):

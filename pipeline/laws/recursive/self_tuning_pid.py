@@ -46,6 +46,7 @@ class SelfTuningPid(ControlLaw):
 
     name: ClassVar[str] = "self_tuning_pid"
     title: ClassVar[str] = "Self-tuning PID"
+    parts: ClassVar[Mapping[str, str]] = {"arx": "kind arx"}
     incremental: ClassVar[bool] = True
 
     @dataclass(frozen=True, slots=True, kw_only=True)

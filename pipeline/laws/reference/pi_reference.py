@@ -18,6 +18,7 @@ from pipeline.models.memory import Named
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.tuning.reference_model import ReferenceModel
+from pipeline.tuning.rules import PidSettings
 
 
 class PiReference(ReferenceLaw):
@@ -39,6 +40,11 @@ class PiReference(ReferenceLaw):
         kc: float | None = None
         ti_s: float | None = None
 
+        def __post_init__(self) -> None:
+            if self.tuning == "manual" and None in (self.kc, self.ti_s):
+                raise LawError("tuning `manual` needs kc and ti_s; give both or take trained")
+            PidSettings(*(1.0 if v is None else v for v in (self.kc, self.ti_s)))  # refuses wrong numbers
+
     def __init__(
         self,
         signals: Signals,
@@ -49,8 +55,6 @@ class PiReference(ReferenceLaw):
         mv_rate: float | None = None,
     ) -> None:
         super().__init__(signals, model, mv_rate)
-        if not ti_s > 0:
-            raise LawError(f"law {self.name!r} has ti_s = {ti_s} s; it must be above 0")
         self.kc, self.ti_s, self.trained = kc, ti_s, trained
         share = signals.period_s / ti_s
 
@@ -61,12 +65,15 @@ class PiReference(ReferenceLaw):
         self.stage = self.prepared(formulas)
 
     @classmethod
+    def needs(cls, params: Any) -> tuple[str, ...]:
+        """No part where ``kc`` and ``ti_s`` are given."""
+        return () if params.tuning == "manual" else tuple(cls.parts)
+
+    @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law with the numbers of ``params``, or trained through part ``state_space``; raises LawError."""
         require_single_loop(signals, cls.name)
         if params.tuning == "manual":
-            if params.kc is None or params.ti_s is None:
-                raise LawError(f"law {cls.name!r} with tuning `manual` needs kc and ti_s; give both or take trained")
             return cls(signals, params.model(cls.name), params.kc, params.ti_s, mv_rate=params.mv_rate)
 
         def pi(sign: float) -> TrainablePi:

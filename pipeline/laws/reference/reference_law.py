@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -49,6 +50,7 @@ class ReferenceLaw(ControlLaw):
     A law gives ``formulas``, affine in the sample and the past, to ``prepared`` and computes its MV of their values.
     """
 
+    parts: ClassVar[Mapping[str, str]] = {"state_space": "kind state_space"}
     followed: Tensor  # (1,) [mv]
 
     def __init__(self, signals: Signals, model: ReferenceModel, mv_rate: float | None = None) -> None:
