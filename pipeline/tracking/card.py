@@ -60,7 +60,7 @@ def version_description(validation: Validation | None, gate: Gate, run_id: str, 
     if validation is not None:
         parts += [_table(validation, gate), _analysis(validation, gate.law)]
     if picture:
-        alt = f"Closed loop on the test that weighs most, beside the {escape(gate.baseline_name)}"
+        alt = "Closed loop on the test that weighs most, beside the baseline of the case"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
     return "\n".join(filter(None, parts))
 
