@@ -28,7 +28,7 @@ class Excitation(ABC):
     """
 
     kind: ClassVar[str]
-    samples: int = within(60_000, 1)
+    samples: int = field(metadata={"range": (1, np.inf)})
     noise: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
