@@ -11,12 +11,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, ReportError
 from pipeline.evaluation.case import Case, Curve
 from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.model_evidence import model_figure
-from pipeline.evaluation.typed_json import ReportError, read_mapping
+from pipeline.evaluation.typed_json import read_mapping
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]

@@ -10,10 +10,10 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure as Canvas
 
+from pipeline.errors import ReportError
 from pipeline.evaluation.case import Figure
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.model_evidence import candidates
-from pipeline.evaluation.typed_json import ReportError
 from pipeline.pictures.drawing import STYLE, CasePicture, save
 from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
