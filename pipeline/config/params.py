@@ -53,7 +53,7 @@ def _tree(path: Path) -> dict[str, Any]:
 
 
 def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
-    """What the section ``kind`` lists for ``case``: the values of ``field`` of its entries, in their order."""
+    """The values of ``field`` in the entries that the section ``kind`` has for ``case``, in their order."""
     own = {name: e for name, e in (_tree(path).get(kind) or {}).items() if e.get("case") == case}
     return tuple(str(_entry(e, field, f"{path}: {kind}.{name}")) for name, e in own.items())
 

@@ -1,4 +1,4 @@
-"""What every excitation is: numbers from params.yaml that make a record out of a plant and a seed."""
+"""Base of every excitation: numbers from params.yaml that make a record out of a plant and a seed."""
 
 from __future__ import annotations
 

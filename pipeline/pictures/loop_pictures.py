@@ -200,7 +200,7 @@ def _allow_only(axes: Axes, signal: Signal) -> None:
 
 
 def reference_of(evidence: Evidence, scenario: str) -> Array | None:
-    """What the controlled variable should do in a test (its first sequence) where it is not the set point, (n, 1)."""
+    """Reference of the controlled variable in a test (its first sequence), (n, 1); None if it is the set point."""
     tests = evidence.tests.get(scenario.removesuffix(NOISE_SUFFIX), ())
     return tests[0].reference if tests else None
 
@@ -240,7 +240,7 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas:
 
 
 def info_picture(evidence: Evidence, figure: Figure) -> Canvas:
-    """What the controllers of a figure say of themselves over time, a panel for each entry of info."""
+    """The info of the controllers of a figure over time, a panel for each entry."""
     found: dict[str, tuple[str, Loop, dict[str, Array]]] = {}
     period_s = evidence.case.plant.period_s
     for curve, colour in zip(figure.curves, colours(evidence, figure.curves), strict=True):

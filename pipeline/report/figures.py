@@ -67,7 +67,7 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
 
 
 def main_words(evidence: Evidence) -> tuple[str, str]:
-    """What a picture of the main test shows, and what the test is to somebody who doubts a tuning."""
+    """The main test in words: as a picture shows it, and for a reader who doubts a tuning."""
     name, recipe = evidence.main_test, evidence.case.recipe
     if len(evidence.tests[name.removesuffix(NOISE_SUFFIX)]) == 1:
         return (scenario_name(name, recipe, evidence.case.test_words),) * 2

@@ -1,4 +1,4 @@
-"""What a person reads in MLflow's registry: HTML, because its Markdown has no tables.
+"""Descriptions for MLflow's registry: HTML, because its Markdown has no tables.
 
 Pictures are linked relative to the server's root, through its get-artifact route: the registry
 strips ``data:`` images and every size or style, so pictures are drawn in the size they are shown.
