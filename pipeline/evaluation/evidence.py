@@ -113,8 +113,8 @@ class Evidence:
         return tests[0].late_from if tests else 0
 
     def late_s(self, scenario: str) -> float:
-        """The same in seconds."""
-        return self.late_from(scenario) * self.case.plant.period_s
+        """The same in seconds; 0 also where the case's metric has no late figure."""
+        return self.late_from(scenario) * self.case.plant.period_s if self.case.criterion.late else 0.0
 
     @property
     def main_title(self) -> str:

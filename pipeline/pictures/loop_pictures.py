@@ -332,7 +332,7 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas:
         raise NotMeasuredError
     error, times = evidence.figure(law, scenario), evidence.ratio(law, scenario)
     beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
-    late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
+    late, late_s = evidence.figure(law, scenario, metric.late), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{metric.short} {_error(error, metric)}{beside}{rest}"
     loops, names = {law_name(law): own}, [law]

@@ -123,14 +123,14 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
         for name, kind in dict.fromkeys(pairs)
         if (value := evidence.ratio(best, name, kind)) is not None
     ]
-    for need in (n for n in needs if n.metric == "sse_late"):
+    for need in (n for n in needs if n.metric == case.criterion.late):
         late = evidence.figure(best, need.scenario, need.metric)
         if late is not None:
             words = f"{case.metrics[need.metric].short} on {name_of(need.scenario)}"
             rows.append((number(late), f"{words}; at most {number(need.high)} is asked"))
     rows = rows[:MOST_HEADLINES]
     late_s = evidence.late_s(evidence.main_test)
-    metric = "sse_late" if late_s else case.metric
+    metric = case.criterion.late if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
     if own and other and own < other:
         where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
@@ -170,10 +170,11 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
     for name, title in evidence.scenarios.items():
         rows.append(_row(evidence, name, title, case.metric))
         if late_s := evidence.late_s(name):
-            rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", "sse_late"))
+            rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", case.criterion.late))
     mv, *others = case.plant_class.mv_signals
     unit = ", all MVs together" if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
-    return [*rows, _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")]
+    travel = _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")
+    return [*rows, travel | {"winner": None}]
 
 
 def _further(evidence: Evidence) -> list[dict[str, Any]]:
@@ -228,7 +229,7 @@ def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, An
         }
         for law in evidence.laws
     }
-    medians = {law: c["value"] for law, c in cells.items() if c["value"] is not None and metric != "mv_travel"}
+    medians = {law: c["value"] for law, c in cells.items() if c["value"] is not None}
     return {
         "name": name,
         "title": title,
