@@ -20,7 +20,7 @@ from pipeline.pictures.words import law_name, scenario_name
 from pipeline.report.figures import draw_all, main_words
 from pipeline.report.for_programs import validation
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
-from pipeline.report.verdicts import RULE, Judged, judge
+from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 MOST_HEADLINES = 5
@@ -91,10 +91,11 @@ def _bound_notes(evidence: Evidence) -> list[str]:
         kind: [
             n for n, tests in evidence.tests.items() if bounded(evidence.case, tests) and kind not in bounds.get(n, {})
         ]
-        for kind in ("nmpc", "offline")
+        for kind in BOUNDS
     }
-    words = {"nmpc": "The perfect-model NMPC", "offline": "The offline optimum"}
-    notes = [f"{words[kind]} was not computed for: {', '.join(names)}." for kind, names in lacking.items() if names]
+    notes = [
+        f"The {BOUNDS[kind]} was not computed for: {', '.join(names)}." for kind, names in lacking.items() if names
+    ]
     replaced = [n for n, of in bounds.items() if of.get("offline", {}).get("from_nmpc")]
     if replaced:
         notes.append(f"No search improved the NMPC's plan; its figures stand for the optimum: {', '.join(replaced)}.")
@@ -114,12 +115,11 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     best, case = evidence.best, evidence.case
     if best is None:
         return []
-    bounds = {"nmpc": "perfect-model NMPC", "offline": "offline optimum"}
     needs = [n for n in case.requirements if n.law in (None, best) and not n.low and not n.setting]
     pairs = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
     name_of = partial(scenario_name, recipe=case.recipe, own=case.test_words)
     rows = [
-        (ratio(value), f"× {case.criterion.short} of the {bounds.get(kind, kind)} on {name_of(name)}")
+        (ratio(value), f"× {case.criterion.short} of the {BOUNDS.get(kind, kind)} on {name_of(name)}")
         for name, kind in dict.fromkeys(pairs)
         if (value := evidence.ratio(best, name, kind)) is not None
     ]
