@@ -107,7 +107,10 @@ def cstr(seconds: float, seeds: int) -> None:
     from pipeline.models.training.regressors import forward_pairs
 
     plant = PLANTS["thiosulfate_cstr"]()
-    pairs = [forward_pairs(EXCITATIONS["operating_point"]().run(plant, seed), 3, 0) for seed in (0, 1)]
+    pairs = [
+        forward_pairs(EXCITATIONS["operating_point"](samples=40_000, restarts=60_000).run(plant, seed), 3, 0)
+        for seed in (0, 1)
+    ]
     order = np.random.default_rng(0).permutation(len(pairs[0]))
     parts = [pairs[0].take(order[:ROWS]), pairs[0].take(order[ROWS : ROWS + 4_000])]
     train, validation = (Samples(p.x, p.y) for p in parts)

@@ -1,1 +1,1 @@
-"""From plants and plant data to published controllers."""
+"""From plants and plant data to published controllers. What runs them on a plant is ``serving``."""

@@ -1,14 +1,16 @@
-"""What can go wrong between a plant and a published controller.
+"""Errors between a plant and a published controller.
 
 LoopwrightError (serving)
 +-- PipelineError
-    +-- ParamsError    params.yaml: an unknown key, a wrong type, a value out of range
-    +-- PlantError     a plant cannot do what was asked: no steady state there, wrong shape
-    +-- RecordError    a record's file: missing column, wrong unit, NaN, time not uniform, too short
-    +-- ModelError     training data or a stored model do not fit the model
-    +-- LawError       a control law cannot be designed from what it was given
-    +-- ExportError    a law cannot be written as one graph, or the graph differs from the law
-    +-- TrackingError  the MLflow store or registry cannot be read or written
+    +-- ParamsError       params.yaml: an unknown key, a wrong type, a value out of range
+    +-- PlantError        a plant cannot do what was asked: no steady state there, wrong shape
+    +-- RecordError       a record's file: missing column, wrong unit, NaN, time not uniform, too short
+    +-- ModelError        training data or a stored model do not fit the model
+    +-- LawError          a control law cannot be designed from what it was given
+    +-- ExportError       a law cannot be written as one graph, or the graph differs from the law
+    +-- NotMeasuredError  evaluation.evidence: a check or a picture needs a figure that was not measured
+    +-- ReportError       a report lacks a stage's results, or cannot read them
+    +-- TrackingError     the MLflow store or registry cannot be read or written
 """
 
 from __future__ import annotations
@@ -45,6 +47,10 @@ class LawError(PipelineError):
 
 class ExportError(PipelineError):
     """A law cannot be exported, or its graph differs from it."""
+
+
+class ReportError(PipelineError):
+    """The stages left nothing that a report could be made of."""
 
 
 class TrackingError(PipelineError):

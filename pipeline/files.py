@@ -52,7 +52,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """What ``write_json`` wrote; PipelineError where an earlier stage has not run."""
+    """The content of a file of ``write_json``; PipelineError where an earlier stage has not run."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -267,7 +267,7 @@ def write_validation(
 
 
 def bounds(mini: Miniature = THIOSULFATE) -> dict[str, Any]:
-    """What the oracle's script stored; the squared error after a recipe's start is nothing to it."""
+    """The stored bounds; they have no squared error after a recipe's start."""
     rows: dict[str, Any] = {name: {"nmpc": figures(error, mini.of.metric)} for name, error in mini.bound.items()}
     for name, error in mini.offline.items():
         rows[name]["offline"] = figures(error, mini.of.metric)

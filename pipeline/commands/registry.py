@@ -75,11 +75,11 @@ def options(parser: argparse.ArgumentParser) -> None:
     command("publish", lambda _: publish(Path.cwd()), "write the cached results that the store lacks")
     command("list", _list, "controllers, versions, gate scores and aliases; the champion of each case first")
     one = command("promote", _promote, "make a version the champion of its case, or move another alias")
-    one.add_argument("name", help="registered controller: CASE-LAW")
+    one.add_argument("name", help="registered controller: CASE-CONTROLLER")
     one.add_argument("version", help="its version, a number")
     one.add_argument("--alias", default=CHAMPION, help="default: %(default)s")
     one = command("fetch", _fetch, "write a controller and its manifest into a folder")
-    names = "CASE (its champion), CASE-LAW (its best version), CASE-LAW@ALIAS or CASE-LAW/VERSION"
+    names = "CASE (its champion), CASE-CONTROLLER (its best version), CASE-CONTROLLER@ALIAS or CASE-CONTROLLER/VERSION"
     one.add_argument("controller", help=names)
     one.add_argument("folder", type=Path)
     one = command("serve", _serve, "open MLflow's UI on this machine only, its job execution off")

@@ -53,7 +53,7 @@ def _tree(path: Path) -> dict[str, Any]:
 
 
 def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
-    """What the section ``kind`` lists for ``case``: the values of ``field`` of its entries, in their order."""
+    """The values of ``field`` in the entries that the section ``kind`` has for ``case``, in their order."""
     own = {name: e for name, e in (_tree(path).get(kind) or {}).items() if e.get("case") == case}
     return tuple(str(_entry(e, field, f"{path}: {kind}.{name}")) for name, e in own.items())
 
@@ -207,14 +207,14 @@ class ControllerParams:
 
     @classmethod
     def read(cls, name: str) -> ControllerParams:
-        """The section of one controller; ParamsError where its name is not that of the section."""
-        section, where = read_section("controllers", name), f"controllers.{name}"
-        case, dash, wanted = name.partition("-")
-        if dash and case == section.get("case") and section.get("name") != wanted:
+        """The section of one controller; ParamsError where the section is not called by its case and name."""
+        params = _with_rest(cls, read_section("controllers", name), "settings", f"controllers.{name}")
+        if name != (wanted := f"{params.case}-{params.name}"):
             raise ParamsError(
-                f"{where}.name is {section.get('name')!r}; the section is called CASE-NAME, so give `name: {wanted}`"
+                f"controllers.{name} has `case: {params.case}` and `name: {params.name}`; correct these, or call the "
+                f"section {wanted}"
             )
-        return _with_rest(cls, section, "settings", where)
+        return params
 
 
 def _with_rest(cls: type[T], section: Mapping[str, Any], rest: str, where: str) -> T:

@@ -153,7 +153,7 @@ def closed_loop_metrics(
         Every metric with ``of``, among them ``mae`` [CV] and ``sse`` [CV^2]; ``ise`` [CV^2 s],
         ``masse`` and ``max_asse`` [CV], ``overshoot`` (mean over the steps, fraction of the step;
         0 without steps), ``settling`` [s] (median over the holds), ``mv_travel`` [MV], and
-        ``sse_late`` [CV^2] where asked for. Several loops: the mean, the largest ``max_asse``.
+        ``sse_late`` [CV^2] where asked for. Several loops: the mean, or the largest (``Metric.together``).
 
     Raises
     ------
@@ -177,7 +177,7 @@ def closed_loop_metrics(
         "overshoot": [float(np.mean(steps)) if steps.size else 0.0 for steps in over],
         "settling": [period_s * float(np.median(settling_samples(a, b, hold, span))) for a, b in pairs],
     }
-    figures = {name: float(np.max(v) if name == "max_asse" else np.mean(v)) for name, v in loops.items()}
+    figures = {name: float(np.max(v) if METRICS[name].together == "max" else np.mean(v)) for name, v in loops.items()}
     figures["mv_travel"] = mv_travel(u)
     if late_from:
         figures["sse_late"] = float(np.mean([sse_late(a, b, late_from) for a, b in pairs]))

@@ -9,14 +9,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, ReportError
 from pipeline.evaluation.case import Case, Curve
-from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop
+from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.model_evidence import model_figure
-from pipeline.evaluation.typed_json import ReportError, read_mapping
+from pipeline.evaluation.typed_json import read_mapping
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]
@@ -113,8 +111,8 @@ class Evidence:
         return tests[0].late_from if tests else 0
 
     def late_s(self, scenario: str) -> float:
-        """The same in seconds."""
-        return self.late_from(scenario) * self.case.plant.period_s
+        """The same in seconds; 0 also where the case's metric has no late figure."""
+        return self.late_from(scenario) * self.case.plant.period_s if self.case.criterion.late else 0.0
 
     @property
     def main_title(self) -> str:
@@ -234,8 +232,4 @@ class Evidence:
 
     def predictions(self, model_set: str) -> Loop:
         """Arrays that the fit of a model set stored with its figures; empty if there are none."""
-        path = self.model_folder / model_set / "predictions.npz"
-        if not path.exists():
-            return {}
-        with np.load(path, allow_pickle=False) as file:
-            return {key: np.asarray(file[key], float) for key in file.files}
+        return arrays(self.model_folder / model_set / "predictions.npz")

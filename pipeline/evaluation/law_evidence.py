@@ -152,7 +152,7 @@ class LawEvidence:
     def analysis_arrays(self, setting: Mapping[str, Any]) -> Loop:
         """Arrays of the analysis by name; empty where none were kept."""
         start = f"{self.form_of(setting)}/"
-        return _under(start, self.trajectories.with_name("analysis.npz"))
+        return arrays(self.trajectories.with_name("analysis.npz"), start)
 
     def loop(self, scenario: str, setting: Mapping[str, Any]) -> Loop | None:
         """Trajectory of the shipped data seed, arrays (n, ...) by field; None where none was stored.
@@ -160,11 +160,11 @@ class LawEvidence:
         Of a test of several sequences, or of several draws of the noise, it is the first.
         """
         start = f"{scenario}/{self.form_of(setting)}/{self.metrics.shipped_seed}/"
-        return _under(start, self.trajectories) or None
+        return arrays(self.trajectories, start) or None
 
 
-def _under(start: str, path: Path) -> Loop:
-    """Arrays of an .npz whose names begin so, by the rest of the name; empty where there is no such file."""
+def arrays(path: Path, start: str = "") -> Loop:
+    """Arrays of an .npz whose names begin with ``start``, by the rest of the name; empty where there is no file."""
     if not path.exists():
         return {}
     with np.load(path, allow_pickle=False) as file:

@@ -43,8 +43,8 @@ class Metric:
     ``unit`` has ``{cv}`` in place of the controlled variable's unit. ``together`` combines the figures of
     several sequences; for a worst-case figure it is the worst of them. A metric with a ``floor`` can compare
     the laws of a case. The bounds then minimize its errors, ``squared`` or absolute, from the ``reference`` or
-    from the set point. ``of`` computes the figure from the set points and the controlled variable, each (n,),
-    if they are sufficient.
+    from the set point. ``late`` names the same figure over the late part of a test. ``of`` computes the figure
+    from the set points and the controlled variable, each (n,), if they are sufficient.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Metric:
     floor: Floor | None = None
     squared: bool = False
     reference: bool = False
+    late: str = ""
     of: Callable[[ArrayLike, ArrayLike], float] | None = None
 
     def unit_of(self, cv: str) -> str:
@@ -93,7 +94,9 @@ METRICS: dict[str, Metric] = {
     metric.name: metric
     for metric in (
         Metric("mae", "MAE", "mean absolute error", "{cv}", floor=_ABSOLUTE, of=metrics.mae),
-        Metric("sse", "SSE", "sum of squared errors", "{cv}²", floor=_SUM, squared=True, of=metrics.sse),
+        Metric(
+            "sse", "SSE", "sum of squared errors", "{cv}²", floor=_SUM, squared=True, late="sse_late", of=metrics.sse
+        ),
         Metric(
             "tracking",
             "tracking RMS",

@@ -9,14 +9,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.config.params import parse
-from pipeline.errors import ParamsError, PipelineError
+from pipeline.errors import ParamsError, ReportError
 
 T = TypeVar("T")
 REMEDY = "run `dvc repro`, which writes it again"
-
-
-class ReportError(PipelineError):
-    """The stages left nothing that a report could be made of."""
 
 
 def to_json(value: Any, schema: int) -> str:

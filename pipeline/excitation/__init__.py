@@ -1,4 +1,4 @@
-"""Excitations by the name they have in params.yaml (``kind``): adding one is a class and a line here."""
+"""Excitations by ``kind``: adding one is a class and a line here. One that only a case has stands in its folder."""
 
 from __future__ import annotations
 

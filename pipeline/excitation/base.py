@@ -1,4 +1,4 @@
-"""What every excitation is: numbers from params.yaml that make a record out of a plant and a seed."""
+"""Base of every excitation: numbers from params.yaml that make a record out of a plant and a seed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Excitation(ABC):
     """
 
     kind: ClassVar[str]
-    samples: int = within(60_000, 1)
+    samples: int = field(metadata={"range": (1, np.inf)})
     noise: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:

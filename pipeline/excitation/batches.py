@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -42,12 +42,11 @@ class Batches(OpenLoop):
     """
 
     kind: ClassVar[str] = "batches"
-    samples: int = within(50, 1)
-    batches: int = within(100, 1)
+    batches: int = field(metadata={"range": (1, np.inf)})
     hold: int = within(3, 1)
-    constant: float = within(0.1, 0, 1)
-    binary: float = within(0.2, 0, 1)
-    end_fraction: float = within(0.3, 0, 1)
+    constant: float = within(0.0, 0, 1)
+    binary: float = within(0.0, 0, 1)
+    end_fraction: float = within(0.0, 0, 1)
     start_spread: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:

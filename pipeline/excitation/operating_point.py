@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -74,7 +74,6 @@ class OperatingPoint(Excitation):
     """
 
     kind: ClassVar[str] = "operating_point"
-    samples: int = within(40_000, 1)
     run_length: int = within(1_000, 1)
     sp_low: float | None = None
     sp_high: float | None = None
@@ -87,7 +86,7 @@ class OperatingPoint(Excitation):
     td_s: float = within(0.0, 0)
     dither: float | None = within(None, 0)
     dither_hold: int = within(3, 1)
-    restarts: int = within(60_000, 0)
+    restarts: int = field(metadata={"range": (1, np.inf)})
     moves: int = within(1, 1)
     move_hold: int = within(3, 1)
     near: float | None = within(None, 0)

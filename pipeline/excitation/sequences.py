@@ -96,7 +96,6 @@ class Aprbs(Prbs):
     """
 
     kind: ClassVar[str] = "aprbs"
-    hold: int = within(4, 1)
 
     def unit_sequence(self, n_mv: int, rng: np.random.Generator) -> Array:
         """Levels on [0, 1], shape (samples, n_mv)."""

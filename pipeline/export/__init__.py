@@ -1,1 +1,1 @@
-"""From a control law to a controller file: the ONNX graph, the parity gate, the manifest inside."""
+"""From a law to a controller file: ONNX graph, parity gate, manifest. Nothing that runs the file stands here."""

@@ -1,4 +1,4 @@
-"""What a law of the velocity form need not take back after an actuator that stood still."""
+"""The move that a law in velocity form need not take back after an actuator stood still."""
 
 from __future__ import annotations
 

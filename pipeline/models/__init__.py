@@ -1,4 +1,4 @@
-"""Models by kind: adding one is a file in a family's folder (the model and its Part) and a line here."""
+"""Models by kind: adding one is a file in a family's folder (model and Part) and a line here. No law stands here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every model is: a float64 torch module with its scaling inside, and a file."""
+"""Base of every model: a float64 torch module with its scaling inside, and a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a law remembers, by name; and everything that is affine in it, computed as one matrix product."""
+"""The memory of a law, by name; and everything that is affine in it, computed as one matrix product."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What no controller can beat: collocation, horizon, NMPC and the stored bounds."""
+"""The bounds of all controllers: collocation, horizon, NMPC, offline optimum. No controller to ship stands here."""

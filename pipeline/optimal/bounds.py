@@ -51,7 +51,7 @@ def kinds(case: Case) -> tuple[str, ...]:
 
 
 def problem(case: Case) -> dict[str, Any]:
-    """What the bounds of a whole case depend on, beside the scenarios: stored, and compared with what is stored."""
+    """Everything that a case's bounds depend on, beside the scenarios: stored, and compared with what is stored."""
     aim = {key: getattr(case, key) for key in DEFAULTS} | {"limits": dict(case.limits), "effort": asdict(case.effort)}
     as_read: dict[str, Any] = json.loads(json.dumps(aim))
     return {"plant": plant_digest(equations(case.plant, f"a bound of case {case.name!r}")), **as_read}

@@ -205,7 +205,7 @@ def run_offline(
 
 
 def _course(scenario: Scenario, recipe: bool) -> Array:
-    """What the CV should do: the set point, or what stands in its place where its course is known."""
+    """The course that the CV should take: the set point, or the reference where that is known in advance."""
     return scenario.sp if scenario.reference is None or not recipe else scenario.reference
 
 

@@ -1,4 +1,4 @@
-"""What all pictures share: size, style, colours, labels, axes, legends, and the file that is written."""
+"""Shared parts of all pictures: size, style, colours, labels, axes, legends, and the file that is written."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ Figures = dict[str, list[float]]  # one_step_rmse, free_run_rmse, free_run_fit -
 
 
 def free_run_figures(evidence: Evidence, model_set: str, kind: str, trained: str, pv: str) -> Figures:
-    """What the fits of ``kind`` measured of one PV over the data seeds; raises NotMeasuredError without any."""
+    """Figures of one PV over the data seeds, from fits of ``kind``; raises NotMeasuredError without any."""
     parts = (evidence.models.get(model_set, {}).get("parts") or {}).values()
     rows = [row for part in parts for row in (part.get("per_seed") or {}).values()]
     found = [row[kind][trained][pv] for row in rows if pv in ((row.get(kind) or {}).get(trained) or {})]

@@ -1,4 +1,4 @@
-"""What a simulated run leaves behind: a picture, a table of samples, a line of figures."""
+"""The results of a simulated run: a picture, a table of samples, a line of figures."""
 
 from __future__ import annotations
 

@@ -199,12 +199,6 @@ def _allow_only(axes: Axes, signal: Signal) -> None:
     axes.set_ylim(values[0] - room, values[-1] + room)
 
 
-def reference_of(evidence: Evidence, scenario: str) -> Array | None:
-    """What the controlled variable should do in a test (its first sequence) where it is not the set point, (n, 1)."""
-    tests = evidence.tests.get(scenario.removesuffix(NOISE_SUFFIX), ())
-    return tests[0].reference if tests else None
-
-
 def first(values: Array) -> Array:
     """The controlled variable or the first MV, shape (n,)."""
     return values if values.ndim == 1 else values[:, 0]
@@ -229,18 +223,25 @@ def loops_picture(evidence: Evidence, figure: Figure) -> Canvas:
     if best is not None and best not in shipped:
         drawn[f"{law_name(best)} (ours, best)"] = Curve(best), "black"
     # The paper's curves lie in front: the figure is about them.
-    loops = {label: loop for label, (c, _) in drawn.items() if (loop := evidence.loop(c, scenario)) is not None}
-    if not loops:
+    found = {label: (loop, colour) for label, (c, colour) in drawn.items() if (loop := evidence.loop(c, scenario))}
+    if not found:
         raise NotMeasuredError
-    late, reference = evidence.late_from(scenario), reference_of(evidence, scenario)
-    panels = LoopPanels(evidence.case, f"Figure {figure.number}. {figure.title}", loops, late, reference)
-    for label, loop in loops.items():
-        panels.add(loop, label, drawn[label][1])
+    return _picture(evidence, scenario, f"Figure {figure.number}. {figure.title}", found)
+
+
+def _picture(evidence: Evidence, scenario: str, title: str, drawn: Mapping[str, tuple[Loop, str]]) -> Canvas:
+    """Loops of a test by their labels, each with its colour; the reference is that of the test's first sequence."""
+    tests = evidence.tests.get(scenario.removesuffix(NOISE_SUFFIX), ())
+    loops = {label: loop for label, (loop, _) in drawn.items()}
+    reference = tests[0].reference if tests else None
+    panels = LoopPanels(evidence.case, title, loops, evidence.late_from(scenario), reference)
+    for label, (loop, colour) in drawn.items():
+        panels.add(loop, label, colour)
     return panels.finish(next(iter(loops.values())))
 
 
 def info_picture(evidence: Evidence, figure: Figure) -> Canvas:
-    """What the controllers of a figure say of themselves over time, a panel for each entry of info."""
+    """The info of the controllers of a figure over time, a panel for each entry."""
     found: dict[str, tuple[str, Loop, dict[str, Array]]] = {}
     period_s = evidence.case.plant.period_s
     for curve, colour in zip(figure.curves, colours(evidence, figure.curves), strict=True):
@@ -332,19 +333,16 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas:
         raise NotMeasuredError
     error, times = evidence.figure(law, scenario), evidence.ratio(law, scenario)
     beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
-    late, late_s = evidence.figure(law, scenario, "sse_late"), evidence.late_s(scenario)
+    late, late_s = evidence.figure(law, scenario, metric.late), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
     title = f"{evidence.laws[law].title}\n{metric.short} {_error(error, metric)}{beside}{rest}"
-    loops, names = {law_name(law): own}, [law]
+    drawn = {law_name(law): (own, colour_of(law, evidence.laws, baseline))}
     other = evidence.loop(Curve(baseline), scenario) if law != baseline else None
     if other is not None:
         error = evidence.figure(baseline, scenario)
-        loops[f"{law_name(baseline)}, {metric.short} {_error(error, metric)}"] = other
-        names.append(baseline)
-    panels = LoopPanels(evidence.case, title, loops, evidence.late_from(scenario), reference_of(evidence, scenario))
-    for (label, loop), name in zip(loops.items(), names, strict=True):
-        panels.add(loop, label, colour_of(name, evidence.laws, baseline))
-    return panels.finish(own)
+        label = f"{law_name(baseline)}, {metric.short} {_error(error, metric)}"
+        drawn[label] = other, colour_of(baseline, evidence.laws, baseline)
+    return _picture(evidence, scenario, title, drawn)
 
 
 def _error(value: float | None, metric: Metric) -> str:

@@ -9,9 +9,9 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:,.0f}" if large else f"{value:.{digits}g}"
 
 
-def ratio(value: float) -> str:
-    """A multiple of a bound: two decimals, and more where it comes within a hundredth of it."""
-    return f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
+def ratio(value: float | None) -> str:
+    """A multiple of a bound: two decimals, and more within a hundredth of it; a dash where there is none."""
+    return "–" if value is None else f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
 
 
 def figure(value: float | None, digits: int = 3) -> str:
@@ -22,16 +22,6 @@ def figure(value: float | None, digits: int = 3) -> str:
 def times(value: float | None) -> str:
     """A ratio with three digits, and one more where it comes near 1."""
     return "–" if value is None else number(value, 4 if abs(value - 1) < 0.01 else 3)
-
-
-def headline(value: float | None) -> str:
-    """A case's main figure, with a digit more: the best laws come close to one another."""
-    return "–" if value is None else number(value, 4)
-
-
-def multiple(value: float | None) -> str:
-    """A multiple of a bound; a dash where there is none."""
-    return "–" if value is None else ratio(value)
 
 
 def kilobytes(value: int | None) -> str:

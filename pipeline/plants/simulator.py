@@ -1,4 +1,4 @@
-"""What a closed loop needs of a plant: signals, where it starts, one step, and what is measured."""
+"""A plant as a closed loop needs it: signals, where it starts, one step, and what is measured."""
 
 from __future__ import annotations
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure as Canvas
 
+from pipeline.errors import ReportError
 from pipeline.evaluation.case import Figure
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.model_evidence import candidates
-from pipeline.evaluation.typed_json import ReportError
 from pipeline.pictures.drawing import STYLE, CasePicture, save
 from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
@@ -67,7 +67,7 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
 
 
 def main_words(evidence: Evidence) -> tuple[str, str]:
-    """What a picture of the main test shows, and what the test is to somebody who doubts a tuning."""
+    """The main test in words: as a picture shows it, and for a reader who doubts a tuning."""
     name, recipe = evidence.main_test, evidence.case.recipe
     if len(evidence.tests[name.removesuffix(NOISE_SUFFIX)]) == 1:
         return (scenario_name(name, recipe, evidence.case.test_words),) * 2

@@ -20,7 +20,7 @@ from pipeline.pictures.words import law_name, scenario_name
 from pipeline.report.figures import draw_all, main_words
 from pipeline.report.for_programs import validation
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
-from pipeline.report.verdicts import RULE, Judged, judge
+from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 MOST_HEADLINES = 5
@@ -91,10 +91,11 @@ def _bound_notes(evidence: Evidence) -> list[str]:
         kind: [
             n for n, tests in evidence.tests.items() if bounded(evidence.case, tests) and kind not in bounds.get(n, {})
         ]
-        for kind in ("nmpc", "offline")
+        for kind in BOUNDS
     }
-    words = {"nmpc": "The perfect-model NMPC", "offline": "The offline optimum"}
-    notes = [f"{words[kind]} was not computed for: {', '.join(names)}." for kind, names in lacking.items() if names]
+    notes = [
+        f"The {BOUNDS[kind]} was not computed for: {', '.join(names)}." for kind, names in lacking.items() if names
+    ]
     replaced = [n for n, of in bounds.items() if of.get("offline", {}).get("from_nmpc")]
     if replaced:
         notes.append(f"No search improved the NMPC's plan; its figures stand for the optimum: {', '.join(replaced)}.")
@@ -114,23 +115,22 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     best, case = evidence.best, evidence.case
     if best is None:
         return []
-    bounds = {"nmpc": "perfect-model NMPC", "offline": "offline optimum"}
     needs = [n for n in case.requirements if n.law in (None, best) and not n.low and not n.setting]
     pairs = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
     name_of = partial(scenario_name, recipe=case.recipe, own=case.test_words)
     rows = [
-        (ratio(value), f"× {case.criterion.short} of the {bounds.get(kind, kind)} on {name_of(name)}")
+        (ratio(value), f"× {case.criterion.short} of the {BOUNDS.get(kind, kind)} on {name_of(name)}")
         for name, kind in dict.fromkeys(pairs)
         if (value := evidence.ratio(best, name, kind)) is not None
     ]
-    for need in (n for n in needs if n.metric == "sse_late"):
+    for need in (n for n in needs if n.metric == case.criterion.late):
         late = evidence.figure(best, need.scenario, need.metric)
         if late is not None:
             words = f"{case.metrics[need.metric].short} on {name_of(need.scenario)}"
             rows.append((number(late), f"{words}; at most {number(need.high)} is asked"))
     rows = rows[:MOST_HEADLINES]
     late_s = evidence.late_s(evidence.main_test)
-    metric = "sse_late" if late_s else case.metric
+    metric = case.criterion.late if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
     if own and other and own < other:
         where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
@@ -170,10 +170,11 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
     for name, title in evidence.scenarios.items():
         rows.append(_row(evidence, name, title, case.metric))
         if late_s := evidence.late_s(name):
-            rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", "sse_late"))
+            rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", case.criterion.late))
     mv, *others = case.plant_class.mv_signals
     unit = ", all MVs together" if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
-    return [*rows, _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")]
+    travel = _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")
+    return [*rows, travel | {"winner": None}]
 
 
 def _further(evidence: Evidence) -> list[dict[str, Any]]:
@@ -228,7 +229,7 @@ def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, An
         }
         for law in evidence.laws
     }
-    medians = {law: c["value"] for law, c in cells.items() if c["value"] is not None and metric != "mv_travel"}
+    medians = {law: c["value"] for law, c in cells.items() if c["value"] is not None}
     return {
         "name": name,
         "title": title,

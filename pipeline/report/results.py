@@ -70,7 +70,7 @@ def overview(standings: Iterable[Standing]) -> Table:
 
 
 def _about(standing: Standing) -> list[str]:
-    """What stands in a case's first column, a line a row."""
+    """The first column of a case, a line a row."""
     lines = [f"[bold]{standing.case}[/bold]", f"{standing.metric}, {standing.test}"]
     for words, (good, known) in (
         ("requirements", tally(standing.requirements)),

@@ -9,7 +9,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.files import write_text
-from pipeline.pictures.numbers import figure, headline, kilobytes, multiple, times
+from pipeline.pictures.numbers import figure, kilobytes, ratio, times
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 """Where `make registry` serves the registry, unless another port was asked for."""
@@ -25,15 +25,7 @@ def render(name: str, content: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {
-        "figure": figure,
-        "times": times,
-        "cell": cell,
-        "sentence": sentence,
-        "headline": headline,
-        "multiple": multiple,
-        "kilobytes": kilobytes,
-    }
+    environment.filters |= {f.__name__: f for f in (figure, times, ratio, kilobytes, cell, sentence)}
     return environment.get_template(name).render(content)
 
 

@@ -17,7 +17,7 @@ RULE = (
     "its unit, or by at most the tolerance in its row. Our figures are medians over the data seeds; the models of each "
     "seed are trained on a record of their own."
 )
-BOUNDS = {"nmpc": "perfect NMPC", "offline": "offline optimum"}
+BOUNDS = {"nmpc": "perfect-model NMPC", "offline": "offline optimum"}
 
 
 @dataclass(frozen=True, slots=True)

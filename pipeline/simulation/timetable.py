@@ -1,4 +1,4 @@
-"""What happens in a simulated run, sample by sample, from what a person asked for."""
+"""The events of a simulated run, sample by sample, from what a person asked for."""
 
 from __future__ import annotations
 

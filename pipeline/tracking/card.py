@@ -1,4 +1,4 @@
-"""What a person reads in MLflow's registry: HTML, because its Markdown has no tables.
+"""Descriptions for MLflow's registry: HTML, because its Markdown has no tables.
 
 Pictures are linked relative to the server's root, through its get-artifact route: the registry
 strips ``data:`` images and every size or style, so pictures are drawn in the size they are shown.
@@ -60,7 +60,7 @@ def version_description(validation: Validation | None, gate: Gate, run_id: str, 
     if validation is not None:
         parts += [_table(validation, gate), _analysis(validation, gate.law)]
     if picture:
-        alt = f"Closed loop on the test that weighs most, beside the {escape(gate.baseline_name)}"
+        alt = "Closed loop on the test that weighs most, beside the baseline of the case"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
     return "\n".join(filter(None, parts))
 

@@ -12,9 +12,8 @@ Aliases:
     the newest version of a controller.
 ``best``
     the best version of a controller that passed the gate. It moves only to a version that did not
-    lock up in any run, whose score is below that of the case's baseline (a PID where the case has no
-    better yardstick) in the same validation, and below that of the present best version. The
-    baseline has nobody else to beat than its own former version.
+    lock up in any run, whose score is below that of the case's baseline in the same validation, and
+    below that of the present best version. The baseline has only its own former version to beat.
 ``champion``
     one in a case: the best version with the lowest score among the case's controllers, or the one
     that a person promoted.
@@ -23,13 +22,11 @@ Aliases:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.validation import GateResult, Validation
-
-BASELINE = "pid"  # of a validation that names none
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,20 +34,20 @@ class Gate:
     """The gate's figures of one law, from the case's validation.json."""
 
     law: str
-    id: str
-    score: float | None
-    baseline: float | None  # the baseline's score on the same test
-    lock_ups: int | None
-    ratios: Mapping[str, float]
-    baseline_law: str = BASELINE
-    baseline_name: str = "PID"
+    id: str = ""
+    score: float | None = None
+    baseline: float | None = None  # the baseline's score on the same test
+    lock_ups: int | None = None
+    ratios: Mapping[str, float] = field(default_factory=dict)
+    baseline_law: str = ""  # as the case names it
+    baseline_name: str = ""
     locked_up: str = ""  # on which tests, of which data seeds
 
     @classmethod
     def of(cls, validation: Validation | None, law: str) -> Self:
         """The figures of ``law``; scores are None where the validation, or the whole of it, is missing."""
         if validation is None:
-            return cls(law, "", None, None, None, {})
+            return cls(law)
         gate, absent = validation.gate, GateResult(None, None, {})
         own, baseline = gate.laws.get(law, absent), gate.laws.get(gate.baseline, absent)
         result = validation.laws.get(law)
@@ -72,7 +69,7 @@ class Gate:
         rows: dict[str, Any] = {
             "gate_id": self.id,
             "gate_score": self.score,
-            "gate_baseline": self.baseline_law,
+            "gate_baseline": self.baseline_law or None,
             "gate_baseline_score": self.baseline,
             "lock_ups": self.lock_ups,
             "locked_up": self.locked_up or None,

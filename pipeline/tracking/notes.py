@@ -1,4 +1,4 @@
-"""What a person reads first on the page of a run or an experiment, in Markdown."""
+"""The note at the top of the page of a run or an experiment, in Markdown."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class StageResult:
 
     @property
     def item(self) -> str:
-        """What the stage was run for, without its case: a record, a model set, a controller; the case for a report."""
+        """The stage's item without its case: a record, a model set, a controller; the case for a report."""
         return self.name.partition("@")[2].removeprefix(f"{self.case}-")
 
     def files(self, root: Path) -> Iterator[tuple[Path, str | None]]:

@@ -72,6 +72,6 @@ def test_plants_and_numbers_that_do_not_fit_are_refused() -> None:
     with pytest.raises(PlantError, match=r"'thiosulfate_cstr' has the signals C_A, T, T_j; 'jacket_pulses' needs"):
         JacketPulses(samples=10).run(ThiosulfateCstr(), 0)
     with pytest.raises(ParamsError, match=r"pulse_high is 1; it must be at least 2"):
-        JacketPulses(pulse_high=1)
+        JacketPulses(samples=10, pulse_high=1)
     with pytest.raises(ParamsError, match=r"shut is 1\.5; it must be between 0 and 1"):
-        JacketPulses(shut=1.5)
+        JacketPulses(samples=10, shut=1.5)

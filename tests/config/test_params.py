@@ -11,9 +11,11 @@ import pytest
 import yaml
 from shipped import required
 
+from pipeline import errors
 from pipeline.cases import CASES
 from pipeline.config.params import ControllerParams, ModelParams, RecordParams, choose, parse, read_section
-from pipeline.errors import ParamsError
+from pipeline.errors import ParamsError, PipelineError
+from pipeline.evaluation.evidence import NotMeasuredError
 from pipeline.files import digest
 from pipeline.laws import LAWS
 from pipeline.models import MODELS
@@ -83,6 +85,12 @@ def test_section_errors_name_the_nearest(tmp_path: Path) -> None:
     path.write_text("records: [")
     with pytest.raises(ParamsError, match="is not YAML"):
         read_section("records", "first", path)
+
+
+def test_every_error_stands_in_the_tree() -> None:
+    known = [error.__name__ for error in (PipelineError, *PipelineError.__subclasses__())]
+    assert NotMeasuredError.__name__ in known
+    assert [name for name in known if name not in (errors.__doc__ or "").split()] == []
 
 
 def test_a_record_needs_seeds() -> None:

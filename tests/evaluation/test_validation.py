@@ -139,6 +139,7 @@ def test_standing_gate_and_card_say_what_the_file_says(validation: Validation, w
 def test_without_a_validation_there_is_no_evidence() -> None:
     gate = Gate.of(None, "pid")
     assert gate.refusal() == "its validation has no gate score"
+    assert "gate_baseline" not in gate.tags()  # only a case names its baseline
     assert version_description(None, gate, "run", None).startswith("No closed-loop evidence yet")
     assert "<b>pid</b> for tank" in model_description("tank", "pid", None, None)
 

@@ -39,6 +39,7 @@ SMALL = {
 }
 # The plant that an excitation is for; the others excite the first case's.
 PLANT_OF = {"jacket_pulses": JacketedBatchReactor}
+FEW = {"samples": 200, "restarts": 20}
 FEEDBACK = {"operating_point", "jacket_pulses"}  # whose MVs answer to what is measured
 
 
@@ -104,7 +105,7 @@ def test_params_are_parsed_and_wrong_ones_refused(kind):
     with pytest.raises(ParamsError, match="unknown key 'sample'; did you mean 'samples'"):
         parse(EXCITATIONS[kind], {"sample": 3}, "records.x")
     with pytest.raises(ParamsError, match=f"{kind}'?: samples is 0; it must be at least 1"):
-        EXCITATIONS[kind](samples=0)
+        EXCITATIONS[kind](**SMALL[kind] | {"samples": 0})
 
 
 def test_every_field_is_documented():
@@ -178,7 +179,7 @@ def test_multisines_of_several_mvs_share_no_frequency():
     assert lines.sum(axis=0).tolist() == [40, 40, 40]
     assert lines.sum(axis=1).max() == 1
     with pytest.raises(ParamsError, match="lengthen it or take fewer lines"):
-        Multisine(cycle=600, lines=100).unit_sequence(3, np.random.default_rng(0))
+        Multisine(samples=600, cycle=600, lines=100).unit_sequence(3, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("kind", [k for k, e in EXCITATIONS.items() if issubclass(e, OpenLoop)])
@@ -216,16 +217,16 @@ def test_range_may_be_narrowed_but_not_left(cstr):
     assert 295 < record.mv.max() <= 300
     for low, high in ((-1.0, None), (None, 501.0), (300.0, 200.0)):
         with pytest.raises(ParamsError, match="low < high within 0 to 500 are allowed"):
-            RandomSteps(low=low, high=high).run(cstr, 0)
+            RandomSteps(samples=10, low=low, high=high).run(cstr, 0)
     with pytest.raises(ParamsError, match="order is 40; it must be between 2 and 18"):
-        Prbs(order=40)
+        Prbs(samples=10, order=40)
 
 
 # ---------------------------------------------------------------- what the records hold
 
 
 def test_random_steps_hold_one_percent_of_the_unstable_region(cstr):
-    record = RandomSteps().run(cstr, 0)
+    record = RandomSteps(samples=60_000).run(cstr, 0)
     share = np.bincount(cstr.region(record.pv[:, 0]), minlength=3) / len(record)
     assert len(record) == 60_000
     # The plant changes branches only some 50 times in a record, so that the shares of hot and
@@ -278,32 +279,37 @@ def test_operating_point_feeds_pairs_over_its_hold(around):
 def test_share_of_moves_near_the_feedback(cstr):
     plant_range = 500.0
     used = np.full(4000, 250.0)
-    near = OperatingPoint(near=10.0, near_fraction=1.0).sequence(cstr, used, np.random.default_rng(0))[:, 0]
+    near = OperatingPoint(**FEW, near=10.0, near_fraction=1.0).sequence(cstr, used, np.random.default_rng(0))[:, 0]
     assert near.std() == pytest.approx(10.0, rel=0.1)
-    anywhere = OperatingPoint(near_fraction=0.0).sequence(cstr, used, np.random.default_rng(0))[:, 0]
+    anywhere = OperatingPoint(**FEW, near_fraction=0.0).sequence(cstr, used, np.random.default_rng(0))[:, 0]
     assert anywhere.std() == pytest.approx(plant_range / np.sqrt(12), rel=0.05)
-    assert OperatingPoint(near=1e3, near_fraction=1.0).sequence(cstr, used, np.random.default_rng(0))[:, 0].min() == 0.0
+    wide = OperatingPoint(**FEW, near=1e3, near_fraction=1.0).sequence(cstr, used, np.random.default_rng(0))[:, 0]
+    assert wide.min() == 0.0
 
 
 def test_feedback_holds_its_set_point_without_dither(cstr):
-    excitation = OperatingPoint(dither=0.0, sp_low=0.6, sp_high=0.7, sp_hold_low=200, sp_hold_high=200, filter_s=1.7)
+    excitation = OperatingPoint(
+        **FEW, dither=0.0, sp_low=0.6, sp_high=0.7, sp_hold_low=200, sp_hold_high=200, filter_s=1.7
+    )
     loop = excitation.closed_loop(cstr, excitation.settings(cstr), 200, np.random.default_rng(0))
     assert np.ptp(loop.pv[-30:, 0]) < 1e-3
     assert 0.6 < loop.pv[-1, 0] < 0.7
 
 
 def test_a_pid_may_be_given_and_other_plants_are_served(cstr):
-    excitation = OperatingPoint(kc=-1200.0, ti_s=9.0, td_s=2.0)
+    excitation = OperatingPoint(**FEW, kc=-1200.0, ti_s=9.0, td_s=2.0)
     settings = excitation.settings(cstr)
     assert (settings.kc, settings.ti_s, settings.td_s) == (-1200.0, 9.0, 2.0)
     lag = OperatingPoint(samples=200, restarts=20, filter_s=60.0, dither=1.0, near=1.0).run(Lag(), 0)
     assert lag.pv.shape == (200 + 80, 1)
     with pytest.raises(PlantError, match="has 2 MVs; 'operating_point' excites exactly one"):
-        OperatingPoint().run(Mixer(), 0)
+        OperatingPoint(**FEW).run(Mixer(), 0)
     with pytest.raises(PlantError, match="sp_low < sp_high within 0 to 1 are allowed"):
-        OperatingPoint(sp_low=0.5, sp_high=0.4).set_points(cstr)
+        OperatingPoint(**FEW, sp_low=0.5, sp_high=0.4).set_points(cstr)
     with pytest.raises(ParamsError, match="sp_hold_high is 5; it must be at least 20"):
-        OperatingPoint(sp_hold_high=5)
+        OperatingPoint(**FEW, sp_hold_high=5)
+    with pytest.raises(ParamsError, match="restarts is 0; it must be at least 1"):
+        OperatingPoint(samples=200, restarts=0)
 
 
 def test_short_runs_of_several_moves_hold_each_and_go_to_the_ends(cstr: ThiosulfateCstr) -> None:
@@ -326,7 +332,7 @@ def levels_of(excitation: Batches, seed: int = 0) -> np.ndarray:
 
 def test_every_batch_is_a_run_from_the_start_of_the_plant() -> None:
     plant = BatchReactor()
-    record = Batches(samples=50, batches=40).run(plant, 0)
+    record = Batches(samples=50, batches=40, binary=0.2, end_fraction=0.3).run(plant, 0)
     assert np.array_equal(np.bincount(record.run), np.full(40, 50))
     first = np.flatnonzero(record.time_s == 0)
     assert np.array_equal(record.pv[first, 0], np.full(40, 25.0))
@@ -369,9 +375,9 @@ def test_the_start_of_a_batch_may_vary_within_the_range_of_the_states() -> None:
     assert x0[:, 2].mean() == pytest.approx(25.0, abs=0.2)
     assert x0[:, 2].std() == pytest.approx(2.0, rel=0.1)
     with pytest.raises(ParamsError, match=r"start_spread is \[1\.0\]; give one .* each state .*: C_A, C_B, T"):
-        Batches(start_spread=(1.0,)).run(plant, 0)
+        Batches(samples=5, batches=2, start_spread=(1.0,)).run(plant, 0)
     with pytest.raises(ParamsError, match=r"binary is 0\.6; it must be between 0 and 0\.5"):
-        Batches(constant=0.5, binary=0.6)
+        Batches(samples=5, batches=2, constant=0.5, binary=0.6)
 
 
 def test_an_experiment_starts_where_its_plant_does() -> None:

@@ -141,7 +141,7 @@ def test_the_adjusted_reference_is_followed_to_rounding(exact: Loops) -> None:
     assert exact.pv[0, :, 1].max() <= 70 + 1e-9
 
 
-def test_figures_of_an_independent_implementation(exact: Loops) -> None:
+def test_reference_figures(exact: Loops) -> None:
     adjusted = np.abs(exact.info[0, :, 1] - exact.info[0, :, 2]) > 1e-9
     assert np.count_nonzero(adjusted) == 251
     beyond = [

@@ -1,4 +1,4 @@
-"""The laws over an NNARX: the reference's figures, mirrored plants, the search for the best move."""
+"""The laws over an NNARX: reference figures, mirrored plants, the search for the best move."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ph_law(model: NNARX, name: str, **params) -> ControlLaw:
     return designed(name, model, PH.plant, **params)
 
 
-# The reference's figures, of an independent implementation, with the tolerances that the case requires.
+# Reference figures, with the tolerances that the case requires.
 @pytest.mark.parametrize(
     ("name", "params", "low", "high"),
     [

@@ -177,7 +177,7 @@ def sse(law: PID, plant: EquationPlant, test) -> float:
 
 
 def test_itae_on_the_ph_tank() -> None:
-    """Tuned at pH 8: an independent implementation's 8.29 and 0.368 with a whole period of dead time for the
+    """Tuned at pH 8: the reference figures, 8.29 and 0.368, with a whole period of dead time for the
     sampling, or better; with half of one the loop oscillates where the titration curve is steepest, as the paper's."""
     case = PhNeutralizationCase()
     tests = {name: case.scenarios()[name][0] for name in ("set_point", "disturbance")}

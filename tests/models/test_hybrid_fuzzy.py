@@ -230,7 +230,7 @@ def test_what_the_data_leave_open_is_named() -> None:
 
 
 # ------------------------------------------------------------------ the part
-def test_one_step_errors_are_those_of_an_independent_implementation(reactor_record: Record) -> None:
+def test_one_step_errors_are_the_reference_figures(reactor_record: Record) -> None:
     # A fifth is left for the draw of the pulses.
     expected = {"local": 0.18, "global": 0.070, "tied": 0.076}
     plant = JacketedBatchReactor()
@@ -278,7 +278,7 @@ def test_physics_of_the_linear_part_are_the_matrix_exponential() -> None:
     assert truth["core_jacket"] == pytest.approx(phi[0, 1], abs=1e-8)
 
 
-def test_the_printed_gap_is_what_was_found_independently() -> None:
+def test_the_printed_gap_is_the_reference_figure() -> None:
     # "Up to 1.4 degC a step" within core temperatures that the test's profile reaches.
     found = gap(printed_model(), FuzzyBatchReactor().signals)
     assert found["gap"] == pytest.approx(1.4, abs=0.1)

@@ -1,4 +1,4 @@
-"""NNARX of the pH tank and the batch reactor against the figures of an independent implementation."""
+"""NNARX of the pH tank and the batch reactor against reference figures."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from pipeline.optimal.bounds import (
 from pipeline.optimal.horizon import Horizon, Plan
 from pipeline.optimal.perfect import run_offline
 from pipeline.simulation.scenario import Scenario
-from pipeline.stages import bounds as oracle
+from pipeline.stages import bounds as bounds_stage
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TinyCase(ThiosulfateCstrCase):
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bounds") / "tiny.json"
-    lines = list(oracle.compute(TinyCase(), ["held_out"], path=path))
+    lines = list(bounds_stage.compute(TinyCase(), ["held_out"], path=path))
     assert len(lines) == 6
     return path
 
@@ -111,7 +111,7 @@ def test_an_optimum_is_no_worse_than_the_nmpc_and_says_that_it_did_not_converge(
         return plan if self.n == case.effort.periods else replace(plan, solved=False)
 
     monkeypatch.setattr(Horizon, "solve", gives_up)
-    lines = list(oracle.compute(case, ["held_out"], path=path))
+    lines = list(bounds_stage.compute(case, ["held_out"], path=path))
     bounds = whole_bounds(case, path)["held_out"]
     alone = run_offline(case.plant, case.scenarios()["held_out"][0], METRICS["mae"], False, case.effort)
     assert alone["mae"] > 1.1 * bounds["nmpc"]["mae"]
@@ -123,11 +123,11 @@ def test_an_optimum_is_no_worse_than_the_nmpc_and_says_that_it_did_not_converge(
 
 def test_the_nmpc_stands_for_an_optimum_that_is_worse() -> None:
     nmpc, worse = {"sse": 1.0, "failures": 0.0, "step_ms_p50": 3.0}, {"sse": 6.0, "failures": 2.0}
-    assert oracle.better(worse, nmpc, "sse") == {"sse": 1.0, "failures": 2.0, "from_nmpc": 1.0}
-    assert oracle.better(worse | {"sse": float("nan")}, nmpc, "sse")["sse"] == 1.0
+    assert bounds_stage.better(worse, nmpc, "sse") == {"sse": 1.0, "failures": 2.0, "from_nmpc": 1.0}
+    assert bounds_stage.better(worse | {"sse": float("nan")}, nmpc, "sse")["sse"] == 1.0
     best = {"sse": 0.5, "failures": 0.0}
-    assert oracle.better(best, nmpc, "sse") == best
-    assert together([oracle.better(worse, nmpc, "sse"), best]) == {"sse": 0.75, "failures": 2.0, "from_nmpc": 1.0}
+    assert bounds_stage.better(best, nmpc, "sse") == best
+    assert together([bounds_stage.better(worse, nmpc, "sse"), best]) == {"sse": 0.75, "failures": 2.0, "from_nmpc": 1.0}
 
 
 def test_figures_of_another_plant_are_refused(stored: Path, tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_the_stored_figures_belong_to_the_case_as_it_is(name: str) -> None:
         assert figures["nmpc"]["failures"] <= 10
 
 
-def test_the_thiosulfate_bounds_are_those_of_an_independent_implementation() -> None:
+def test_the_thiosulfate_bounds_are_the_reference_figures() -> None:
     bounds = whole_bounds(CASES["thiosulfate_cstr"])
     assert bounds["sp_a"]["nmpc"]["mae"] == pytest.approx(0.064, rel=0.01)
     assert bounds["sp_a"]["offline"]["mae"] == pytest.approx(0.0635, rel=0.01)
@@ -182,21 +182,21 @@ def test_the_thiosulfate_bounds_are_those_of_an_independent_implementation() -> 
     assert bounds["sp_b"]["offline"]["mae"] == pytest.approx(0.0072, rel=0.02)
 
 
-def test_the_tank_s_bounds_are_those_of_an_independent_implementation() -> None:
+def test_the_bounds_of_the_tank_are_the_reference_figures() -> None:
     bounds = whole_bounds(CASES["ph_neutralization"])
     assert bounds["set_point"]["nmpc"]["sse"] == pytest.approx(6.04, abs=0.005)
     assert bounds["disturbance"]["nmpc"]["sse"] == pytest.approx(0.144, abs=0.0005)
 
 
-def test_the_batch_s_bounds_are_those_of_an_independent_implementation() -> None:
+def test_the_bounds_of_the_batch_are_the_reference_figures() -> None:
     bounds = whole_bounds(CASES["batch_reactor"])
     for kind in ("nmpc", "offline"):
         assert bounds["trajectory"][kind]["sse"] == pytest.approx(13_252, abs=1)
         assert bounds["trajectory"][kind]["sse_late"] < 0.05
 
 
-def test_the_bounds_of_the_reactors_stand_beside_an_independent_implementation_s_controllers() -> None:
-    # Nobody computed these bounds before; what others' tuned controllers reach cannot be ahead of them.
+def test_no_controller_of_reference_is_ahead_of_the_bounds_of_the_reactors() -> None:
+    # These bounds have no reference figures; the figures are those of tuned controllers.
     cstr = whole_bounds(CASES["henson_seborg_cstr"])
     for test, iae in (("up", 0.0296), ("down", 0.0296), ("jump", 0.0452)):
         assert 0.3 * iae < cstr[test]["nmpc"]["iae"] < iae
@@ -221,7 +221,7 @@ class TinyTank(PhNeutralizationCase):
 @pytest.fixture(scope="module")
 def tank(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bounds") / "tank.json"
-    lines = list(oracle.compute(TinyTank(), ["held_out"], path=path))
+    lines = list(bounds_stage.compute(TinyTank(), ["held_out"], path=path))
     assert [line.split(": ")[1].split()[0] for line in lines] == ["sse", "sse"]
     return path
 
@@ -250,7 +250,7 @@ def test_figures_for_another_aim_are_refused_and_computed_anew(
         whole_bounds(TinyTank(), tank)
     path = tmp_path / "again.json"
     path.write_text(tank.read_text())
-    assert len(list(oracle.compute(TinyTank(), ["held_out"], path=path))) == 2
+    assert len(list(bounds_stage.compute(TinyTank(), ["held_out"], path=path))) == 2
     assert json.loads(path.read_text())[key] == problem(TinyTank())[key]
     whole_bounds(TinyTank(), path)
 
@@ -266,12 +266,12 @@ def test_a_file_that_says_no_aim_means_the_defaults(stored: Path, tmp_path: Path
 def test_noisy_figures_are_means_over_the_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def figures(draws: int, seed: int) -> dict[str, float]:
         monkeypatch.setattr(ThiosulfateCstrCase, "noise_draws", draws)
-        monkeypatch.setattr(oracle, "NOISE_SEED", seed)
+        monkeypatch.setattr(bounds_stage, "NOISE_SEED", seed)
         path = tmp_path / f"{draws}_{seed}.json"
-        list(oracle.compute(TinyCase((1,)), ["held_out"], path=path))
+        list(bounds_stage.compute(TinyCase((1,)), ["held_out"], path=path))
         return whole_bounds(TinyCase((1,)), path)["held_out_noise"]["nmpc"]
 
-    both, one, other = figures(2, 0), figures(1, 0), figures(1, oracle.DRAW)
+    both, one, other = figures(2, 0), figures(1, 0), figures(1, bounds_stage.DRAW)
     assert both["mae"] == pytest.approx((one["mae"] + other["mae"]) / 2, rel=1e-5)
     assert one["mae"] != other["mae"]
 

@@ -27,7 +27,7 @@ from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.simulation.simulate import simulate_closed, simulate_open
-from pipeline.stages import bounds as oracle
+from pipeline.stages import bounds as bounds_stage
 from pipeline.tuning.reference_model import ReferenceModel
 
 QUICK = Effort(periods=20, elements=1, fine=1, degree=2, reaches=(3,), tail=10, every=5, noisy=False)
@@ -238,7 +238,7 @@ class Vessels(Case):
 
 def test_tests_on_other_plants_have_their_own_bounds_and_those_on_a_map_none(tmp_path: Path) -> None:
     case, path = Vessels(), tmp_path / "vessels.json"
-    lines = list(oracle.compute(case, ["own", "cool", "map"], path=path))
+    lines = list(bounds_stage.compute(case, ["own", "cool", "map"], path=path))
     assert len(lines) == 4  # NMPC and offline, of two tests; nothing is measured with noise
     bounds = whole_bounds(case, path)
     assert set(bounds) == {"own", "own_noise", "cool", "cool_noise"}
@@ -249,11 +249,11 @@ def test_tests_on_other_plants_have_their_own_bounds_and_those_on_a_map_none(tmp
 
 def test_a_fixed_test_that_changed_leaves_no_figures_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case, path = Vessels(), tmp_path / "vessels.json"
-    list(oracle.compute(case, ["own", "cool"], path=path))
+    list(bounds_stage.compute(case, ["own", "cool"], path=path))
     tests = case.scenarios()
     longer = replace(tests["own"][0], sp=np.full((6, 1), 22.0))
     monkeypatch.setattr(Vessels, "scenarios", lambda self: {"own": (longer,)})
-    list(oracle.compute(case, ["own"], path=path))
+    list(bounds_stage.compute(case, ["own"], path=path))
     figures = json.loads(path.read_text())["figures"]
     assert {name: list(rows) for name, rows in figures.items()} == {"own": [longer.digest()]}
 

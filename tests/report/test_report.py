@@ -17,9 +17,9 @@ import yaml
 from made_up_case import CASE
 
 from pipeline.cases import CASES
+from pipeline.errors import ReportError
 from pipeline.evaluation.case import Curve, PaperFigure, Requirement
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.typed_json import ReportError
 from pipeline.evaluation.verdicts import PLAIN, close
 from pipeline.optimal import bounds
 from pipeline.report.verdicts import acceptance, judge, requirement, table_row

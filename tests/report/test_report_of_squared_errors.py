@@ -132,6 +132,17 @@ def test_the_headline_is_the_cases_own(written):
         assert "lower sum of squared errors than the PID" in words
 
 
+def test_only_a_metric_with_a_late_figure_has_a_late_part(batch):
+    class Absolute(type(BATCH.of)):
+        metric = "mae"
+
+    evidence = load(batch, BATCH)
+    assert evidence.late_s("trajectory") == 200
+    absolute = replace(evidence, case=Absolute(evidence.case.held_out_seeds))
+    assert absolute.late_s("trajectory") == 0
+    assert not any("from 200 s on" in words for _, words in headline(absolute))
+
+
 def test_requirements_with_noise_with_late_errors_and_of_variants(batch):
     evidence = load(batch, BATCH)
     noisy = 13_252 * 1.001 * 1.1 + 1e-4

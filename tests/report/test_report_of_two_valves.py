@@ -17,11 +17,11 @@ from made_up_case import Miniature
 from matplotlib.figure import Figure as Canvas
 
 from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from pipeline.errors import ReportError
 from pipeline.evaluation.case import Array, Case, Requirement
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.law_evidence import Analysis
 from pipeline.evaluation.metric import Metric
-from pipeline.evaluation.typed_json import ReportError
 from pipeline.evaluation.validation import Validation
 from pipeline.evaluation.verdicts import PLAIN
 from pipeline.pictures.drawing import CasePicture

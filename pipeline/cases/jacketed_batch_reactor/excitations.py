@@ -42,7 +42,6 @@ class JacketPulses(Excitation):
     """
 
     kind: ClassVar[str] = "jacket_pulses"
-    samples: int = within(20_000, 1)
     target_low: float = 12.0
     target_high: float = 74.0
     hold_low: int = within(20, 1)

@@ -56,7 +56,7 @@ def _over_centres(found: Coefficients, coefficient: str, mode: str) -> tuple[Arr
 
 
 def reach_picture(evidence: Evidence) -> Canvas:
-    """What the jacket can do in one period over its temperature, in each mode, and what lies between the modes."""
+    """The jacket's reach in one period over its temperature, in each mode, and the gap between the modes."""
     parts = _parts(evidence)
     canvas = Canvas(figsize=(SIZE[0], 6.4), layout="constrained")
     grid = canvas.subplots(2, 2, sharex=True, sharey=True)
@@ -121,7 +121,7 @@ def coefficients_picture(evidence: Evidence) -> Canvas:
 
 
 def drift_when_shut(evidence: Evidence, how: str, at: float) -> tuple[float, float]:
-    """What an identification has a shut throttle do to a jacket as warm as its core, ``at`` degC, in mode hot and cold.
+    """Drift of a jacket as warm as its core, ``at`` degC, by an identification: throttle shut, in mode hot and cold.
 
     [degC a period]. Above 0 in the one and below it in the other, neither holds the temperature, nor
     does any throttle: an open one moves it further away. Raises NotMeasuredError without that identification.

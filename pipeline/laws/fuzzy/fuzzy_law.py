@@ -1,4 +1,4 @@
-"""What the laws over a hybrid fuzzy model share: its inverse in every mode, and which mode is taken."""
+"""Shared parts of the laws over a hybrid fuzzy model: its inverse in every mode, the choice of the mode."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Move(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FuzzyParams:
-    """What every law of this family has.
+    """Settings of every law of this family.
 
     ``part`` names the model of the set (None: its only one). ``jacket_low`` and ``jacket_high``
     [degC] are what the jacket may have. ``switch_penalty`` [degC] is how much nearer another mode

@@ -1,1 +1,1 @@
-"""Inverse control: direct inverses, applicability domain, disturbance observers."""
+"""Laws that invert a model, with domain or disturbance observer. The models stand in ``models/static``."""

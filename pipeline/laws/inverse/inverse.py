@@ -152,7 +152,7 @@ class INCADEC(DomainLaw):
         """``r`` >= 1 is the narrowing; ``correction`` as in the class; ``mv_rate`` [mv] a sample, None unlimited."""
 
         r: float
-        correction: Literal["as_printed", "back_calculation"] = "as_printed"
+        correction: Literal["as_printed", "back_calculation"]
         mv_rate: float | None = None
 
     flat: Tensor  # (1,) [mv^2] far below the square of a chord worth following
@@ -163,7 +163,7 @@ class INCADEC(DomainLaw):
         inverse: Model,
         domain: LeverageDomain,
         r: float,
-        correction: str = "as_printed",
+        correction: str,
         mv_rate: float | None = None,
     ) -> None:
         super().__init__(signals, inverse, domain, r, mv_rate)

@@ -35,7 +35,7 @@ def _rising(forward: Model, signals: Signals) -> bool:
 
 
 class ObserverLaw(ControlLaw):
-    """What both forms share: everything but the inversion.
+    """Base of both forms: everything but the inversion.
 
         mv(k) = v(k) - d(k),   v = inverse(x(k), w + I),
 

@@ -1,4 +1,4 @@
-"""What the laws share that act on the prediction of an NNARX."""
+"""Shared parts of the laws that act on the prediction of an NNARX."""
 
 from __future__ import annotations
 

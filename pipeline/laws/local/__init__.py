@@ -1,1 +1,1 @@
-"""Local controllers blended over local models."""
+"""Local controllers blended over local models. The local models themselves stand in ``models/local``."""

@@ -1,4 +1,4 @@
-"""What the local controller networks share: PIDs at operating points, blended by where the plant is."""
+"""Shared parts of the local controller networks: PIDs at operating points, blended by the plant's place."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class LocalPid:
 
 @dataclass(frozen=True, slots=True)
 class BlendedParams:
-    """What a user sets of any local controller network, however its local controllers are tuned.
+    """Settings of any local controller network, however its local controllers are tuned.
 
     ``blending``: what is blended (``gains``, ``outputs`` or ``velocity``, see LocalControllers).
     ``derivative_limit`` is N of the derivative's filter, Tf = Td/N. ``stability`` says how the

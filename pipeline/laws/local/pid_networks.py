@@ -29,7 +29,7 @@ class LocalPidNetwork(LocalControllers):
     """
 
     name: ClassVar[str] = "local_pid_network"
-    title: ClassVar[str] = "Local controller network, printed gains"
+    title: ClassVar[str] = "Local controller network, given gains"
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(BlendedParams):

@@ -1,4 +1,4 @@
-"""What the laws share that go on learning an ARX model."""
+"""Shared parts of the laws that go on learning an ARX model."""
 
 from __future__ import annotations
 

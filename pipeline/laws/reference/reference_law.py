@@ -1,4 +1,4 @@
-"""What the laws share that make the controlled variable follow a reference model."""
+"""Shared parts of the laws that make the controlled variable follow a reference model."""
 
 from __future__ import annotations
 
@@ -87,6 +87,6 @@ class ReferenceLaw(ControlLaw):
         return torch.cat([sp, y, mv_applied, torch.where(known > 0, state[..., 1:], at_rest)], dim=-1)
 
     def stepped(self, x: Tensor, done: Named, mv: Tensor) -> Stepped:
-        """What ``forward`` returns, from ``recalled``'s vector, the stage's results and the MV."""
+        """The results of ``forward``, from ``recalled``'s vector, the stage's results and the MV."""
         state = torch.cat([torch.ones_like(mv), done["next"], done["error"], mv], dim=-1)
         return mv, state, x[..., 3:4]

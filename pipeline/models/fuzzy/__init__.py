@@ -1,1 +1,1 @@
-"""Hybrid fuzzy models."""
+"""Hybrid fuzzy models and their identification. A paper's own matrices stand in its case's folder."""

@@ -104,7 +104,7 @@ class Rules:
         return Rules(self.centres, self.t_w[rows])
 
     def basis(self, name: str) -> Array:
-        """What a coefficient may be over the centres, shape (K, m): anything, but r has no slope."""
+        """Basis of a coefficient over the centres, shape (K, m): it may be anything, but r has no slope."""
         if name != "r":
             return np.eye(len(self.centres))
         share = self.beta.mean(axis=0)

@@ -49,7 +49,7 @@ class HybridFuzzyPart(Part):
 
 
 def figures(model: HybridFuzzy, source: Source, train_fraction: float, free_run: int) -> dict[str, Any]:
-    """What is reported of a model: gap and coefficients, and with a record the errors over its last part."""
+    """Figures of a model: gap and coefficients, and with a record the errors over its last part."""
     own = {**gap(model, source.signals), **coefficients(model, source.plant)}
     if source.record is None:
         return own

@@ -1,1 +1,1 @@
-"""Models of past inputs and outputs: NNARX, ARX, and what is linearized from them at every sample."""
+"""Models of past inputs and outputs: NNARX, ARX, and their linearization at a sample. No law stands here."""

@@ -1,4 +1,4 @@
-"""What predictors from lags share: their regressor, their training data, and running free."""
+"""Shared parts of predictors from lags: their regressor, their training data, and running free."""
 
 from __future__ import annotations
 

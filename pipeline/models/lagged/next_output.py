@@ -13,7 +13,7 @@ from pipeline.models.memory import Named, Slot, constant, lag_slots, regressors
 
 
 class Ahead(NamedTuple):
-    """What is known of y(t+1): ``gap`` = r(t+1) - y0(t+1) and its slope over the move, (..., 1) each.
+    """Forecast of y(t+1): ``gap`` = r(t+1) - y0(t+1) and its slope over the move, (..., 1) each.
 
     ``at`` is the network's preactivation without a move, ``rest`` its output there less what is
     affine; ``offset`` is y(t) - NN(phi(t)), filtered; ``kept`` is what the law remembers.
@@ -98,7 +98,7 @@ class NextOutput(nn.Module):
         return Ahead(goal - rest - offset, slope, rest, at, offset, kept)
 
     def moved(self, ahead: Ahead, step: Tensor) -> Tensor:
-        """What the network says that a move of ``step`` units adds to y(t+1), (..., 1)."""
+        """Change of y(t+1) by a move of ``step`` units, as the network says, (..., 1)."""
         return self.along.rest(self.along.moved(ahead.at, step)) - ahead.rest
 
     def relinearized(self, ahead: Ahead, step: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ SLACK = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """What a candidate changes of a part: lags and hidden widths; None leaves the part's own."""
+    """Changes of a part by a candidate: lags and hidden widths; None leaves the part's own."""
 
     n_y: int | None = None
     n_u: int | None = None

@@ -1,1 +1,1 @@
-"""Local linear models and the linearized plant."""
+"""Local linear models and the linearized plant. No blending of controllers stands here."""

@@ -1,1 +1,1 @@
-"""State-space networks."""
+"""State-space networks. Models of past outputs stand in ``lagged``."""

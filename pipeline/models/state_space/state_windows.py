@@ -1,4 +1,4 @@
-"""What the training of a state-space network minimizes: its free-run error over windows."""
+"""Objective of a state-space network's training: its free-run error over windows."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""How networks learn: objectives, trainers, Jacobians, and how rows are split in time."""
+"""How networks learn: objectives, trainers, Jacobians, and how rows are split in time. No model stands here."""

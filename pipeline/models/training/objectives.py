@@ -1,4 +1,4 @@
-"""What a trainer minimizes: the one-step error over samples, or the free-run error over windows."""
+"""Objectives of the trainers: the one-step error over samples, or the free-run error over windows."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ class Windows(Rows):
         return int(self.future.shape[1])
 
     def _root(self, net: MLP) -> Tensor:
-        """What an error is multiplied by, so that the sum of squares is a mean of scaled ones, shape (1,)."""
+        """The factor of an error that makes the sum of squares a mean of scaled ones, shape (1,)."""
         return math.sqrt(1 / self.future.size) / net.y_scale
 
     def loss(self, net: MLP) -> Tensor:

@@ -153,8 +153,8 @@ def test_an_unforeseen_disturbance_costs_the_nmpc_one_sample(tank: EquationPlant
 
 @pytest.mark.parametrize(("period_s", "lowest"), [(20.0, 13_252.0), (10.0, 19_417.0)])
 def test_a_recipe_is_followed_as_closely_as_can_be(batch: Case, period_s: float, lowest: float) -> None:
-    # Full heating until the profile comes within reach, and on it from then on; the figures are an independent
-    # implementation's for 1000 s, of which 300 are enough, because nothing adds to the lowest sum after them.
+    # Full heating until the profile comes within reach, and on it from then on; the reference figures are
+    # for 1000 s, of which 300 are enough, because nothing adds to the lowest sum after them.
     # Without sight of the recipe the same NMPC trails it.
     printed = batch.scenarios()["trajectory"][0]
 
