@@ -13,7 +13,7 @@ from serving.errors import LoopwrightError
 
 
 def inspect_options(parser: argparse.ArgumentParser) -> None:
-    """What ``inspect`` takes."""
+    """Add the arguments of ``inspect``."""
     parser.add_argument("file", metavar="FILE", help="a controller's .onnx file")
     parser.add_argument("--json", action="store_true", help="as JSON, for programs")
     parser.add_argument("--sha256", metavar="HEX", help="refuse any file but this one")
@@ -26,7 +26,7 @@ def run_inspect(options: argparse.Namespace) -> None:
 
 
 def bench_options(parser: argparse.ArgumentParser) -> None:
-    """What ``bench`` takes."""
+    """Add the arguments of ``bench``."""
     parser.add_argument("file", metavar="FILE", help="a controller's .onnx file")
     parser.add_argument("--steps", type=_positive, default=5_000, metavar="N", help="hot steps (5000)")
     parser.add_argument("--loop-steps", type=_positive, default=500, metavar="N", help="steps in the loop (500)")

@@ -12,7 +12,7 @@ SHOWN = {"scenarios", "locked_up", "as_printed"}  # entries of the evidence that
 
 
 def card(controller: Controller) -> str:
-    """What the controller is, what goes in and out, where it comes from and how its validation went."""
+    """Text about the controller: its law, signals, origin and validation."""
     m, graph = controller.manifest, controller.summary
     lines = [
         f"{m.law} for {m.case}",

@@ -1,4 +1,4 @@
-"""What can go wrong when a controller is loaded, stepped or run.
+"""Errors of loading, stepping and running a controller.
 
 LoopwrightError
 +-- ArtifactError      the file is not a controller: corrupt, truncated, foreign, changed after export

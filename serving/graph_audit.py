@@ -1,4 +1,4 @@
-"""What a controller's graph may hold, proved from the file's bytes before any runtime touches them.
+"""The limits of a controller's graph, proved from the file's bytes before any runtime touches them.
 
 A controller runs at a fixed cost with nothing outside its file: no loops or branches, no external
 tensors, no functions, only operators of the list, and no more than a stated work a step.
@@ -28,7 +28,7 @@ ATTRIBUTE_FIELDS = {
 
 @dataclass(frozen=True, slots=True)
 class GraphSummary:
-    """What the file holds: versions, operators with their counts, metadata, and the work of a step.
+    """Content of the file: versions, operators with their counts, metadata, and the work of a step.
 
     ``work`` is an upper bound in multiply-adds: those of products of matrices, and 32 for each
     element that any operator reads or writes.

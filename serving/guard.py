@@ -20,7 +20,7 @@ READ_BACK_MARGIN = 0.02  # share of an MV's range by which scaling may carry a s
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What the plant's side knows at one scan, in engineering units.
+    """Values of the plant's side at one scan, in engineering units.
 
     ``mv_applied`` is the MV that the plant really received over the last period, read back; None
     where it cannot be read. ``age_s`` is the time since the PVs were measured.

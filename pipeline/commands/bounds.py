@@ -1,4 +1,4 @@
-"""What no controller of a case can beat, computed and stored beside the case."""
+"""``loopwright bounds``: bounds that no controller of a case can beat, stored beside the case."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipeline.stages.bounds import compute
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """What the command takes."""
+    """Add the command's arguments."""
     parser.add_argument("case", metavar="CASE", help=", ".join(sorted(CASES)))
     parser.add_argument("--scenario", metavar="NAME", action="append", help="only this test (may be given again)")
     parser.add_argument("--jobs", metavar="N", type=int, default=1, help="processes side by side (1)")

@@ -1,4 +1,4 @@
-"""What a controller file is, and how its validation went."""
+"""``loopwright inspect``: a controller file and how its validation went."""
 
 from __future__ import annotations
 

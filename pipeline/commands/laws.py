@@ -9,7 +9,7 @@ from pipeline.laws import LAWS
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """What the command takes."""
+    """Add the command's arguments."""
     parser.add_argument(
         "name", metavar="NAME", nargs="?", help="a law: show its parameters and model parts (default: list)"
     )

@@ -9,7 +9,7 @@ from pipeline.models import MODELS
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """What the command takes."""
+    """Add the command's arguments."""
     parser.add_argument("name", metavar="KIND", nargs="?", help="a kind: show its parameters (default: list the kinds)")
 
 

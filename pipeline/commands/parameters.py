@@ -56,7 +56,7 @@ def texts(params: type[Any]) -> list[str]:
 
 
 def first_sentence(cls: type[Any]) -> str:
-    """What the class is, in its own words."""
+    """First paragraph of the class's docstring."""
     return " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].replace("``", "").split())
 
 

@@ -64,7 +64,7 @@ def _serve(args: argparse.Namespace) -> None:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """What the command takes: a command of its own and what that one takes."""
+    """Add the registry's own commands and their arguments."""
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=type(parser))
 
     def command(name: str, action: Callable[[argparse.Namespace], object], words: str) -> argparse.ArgumentParser:

@@ -9,7 +9,7 @@ from pipeline.report.results import show_results
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """What the command takes."""
+    """Add the command's arguments."""
     parser.add_argument("case", metavar="CASE", nargs="?", help="one case, in all of its tests (default: all cases)")
     parser.add_argument("--artifacts", type=Path, default=Path("artifacts"), help="folder of the controllers")
 

@@ -27,7 +27,7 @@ KINDS = {"records": "excite", "models": "fit", "controllers": "validate"}  # a s
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """What the command takes."""
+    """Add the command's arguments."""
     parser.add_argument(
         "targets", metavar="TARGET", nargs="*", help="cases, controllers, models or records of params.yaml (all)"
     )
@@ -98,7 +98,7 @@ def status(targets: Iterable[str]) -> Mapping[str, list[str]]:
 
 
 def reasons(entries: Iterable[Mapping[str, Mapping[str, Any]] | str]) -> list[str]:
-    """What DVC says of a stage, in words: ``[{"changed deps": {"params.yaml": {"x.y": "modified"}}}]``."""
+    """Reasons of DVC for a stage, in words: ``[{"changed deps": {"params.yaml": {"x.y": "modified"}}}]``."""
     lines = []
     for entry in entries:
         if isinstance(entry, str):  # "changed command", "always changed"
@@ -115,7 +115,7 @@ def reasons(entries: Iterable[Mapping[str, Mapping[str, Any]] | str]) -> list[st
 
 
 def plan(changed: Mapping[str, list[str]]) -> list[str]:
-    """What runs and why, a line a stage; of many stages, a line for each kind."""
+    """Stages that will run and why, a line each; of many stages, a line for each kind."""
     if not changed:
         return ["nothing has changed; everything is up to date"]
     head = f"{len(changed)} stages have changed; they run, and after them what depends on them:"
@@ -127,7 +127,7 @@ def plan(changed: Mapping[str, list[str]]) -> list[str]:
 
 
 def _dvc(*arguments: str) -> str:
-    """What DVC prints; PipelineError with its last line where it failed."""
+    """Output of DVC; PipelineError with its last line where it failed."""
     command = [sys.executable, "-m", "dvc", *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """What the command takes."""
+    """Add the command's arguments."""
 
     def events(option: str, form: str, words: str) -> None:
         parse = partial(_argument, partial(parse_event, form=form))

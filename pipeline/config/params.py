@@ -168,8 +168,10 @@ class RecordParams:
 
     @classmethod
     def read(cls, name: str) -> RecordParams:
-        """The section of one record."""
-        return _with_rest(cls, read_section("records", name), "excitation", f"records.{name}")
+        """The section of one record; ParamsError where the section is not called by its case and record."""
+        params = _with_rest(cls, read_section("records", name), "excitation", f"records.{name}")
+        _checked_key(name, "records", params.case, "record", params.record)
+        return params
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -183,8 +185,10 @@ class ModelParams:
 
     @classmethod
     def read(cls, name: str) -> ModelParams:
-        """The section of one model set."""
-        return parse(cls, read_section("models", name), f"models.{name}")
+        """The section of one model set; ParamsError where the section is not called by its case and model."""
+        params = parse(cls, read_section("models", name), f"models.{name}")
+        _checked_key(name, "models", params.case, "model", params.model)
+        return params
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -209,12 +213,16 @@ class ControllerParams:
     def read(cls, name: str) -> ControllerParams:
         """The section of one controller; ParamsError where the section is not called by its case and name."""
         params = _with_rest(cls, read_section("controllers", name), "settings", f"controllers.{name}")
-        if name != (wanted := f"{params.case}-{params.name}"):
-            raise ParamsError(
-                f"controllers.{name} has `case: {params.case}` and `name: {params.name}`; correct these, or call the "
-                f"section {wanted}"
-            )
+        _checked_key(name, "controllers", params.case, "name", params.name)
         return params
+
+
+def _checked_key(name: str, section: str, case: str, field: str, own: str) -> None:
+    """ParamsError unless the key of an entry is ``<case>-<own>``, which files and DVC targets go by."""
+    if name != (wanted := f"{case}-{own}"):
+        raise ParamsError(
+            f"{section}.{name} has `case: {case}` and `{field}: {own}`; correct these, or call the section {wanted}"
+        )
 
 
 def _with_rest(cls: type[T], section: Mapping[str, Any], rest: str, where: str) -> T:

@@ -1,4 +1,4 @@
-"""What every stage does around its work: one line for an error, no traceback."""
+"""A stage's command line: one line for an error, no traceback."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.linalg import LinAlgError
 from serving.errors import LoopwrightError
 
 FAILURES = (LoopwrightError, OSError, LinAlgError)
-"""What bad input can raise: one line on standard error, exit status 2."""
+"""Errors that bad input can raise: one line on standard error, exit status 2."""
 
 
 def reason(error: Exception) -> str:

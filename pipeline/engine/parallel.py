@@ -144,7 +144,7 @@ class _Helper:
 
 
 def _help(connection: Connection, function: Callable[[Any], Any] | bytes, others: Connection | None) -> None:
-    """What a helper runs: items as they come, until the other end is closed."""
+    """Run items as they come, in a helper, until the other end is closed."""
     end_with_parent()
     if others is not None:
         others.close()  # this fork's copy, which would keep it from seeing the end

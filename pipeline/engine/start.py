@@ -24,7 +24,7 @@ DIED = 70
 
 
 def served() -> list[str]:
-    """What a warm process must share with this one to stand in for it."""
+    """Environment and folder, which a warm process must share with this one to stand in for it."""
     return [sys.prefix, os.getcwd()]
 
 

@@ -123,7 +123,7 @@ class _Server:
         self.waiting.register(line, selectors.EVENT_READ, pid)
 
     def _become(self, request: dict[str, Any], files: list[int]) -> None:
-        """What the fork does: be the process that asked. It does not return."""
+        """Run the stage in the fork, in place of the process that asked. It does not return."""
         code = 1
         try:
             signal.set_wakeup_fd(-1)

@@ -1,4 +1,4 @@
-"""What no controller can beat by much: perfect-model NMPC and the offline optimum.
+"""Bounds that no controller can beat by much: perfect-model NMPC and the offline optimum.
 
 ``pipeline.optimal.perfect`` says what they know and what they do not. A plant with a discrete MV is replaced by
 its ``relaxed()``. The offline optimum is searched from the NMPC's moves too; where no plan is better than the
@@ -70,7 +70,7 @@ def better(offline: dict[str, float], nmpc: dict[str, float], metric: str) -> di
 
 
 def _remark(figures: dict[str, float]) -> str:
-    """What a person must know of an offline optimum; empty where all is well."""
+    """Doubts about an offline optimum, for a person to read; empty where there are none."""
     remarks = [f"{figures['failures']:.0f} plans were not solved"] if figures.get("failures") else []
     remarks += ["no plan was better than the NMPC, whose figures stand here"] if figures.get("from_nmpc") else []
     return f" - {'; '.join(remarks)}" if remarks else ""

@@ -84,7 +84,7 @@ def modules(stage: str, case: str = "") -> set[str]:
 
 @cache
 def graph() -> grimp.ImportGraph:
-    """What imports what, wherever in a module's text."""
+    """All imports among the modules, wherever they stand in the text."""
     return grimp.build_graph(*PACKAGES, cache_dir=None)
 
 

@@ -69,7 +69,7 @@ def _export(
 
 
 def _analysed(law: ControlLaw, plant: Simulator, path: Path) -> dict[str, Any]:
-    """What the law says of itself, its arrays in a file of their own; nothing of a law that has no analysis."""
+    """The law's own analysis, its arrays in a file of their own; nothing of a law that has none."""
     analysis = law.analysis(plant)
     if analysis.arrays:
         arrays: dict[str, Any] = {name: np.asarray(array) for name, array in analysis.arrays.items()}

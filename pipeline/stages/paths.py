@@ -50,5 +50,5 @@ def step_time_file(case: str, name: str) -> Path:
 
 
 def receipt_file(case: str) -> Path:
-    """What a report leaves for the overview to wait for, in one folder because DVC cannot list a file a case."""
+    """Receipt of a report, which the overview waits for; in one folder because DVC cannot list a file a case."""
     return WORK / "reports" / f"{case}.json"

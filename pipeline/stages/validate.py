@@ -100,7 +100,7 @@ def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:
 def _metrics(
     params: ControllerParams, case: Case, designed: Mapping[str, Any], trials: list[Trial], shipped: Trial
 ) -> LawMetrics:
-    """What is kept of the trials; ``designed`` is what design left of every form and seed."""
+    """Figures of the trials that are kept; ``designed`` is metrics.json of the design stage."""
     base = [t for t in trials if t.form == BASE]
     analyses = {row["form"]: row.get("analysis") for row in designed["controllers"] if row["seed"] == shipped.seed}
 
@@ -141,7 +141,7 @@ def _over_seeds(rows: Mapping[int, Metrics]) -> OverSeeds:
 
 
 def _evidence(case: Case, base: list[Trial], shipped: Trial) -> dict[str, Any]:
-    """What the shipped file says of itself: its own figures, and the median over the data seeds."""
+    """Evidence in the shipped file's manifest: its own figures, and the median over the data seeds."""
     figures = {
         name: {**row, f"{case.metric}_median": statistics.median(t.metrics[name][case.metric] for t in base)}
         for name, row in shipped.metrics.items()

@@ -33,7 +33,7 @@ METRICS = {
 def run_note(result: StageResult, case: str, validation: Validation | None, times: Times) -> str:
     """The description of a run: what the stage did, what came out, and what its metrics mean."""
     item = result.item
-    words = {"case": case, "item": item, "metric": "mae"}
+    words = {"case": case, "item": item, "metric": "<metric>"}
     if validation is not None:
         words |= {"case": validation.titles.case, "metric": validation.metric}
         if result.kind in {"design", "validate"}:

@@ -50,7 +50,11 @@ def test_the_repositorys_own_has_none(params: dict[str, Any], capsys: pytest.Cap
         (("models", "batch_reactor-nnarx", "data"), "mine.csv", "which is not there"),
         (("models", "batch_reactor-nnarx", "parts", "arx", "kind"), "arxx", "did you mean 'arx'"),
         (("models", "thiosulfate_cstr-three_periods", "parts", "forward", "trainer", "kind"), "ml", "trainer"),
-        (("models", "ph_neutralization-identification_example", "case"), "batch", "known: batch_reactor"),
+        (
+            ("models", "ph_neutralization-identification_example", "case"),
+            "batch",
+            "call the section batch-identification_example",
+        ),
         (("controllers", "batch_reactor-pid", "law"), "pit", "did you mean 'pid'"),
         (("controllers", "batch_reactor-pid", "name"), "fast", "or call the section batch_reactor-fast"),
         (("controllers", "batch_reactor-pid", "model"), "linear", "has the model sets"),
