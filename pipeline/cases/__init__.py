@@ -13,10 +13,12 @@ from typing import Any
 from pipeline.cases.batch_reactor.case import BatchReactorCase
 from pipeline.cases.henson_seborg_cstr.case import HensonSeborgCstrCase
 from pipeline.cases.jacketed_batch_reactor.case import JacketedBatchReactorCase
+from pipeline.cases.own_plant import own_case
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
 from pipeline.cases.ph_neutralization.case_15s import PhNeutralization15sCase
 from pipeline.cases.reversible_cstr.case import ReversibleCstrCase
 from pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
+from pipeline.config.params import PARAMS_FILE, sections
 from pipeline.evaluation.case import Case
 from pipeline.plants.simulator import Simulator
 
@@ -35,6 +37,12 @@ PLANTS: dict[str, type[Simulator]] = {
 }
 
 
+def all_cases() -> dict[str, Case]:
+    """CASES, and after them the own plants of params.yaml, where there is one here."""
+    own = sections("plants") if PARAMS_FILE.exists() else ()
+    return {**CASES, **{name: own_case(name) for name in own}}
+
+
 def beside(case: Case, module: str, name: str, default: Any) -> Any:
     """``name`` in the module that stands beside the case: ``paper`` of case.py, ``paper_15s`` of case_15s.py.
 
@@ -47,4 +55,4 @@ def beside(case: Case, module: str, name: str, default: Any) -> Any:
     return default if importlib.util.find_spec(path) is None else getattr(importlib.import_module(path), name)
 
 
-__all__ = ["CASES", "PLANTS", "beside"]
+__all__ = ["CASES", "PLANTS", "all_cases", "beside"]

@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from pipeline.cases import CASES, PLANTS
+from pipeline.cases import PLANTS, all_cases
 from pipeline.config.params import choose
 from pipeline.errors import ParamsError, nearest
 from pipeline.evaluation.case import Case
@@ -170,11 +170,12 @@ class _Endpoint:
 
 def _plant_of(manifest: Manifest) -> tuple[Simulator, Case | None]:
     """The plant that the controller was made for, and its case if it has one."""
-    case = CASES.get(manifest.case)
+    cases = all_cases()
+    case = cases.get(manifest.case)
     if case is None and manifest.case not in PLANTS:
         raise ParamsError(
             f"the controller is for {manifest.case!r}, which is neither a case nor a plant here"
-            f"{nearest(manifest.case, {*CASES, *PLANTS})}"
+            f"{nearest(manifest.case, {*cases, *PLANTS})}"
         )
     plant = PLANTS[manifest.case]() if case is None else case.plant
     for name in ("sp", "pv", "dv", "mv"):

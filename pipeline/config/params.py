@@ -27,8 +27,14 @@ def read_section(kind: str, name: str, path: Path = PARAMS_FILE) -> dict[str, An
 
 
 def sections(kind: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
-    """Names of all sections of one kind (cases, records, models, controllers), in their order."""
-    section = _entry(_tree(path), kind, str(path))
+    """Names of all sections of one kind (cases, records, models, controllers, plants), in their order.
+
+    ``plants`` may be left out.
+    """
+    tree = _tree(path)
+    if kind == "plants" and kind not in tree:
+        return ()
+    section = _entry(tree, kind, str(path))
     if not isinstance(section, dict):
         raise ParamsError(f"{path}: {kind} is {section!r}; it must be a mapping of names to their sections")
     return tuple(map(str, section))
@@ -150,6 +156,29 @@ class CaseParams:
 
     held_out_seeds: tuple[int, ...]
     noise_seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class PlantParams:
+    """``plants.<name>``: a person's own plant, known by its record alone; ``loopwright new`` writes the section.
+
+    ``sp``, ``pv``, ``mv``, ``dv``: signals, each a mapping of name, unit, low and high; the PVs with a set point
+    come first. ``data``: the record. ``source``: the raw files with their digests.
+    """
+
+    period_s: float
+    sp: tuple[Mapping[str, Any], ...]
+    pv: tuple[Mapping[str, Any], ...]
+    mv: tuple[Mapping[str, Any], ...]
+    data: Path
+    dv: tuple[Mapping[str, Any], ...] = ()
+    title: str = ""
+    source: tuple[Mapping[str, Any], ...] = ()
+
+    @classmethod
+    def read(cls, name: str) -> PlantParams:
+        """The section of one plant."""
+        return parse(cls, read_section("plants", name), f"plants.{name}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -115,6 +115,7 @@ class Case(ABC):
     effort: ClassVar[Effort] = Effort()  # horizon and resolution of the bounds' search
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
+    evidence_of: ClassVar[str] = "equations"  # the tests run on these; "identified": on models of the plant's record
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
 
     def __post_init__(self) -> None:
@@ -135,6 +136,11 @@ class Case(ABC):
                 "implement that, or give another plant_class"
             )
         return self.plant_class()
+
+    @property
+    def ready(self) -> bool:
+        """Whether the plant can be simulated yet; a plant known by its record alone waits for its models."""
+        return True
 
     @property
     def equations(self) -> EquationPlant:

@@ -163,7 +163,7 @@ class Evidence:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of the controlled variable's measurement noise."""
-        return float(self.case.noise[self.case.plant_class.sp_signals[0].name])
+        return float(self.case.noise_std[0])
 
     @cached_property
     def floors(self) -> dict[str, float]:

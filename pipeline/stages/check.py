@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import CASES
+from pipeline.cases import all_cases
 from pipeline.config.params import (
     CaseParams,
     ControllerParams,
@@ -48,7 +48,7 @@ def mistakes() -> list[str]:
 
 def notes() -> list[str]:
     """One line for what may be missing on purpose: cases without a section, bounds that a report will lack."""
-    unused = [name for name in CASES if name not in sections("cases")]
+    unused = [name for name in all_cases() if name not in sections("cases")]
     lines = [f"params.yaml has no section for {_listed(unused)}: the case takes no part"] if unused else []
     for name in sections("cases"):
         try:
@@ -66,12 +66,14 @@ def notes() -> list[str]:
 
 def _case_of(name: str) -> Case:
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
-    return choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+    return choose(all_cases(), name, "case", "cases").with_held_out(params.held_out_seeds)
 
 
 def _case(name: str) -> None:
     case = _case_of(name)
     _ = case.plant  # raises where its class is abstract
+    if not case.ready:
+        return
     case.tests()
     if not case.development():
         raise ParamsError(f"case {name!r} has no development sequences; without them no controller can be chosen")
@@ -80,7 +82,7 @@ def _case(name: str) -> None:
 def _record(name: str) -> None:
     params, where = RecordParams.read(name), f"records.{name}"
     _known_case(params.case, where)
-    parse(choose(excitations(CASES[params.case]), params.kind, "excitation", where), params.excitation, where)
+    parse(choose(excitations(all_cases()[params.case]), params.kind, "excitation", where), params.excitation, where)
 
 
 def _model(name: str) -> None:
@@ -118,7 +120,8 @@ def _controller(name: str) -> None:
         described = parts_of(model_set, f"models.{name}")
     except ParamsError:  # the check of that model set says so
         described = {}
-    plant = CASES[params.case].plant
+    case = all_cases()[params.case]
+    plant = case.plant
     parts = {
         k: p.learn(Source(None, plant.signals, plant=plant)).model
         for k, p in described.items()
@@ -131,6 +134,8 @@ def _controller(name: str) -> None:
                 f"{place}: law {params.law!r} needs a part {lacking[0]!r}; model set {params.model!r} has "
                 f"{_listed(described)}: add it to `models.{name}.parts`, or name another set"
             )
+        if not case.ready:
+            continue
         try:
             law.check(settings, parts, plant)
         except PipelineError as error:
@@ -138,7 +143,7 @@ def _controller(name: str) -> None:
 
 
 def _known_case(case: str, where: str) -> None:
-    choose(CASES, case, "case", where)
+    choose(all_cases(), case, "case", where)
     if case not in sections("cases"):
         raise ParamsError(f"{where}.case is {case!r}, which has no section under `cases:` of params.yaml; add one")
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import grimp
 
-from pipeline.cases import CASES
+from pipeline.cases import all_cases
 from pipeline.engine.command import run_stage
 from pipeline.files import sha256, write_json
 from pipeline.stages.paths import WORK
@@ -50,7 +50,7 @@ TEMPLATES = "pipeline/report/templates/*"
 
 def code() -> None:
     """Write work/code: one file for each stage of each case, one for each of those at the end."""
-    for stage, case in (*((stage, "") for stage in LAST), *product(STAGES, CASES)):
+    for stage, case in (*((stage, "") for stage in LAST), *product(STAGES, all_cases())):
         write_json(WORK / "code" / f"{stage}{case and '-' + case}.json", listing(Path.cwd(), stage, case))
 
 
@@ -90,7 +90,7 @@ def graph() -> grimp.ImportGraph:
 
 def beside(case: str, name: str) -> str:
     """The module ``name`` beside the case's own: paper_15s beside case_15s."""
-    package, _, own = type(CASES[case]).__module__.rpartition(".")
+    package, _, own = type(all_cases()[case]).__module__.rpartition(".")
     return f"{package}.{own.replace('case', name, 1)}"
 
 

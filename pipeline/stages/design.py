@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import CASES
+from pipeline.cases import all_cases
 from pipeline.config.params import ControllerParams, choose, parse
 from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
@@ -32,7 +32,7 @@ def design(name: str) -> None:
     """Export ``controllers.<name>`` for each seed of its model set, its variants too."""
     params = ControllerParams.read(name)
     where = f"controllers.{name}"
-    case, law = choose(CASES, params.case, "case", where), choose(LAWS, params.law, "law", where)
+    case, law = choose(all_cases(), params.case, "case", where), choose(LAWS, params.law, "law", where)
     forms = {BASE: params.settings, **{v: {**params.settings, **s} for v, s in params.variants.items()}}
     read = {form: parse(law.Params, settings, where) for form, settings in forms.items()}
     models = model_folder(params.case, params.model)

@@ -7,7 +7,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from pipeline.cases import CASES, beside
+from pipeline.cases import all_cases, beside
 from pipeline.config.params import RecordParams, choose, parse
 from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
@@ -22,7 +22,7 @@ def excite(name: str) -> None:
     """Write the records of ``records.<name>``: seed<k>.parquet each, and metrics.json."""
     params = RecordParams.read(name)
     where = f"records.{name}"
-    case = choose(CASES, params.case, "case", where)
+    case = choose(all_cases(), params.case, "case", where)
     kind = choose(excitations(case), params.kind, "excitation", where)
     excitation = parse(kind, params.excitation, where)
     folder = record_folder(params.case, params.record)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import CASES, beside
+from pipeline.cases import all_cases, beside
 from pipeline.config.params import ModelParams, choose, parse
 from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
@@ -27,7 +27,7 @@ from pipeline.stages.paths import model_folder
 def fit(name: str) -> None:
     """Train the parts of ``models.<name>`` on each data seed; write them, metrics.json and the sweep."""
     params = ModelParams.read(name)
-    case = choose(CASES, params.case, "case", f"models.{name}")
+    case = choose(all_cases(), params.case, "case", f"models.{name}")
     parts = parts_of(params, f"models.{name}")
     folder = model_folder(params.case, params.model)
     shutil.rmtree(folder, ignore_errors=True)
@@ -50,7 +50,7 @@ def fit(name: str) -> None:
 
 def parts_of(params: ModelParams, where: str) -> dict[str, Part]:
     """The descriptions of a set's parts by name; ParamsError says what of them cannot be."""
-    kinds = {**MODELS, **beside(CASES[params.case], "models", "MODELS", {})}
+    kinds = {**MODELS, **beside(all_cases()[params.case], "models", "MODELS", {})}
     parts = {}
     for name, values in params.parts.items():
         place, options = f"{where}.parts.{name}", dict(values)

@@ -6,7 +6,7 @@ import hashlib
 import sys
 from pathlib import Path
 
-from pipeline.cases import CASES, beside
+from pipeline.cases import all_cases, beside
 from pipeline.config.params import CaseParams, choose, entries, parse, read_section
 from pipeline.engine.command import run_stage
 from pipeline.evaluation.evidence import Evidence
@@ -20,7 +20,7 @@ from pipeline.stages.paths import ARTIFACTS, TIMING, WORK, receipt_file
 def report(name: str) -> None:
     """Write artifacts/<case>/{validation.json,report.html,report.md,figures/} from work/<case>."""
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
-    case = choose(CASES, name, "case", "cases").with_held_out(params.held_out_seeds)
+    case = choose(all_cases(), name, "case", "cases").with_held_out(params.held_out_seeds)
     case.tests()  # raises where there are none
     # A new case has no bounds until `loopwright bounds` has run; stale ones are an error, never shown.
     bounds, missing = stored_bounds(case) if bounds_path(case).exists() else ({}, [])

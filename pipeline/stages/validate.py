@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import CASES
+from pipeline.cases import all_cases
 from pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section
 from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
@@ -39,7 +39,7 @@ def validate(name: str) -> None:
     """Run every file of ``controllers.<name>`` over its plant; ship the best by the development sequences."""
     params = ControllerParams.read(name)
     choices = parse(CaseParams, read_section("cases", params.case), f"cases.{params.case}")
-    case = choose(CASES, params.case, "case", f"controllers.{name}").with_held_out(choices.held_out_seeds)
+    case = choose(all_cases(), params.case, "case", f"controllers.{name}").with_held_out(choices.held_out_seeds)
     case.tests()  # before hours of closed loops: raises where there are none
     seeds = sorted(
         int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.name) / BASE).glob("*.onnx")
@@ -146,7 +146,8 @@ def _evidence(case: Case, base: list[Trial], shipped: Trial) -> dict[str, Any]:
         name: {**row, f"{case.metric}_median": statistics.median(t.metrics[name][case.metric] for t in base)}
         for name, row in shipped.metrics.items()
     }
-    return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), "scenarios": figures}
+    of = {} if case.evidence_of == "equations" else {"plant": case.evidence_of}
+    return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "scenarios": figures}
 
 
 if __name__ == "__main__":

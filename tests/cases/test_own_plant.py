@@ -1,0 +1,142 @@
+"""A person's own plant as a case: its section of params.yaml, its record, and models in place of the plant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.cases import CASES, all_cases
+from pipeline.cases.own_plant import GAINS, OwnCase, own_case
+from pipeline.errors import ParamsError, PlantError
+from pipeline.plants.signals import Signals
+from pipeline.records.record import Record
+from pipeline.simulation.simulate import simulate_closed
+from serving.manifest import Signal
+
+TEMPERATURE = {"name": "TIC-101.PV", "unit": "degC", "low": 20.0, "high": 90.0}
+VALVE = {"name": "TIC-101.OP", "unit": "%", "low": 0.0, "high": 100.0}
+SECTION: dict[str, Any] = {
+    "period_s": 10.0,
+    "title": "Heater",
+    "sp": [TEMPERATURE],
+    "pv": [TEMPERATURE],
+    "mv": [VALVE],
+    "data": "data/heater/record.parquet",
+}
+
+
+def model(pole: float) -> dict[str, np.ndarray]:
+    """A lag from the valve to the temperature: 20 degC at 0 %, 80 degC at 100 %."""
+    return {
+        "a": np.array([[pole]]),
+        "b": np.array([[(1 - pole) * 1.5]]),
+        "c": np.zeros(1),
+        "w1": np.zeros((0, 2)),
+        "b1": np.zeros(0),
+        "w2": np.zeros((1, 0)),
+        "y_center": np.array([50.0]),
+        "y_scale": np.array([20.0]),
+        "v_center": np.array([50.0]),
+        "v_scale": np.array([50.0]),
+        "noise": np.array([0.01]),
+    }
+
+
+def wrote(folder: Path, section: dict[str, Any]) -> None:
+    (folder / "params.yaml").write_text(yaml.safe_dump({"plants": {"heater": section}, "cases": {}}))
+
+
+@pytest.fixture
+def heater(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OwnCase:
+    """The case in a folder with its record and three trained models, the last two for its tests."""
+    monkeypatch.chdir(tmp_path)
+    wrote(tmp_path, SECTION)
+    signal, valve = Signal(**TEMPERATURE), Signal(**VALVE)
+    signals = Signals(10.0, (signal,), (signal,), (), (valve,))
+    mv = np.random.default_rng(0).uniform(20, 60, (500, 1))
+    Path("data/heater").mkdir(parents=True)
+    Record.of(signals, 20 + 0.6 * mv, mv).write(Path(SECTION["data"]))
+    folder = Path("work/heater/models/identified/seed0")
+    folder.mkdir(parents=True)
+    for name, pole in {"identified": 0.9, "plant1": 0.88, "plant2": 0.92}.items():
+        np.savez(folder / f"{name}.npz", **model(pole))
+    case = all_cases()["heater"]
+    assert isinstance(case, OwnCase)
+    return case
+
+
+def test_it_stands_after_the_cases_of_the_papers(heater: OwnCase) -> None:
+    assert list(all_cases()) == [*CASES, "heater"]
+    assert (heater.title, heater.plant.period_s, heater.evidence_of) == ("Heater", 10.0, "identified")
+    assert heater.ready
+
+
+def test_no_test_runs_on_the_law_s_own_model(heater: OwnCase) -> None:
+    tests = [test for sequences in heater.tests().values() for test in sequences]
+    assert all(test.plant is not None and test.plant is not heater.plant for test in tests)
+    assert {id(test.plant) for test in tests} == {id(plant) for plant in heater.members}
+    assert all(test.plant is heater.plant for test in heater.development())
+
+
+def test_set_points_are_what_the_model_reaches_within_the_record(heater: OwnCase) -> None:
+    low, high = np.quantile(heater.record.mv, (0.1, 0.9))
+    for test in heater.scenarios()["held_out"]:
+        assert test.sp.min() >= 20 + 0.6 * low - 1e-6
+        assert test.sp.max() <= 20 + 0.6 * high + 1e-6
+        assert len(np.unique(test.sp)) == len(test.sp) // heater.hold
+    other = own_case("heater").with_held_out((7, 8, 9)).scenarios()["held_out"]
+    assert not np.array_equal(other[0].sp, heater.scenarios()["held_out"][0].sp)
+
+
+def test_a_set_point_is_held_three_times_as_long_as_the_model_needs(heater: OwnCase) -> None:
+    needed = np.ceil(np.log(0.05) / np.log(0.9))
+    assert abs(heater.hold - 3 * needed) <= 3
+
+
+def test_spoilt_plants_have_another_gain_and_carry_a_load(heater: OwnCase) -> None:
+    tests = heater.scenarios()
+    assert {float(t.changes["gain"][0]) for t in tests["gain"]} == set(GAINS)
+    for test in tests["load"]:
+        assert test.plant is not None
+        rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
+        # 10 % of the valve's range, 0.6 degC a percent
+        assert abs(rest.pv[-1, 0] - rest.pv[0, 0]) == pytest.approx(6.0, rel=0.01)
+
+
+def test_noise_is_that_of_the_model(heater: OwnCase) -> None:
+    assert heater.noise_std == pytest.approx([0.2])
+
+
+def test_before_training_the_signals_are_known_and_the_rest_is_asked_for(heater: OwnCase) -> None:
+    for path in Path("work").rglob("*.npz"):
+        path.unlink()
+    case = own_case("heater")
+    assert not case.ready
+    assert [s.name for s in case.plant.mv_signals] == ["TIC-101.OP"]
+    with pytest.raises(PlantError, match="`loopwright run heater` trains"):
+        _ = case.plant.start
+    with pytest.raises(PlantError, match="add parts plant1"):
+        case.scenarios()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"mv": []}, "at least one pv and one mv"),
+        ({"mv": [{**VALVE, "high": 0.0}]}, "low < high"),
+        ({"mv": [{"name": "u", "unit": "%"}]}, "each signal has name, unit, low and high"),
+        ({"sp": [VALVE]}, "a set point for the first PVs"),
+        ({"sp": [TEMPERATURE, VALVE], "pv": [TEMPERATURE, VALVE]}, "one controlled variable so far"),
+        ({"perod_s": 1.0}, "unknown key 'perod_s'"),
+    ],
+)
+def test_a_wrong_section_is_one_line(heater: OwnCase, tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    wrote(tmp_path, {**SECTION, **change})
+    with pytest.raises(ParamsError, match=r"plants\.heater") as error:
+        own_case("heater")
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
