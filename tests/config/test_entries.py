@@ -1,0 +1,76 @@
+"""Entries that are written into params.yaml: the rest of the text stays as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.config.entries import add_entries
+from pipeline.errors import ParamsError
+
+TEXT = """# Settings.
+cases:
+  a: {seeds: [1, 2]} # of a
+
+# The models.
+models:
+  # First.
+  a-x:
+    case: a
+controllers: {}
+"""
+NEW = {
+    "cases": {"b": {"seeds": [3]}},
+    "models": {"b-x": {"case": "b", "parts": {"x": {"kind": "arx"}}}},
+    "controllers": {"b-pid": {"law": "pid"}},
+    "plants": {"b": {"title": "Kessel für Öl", "pv": [{"name": "TIC-101.PV", "unit": "degC"}]}},
+}
+
+
+def test_entries_stand_at_the_ends_of_their_sections_and_nothing_else_changes(tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text(TEXT, encoding="utf-8")
+    add_entries(NEW, path)
+    after = path.read_text(encoding="utf-8")
+    assert yaml.safe_load(after) == {
+        **{k: {**(yaml.safe_load(TEXT)[k] or {}), **NEW[k]} for k in list(NEW)[:3]},
+        "plants": NEW["plants"],
+    }
+    left = iter(after.splitlines())
+    assert all(line in left for line in TEXT.replace("controllers: {}", "controllers:").splitlines())
+    assert after.index("  b:\n") < after.index("\n# The models.")
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n# The end."])
+def test_a_file_may_end_as_it_likes(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text("cases:\n  a: 1" + end)
+    add_entries({"cases": {"b": {"x": 1}}}, path)
+    assert yaml.safe_load(path.read_text()) == {"cases": {"a": 1, "b": {"x": 1}}}
+
+
+def test_the_project_s_own_file_takes_them(tmp_path: Path) -> None:
+    source = Path(__file__).parents[2] / "params.yaml"
+    path = tmp_path / "params.yaml"
+    path.write_bytes(source.read_bytes())
+    add_entries(NEW, path)
+    left = iter(path.read_text(encoding="utf-8").splitlines())
+    assert all(line in left for line in source.read_text(encoding="utf-8").splitlines())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("cases:\n  b: 1\n", "cases.b exists already"),
+        ("cases: {a: 1}\n", "write each of these sections as a block"),
+    ],
+)
+def test_nothing_is_written_where_an_entry_cannot_be_added(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text(text)
+    with pytest.raises(ParamsError, match=r"params\.yaml") as error:
+        add_entries({"plants": {"b": {}}, "cases": {"b": {"x": 1}}}, path)
+    assert said in str(error.value)
+    assert path.read_text() == text
