@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from pipeline.cases import CASES, all_cases
-from pipeline.cases.own_plant import GAINS, OwnCase, own_case
+from pipeline.cases.own_plant import GAINS, LOAD, OwnCase, own_case
 from pipeline.errors import ParamsError, PlantError
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
@@ -43,6 +43,7 @@ def model(pole: float) -> dict[str, np.ndarray]:
         "v_center": np.array([50.0]),
         "v_scale": np.array([50.0]),
         "noise": np.array([0.01]),
+        "rest": np.array([[1.0, 0.0, 0.0]]),
     }
 
 
@@ -97,14 +98,15 @@ def test_a_set_point_is_held_three_times_as_long_as_the_model_needs(heater: OwnC
     assert abs(heater.hold - 3 * needed) <= 3
 
 
-def test_spoilt_plants_have_another_gain_and_carry_a_load(heater: OwnCase) -> None:
+def test_spoilt_plants_have_errors_and_carry_a_load(heater: OwnCase) -> None:
     tests = heater.scenarios()
-    assert {float(t.changes["gain"][0]) for t in tests["gain"]} == set(GAINS)
+    assert {float(t.changes["gain_TIC-101.OP"][0]) for t in tests["spoilt"]} == set(GAINS)
     for test in tests["load"]:
         assert test.plant is not None
         rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
-        # 10 % of the valve's range, 0.6 degC a percent
-        assert abs(rest.pv[-1, 0] - rest.pv[0, 0]) == pytest.approx(6.0, rel=0.01)
+        moved = rest.pv[heater.hold, 0] - rest.pv[0, 0]
+        assert abs(moved) == pytest.approx(LOAD * heater.record.pv[:, 0].std(), rel=0.01)
+    assert len({np.sign(test.changes["load_TIC-101.PV"][0]) for test in tests["load"]}) == 2
 
 
 def test_noise_is_that_of_the_model(heater: OwnCase) -> None:
