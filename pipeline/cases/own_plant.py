@@ -16,6 +16,7 @@ from pipeline.evaluation.case import Array, Case
 from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
+from pipeline.plants.spoilt import SpoiltPlant
 from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.simulation.simulate import simulate_batch
@@ -31,6 +32,30 @@ HOLD = (30, 400)  # fewest and most samples of a set point
 LOAD = 0.25  # standard deviations of the record's CV
 RESTING = 2_000  # samples
 GAINS, SPEEDS, DELAYS = (0.8, 1.25), (1.25, 0.8), (1.0, 0.0)  # factors of gain and time constant; [periods]
+
+
+class OwnPlant(IdentifiedPlant):
+    """A model of an own plant, with the measurement noise of its record and the errors that it may have."""
+
+    noise: Array
+
+    @property
+    def noise_std(self) -> Array:
+        """Standard deviation of the measurement noise, shape (n_pv,)."""
+        return self.noise
+
+    def variations(self) -> tuple[Simulator, ...]:
+        """The model itself, and with errors of gain, speed and dead time."""
+        return (self, *(SpoiltPlant(self, errors) for errors in errors_of(self)))
+
+
+def errors_of(plant: IdentifiedPlant) -> list[dict[str, float]]:
+    """Parameters of the spoilt plants: slow with a high gain and a longer dead time, fast with a low gain."""
+    gains = [dict.fromkeys((f"gain_{s.name}" for s in plant.mv_signals), gain) for gain in GAINS]
+    return [
+        {**gain, "time_constant": speed, "dead_time": delay}
+        for gain, speed, delay in zip(gains, SPEEDS, DELAYS, strict=True)
+    ]
 
 
 class Untrained(Simulator):
@@ -67,7 +92,7 @@ class OwnCase(Case):
 
     development_seeds: ClassVar[tuple[int, ...]] = (1, 2)
     gate: ClassVar[Mapping[str, float]] = {"held_out": 0.5, "held_out_noise": 0.2, "load": 0.15, "spoilt": 0.15}
-    evidence_of: ClassVar[str] = "identified"
+    on_models: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 1
     unforeseen: ClassVar[bool] = True
     signals: ClassVar[Signals]
@@ -89,12 +114,12 @@ class OwnCase(Case):
         return self._member(self._law_file) if self.ready else self.plant_class()
 
     @property
-    def _nominal(self) -> IdentifiedPlant:
-        assert isinstance(self.plant, IdentifiedPlant)
+    def _nominal(self) -> OwnPlant:
+        assert isinstance(self.plant, OwnPlant)
         return self.plant
 
     @cached_property
-    def members(self) -> tuple[IdentifiedPlant, ...]:
+    def members(self) -> tuple[OwnPlant, ...]:
         """The other models of the ensemble; PlantError where there are none."""
         paths = sorted(self.models.glob(MEMBERS))
         if not paths:
@@ -104,22 +129,24 @@ class OwnCase(Case):
             )
         return tuple(map(self._member, paths))
 
-    def _member(self, path: Path) -> IdentifiedPlant:
+    def _member(self, path: Path) -> OwnPlant:
         with np.load(path, allow_pickle=False) as file:
             arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
+            noise = np.asarray(file["noise"] * file["y_scale"])
         mv, dv = (np.median(values, axis=0) for values in (self.record.mv, self.record.dv))
-        return IdentifiedPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=int(max(DELAYS)))
+        plant = OwnPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=int(max(DELAYS)))
+        plant.noise = noise
+        return plant
 
     @cached_property
     def record(self) -> Record:
         """The record of the plant."""
         return Record.read(self.data, self.signals)
 
-    @cached_property
+    @property
     def noise_std(self) -> Array:
         """Measurement noise as the law's model estimates it, shape (n_pv,)."""
-        with np.load(self._law_file, allow_pickle=False) as file:
-            return np.asarray(file["noise"] * file["y_scale"])
+        return self._nominal.noise_std
 
     @cached_property
     def hold(self) -> int:
@@ -165,14 +192,12 @@ class OwnCase(Case):
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """Set points on the other models; the same on spoilt ones; and a load, upwards and downwards."""
-        members, cv, mv = self.members, self.plant.pv_signals[0], self.plant.mv_signals[0]
+        members, cv = self.members, self.plant.pv_signals[0]
         pairs = [(seed, members[i % len(members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
         held_out = "Set points, on models identified from the record"
         spoilt = "Set points, on such models with errors of gain, speed and dead time"
         loads = f"A load worth {LOAD:g} standard deviations of the record's {cv.name}"
-        errors = [
-            {f"gain_{mv.name}": GAINS[i], "time_constant": SPEEDS[i], "dead_time": DELAYS[i]} for i in range(len(GAINS))
-        ]
+        errors = errors_of(self._nominal)
         return {
             "held_out": tuple(self._test("held_out", held_out, self._sequence(s), p, s) for s, p, _ in pairs),
             "spoilt": tuple(self._test("spoilt", spoilt, self._sequence(s), p, s, **errors[i]) for s, p, i in pairs),
@@ -212,7 +237,6 @@ def own_case(name: str) -> Case:
         "plant_class": type("OwnPlant", (Untrained,), {**described, "name": name, "title": title, "needs": models}),
         "models": models,
         "data": params.data,
-        "disclosure": "All tests ran on models identified from the record, none on the plant.",
     }
     return type("OwnPlantCase", (OwnCase,), own)((9001, 9002, 9003))
 

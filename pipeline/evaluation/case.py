@@ -115,7 +115,7 @@ class Case(ABC):
     effort: ClassVar[Effort] = Effort()  # horizon and resolution of the bounds' search
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
-    evidence_of: ClassVar[str] = "equations"  # the tests run on these; "identified": on models of the plant's record
+    on_models: ClassVar[bool] = False  # the tests run on models of the plant's record; they have no bounds
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
 
     def __post_init__(self) -> None:

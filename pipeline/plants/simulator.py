@@ -71,6 +71,15 @@ class Simulator(ABC):
         """Nominal measured disturbances, shape (n_dv,)."""
         return np.zeros(len(self.dv_signals))
 
+    @property
+    def noise_std(self) -> Array:
+        """Standard deviation of the measurement noise that a tuning in closed loop counts with, shape (n_pv,)."""
+        return np.zeros(len(self.pv_signals))
+
+    def variations(self) -> tuple[Simulator, ...]:
+        """The plants that a tuning must suit: this one, and what it may be where its equations are not certain."""
+        return (self,)
+
     # ------------------------------------------------------------------ parameters
     @classmethod
     def parameter_names(cls) -> tuple[str, ...]:

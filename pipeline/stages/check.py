@@ -53,12 +53,10 @@ def notes() -> list[str]:
     for name in sections("cases"):
         try:
             case = _case_of(name)
-            has_bounds = bounds_path(case).exists()
-            lines += (
-                stored_bounds(case)[1]
-                if has_bounds
-                else [f"case {name!r} has no bounds; run `loopwright bounds {name}`"]
-            )
+            if bounds_path(case).exists():
+                lines += stored_bounds(case)[1]
+            elif not case.on_models:
+                lines.append(f"case {name!r} has no bounds; run `loopwright bounds {name}`")
         except LoopwrightError as error:
             lines.append(" ".join(str(error).split()))
     return lines

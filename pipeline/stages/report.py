@@ -24,7 +24,9 @@ def report(name: str) -> None:
     case.tests()  # raises where there are none
     # A new case has no bounds until `loopwright bounds` has run; stale ones are an error, never shown.
     bounds, missing = stored_bounds(case) if bounds_path(case).exists() else ({}, [])
-    for line in missing or ([] if bounds else [f"no bounds yet; `loopwright bounds {name}` computes them"]):
+    for line in missing or (
+        [] if bounds or case.on_models else [f"no bounds yet; `loopwright bounds {name}` computes them"]
+    ):
         print(f"report {name}: {line}", file=sys.stderr)
     laws, models = entries("controllers", name, "name"), entries("models", name, "model")
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))

@@ -19,6 +19,7 @@ LawStep = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tenso
 """A control law or its ``forward``: (sp, pv, dv, mv_applied, state) -> (mv, state_next, info)."""
 
 MARGIN = 0.02  # share of the reachable range of the controlled variable that is left out at either end
+TRAVEL = 0.1  # share of the range of the controlled variable that a move over the MV's range costs
 CHECK = 25  # samples between two looks at who has arrived
 
 
@@ -107,9 +108,13 @@ class DevelopmentLoops:
         of the mean an ITAE: a slow or swinging end then counts for more than the unavoidable beginning.
         ``step`` takes shapes (candidates, s, .): a law whose numbers have a leading dimension
         of candidates. The error of a sample counts before that sample's move acts. A candidate
-        whose loop is not finite has an infinite error.
+        whose loop is not finite has an infinite error. Where the plant has measurement noise, the law is given it, and
+        the error counts ``TRAVEL`` of the MV's travel, both in shares of their ranges.
         """
         n, s = self.sp.shape
+        noise, mv = self.plant.noise_std, self.plant.mv_signals[0]
+        rng, span = np.random.default_rng(0), self.plant.sp_signals[0].high - self.plant.sp_signals[0].low
+        price = TRAVEL * span / (mv.high - mv.low) if noise.any() else 0.0
         lanes = (candidates, s)
         x0, mv0 = np.tile(self.x0, (candidates, 1)), np.tile(self.mv0, (candidates, 1, 1))
         loops, error = BatchLoops(self.plant, step, n_state, lanes, x0, mv0), np.zeros(lanes)
@@ -117,7 +122,11 @@ class DevelopmentLoops:
             pv = loops.measured()
             weight = k % self.hold if time_weighted else 1
             error += weight * np.abs(self.sp[k] - pv[..., 0])
-            loops.step(torch.from_numpy(self.sp[k])[:, None].expand(*lanes, 1), pv)
+            before = loops.mv
+            noisy = pv + noise * rng.standard_normal((s, len(noise))) if noise.any() else pv
+            loops.step(torch.from_numpy(self.sp[k])[:, None].expand(*lanes, 1), noisy)
+            if price:
+                error += price * (loops.mv - before)[..., 0].abs().numpy()
         total = error.mean(axis=1) / n
         return np.where(np.isfinite(total), total, np.inf)
 

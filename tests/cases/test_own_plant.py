@@ -72,7 +72,7 @@ def heater(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OwnCase:
 
 def test_it_stands_after_the_cases_of_the_papers(heater: OwnCase) -> None:
     assert list(all_cases()) == [*CASES, "heater"]
-    assert (heater.title, heater.plant.period_s, heater.evidence_of) == ("Heater", 10.0, "identified")
+    assert (heater.title, heater.plant.period_s, heater.on_models) == ("Heater", 10.0, True)
     assert heater.ready
 
 

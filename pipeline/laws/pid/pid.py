@@ -172,12 +172,15 @@ class PID(ControlLaw):
         elif p.tuning == "optimized":
             if plant is None:
                 raise LawError("PID tuning `optimized` needs a simulator; take manual, imc, simc or itae")
-            loops = DevelopmentLoops.draw(plant, p.development_seeds, p.development_set_points, p.development_hold)
+            drawn = (p.development_seeds, p.development_set_points, p.development_hold)
+            plants = [DevelopmentLoops.draw(variation, *drawn) for variation in plant.variations()]
             free = p.set_point_weight is None
 
             def cost(rows: Sequence[PidSettings]) -> Array:
                 law = cls(signals, rows, p.mv_rate)
-                return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
+                weighted = p.criterion == "itae"
+                each = [loops.error(law, law.n_state, len(rows), time_weighted=weighted) for loops in plants]
+                return np.asarray(np.mean(each, axis=0))
 
             settings = tuning.optimized_imc(AllPole.near(lin), signals.period_s, cost, given, optimize_weight=free)
             return cls(signals, settings, p.mv_rate)

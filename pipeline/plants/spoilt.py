@@ -1,0 +1,58 @@
+"""An identified plant with errors: what a tuning must suit beside the model itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pipeline.plants.identified import IdentifiedPlant
+from pipeline.plants.simulator import AdvanceMany, Array, Simulator
+
+
+class SpoiltPlant(Simulator):
+    """An identified plant whose parameters are others from the start on, such as a gain of 1.25."""
+
+    def __init__(self, plant: IdentifiedPlant, changed: Mapping[str, float]) -> None:
+        # The attributes that other plants have by their class, this one has by the plant that it spoils.
+        names = ("name", "period_s", "pv_signals", "sp_signals", "mv_signals", "dv_signals")
+        vars(self).update({name: getattr(plant, name) for name in names})
+        self.plant, self.changed = plant, dict(changed)
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """The start of the plant."""
+        return self.plant.start
+
+    @property
+    def dv_nominal(self) -> Array:
+        """Measured disturbances at the start, shape (n_dv,)."""
+        return self.plant.dv_nominal
+
+    @property
+    def noise_std(self) -> Array:
+        """Standard deviation of the measurement noise, shape (n_pv,)."""
+        return self.plant.noise_std
+
+    def parameter_names(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Names of the plant's parameters."""
+        return self.plant.parameter_names()
+
+    def parameters(self, changed: Mapping[str, float] | None = None) -> Array:
+        """The parameter vector with this plant's errors, some of them changed by name."""
+        return self.plant.parameters({**self.changed, **(changed or {})})
+
+    def step(self, x: Array, mv: Array, dv: Array, p: Array) -> Array:
+        """The state one period later."""
+        return self.plant.step(x, mv, dv, p)
+
+    def measure(self, x: Array) -> Array:
+        """The process variables of a state."""
+        return self.plant.measure(x)
+
+    def measured(self, x: Array) -> Array:
+        """Process variables (..., n_pv) of states (..., n_x)."""
+        return self.plant.measured(x)
+
+    def many(self, n: int) -> AdvanceMany:
+        """``step`` of ``n`` runs side by side."""
+        dv, p = self.dv_nominal, self.parameters()
+        return lambda x, mv: self.plant.step(x, mv, dv, p)
