@@ -24,6 +24,7 @@ from serving.errors import ArtifactError
 from serving.manifest import Signal
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
+MEMBER_NUMBERS = (1, 2, 3)
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
 VISITED = (0.1, 0.9)  # quantiles of the record's MV between which tests move
 LEVELS = 6  # set points of a sequence
@@ -258,3 +259,18 @@ def signals_of(params: PlantParams, where: str) -> Signals:
             "so far"
         )
     return Signals(params.period_s, **groups)
+
+
+def entries_of(name: str, plant: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The entries of params.yaml for an own plant: its section, its tests, its models, and two controllers."""
+    parts = {LAW_PART: {"kind": LAW_PART}, **{f"plant{k}": {"kind": LAW_PART, "member": k} for k in MEMBER_NUMBERS}}
+    own = {"case": name, "model": MODEL_SET}
+    return {
+        "plants": {name: dict(plant)},
+        "cases": {name: {"held_out_seeds": [9001, 9002, 9003], "noise_seed": 1}},
+        "models": {f"{name}-{MODEL_SET}": {**own, "data": plant["data"], "parts": parts}},
+        "controllers": {
+            f"{name}-predictive": {**own, "name": "predictive", "law": "predictive"},
+            f"{name}-pid": {**own, "name": "pid", "law": "pid"},
+        },
+    }

@@ -184,8 +184,12 @@ class Evidence:
         return None if own is None or bound is None else ratio_to_bound(own, bound, self.floor(scenario))
 
     def gate_ratio(self, law: str, scenario: str) -> float | None:
-        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide."""
-        own, bound = self.figure(law, scenario), self.bound(scenario)
+        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide.
+
+        A case whose tests run on models has no NMPC; the baseline's error stands in its place.
+        """
+        own = self.figure(law, scenario)
+        bound = self.figure(self.case.baseline, scenario) if self.case.on_models else self.bound(scenario)
         return None if own is None or bound is None else gate_ratio(own, bound, self.floor(scenario))
 
     def score(self, law: str) -> float | None:

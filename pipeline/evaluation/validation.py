@@ -95,6 +95,7 @@ class Titles:
 class Validation:
     """The whole file. ``metric`` is the one that laws are compared by, ``main`` the test that weighs most.
 
+    ``on_models``: the tests ran on models of the plant's record, and the gate compares with the baseline.
     ``scenarios``: test -> law -> figures, medians over the data seeds, with ``<criterion>_min`` and
     ``<criterion>_max`` over the seeds and their number, ``seeds``; ``bounds``: test -> bound -> figures.
     """
@@ -111,6 +112,7 @@ class Validation:
     requirements: tuple[Statement, ...]
     claims: tuple[Statement, ...]
     paper: tuple[PaperResult, ...]
+    on_models: bool = False
 
     def to_json(self) -> str:
         """The file's text; ValueError for NaN and infinity."""

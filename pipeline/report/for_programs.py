@@ -45,6 +45,7 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
             for table, rows in judged.tables
             for row in rows
         ),
+        on_models=case.on_models,
     )
 
 

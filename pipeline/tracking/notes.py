@@ -18,14 +18,18 @@ WHAT = {
     " *{case}*. The best file by the development tests is shipped and stands in the registry.",
     "report": "Compared all control laws of the case *{case}* with each other, with the bound and with the paper.",
 }
+# What an error is divided by: of a case that is tested on its plant's equations, and on models of its record.
+BOUND = {
+    False: "an NMPC that knows the plant exactly, and 1 is the bound",
+    True: "the baseline, which ran on the same models of the plant's record",
+}
 METRICS = {
     "excite": "`rows` counts the samples of all data seeds.",
     "fit": "The metrics are medians over the data seeds: `rmse` one step ahead, `free_run_rmse` when the model runs on"
     " its own output. `training/` and `sweep/` are curves.",
     "design": "`bytes` is the largest file, `states` the length of the state vector.",
-    "validate": "`ratio_to_bound` is the figure that decides: the error divided by that of an NMPC that knows the plant"
-    " exactly; 1 is the bound, lower is better. `{metric}/…` is the error on each test, the median over the data seeds."
-    " `lock_ups` must be 0. `step_us` is the time of one step in microseconds.",
+    "validate": "`ratio_to_bound` is the figure that decides: the error divided by that of {bound};"
+    " lower is better. `{metric}/…` is the error on each test, the median over the data seeds. `lock_ups` must be 0. `step_us` is the time of one step in microseconds.",
     "report": "`best_ratio_to_bound` is that of the best law; 1 is the bound.",
 }
 
@@ -33,9 +37,9 @@ METRICS = {
 def run_note(result: StageResult, case: str, validation: Validation | None, times: Times) -> str:
     """The description of a run: what the stage did, what came out, and what its metrics mean."""
     item = result.item
-    words = {"case": case, "item": item, "metric": "<metric>"}
+    words = {"case": case, "item": item, "metric": "<metric>", "bound": BOUND[False]}
     if validation is not None:
-        words |= {"case": validation.titles.case, "metric": validation.metric}
+        words |= {"case": validation.titles.case, "metric": validation.metric, "bound": BOUND[validation.on_models]}
         if result.kind in {"design", "validate"}:
             words["item"] = validation.titles.laws.get(item, item)
     # the page shows the first lines, the rest on a click
