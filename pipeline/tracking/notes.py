@@ -29,7 +29,8 @@ METRICS = {
     " its own output. `training/` and `sweep/` are curves.",
     "design": "`bytes` is the largest file, `states` the length of the state vector.",
     "validate": "`ratio_to_bound` is the figure that decides: the error divided by that of {bound};"
-    " lower is better. `{metric}/…` is the error on each test, the median over the data seeds. `lock_ups` must be 0. `step_us` is the time of one step in microseconds.",
+    " lower is better. `{metric}/…` is the error on each test, the median over the data seeds."
+    " `lock_ups` must be 0. `step_us` is the time of one step in microseconds.",
     "report": "`best_ratio_to_bound` is that of the best law; 1 is the bound.",
 }
 
