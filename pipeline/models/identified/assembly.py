@@ -1,0 +1,127 @@
+"""From fitted arrays to the model: dead times become states that remember inputs, scales and noise come inside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.models.identified.dynamics import Dynamics, Stretch
+from pipeline.models.identified.identified import Identified
+from pipeline.models.identified.output_error import fit_starts
+from pipeline.models.identified.rests import rest_map
+from pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
+
+ANSWERS = 0.03
+"""Share of the largest step response below which an output has not answered yet."""
+
+
+def remembering(model: Dynamics, delays: Sequence[int]) -> Dynamics:
+    """The model whose input j acts ``delays[j]`` periods later: x = [x of the model, past inputs, newest first]."""
+    n, n_v, total = model.n_x, model.n_v, int(sum(delays))
+    a, b, c = np.zeros((n + total, n + total)), np.zeros((n + total, n_v)), np.zeros(n + total)
+    w1, w2 = np.zeros((model.n_hidden, n + total + n_v)), np.zeros((n + total, model.n_hidden))
+    a[:n, :n], c[:n], w1[:, :n], w2[:n] = model.a, model.c, model.w1[:, :n], model.w2
+    at = n
+    for j, d in enumerate(delays):
+        if not d:
+            b[:n, j], w1[:, n + total + j] = model.b[:, j], model.w1[:, n + j]
+            continue
+        b[at, j] = 1.0
+        a[at + 1 : at + d, at : at + d - 1] = np.eye(d - 1)
+        a[:n, at + d - 1], w1[:, at + d - 1] = model.b[:, j], model.w1[:, n + j]
+        at += d
+    return Dynamics(a, b, c, w1, model.b1, w2)
+
+
+def noise_of(residuals: Sequence[Array]) -> Array:
+    """Standard deviation (n_y,) of the measurement noise from free-run residuals (n, n_y) of each stretch.
+
+    min(sd of the differenced residual / sqrt 2, sd of the residual): what the model misses is mostly slow.
+    """
+    differenced = np.concatenate([np.diff(r, axis=0) for r in residuals]).std(axis=0) / np.sqrt(2)
+    return np.asarray(np.minimum(differenced, np.concatenate(list(residuals)).std(axis=0)))
+
+
+def assembled(
+    model: Dynamics, delays: Sequence[int], scales: Scales, data: ScaledRecord, noise: Array, n_mv: int, seed: int
+) -> Identified:
+    """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,); ``noise`` (n_y,) is scaled."""
+    whole, n_y, n_v = remembering(model, delays), data.y.shape[1], data.v.shape[1]
+    table, covariance = rest_map(model, data.y, data.v, seed)
+    n, total = model.n_x, whole.n_x
+    rest, rest_cov = np.zeros((total, n_y + n_v + 1)), np.zeros((total, total))
+    rest[:n], rest_cov[:n, :n] = table, covariance
+    rest[n:, n_y : n_y + n_v] = np.repeat(np.eye(n_v), delays, axis=0)
+    config = {"n_y": n_y, "n_mv": n_mv, "n_dv": n_v - n_mv, "n_x": total, "n_hidden": model.n_hidden}
+    arrays = {
+        **{name: getattr(whole, name) for name in ("a", "b", "c", "w1", "b1", "w2")},
+        **{name: getattr(scales, name) for name in ("y_center", "y_scale", "v_center", "v_scale")},
+        "noise": noise,
+        "rest": rest,
+        "rest_cov": rest_cov,
+        "dead": dead_periods(model, data)[:n_mv] + np.asarray(delays[:n_mv], dtype=np.float64),
+    }
+    return Identified.from_arrays(config, arrays)
+
+
+def dead_periods(model: Dynamics, data: ScaledRecord, length: int = 60) -> Array:
+    """Fewest periods (n_v,) without an answer at any output to a small step of each input, at the centre of the data.
+
+    An answer is more than 3 % of the largest value of that output's response over ``length`` periods.
+    """
+    middle = np.median(data.v, axis=0)
+    start = rest_map(model, data.y, data.v, 0)[0] @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
+    size = 0.5 * data.v.std(axis=0)
+    response = step_responses(model, start, middle, size, length)[..., : data.y.shape[1]]
+    answers = np.abs(response) > ANSWERS * np.abs(response).max(axis=1, keepdims=True)
+    return np.asarray(answers.any(axis=2).argmax(axis=1), dtype=np.float64)
+
+
+def step_responses(model: Dynamics, x: Array, v: Array, size: Array, length: int) -> Array:
+    """Changes (n_v, length, n_x) of the free run from x (n_x,) under v (n_v,) by steps of ``size`` (n_v,)."""
+    n_v = len(v)
+    inputs = np.concatenate([v + np.diag(size), v[None]])
+    states = np.tile(x, (n_v + 1, 1))
+    found = np.empty((n_v, length, len(x)))
+    for k in range(length):
+        states = model.advance(states, inputs)
+        found[:, k] = states[:-1] - states[-1]
+    return found
+
+
+def of_model(model: Identified) -> tuple[Dynamics, IdentifiedArrays]:
+    """The arrays of a finished model, for the fit's functions and for a plant."""
+    of = {name: np.array(value.numpy()) for name, value in model.state_dict().items()}
+    dynamics = Dynamics(of["a"], of["b"], of["c"], of["w1"], of["b1"], of["w2"])
+    scales = {name: of[name] for name in ("y_center", "y_scale", "v_center", "v_scale", "rest")}
+    return dynamics, IdentifiedArrays(*(of[name] for name in ("a", "b", "c", "w1", "b1", "w2")), **scales)
+
+
+def plant_of(
+    model: Identified,
+    signals: Signals,
+    *,
+    name: str = "identified",
+    mv: Array | None = None,
+    dv: Array | None = None,
+    most_dead_time: int = 0,
+) -> IdentifiedPlant:
+    """The model as a plant; PlantError where the signals are not those of its record."""
+    arrays = of_model(model)[1]
+    return IdentifiedPlant(signals, arrays, name=name, mv=mv, dv=dv, most_dead_time=most_dead_time)
+
+
+def free_run(model: Identified, y: Array, v: Array) -> Array:
+    """Outputs (n, n_y) in their units over neighbouring rows y (n, n_y), v (n, n_v) in engineering units.
+
+    The initial state is the one that fits y best.
+    """
+    dynamics, of = of_model(model)
+    data = Stretch((y - of.y_center) / of.y_scale, (v - of.v_center) / of.v_scale)
+    run = dynamics.free_run(fit_starts(dynamics, [data])[0], data)
+    predicted = np.full(y.shape, np.nan) if run is None else run[0][:, : y.shape[1]]
+    return predicted * of.y_scale + of.y_center

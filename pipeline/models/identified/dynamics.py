@@ -1,0 +1,119 @@
+"""The arrays of an identified model while it is being fitted: free run and slopes, in numpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.plants.simulator import Array
+
+EXPLODED = 1e4
+"""Scaled state beyond which a free run is given up."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Neighbouring rows of one run, scaled: outputs y (n, n_y) and the inputs v (n, n_v) that act in these rows."""
+
+    y: Array
+    v: Array
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dynamics:
+    """x+ = A x + B v + c + W2 tanh(W1 [x, v] + b1), y = x[:n_y]; all scaled. The fields are its parameters."""
+
+    a: Array  # (n_x, n_x)
+    b: Array  # (n_x, n_v)
+    c: Array  # (n_x,)
+    w1: Array  # (n_hidden, n_x + n_v)
+    b1: Array  # (n_hidden,)
+    w2: Array  # (n_x, n_hidden)
+
+    @classmethod
+    def linear(cls, a: Array, b: Array, c: Array | None = None) -> Self:
+        """The model without a hidden unit."""
+        n_x, n_v = b.shape
+        bias = np.zeros(n_x) if c is None else c
+        return cls(a, b, bias, np.zeros((0, n_x + n_v)), np.zeros(0), np.zeros((n_x, 0)))
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.a)
+
+    @property
+    def n_v(self) -> int:
+        """Number of inputs."""
+        return int(self.b.shape[1])
+
+    @property
+    def n_hidden(self) -> int:
+        """Number of tanh units."""
+        return len(self.b1)
+
+    # ------------------------------------------------------------------ parameters as one vector
+    def vector(self) -> Array:
+        """All parameters (P,), field by field, row by row."""
+        return np.concatenate([getattr(self, f.name).ravel() for f in fields(self)])
+
+    def with_vector(self, theta: Array) -> Self:
+        """The same structure with the parameters theta (P,)."""
+        parts, start = {}, 0
+        for f in fields(self):
+            shape = getattr(self, f.name).shape
+            size = int(np.prod(shape))
+            parts[f.name] = theta[start : start + size].reshape(shape)
+            start += size
+        return replace(self, **parts)
+
+    def mask(self, **free: bool | NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which entries of ``vector`` are free (P,): each field by name, as a whole or as a mask of its shape."""
+        parts = []
+        for f in fields(self):
+            value = getattr(self, f.name)
+            parts.append(np.broadcast_to(np.asarray(free.get(f.name, False), dtype=bool), value.shape).ravel())
+        return np.concatenate(parts)
+
+    # ------------------------------------------------------------------ running
+    def advance(self, x: Array, v: Array) -> Array:
+        """The next states (..., n_x) of states (..., n_x) under inputs (..., n_v)."""
+        z = np.concatenate([x, v], axis=-1)
+        return x @ self.a.T + v @ self.b.T + self.c + np.tanh(z @ self.w1.T + self.b1) @ self.w2.T
+
+    def slopes(self, x: Array, v: Array) -> tuple[Array, Array]:
+        """(dx+/dx (..., n_x, n_x), dx+/dv (..., n_x, n_v)) at states (..., n_x) under inputs (..., n_v)."""
+        t = np.tanh(np.concatenate([x, v], axis=-1) @ self.w1.T + self.b1)
+        through = (self.w2 * (1 - t * t)[..., None, :]) @ self.w1
+        return self.a + through[..., : self.n_x], self.b + through[..., self.n_x :]
+
+    def free_run(self, start: Array, data: Stretch, correction: float = 0.0) -> tuple[Array, Array] | None:
+        """(predicted states (n, n_x), states that the next prediction starts from (n, n_x)); None where it explodes.
+
+            x(k+1) = F(x'(k), v(k)),   x' = x but for the outputs:   x'[:n_y] = x[:n_y] + correction (y - x[:n_y])
+
+        With ``correction`` 0 the two are the same, and y is not used; with 1 the outputs are predicted one step ahead.
+        """
+        n_x, n_y, w2 = self.n_x, data.y.shape[1], self.w2
+        matrix = np.concatenate([self.a, self.w1[:, :n_x]])
+        drive = np.concatenate([data.v @ self.b.T + self.c, data.v @ self.w1[:, n_x:].T + self.b1], axis=1)
+        before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
+        x, hidden = np.array(start), self.n_hidden > 0
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, push in enumerate(drive):
+                before[k] = x
+                if correction:
+                    x[:n_y] += correction * (data.y[k] - x[:n_y])
+                    after[k] = x
+                z = matrix @ x
+                z += push
+                x = z[:n_x] + w2 @ np.tanh(z[n_x:]) if hidden else z
+            if not np.all(np.abs(before) < EXPLODED):
+                return None
+        return before, (after if correction else before)

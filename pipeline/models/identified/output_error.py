@@ -1,0 +1,320 @@
+"""Output-error fit: Levenberg-Marquardt on the free run, with exact sensitivities and the initial states free."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from pipeline.models.identified.dynamics import Dynamics, Stretch
+from pipeline.plants.simulator import Array
+
+CHUNK = 512  # rows whose sensitivities are held at a time
+GROWTH = 1e10  # of the damping, after which no step is looked for
+
+
+@dataclass(slots=True, eq=False)
+class Equations:
+    """Sums of a Gauss-Newton step: those of the parameters, and of each stretch's own initial state.
+
+    With J = dy_hat/dtheta and X = dy_hat/dx0: H = J'J, g = J'r, and of each stretch (J'X, X'X, X'r).
+    """
+
+    h: Array  # (P, P)
+    g: Array  # (P,)
+    of_starts: list[tuple[Array, Array, Array]] = field(default_factory=list)
+
+    def solve(self, damping: float, start_damping: float) -> tuple[Array, list[Array]]:
+        """The step of the parameters (P,) and of each initial state (n_x,).
+
+        (H + mu I) is reduced by the initial states, of which each touches its own stretch only.
+        """
+        h, g = self.h + damping * np.eye(len(self.h)), self.g.copy()
+        solved = []
+        for cross, own, right in self.of_starts:
+            factor = linalg.cho_factor(own + start_damping * np.eye(len(own)))
+            back, mean = linalg.cho_solve(factor, cross.T), linalg.cho_solve(factor, right)
+            solved.append((back, mean))
+            h = h - cross @ back
+            g = g - cross @ mean
+        step = linalg.solve(h, g, assume_a="pos") if len(g) else g
+        return step, [mean - back @ step for back, mean in solved]
+
+
+def sensitivity_sums(
+    model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], free: NDArray[np.bool_], correction: float
+) -> Equations | None:
+    """The Gauss-Newton sums of the free runs over ``data`` from ``starts``; None where one explodes.
+
+    The sensitivities S = dx/dtheta follow the recursion
+
+        S(k+1) = dF/dx S'(k) + dF/dtheta(x'(k), v(k)),   S' = S but for the outputs: (1 - correction) S[:n_y]
+
+    and those of the initial state the same without the last term.
+    """
+    n_free, n_x = int(free.sum()), model.n_x
+    sums = Equations(np.zeros((n_free, n_free)), np.zeros(n_free))
+    columns = np.concatenate([free, np.ones(n_x, dtype=bool)])
+    for start, stretch in zip(starts, data, strict=True):
+        run = model.free_run(start, stretch, correction)
+        if run is None:
+            return None
+        predicted, from_states = run
+        n_y = stretch.y.shape[1]
+        own = np.zeros((n_free + n_x, n_free + n_x))
+        right = np.zeros(n_free + n_x)
+        s = np.concatenate([np.zeros((n_x, n_free)), np.eye(n_x)], axis=1)
+        for first in range(0, len(stretch), CHUNK):
+            rows = slice(first, first + CHUNK)
+            x, v = from_states[rows], stretch.v[rows]
+            history = np.concatenate([s[None], _recursion(model, s, x, v, columns, n_y, correction)])
+            s = history[-1]
+            jac = np.ascontiguousarray(history[:-1, :n_y]).reshape(-1, n_free + n_x)
+            own += jac.T @ jac
+            right += jac.T @ (stretch.y[rows] - predicted[rows, :n_y]).ravel()
+        if not np.all(np.isfinite(own)):
+            return None
+        sums.h += own[:n_free, :n_free]
+        sums.g += right[:n_free]
+        sums.of_starts.append((own[:n_free, n_free:], own[n_free:, n_free:], right[n_free:]))
+    return sums
+
+
+def _recursion(
+    model: Dynamics, s: Array, x: Array, v: Array, columns: NDArray[np.bool_], n_y: int, correction: float
+) -> Array:
+    """Sensitivities (m, n_x, P + n_x) after each of m rows, from s before the first."""
+    direct = _direct(model, x, v)
+    if not columns.all():
+        direct = np.ascontiguousarray(direct[:, :, columns])
+    slope = model.slopes(x, v)[0]
+    if slope.ndim == 2:
+        slope = np.broadcast_to(slope, (len(x), *slope.shape))
+    if correction:
+        slope = slope.copy()
+        slope[:, :, :n_y] *= 1 - correction
+    with np.errstate(over="ignore", invalid="ignore"):
+        for row, f in zip(direct, slope, strict=True):
+            row += f @ s
+            s = row
+    return direct
+
+
+def _direct(model: Dynamics, x: Array, v: Array) -> Array:
+    """dF/d[theta, x0] (m, n_x, P + n_x) at states x (m, n_x) under inputs v (m, n_v), the states held."""
+    n_x, n_v, n_h, m = model.n_x, model.n_v, model.n_hidden, len(x)
+    sizes = [n_x * n_x, n_x * n_v, n_x, n_h * (n_x + n_v), n_h, n_x * n_h]
+    of_a, of_b, of_c, of_w1, of_b1, of_w2 = np.concatenate([[0], np.cumsum(sizes)])[:-1]
+    direct = np.zeros((m, n_x, sum(sizes) + n_x))
+    for i in range(n_x):
+        direct[:, i, of_a + i * n_x : of_a + (i + 1) * n_x] = x
+        direct[:, i, of_b + i * n_v : of_b + (i + 1) * n_v] = v
+        direct[:, i, of_c + i] = 1.0
+    if n_h:
+        z = np.concatenate([x, v], axis=1)
+        t = np.tanh(z @ model.w1.T + model.b1)
+        through = model.w2 * (1 - t * t)[:, None, :]  # (m, n_x, n_h)
+        direct[:, :, of_w1:of_b1] = (through[..., None] * z[:, None, None, :]).reshape(m, n_x, -1)
+        direct[:, :, of_b1:of_w2] = through
+        for i in range(n_x):
+            direct[:, i, of_w2 + i * n_h : of_w2 + (i + 1) * n_h] = t
+    return direct
+
+
+# ---------------------------------------------------------------------- errors of free runs
+def residuals(
+    model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], correction: float = 0.0
+) -> list[Array] | None:
+    """Residuals y - y_hat (n, n_y) of each stretch; None where a free run explodes."""
+    found = []
+    for start, stretch in zip(starts, data, strict=True):
+        run = model.free_run(start, stretch, correction)
+        if run is None:
+            return None
+        found.append(stretch.y - run[0][:, : stretch.y.shape[1]])
+    return found
+
+
+def squares(model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], correction: float = 0.0) -> float:
+    """Sum of squared residuals over all stretches; infinite where a free run explodes."""
+    found = residuals(model, starts, data, correction)
+    return np.inf if found is None else float(sum(np.vdot(r, r) for r in found))
+
+
+def fit_starts(
+    model: Dynamics,
+    data: Sequence[Stretch],
+    correction: float = 0.0,
+    starts: Sequence[Array] | None = None,
+    iterations: int = 3,
+) -> list[Array]:
+    """The initial state (n_x,) of each stretch that fits its free run best, by damped Gauss-Newton.
+
+    It starts from ``starts``, or from the first outputs with the hidden states at zero.
+    """
+    nothing = np.zeros(len(model.vector()), dtype=bool)
+    found = []
+    for i, stretch in enumerate(data):
+        x0 = starts[i] if starts is not None else np.r_[stretch.y[0], np.zeros(model.n_x - stretch.y.shape[1])]
+        best = squares(model, [x0], [stretch], correction)
+        for _ in range(iterations if np.isfinite(best) else 0):
+            sums = sensitivity_sums(model, [x0], [stretch], nothing, correction)
+            if sums is None:
+                break
+            weight = 1e-7 * float(np.trace(sums.of_starts[0][1])) + 1e-9
+            step = sums.solve(0.0, weight)[1][0]
+            trials = [(squares(model, [x0 + f * step], [stretch], correction), f) for f in (1.0, 0.3)]
+            error, factor = min(trials)
+            if not error < best * (1 - 1e-6):
+                break
+            best, x0 = error, x0 + factor * step
+        found.append(x0)
+    return found
+
+
+def free_run_error(
+    model: Dynamics, data: Sequence[Stretch], correction: float = 0.0, starts: Sequence[Array] | None = None
+) -> tuple[Array, list[Array]]:
+    """(rms of each output's residual (n_y,), initial states) over ``data``, the initial states fitted to it."""
+    starts = fit_starts(model, data, correction, starts)
+    found = residuals(model, starts, data, correction)
+    if found is None:
+        return np.full(data[0].y.shape[1], np.inf), starts
+    return np.sqrt(np.mean(np.concatenate(found) ** 2, axis=0)), starts
+
+
+def overall(errors: Array) -> float:
+    """One figure of the outputs' scaled errors (n_y,): their root mean square."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+# ---------------------------------------------------------------------- the fit
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """A fitted model, the initial states of its training stretches, and its errors (scaled, over all outputs)."""
+
+    model: Dynamics
+    starts: list[Array]
+    trained: float
+    held_out: float
+    iterations: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputError:
+    """Levenberg-Marquardt for min over theta, x0 of mean (y - y_hat)^2 + ridge |theta_ridged|^2.
+
+    The ridge weight is ``ridge`` times the variance of the present residual over the number of residuals, and
+    acts on W1 and W2 alone. Damping follows Nielsen's rule. ``patience`` iterations without a better held-out
+    error end the fit; the best model is kept.
+
+    Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2nd ed.,
+    DTU 2004, algorithm 3.16; L. Ljung, System identification, 2nd ed., 1999, section 10.3 (output error).
+    """
+
+    iterations: int = 30
+    correction: float = 0.0
+    ridge: float = 0.0
+    patience: int = 10
+    tolerance: float = 1e-5  # relative gain of an iteration below which four in a row end the fit
+
+    def fit(
+        self,
+        model: Dynamics,
+        data: Sequence[Stretch],
+        held: Sequence[Stretch] = (),
+        *,
+        free: NDArray[np.bool_] | None = None,
+        starts: Sequence[Array] | None = None,
+    ) -> Fitted:
+        """The fitted model. ``free`` (P,) masks the parameters that may change; ``held`` rows choose the iterate."""
+        free = np.ones(len(model.vector()), dtype=bool) if free is None else free
+        starts = fit_starts(model, data, self.correction) if starts is None else list(starts)
+        judge = self._judge(held)
+        n = sum(s.y.size for s in data)
+        loss = squares(model, starts, data, self.correction)
+        best = Fitted(model, starts, float(np.sqrt(loss / n)), judge(model), 0)
+        mu, grow, since, flat = -1.0, 2.0, 0, 0
+        for iteration in range(1, self.iterations + 1):
+            sums = sensitivity_sums(model, starts, data, free, self.correction)
+            if sums is None:
+                break
+            weights = self._ridge(model, free, loss, n)
+            if mu < 0:
+                mu = 1e-3 * _scale(sums)
+            moved = self._step(model, starts, data, free, sums, weights, loss, mu, grow)
+            if moved is None:
+                break
+            after, mu, grow, model, starts = moved
+            flat = flat + 1 if loss - after < self.tolerance * loss else 0
+            loss = after
+            error = judge(model)
+            since = 0 if error < best.held_out else since + 1
+            if error < best.held_out or not held:
+                best = Fitted(model, starts, float(np.sqrt(loss / n)), error, iteration)
+            if flat >= 4 or (held and since >= self.patience):
+                break
+        return best
+
+    def _judge(self, held: Sequence[Stretch]) -> Callable[[Dynamics], float]:
+        memory: list[list[Array] | None] = [None]
+
+        def error(model: Dynamics) -> float:
+            if not held:
+                return np.inf
+            errors, starts = free_run_error(model, held, self.correction, memory[0])
+            if np.all(np.isfinite(errors)):
+                memory[0] = starts
+            return overall(errors)
+
+        return error
+
+    def _ridge(self, model: Dynamics, free: NDArray[np.bool_], loss: float, n: int) -> Array:
+        """Weight (P free,) of each parameter's square beside the sum of squared residuals."""
+        return self.ridge * loss / n * model.mask(w1=True, w2=True)[free].astype(np.float64)
+
+    def _step(
+        self,
+        model: Dynamics,
+        starts: list[Array],
+        data: Sequence[Stretch],
+        free: NDArray[np.bool_],
+        sums: Equations,
+        weights: Array,
+        loss: float,
+        mu: float,
+        grow: float,
+    ) -> tuple[float, float, float, Dynamics, list[Array]] | None:
+        """One step that lowers the objective: (loss, mu, growth, model, initial states); None where there is none."""
+        theta = model.vector()
+        now = theta[free]
+        gradient = sums.g - weights * now
+        total, ceiling = loss + float(weights @ now**2), GROWTH * _scale(sums)
+        ridged = Equations(sums.h + np.diag(weights), gradient, sums.of_starts)
+        while mu < ceiling:
+            try:
+                step, moves = ridged.solve(mu, 1e-3 * mu + 1e-9)
+            except linalg.LinAlgError:
+                mu, grow = mu * grow, grow * 2
+                continue
+            trial = theta.copy()
+            trial[free] += step
+            candidate = model.with_vector(trial)
+            begun = [x + move for x, move in zip(starts, moves, strict=True)]
+            after = squares(candidate, begun, data, self.correction)
+            gain = total - after - float(weights @ trial[free] ** 2)
+            right = sum(float(move @ s[2]) for move, s in zip(moves, sums.of_starts, strict=True))
+            promised = float(step @ (mu * step + gradient)) + right
+            if gain > 0:
+                ratio = gain / max(promised, 1e-300)
+                return after, mu * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0, candidate, begun
+            mu, grow = mu * grow, grow * 2
+        return None
+
+
+def _scale(sums: Equations) -> float:
+    diagonal = np.concatenate([np.diag(sums.h), *(np.diag(s[1]) for s in sums.of_starts)])
+    return float(diagonal.max())

@@ -1,0 +1,86 @@
+"""Rests of an identified model: where it stands still, and its state there as a linear map of outputs and inputs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.models.identified.dynamics import Dynamics
+from pipeline.plants.simulator import Array
+
+RESTS = 200
+SETTLE = 3000
+"""Rests that the map is fitted to, and the most periods in which one is reached."""
+
+FAR = 0.25
+"""Deviation of the outputs, scaled, that loads add to the rests."""
+
+
+def settle(model: Dynamics, v: Array, start: Array | None = None, periods: int = SETTLE) -> tuple[Array, Array]:
+    """(states (n, n_x), whether each stands still (n,)) after a free run under constant inputs v (n, n_v)."""
+    x = np.zeros((len(v), model.n_x)) if start is None else np.array(start)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(0, periods, 50):
+            for _ in range(50):
+                before, x = x, model.advance(x, v)
+            moved = np.abs(x - before).max(axis=1)
+            if not np.any(moved > 1e-7):
+                break
+    still = (moved < 1e-5) & (np.abs(x).max(axis=1) < 50)
+    return x, still
+
+
+def hidden_rest(model: Dynamics, y: Array, v: Array, start: Array) -> Array:
+    """States (n, n_x) with outputs y (n, n_y) whose other rows stand still under v (n, n_v), by Newton's method.
+
+    The outputs are held by a load on their own rows. Directions in which the hidden states stand still anywhere
+    stay as they are in ``start`` (n, n_x).
+    """
+    n_y = y.shape[1]
+    x = np.concatenate([y, start[:, n_y:]], axis=1)
+    if n_y == model.n_x:
+        return x
+    eye = np.eye(model.n_x - n_y)
+    for _ in range(8):
+        gap = (model.advance(x, v) - x)[:, n_y:]
+        slope = np.broadcast_to(model.slopes(x, v)[0], (len(x), model.n_x, model.n_x))[:, n_y:, n_y:]
+        step = np.einsum("nij,nj->ni", np.linalg.pinv(eye - slope, rcond=1e-3), gap)
+        x[:, n_y:] += np.clip(step, -2, 2)
+    return x
+
+
+def rest_map(model: Dynamics, y: Array, v: Array, seed: int) -> tuple[Array, Array]:
+    """(map (n_x, n_y + n_v + 1), covariance of its error (n_x, n_x)): x of a rest from [y, v, 1], scaled.
+
+    Least squares over rests at inputs drawn from the rows v (N, n_v): where the model settles by itself, at its
+    outputs and at outputs that loads have moved; where it does not (an integrator), at outputs of the rows y (N, n_y).
+    """
+    rng = np.random.default_rng(seed)
+    rows = rng.integers(len(y), size=RESTS)
+    n_y, chosen = y.shape[1], v[rows]
+    x, still = settle(model, chosen)
+    moved = FAR * rng.normal(size=(RESTS, n_y)) * (rng.random((RESTS, 1)) < 0.7)
+    at = np.where(still[:, None], x[:, :n_y] + moved, y[rows])
+    found = hidden_rest(model, at, chosen, np.where(still[:, None], x, 0.0))
+    good = np.all(np.isfinite(found), axis=1) & (np.abs(found).max(axis=1) < 50)
+    design = np.column_stack([at, chosen, np.ones(RESTS)])[good]
+    weak = 1e-6 * len(design) * np.eye(design.shape[1])
+    table = np.linalg.solve(design.T @ design + weak, design.T @ found[good]).T
+    error = found[good] - design @ table.T
+    covariance = error.T @ error / max(len(error), 1)
+    return table, (covariance + covariance.T) / 2
+
+
+def steady_gain(model: Dynamics, x: Array, v: Array) -> tuple[Array, Array]:
+    """(gains dy/dv (..., n_x, n_v) at rests x (..., n_x) under v (..., n_v), spectral radius there (...,)).
+
+    (I - dF/dx)^-1 dF/dv; only rows of the outputs are of use outside. Not finite at an integrator.
+    """
+    slope, push = model.slopes(x, v)
+    slope = np.broadcast_to(slope, (*x.shape, model.n_x))
+    push = np.broadcast_to(push, (*x.shape, model.n_v))
+    radius = np.abs(np.linalg.eigvals(slope)).max(axis=-1)
+    gap = np.eye(model.n_x) - slope
+    singular = np.linalg.cond(gap) > 1e6
+    safe = np.where(singular[..., None, None], np.eye(model.n_x), gap)
+    gain = np.linalg.solve(safe, push)
+    return np.where(singular[..., None, None], np.inf, gain), radius

@@ -1,0 +1,121 @@
+"""A record as identification needs it: scaled, its inputs shifted by dead times, cut into stretches and folds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ModelError
+from pipeline.models.identified.dynamics import Stretch
+from pipeline.models.training.objectives import check_finite
+from pipeline.models.training.regressors import split_in_time
+from pipeline.plants.simulator import Array
+from pipeline.records.record import Record
+
+HELD_OUT = 0.2
+"""Share of the rows that a fold holds out: the last ones in the first fold, the first ones in the second."""
+
+SHORTEST = 12
+"""Rows of a stretch below which it is left out: its initial state alone would explain it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scales:
+    """Centres and scales of the outputs (n_y,) and of the inputs [mv, dv] (n_v,), in their units.
+
+    Outputs to mean 0 and deviation 1, MVs to -1 .. 1 over their range, measured disturbances to mean 0, deviation 1/2.
+    """
+
+    y_center: Array
+    y_scale: Array
+    v_center: Array
+    v_scale: Array
+
+    @classmethod
+    def of(cls, record: Record, n_y: int) -> Self:
+        """The scales of a record's first ``n_y`` PVs and of its inputs; ModelError where one never changes."""
+        y, mv, dv = record.pv[:, :n_y], record.mv, record.dv
+        signals = (*record.pv_signals[:n_y], *record.mv_signals, *record.dv_signals)
+        still = [s.name for s, column in zip(signals, np.hstack([y, mv, dv]).T, strict=True) if np.ptp(column) == 0]
+        if still:
+            raise ModelError(
+                f"{', '.join(still)} never change in the record, so that nothing can be learnt of them; "
+                "record moves of every input, or leave the signal out"
+            )
+        low, high = (np.array([getattr(s, end) for s in record.mv_signals]) for end in ("low", "high"))
+        return cls(
+            y.mean(axis=0),
+            y.std(axis=0),
+            np.concatenate([(low + high) / 2, dv.mean(axis=0)]),
+            np.concatenate([(high - low) / 2, 2 * dv.std(axis=0)]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaledRecord:
+    """Scaled rows: outputs y (N, n_y), inputs v (N, n_v), and the run (N,) that each row belongs to."""
+
+    y: Array
+    v: Array
+    run: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, record: Record, scales: Scales) -> Self:
+        """The record in scaled numbers; ModelError for a value that is not finite."""
+        n_y = len(scales.y_scale)
+        y, v = record.pv[:, :n_y], np.hstack([record.mv, record.dv])
+        check_finite("the rows to identify from", y, v)
+        return cls((y - scales.y_center) / scales.y_scale, (v - scales.v_center) / scales.v_scale, record.run)
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def delayed(self, delays: Sequence[int]) -> Self:
+        """The same rows with input j of ``delays[j]`` rows before; a run's first input stands for those before it."""
+        if not any(delays):
+            return self
+        v = self.v.copy()
+        for first, last in self.bounds():
+            for j, d in enumerate(delays):
+                at = np.maximum(np.arange(first, last) - d, first)
+                v[first:last, j] = self.v[at, j]
+        return replace(self, v=v)
+
+    def bounds(self) -> list[tuple[int, int]]:
+        """First row of each run and the row after its last one."""
+        change = np.flatnonzero(self.run[1:] != self.run[:-1]) + 1
+        edges = [0, *change.tolist(), len(self.run)]
+        return list(pairwise(edges))
+
+    def rows(self, rows: slice) -> Self:
+        """Some neighbouring rows."""
+        return replace(self, y=self.y[rows], v=self.v[rows], run=self.run[rows])
+
+    def stretches(self) -> list[Stretch]:
+        """The runs that are long enough; ModelError where none is."""
+        found = [Stretch(self.y[i:j], self.v[i:j]) for i, j in self.bounds() if j - i >= SHORTEST]
+        if not found:
+            longest = max(j - i for i, j in self.bounds())
+            raise ModelError(f"the longest run has {longest} rows; identification needs {SHORTEST}: record longer runs")
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """Rows to train on and rows held out."""
+
+    train: slice
+    held: slice
+
+
+def folds(record: Record) -> tuple[Fold, Fold]:
+    """The record cut in time twice: the last fifth held out, then the first. RecordError where one side stays empty."""
+    n = len(record)
+    late = len(split_in_time(record, 1 - HELD_OUT)[0])
+    early = len(split_in_time(record, HELD_OUT)[0])
+    return Fold(slice(0, late), slice(late, n)), Fold(slice(early, n), slice(0, early))

@@ -1,0 +1,151 @@
+"""Output-error fit: exact sensitivities, what it recovers, and its file-free bookkeeping."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.models.identified.dynamics import Dynamics, Stretch
+from pipeline.models.identified.output_error import (
+    CHUNK,
+    OutputError,
+    fit_starts,
+    free_run_error,
+    residuals,
+    sensitivity_sums,
+    squares,
+)
+
+
+def drawn(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(n_x, n_x))
+    a *= 0.8 / np.abs(np.linalg.eigvals(a)).max()
+    return Dynamics(
+        a,
+        rng.normal(size=(n_x, n_v)),
+        0.1 * rng.normal(size=n_x),
+        0.5 * rng.normal(size=(n_hidden, n_x + n_v)),
+        rng.normal(size=n_hidden),
+        0.2 * rng.normal(size=(n_x, n_hidden)),
+    )
+
+
+def stretch(model: Dynamics, n_y: int, rows: int, seed: int, noise: float = 0.0) -> Stretch:
+    rng = np.random.default_rng(seed)
+    v = rng.normal(size=(rows, model.n_v))
+    empty = Stretch(np.zeros((rows, n_y)), v)
+    run = model.free_run(rng.normal(size=model.n_x), empty)
+    assert run is not None
+    return Stretch(run[0][:, :n_y] + noise * rng.normal(size=(rows, n_y)), v)
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    n_y=st.integers(1, 2),
+    n_v=st.integers(1, 2),
+    more=st.integers(0, 2),
+    n_hidden=st.integers(0, 2),
+    correction=st.sampled_from([0.0, 0.05, 1.0]),
+    rows=st.sampled_from([5, CHUNK + 7]),
+    seed=st.integers(0, 50),
+)
+def test_the_gradient_is_that_of_the_free_run(
+    n_y: int, n_v: int, more: int, n_hidden: int, correction: float, rows: int, seed: int
+) -> None:
+    model = drawn(n_y, n_v, n_y + more, n_hidden, seed)
+    data = [stretch(model, n_y, rows, seed + k, 0.3) for k in range(2)]
+    starts = fit_starts(model, data, correction, iterations=0)
+    theta = model.vector()
+    free = np.random.default_rng(seed).random(len(theta)) < 0.7
+    sums = sensitivity_sums(model, starts, data, free, correction)
+    assert sums is not None
+    direction = free * np.random.default_rng(seed + 1).normal(size=len(theta))
+    step = 1e-6
+    ends = [squares(model.with_vector(theta + s * direction), starts, data, correction) for s in (step, -step)]
+    assert -2 * float(sums.g @ direction[free]) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4, abs=1e-4)
+    move = np.random.default_rng(seed + 2).normal(size=model.n_x)
+    moved = [squares(model, [starts[0], starts[1] + s * move], data, correction) for s in (step, -step)]
+    assert -2 * float(sums.of_starts[1][2] @ move) == pytest.approx(
+        (moved[0] - moved[1]) / (2 * step), rel=1e-4, abs=1e-4
+    )
+
+
+def test_the_step_solves_the_whole_system() -> None:
+    model = drawn(1, 1, 2, 1, 3)
+    data = [stretch(model, 1, 30, k, 0.3) for k in range(3)]
+    starts = [np.zeros(2)] * 3
+    free = np.ones(len(model.vector()), dtype=bool)
+    sums = sensitivity_sums(model, starts, data, free, 0.0)
+    assert sums is not None
+    step, moves = sums.solve(0.1, 0.02)
+    n, m = len(step), 2
+    whole, right = np.zeros((n + 3 * m, n + 3 * m)), np.zeros(n + 3 * m)
+    whole[:n, :n], right[:n] = sums.h + 0.1 * np.eye(n), sums.g
+    for i, (cross, own, g) in enumerate(sums.of_starts):
+        at = slice(n + i * m, n + (i + 1) * m)
+        whole[:n, at], whole[at, :n], whole[at, at], right[at] = cross, cross.T, own + 0.02 * np.eye(m), g
+    expected = np.linalg.solve(whole, right)
+    assert np.concatenate([step, *moves]) == pytest.approx(expected)
+
+
+def test_one_step_prediction_is_the_free_run_with_full_correction() -> None:
+    model = drawn(2, 1, 2, 2, 5)
+    data = stretch(model, 2, 40, 1, 0.5)
+    found = residuals(model, [data.y[0]], [data], 1.0)
+    assert found is not None
+    assert found[0][1:] == pytest.approx(data.y[1:] - model.advance(data.y[:-1], data.v[:-1]))
+
+
+def test_a_start_is_found_again() -> None:
+    model = drawn(1, 1, 3, 2, 7)
+    data = stretch(model, 1, 200, 2)
+    errors, _ = free_run_error(model, [data])
+    assert errors[0] < 1e-4
+
+
+def test_a_nonlinear_system_is_fitted_down_to_its_noise() -> None:
+    truth = drawn(1, 1, 2, 2, 11)
+    data, held = stretch(truth, 1, 800, 1, 0.1), stretch(truth, 1, 300, 2, 0.1)
+    rng = np.random.default_rng(0)
+    theta = truth.vector()
+    start = truth.with_vector(theta + 0.05 * rng.normal(size=len(theta)))
+    fitted = OutputError(iterations=30).fit(start, [data], [held])
+    assert fitted.trained == pytest.approx(0.1, rel=0.1)
+    assert fitted.held_out < 0.115
+    assert free_run_error(start, [held])[0][0] > 1.3 * fitted.held_out
+
+
+def test_what_is_not_free_stays() -> None:
+    model = drawn(1, 1, 2, 0, 2)
+    data = stretch(drawn(1, 1, 2, 0, 3), 1, 200, 1, 0.1)
+    fitted = OutputError(iterations=5).fit(model, [data], free=model.mask(b=True, c=True))
+    assert np.array_equal(fitted.model.a, model.a)
+    assert not np.array_equal(fitted.model.b, model.b)
+
+
+def test_a_ridge_shrinks_the_nonlinear_weights() -> None:
+    truth = drawn(1, 1, 2, 2, 11)
+    data = stretch(truth, 1, 400, 1, 0.3)
+    sizes = [
+        float(np.sum(f.model.w1**2) + np.sum(f.model.w2**2))
+        for f in (OutputError(iterations=15, ridge=r).fit(truth, [data]) for r in (0.0, 300.0))
+    ]
+    assert sizes[1] < 0.8 * sizes[0]
+
+
+def test_the_same_data_give_the_same_bytes() -> None:
+    model = drawn(1, 1, 3, 2, 4)
+    data = [stretch(drawn(1, 1, 2, 1, 9), 1, 200, 1, 0.1)]
+    first, second = (OutputError(iterations=4).fit(model, data).model.vector() for _ in range(2))
+    assert first.tobytes() == second.tobytes()
+
+
+def test_an_explosion_counts_as_an_infinite_error() -> None:
+    unstable = Dynamics.linear(np.array([[1.5]]), np.array([[1.0]]))
+    data = Stretch(np.zeros((200, 1)), np.ones((200, 1)))
+    assert squares(unstable, [np.zeros(1)], [data]) == np.inf
+    assert np.isinf(free_run_error(unstable, [data])[0]).all()
+    assert sensitivity_sums(unstable, [np.zeros(1)], [data], np.ones(3, dtype=bool), 0.0) is None
