@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 import henson_seborg_cstr_parts
+import identified_models
 import jacketed_batch_reactor_parts
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from pipeline.simulation.simulate import simulate_batch
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
 QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
+QUICK["predictive"] |= {"horizon": 8, "moves": 4}
 QUICK["pid"] |= {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613}
 for _name in ("model_reference", "model_reference_two_error", "pi_reference"):
     QUICK[_name] |= reversible_cstr_parts.QUICK
@@ -52,6 +54,7 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "self_tuning_pid": [{"prefilter": (0.5,), "forgetting": 1.0}],
     "model_reference": [{"order": 4}],
     "pi_reference": [{"tuning": "manual", "kc": -45.0, "ti_s": 5.0, "order": 1}],
+    "predictive": [{"passes": 1, "mv_rate": 20.0, "speed": 0.5}],
     "local_pid_network": [{"blending": "outputs"}, {"blending": "velocity"}],
 }
 # The plant that a law is for; the others are designed over the first case's.
@@ -59,6 +62,7 @@ PLANT_OF_LAW: dict[str, str] = {
     "local_pid_network": "henson_seborg_cstr",
     "auto_pid_network": "henson_seborg_cstr",
     **dict.fromkeys(("model_reference", "model_reference_two_error", "pi_reference"), "reversible_cstr"),
+    "predictive": "ph_neutralization",
     **dict.fromkeys(jacketed_batch_reactor_parts.LAWS, "jacketed_batch_reactor"),
 }
 # Set points that a plant is put to rest at; of a plant that is not named, three within its range.
@@ -163,6 +167,7 @@ PARTS: dict[str, Callable[[EquationPlant], dict[str, Model]]] = {
     "thiosulfate_cstr": _thiosulfate_parts,
     "henson_seborg_cstr": henson_seborg_cstr_parts.parts,
     "jacketed_batch_reactor": jacketed_batch_reactor_parts.parts,
+    "ph_neutralization": identified_models.parts,
     "reversible_cstr": reversible_cstr_parts.parts,
 }
 

@@ -11,6 +11,7 @@ from pipeline.laws.linearized.gauss_newton import GaussNewtonPid, MinimumVarianc
 from pipeline.laws.linearized.linearized_pid import LinearizedPid
 from pipeline.laws.local.pid_networks import AutoPidNetwork, LocalPidNetwork
 from pipeline.laws.pid.pid import PID
+from pipeline.laws.predictive.predictive import Predictive
 from pipeline.laws.recursive.recursive_pid import RecursivePid
 from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
 from pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
@@ -36,6 +37,7 @@ LAWS: dict[str, type[ControlLaw]] = {
     FuzzyFeedforwardObserver.name: FuzzyFeedforwardObserver,
     InverseDob.name: InverseDob,
     ForwardDob.name: ForwardDob,
+    Predictive.name: Predictive,
 }
 
 __all__ = ["LAWS", "ControlLaw"]

@@ -57,13 +57,13 @@ def require_part(models: Mapping[str, Model], part: str, law: str, n_in: int, n_
     return model
 
 
-def require_kind(models: Mapping[str, Model], cls: type[M], law: str) -> M:
-    """The model whose part name is its kind, for laws of a single loop.
+def require_kind(models: Mapping[str, Model], cls: type[M], law: str, also: str = ", one MV, delay 1") -> M:
+    """The model whose part name is its kind; ``also`` ends the words for what it must be.
 
     Raises a LawError that names the law's need and the parts of the set.
     """
     part = cls.kind
-    needs = f"law {law!r} needs a part {part!r} (kind {part}, one MV, delay 1)"
+    needs = f"law {law!r} needs a part {part!r} (kind {part}{also})"
     model = _named(models, part, needs)
     if not isinstance(model, cls):
         raise LawError(f"{needs}; the model set's is of kind {model.kind}")
@@ -100,6 +100,8 @@ class ControlLaw(nn.Module, ABC):
     # True if the law adds a move to the applied MV: its transfer from manual is bumpless, and a start at the set
     # point does not move the actuator. Other laws compute the MV without the applied one.
     incremental: ClassVar[bool] = False
+    # True if the law starts from an estimate of the plant's state, which the applied MV is a part of.
+    estimates: ClassVar[bool] = False
     parts: ClassVar[Mapping[str, str]] = {}  # what `design` needs of the model set: part name -> what it must be
     n_state: int
     info: tuple[str, ...]

@@ -1,0 +1,1 @@
+"""Model predictive control: an observer, a plan over a horizon, and the law of both."""

@@ -1,0 +1,169 @@
+"""The free run of an identified model over a horizon, and how it follows the moves of a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from pipeline.laws.base import hold_numbers
+from pipeline.laws.predictive.moves import Moves
+from pipeline.laws.predictive.one_step import one_step
+from pipeline.laws.predictive.product import product
+from pipeline.models.identified.identified import Identified
+from pipeline.models.memory import Named, Stage
+
+Scaling = Callable[[Tensor], Tensor]
+"""The scaled MVs (..., n_mv) of a model for MVs (..., n_mv) within -1..1."""
+SMALL = 1e-6  # tanh(SMALL x)/SMALL is x to 3e-13 x^3
+
+
+class Prediction(NamedTuple):
+    """The outputs over the horizon, sample by sample, and their slopes over the entries of the plan."""
+
+    y: Tensor  # (..., 1, N n_cv)
+    slopes: Tensor  # (..., m, N n_cv)
+    slopes_t: Tensor  # (..., N n_cv, m) the same, by output
+
+
+class LinearHorizon(nn.Module):
+    """Free run x(1) .. x(N) of a linear model from [x, d, dv] under a plan z, loads and measured disturbances held.
+
+    It is affine in [x, d, dv, z], one product, and its slopes are constant.
+    """
+
+    slopes: Tensor  # (m, N n_cv)
+    slopes_t: Tensor  # (N n_cv, m)
+
+    @torch.no_grad()
+    def __init__(self, model: Identified, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
+        super().__init__()
+
+        def run(p: Named) -> dict[str, Tensor]:
+            v, x, y = inputs(moves, mv_of, p), p["x"], []
+            for i in range(moves.horizon):
+                x = one_step(model, {"x": x, "d": p["d"], "v": v[..., i, :]})["next"]
+                y.append(x[..., :n_cv])
+            return {"y": torch.cat(y, dim=-1)}
+
+        self.run = Stage(layout_of(model, moves), run)
+        slopes = self.run.matrix[-moves.count :].clone()
+        self.register_buffer("slopes", slopes)
+        self.register_buffer("slopes_t", slopes.T.contiguous())
+
+    def forward(self, start: Tensor, plan: Tensor) -> Prediction:
+        """The run from ``start`` (..., 1, n_x + n_y + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
+        return Prediction(self.run(torch.cat([start, plan], dim=-1))["y"], self.slopes, self.slopes_t)
+
+
+class NetworkHorizon(nn.Module):
+    """Free run x(1) .. x(N) from [x, d, dv] under a plan z, loads and measured disturbances held; and its slopes.
+
+    The run is x(i+1) = A x(i) + B v(i) + c + [d; 0] + W2 tanh(h(i)), h(i) = W1 [x(i), v(i)] + b1, with v(i) from
+    the moves that act at sample i. Everything but the tanh is affine, so the units [h, e x] with a small e all pass
+    the tanh, which hardly bends e x, and a step is one tanh and one product with a constant:
+
+        p(i+1) = tanh(p(i)) M + P(i+1),   p = [h, e x]
+
+    P is affine in [x, d, dv, z] and computed once for the whole horizon. The slopes S(i) (m, n_s) of [x(i), v(i)]
+    over the m entries of z are exact, n_s = n_x + n_mv:
+
+        S(i+1) = S(i) F(i) + [0, Z(i+1)],   F(i) = [[A'], [B']] + W1' diag(1 - t^2) W2', zero in the columns of v
+
+    for t = tanh(h(i)) and Z(i) the share of each entry of the plan in v(i). F is affine in t^2.
+    """
+
+    step: Tensor  # (n_p, n_p) M
+    bends: Tensor  # (n_h, n_s n_s) -W1' W2' of each unit
+    straight: Tensor  # (n_s n_s,) F where no unit bends
+    pushes: Tensor  # (N + 1, m, n_s) [0, Z(i)]
+    pick: Tensor  # (m N n_cv,) the controlled outputs' slopes among all
+    pick_t: Tensor  # (N n_cv m,)
+    by_small: Tensor  # (1,)
+
+    @torch.no_grad()
+    def __init__(self, model: Identified, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
+        super().__init__()
+        n, m, n_x, n_mv = moves.horizon, moves.count, model.n_x, model.n_mv
+        self.n, self.m, self.n_h, self.n_cv, self.n_s = n, m, model.n_hidden, n_cv, n_x + n_mv
+        self.run = Stage(
+            layout_of(model, moves), lambda p: {f"p{i}": u for i, u in enumerate(_forced(model, moves, mv_of, p))}
+        )
+        w1_x, to_x = model.w1[:, :n_x], torch.cat([model.w2, model.a / SMALL], dim=1)  # from tanh(p) to the unforced x
+        gain = mv_of(torch.eye(n_mv, dtype=torch.float64)) - mv_of(torch.zeros(n_mv, dtype=torch.float64))
+        into = torch.cat([w1_x, model.w1[:, n_x : n_x + n_mv] @ gain.T], dim=1)  # (n_h, n_s)
+        bends = into.unsqueeze(-1) * pad(model.w2.T, (0, n_mv)).unsqueeze(-2)  # (n_h, n_s, n_s)
+        linear = pad(torch.cat([model.a.T, gain @ model.b[:, :n_mv].T]), (0, n_mv))  # (n_s, n_s)
+        shares = torch.einsum("ij,ab->ijab", torch.from_numpy(moves.profile), torch.eye(n_mv, dtype=torch.float64))
+        # From the flat (m, N, n_s) slopes to those of the controlled outputs, in both orders.
+        at = np.arange(m * n * self.n_s).reshape(m, n, self.n_s)[:, :, :n_cv].reshape(m, n * n_cv)
+        buffers = {
+            "step": torch.cat([w1_x @ to_x, SMALL * to_x]).T,
+            "bends": -bends.flatten(1),
+            "straight": (linear + bends.sum(dim=0)).flatten(),
+            "pushes": pad(pad(shares.reshape(n, m, n_mv), (n_x, 0)), (0, 0, 0, 0, 0, 1)),  # (N + 1, m, n_s)
+            "pick": torch.from_numpy(at.ravel()),
+            "pick_t": torch.from_numpy(at.T.ravel()),
+        }
+        for name, matrix in buffers.items():
+            self.register_buffer(name, matrix.contiguous())
+        hold_numbers(self, by_small=1 / SMALL)
+
+    def forward(self, start: Tensor, plan: Tensor) -> Prediction:
+        """The run from ``start`` (..., 1, n_x + n_y + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
+        given = torch.cat([start, plan], dim=-1)
+        batch, n_h = given.shape[:-2], self.n_h
+        forced = list(self.run(given).values())
+        t = torch.tanh(forced[0])
+        steps = [t]
+        for force in forced[1:]:
+            t = torch.tanh(product(t, self.step, force))
+            steps.append(t)
+        every = torch.cat(steps, dim=-2)  # (..., N + 1, n_h + n_x)
+        y = self.by_small * every[..., 1:, n_h : n_h + self.n_cv]
+        slopes = self._slopes(every[..., :-1, :n_h]).flatten(-2)
+        return Prediction(
+            y.reshape(*batch, 1, self.n * self.n_cv),
+            slopes.index_select(-1, self.pick).reshape(*batch, self.m, self.n * self.n_cv),
+            slopes.index_select(-1, self.pick_t).reshape(*batch, self.n * self.n_cv, self.m),
+        )
+
+    def _slopes(self, t: Tensor) -> Tensor:
+        """Slopes (..., m, N n_s) of the states and MVs over the plan, from tanh(h(0)) .. tanh(h(N-1)) (..., N, n_h)."""
+        f = product(t * t, self.bends, self.straight).reshape(*t.shape[:-2], self.n * self.n_s, self.n_s)
+        x, slopes = self.pushes[0], []
+        for step, push in zip(torch.split(f, self.n_s, dim=-2), self.pushes[1:], strict=True):
+            x = product(x, step, push)
+            slopes.append(x)
+        return torch.cat(slopes, dim=-1)
+
+
+def horizon_of(model: Identified, moves: Moves, mv_of: Scaling, n_cv: int) -> LinearHorizon | NetworkHorizon:
+    """The free run of a model over the first ``n_cv`` of its outputs."""
+    return (NetworkHorizon if model.n_hidden else LinearHorizon)(model, moves, mv_of, n_cv)
+
+
+def layout_of(model: Identified, moves: Moves) -> dict[str, int]:
+    """Names and sizes of what a free run depends on."""
+    return {"x": model.n_x, "d": model.n_y, "dv": model.n_dv, "z": moves.count}
+
+
+def inputs(moves: Moves, mv_of: Scaling, p: Named) -> Tensor:
+    """Scaled v over the horizon, (..., N, n_v), of a plan p["z"] and measured disturbances p["dv"]."""
+    mv = mv_of(moves.courses(p["z"]))
+    return torch.cat([mv, p["dv"].unsqueeze(-2).expand(*mv.shape[:-1], p["dv"].shape[-1])], dim=-1)
+
+
+def _forced(model: Identified, moves: Moves, mv_of: Scaling, p: Named) -> list[Tensor]:
+    """P(0) .. P(N), each (..., n_h + n_x): what does not come through the tanh of the sample before."""
+    v, found, x = inputs(moves, mv_of, p), [], p["x"]
+    for i in range(moves.horizon + 1):
+        here = v[..., min(i, moves.horizon - 1), :]
+        hidden = one_step(model, {"x": x, "d": p["d"], "v": here})["hidden"]
+        found.append(torch.cat([hidden, SMALL * x], dim=-1))
+        x = one_step(model, {"x": torch.zeros_like(x), "d": p["d"], "v": here})["next"]
+    return found

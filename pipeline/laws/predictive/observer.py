@@ -1,0 +1,139 @@
+"""Extended Kalman filter over an identified model, with a load at every output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.laws.base import hold_numbers
+from pipeline.laws.predictive.one_step import one_step
+from pipeline.laws.predictive.product import product
+from pipeline.models.identified.identified import Identified
+from pipeline.models.memory import Stage
+
+NOISE_FLOOR = 1e-3  # scaled; a model that claims less noise would believe rounding
+FIRST_LOAD = 0.05  # scaled, a period: standard deviation of a load before anything was seen of it
+FORGETTING = 0.5  # of the mean innovation
+RISE = 7.0  # times its variance in pure noise: the square of the mean innovation at which the boost begins
+FULL = 4.0  # further such rises until it is full
+BOOST = 1_000.0  # times its normal variance a load may move in a period then
+
+
+@dataclass(frozen=True, slots=True)
+class Noises:
+    """Variances of the filter, in units of the measurement's: of the outputs' model errors, and of the loads."""
+
+    outputs: float
+    loads: float
+
+
+class Estimate(NamedTuple):
+    """The state and the loads, their covariance, and the mean innovation."""
+
+    mean: Tensor  # (..., 1, n_x + n_y) [x, d]
+    covariance: Tensor  # (..., n_x + n_y, n_x + n_y)
+    drift: Tensor  # (..., 1, n_y) innovations in units of their standard deviation, averaged
+
+
+class Observer(nn.Module):
+    """State x and loads d of an identified model f, scaled.
+
+        x+ = f(x, v) + [d; 0] + w,   d+ = d + n,   y = x[:n_y] + e
+
+    w has the variance q_x R in the rows of the outputs, n has q_d R, e has R, the square of the model's noise. A load
+    passes the plant's poles, unlike an error that is added to the output. The filter is the extended Kalman filter,
+    whose correction takes the outputs one after another.
+
+    A load that steps would be followed slowly. So the innovations e, by their standard deviation s, have a mean
+
+        m <- m + a (e/s - m),   b = clip(m^2 (2 - a)/(7 a) - 1, 0, 4)/4
+
+    and n has the variance q_d R (1 + 1000 b): m^2 (2 - a)/a is 1 on average in pure noise, and the filter stays quiet.
+
+    Source: the extended Kalman filter of Jazwinski, Stochastic Processes and Filtering Theory, section 8.3; loads
+    as integrated noise after Pannocchia and Rawlings, AIChE Journal 49 (2003) 426.
+    """
+
+    place: Tensor  # (n_y, n_a n_a) from a boost to its entry of the covariance
+    first: Tensor  # (n_a, n_a) covariance without a past
+    q: Tensor  # (n_a, n_a)
+    r: Tensor  # (n_y,)
+    f: Tensor  # (n_a, n_a) slope of [x, d] without tanh units
+    f_t: Tensor
+    w1: Tensor  # (n_h, n_a)
+    w1_t: Tensor
+    w2: Tensor  # (n_a, n_h)
+    w2_t: Tensor
+    forgetting: Tensor  # (1,) a
+    rise: Tensor  # (1,) (2 - a)/(7 a)
+    fall: Tensor  # (1,) 1/4
+    diagonal: Tensor  # (n_y,) where the outputs' variances stand in the flat covariance
+
+    @torch.no_grad()
+    def __init__(self, model: Identified, noises: Noises) -> None:
+        super().__init__()
+        self.n_y, self.n_x = model.n_y, model.n_x
+        self.n_a = n_a = model.n_x + model.n_y
+        self.layout = {"x": model.n_x, "d": model.n_y, "v": model.n_mv + model.n_dv}
+        self.step = Stage(self.layout, lambda p: _with_loads(one_step(model, p), p["d"]))
+        self.nonlinear = model.n_hidden > 0
+        f = torch.eye(n_a, dtype=torch.float64)
+        f[: self.n_x, : self.n_x] = model.a
+        f[: self.n_y, self.n_x :] = torch.eye(self.n_y, dtype=torch.float64)
+        w1, w2 = torch.zeros(model.n_hidden, n_a).double(), torch.zeros(n_a, model.n_hidden).double()
+        w1[:, : self.n_x], w2[: self.n_x] = model.w1[:, : self.n_x], model.w2
+        # Both orders of each matrix: a product with a transposed one is not exported.
+        for name, matrix in {"f": f, "w1": w1, "w2": w2}.items():
+            self.register_buffer(name, matrix)
+            self.register_buffer(f"{name}_t", matrix.T.contiguous())
+        r = torch.clamp(model.noise, min=NOISE_FLOOR) ** 2
+        q = torch.zeros(n_a, dtype=torch.float64)
+        q[: self.n_y], q[self.n_x :] = noises.outputs * r, noises.loads * r
+        place = torch.zeros(self.n_y, n_a, n_a, dtype=torch.float64)
+        for o in range(self.n_y):
+            place[o, self.n_x + o, self.n_x + o] = BOOST / FULL * noises.loads * r[o]
+        by_y = model.rest[:, : self.n_y]
+        first = torch.zeros(n_a, n_a, dtype=torch.float64)
+        first[: self.n_x, : self.n_x] = model.rest_cov + (by_y * r) @ by_y.T
+        first[self.n_x :, self.n_x :] = FIRST_LOAD**2 * torch.eye(self.n_y, dtype=torch.float64)
+        for name, values in {"q": torch.diag(q), "r": r, "place": place.flatten(1), "first": first}.items():
+            self.register_buffer(name, values.contiguous())
+        self.register_buffer("diagonal", torch.arange(self.n_y) * (n_a + 1))
+        hold_numbers(self, forgetting=FORGETTING, rise=(2 - FORGETTING) / (RISE * FORGETTING), fall=1 / FULL)
+
+    def forward(self, y: Tensor, v: Tensor, past: Estimate) -> tuple[Estimate, Tensor]:
+        """The estimate after the measurement, and the boost b (..., 1, n_y), 0 to 1.
+
+        y (..., 1, n_y) and v (..., 1, n_v) scaled: what is measured now, and what acted over the last period.
+        """
+        mean, covariance = self.predicted(v, past)
+        variance = covariance.flatten(-2).index_select(-1, self.diagonal).unsqueeze(-2)
+        sd = torch.sqrt(variance + self.r)
+        drift = past.drift + self.forgetting * ((y - mean[..., : self.n_y]) / sd - past.drift)
+        boost = torch.clamp(self.rise * drift * drift - 1.0, 0.0, FULL)
+        covariance = covariance + (boost @ self.place).reshape(covariance.shape)
+        for o in range(self.n_y):
+            row = covariance[..., o : o + 1, :]
+            gain = row / (row[..., o : o + 1] + self.r[o : o + 1])
+            mean = mean + gain * (y[..., o : o + 1] - mean[..., o : o + 1])
+            covariance = covariance - gain.reshape(*gain.shape[:-2], self.n_a, 1) * row
+        return Estimate(mean, covariance, drift), self.fall * boost
+
+    def predicted(self, v: Tensor, past: Estimate) -> tuple[Tensor, Tensor]:
+        """Mean and covariance one period on, before the measurement."""
+        now = self.step(torch.cat([past.mean, v], dim=-1))
+        if not self.nonlinear:
+            return now["next"], self.f @ past.covariance @ self.f_t + self.q
+        t = torch.tanh(now["hidden"])
+        slope = 1.0 - t * t
+        f = product(self.w2 * slope, self.w1, self.f)
+        f_t = product(self.w1_t * slope, self.w2_t, self.f_t)
+        return product(t, self.w2_t, now["next"]), product(f @ past.covariance, f_t, self.q)
+
+
+def _with_loads(found: dict[str, Tensor], d: Tensor) -> dict[str, Tensor]:
+    """The pieces of a step with ``next`` of [x, d]: loads stay as they are."""
+    return {**found, "next": torch.cat([found["next"], d], dim=-1)}

@@ -1,0 +1,364 @@
+"""The predictive law against independent computations, and in closed loops on plants that are not its model."""
+
+from __future__ import annotations
+
+import cvxpy as cp
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from identified_models import first_order, made_signals, random_model, scaled_model
+from torch import Tensor
+
+from pipeline.errors import LawError
+from pipeline.export.gate import export
+from pipeline.laws.predictive.horizon import horizon_of
+from pipeline.laws.predictive.moves import Moves
+from pipeline.laws.predictive.observer import BOOST, FIRST_LOAD, FORGETTING, FULL, RISE, Estimate, Noises, Observer
+from pipeline.laws.predictive.plan import Cost, Planner
+from pipeline.laws.predictive.predictive import Predictive
+from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
+from pipeline.models.identified.identified import Identified
+from pipeline.models.static.mlp import MLP
+from serving import Controller
+from serving.manifest import Signal
+
+NONE = torch.zeros(0, dtype=torch.float64)
+few = settings(max_examples=15, deadline=None)
+seeds = st.integers(0, 2**16)
+
+
+def same(z: Tensor) -> Tensor:
+    return z
+
+
+def law_of(model: Identified, **params) -> Predictive:
+    return Predictive(made_signals(model.n_y, model.n_mv, model.n_dv), model, Predictive.Params(**params)).eval()
+
+
+def row(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+# ---------------------------------------------------------------------- moves
+@given(horizon=st.integers(1, 60), moves=st.integers(1, 12), n_mv=st.integers(1, 3), ramps=st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_moves_cover_the_horizon_and_grow(horizon: int, moves: int, n_mv: int, ramps: bool) -> None:
+    if moves > horizon:
+        with pytest.raises(LawError, match=f"{moves} moves do not fit in a horizon of {horizon}"):
+            Moves.over(horizon, moves, n_mv)
+        return
+    plan = Moves.over(horizon, moves, n_mv, ramps=ramps)
+    starts = np.array([*plan.starts, horizon])
+    assert starts[0] == 0
+    assert (np.diff(starts) >= 1).all()
+    np.testing.assert_allclose(plan.profile.sum(axis=1), 1.0)
+    constant = torch.ones(plan.count, dtype=torch.float64)
+    np.testing.assert_allclose(plan.courses(constant), 1.0)
+    np.testing.assert_allclose(constant.numpy() @ plan.shift, 1.0)
+
+
+@given(seed=seeds, ramps=st.booleans())
+@few
+def test_a_shifted_plan_is_the_plan_one_sample_later(seed: int, ramps: bool) -> None:
+    moves = Moves.over(20, 8, 2, ramps=ramps)
+    plan = np.random.default_rng(seed).normal(size=moves.count)
+    now, later = (moves.courses(torch.from_numpy(p)).numpy() for p in (plan, plan @ moves.shift))
+    for start in moves.starts:
+        np.testing.assert_allclose(later[start], now[min(start + 1, 19)])
+    change = np.diff(np.vstack([np.zeros(2), plan.reshape(-1, 2)]), axis=0)
+    assert plan @ moves.curvature @ plan == pytest.approx(float((change**2).sum()))
+
+
+# ---------------------------------------------------------------------- free run
+@pytest.mark.parametrize("n_hidden", [0, 5])
+@pytest.mark.parametrize("ramps", [False, True])
+@given(seed=seeds)
+@settings(max_examples=8, deadline=None)
+def test_the_run_and_its_slopes_are_those_of_the_model(seed: int, n_hidden: int, ramps: bool) -> None:
+    model = random_model(seed, n_y=2, n_mv=2, n_dv=1, n_hidden=n_hidden)
+    moves = Moves.over(14, 5, 2, ramps=ramps)
+    horizon, rng = horizon_of(model, moves, lambda z: 0.5 * z + 0.1, n_cv=2), np.random.default_rng(seed)
+    x, d, dv, plan = (torch.from_numpy(rng.normal(size=n)) for n in (4, 2, 1, moves.count))
+
+    def run(plan: Tensor) -> Tensor:
+        at, found = x, []
+        for mv in 0.5 * moves.courses(plan) + 0.1:
+            at = model(torch.cat([at, mv, dv])) + torch.cat([d, torch.zeros(2, dtype=torch.float64)])
+            found.append(at[:2])
+        return torch.cat(found)
+
+    predicted = horizon(torch.cat([x, d, dv])[None], plan[None])
+    torch.testing.assert_close(predicted.y[0], run(plan), rtol=1e-9, atol=1e-10)
+    slopes = torch.autograd.functional.jacobian(run, plan)
+    torch.testing.assert_close(predicted.slopes_t, slopes, rtol=1e-8, atol=1e-9)
+    assert torch.equal(predicted.slopes, predicted.slopes_t.T)
+
+
+# ---------------------------------------------------------------------- plan
+@pytest.mark.parametrize("rate", [None, 0.05])
+@pytest.mark.parametrize("sp", [0.3, 5.0])
+def test_the_plan_is_the_minimum_of_its_cost(sp: float, rate: float | None) -> None:
+    """A linear model makes the cost convex: many passes end where a convex solver does, also at the bounds."""
+    model = random_model(3, n_y=2, n_mv=2, n_hidden=0)
+    moves = Moves.over(15, 4, 2, ramps=rate is not None)
+    horizon = horizon_of(model, moves, same, n_cv=2)
+    rates = None if rate is None else torch.full((2,), rate, dtype=torch.float64)
+    planner = Planner(horizon, moves, Cost((1.0, 0.5), 0.2, 0.1), passes=60, sweeps=30, rate=rates)
+    start, applied, wanted = torch.zeros(1, 6, dtype=torch.float64), row(0.2, -0.1)[None], row(sp, -0.2)[None]
+    plan, ahead = planner(start, wanted, applied, torch.zeros(1, moves.count, dtype=torch.float64))
+
+    z = cp.Variable(moves.count)
+    free = horizon(start, torch.zeros_like(plan))
+    slopes, at_rest = free.slopes_t.numpy(), free.y[0].numpy()
+    error = at_rest + slopes @ z - np.tile(wanted[0].numpy(), 15)
+    lengths = cp.norm(cp.vstack([error, np.full(30, 0.1)]), 2, axis=0)
+    change = cp.hstack([z[:2] - applied[0].numpy(), z[2:] - z[:-2]])
+    bounds = [cp.abs(z) <= 1]
+    if rate is not None:
+        bounds.append(cp.abs(change) <= rate * moves.lengths)
+    cp.Problem(cp.Minimize(np.tile([1.0, 0.5], 15) @ lengths + 0.2 * cp.sum_squares(change)), bounds).solve(
+        solver=cp.CLARABEL
+    )
+    if rate is None:
+        np.testing.assert_allclose(plan[0], z.value, atol=2e-4)
+        np.testing.assert_allclose(ahead[0], (at_rest + slopes @ z.value)[:2], atol=1e-3)
+    np.testing.assert_allclose(plan[0, :2], z.value[:2], atol=2e-4)
+
+
+def test_the_first_move_is_that_of_a_dense_quadratic_program() -> None:
+    """Errors far below eps count by their square: one pass is the textbook's unconstrained MPC."""
+    model, sp = first_order(pole=0.8, gain=1.0, dead=1), 1e-4
+    law = law_of(model, horizon=10, moves=4, eps=10.0, move_weight=0.5, passes=1, sweeps=400)
+    mv, _, _ = law(row(sp), row(0.0), NONE, row(0.0), torch.zeros(law.n_state, dtype=torch.float64))
+    ends = [*law.moves.starts, 10]
+    answer = np.array([0.0, *(1 - 0.8 ** np.arange(1, 11))])  # of a unit step at sample 0, dead time 1
+    s = np.zeros((10, 4))
+    for j in range(4):
+        for k in range(10):
+            since, till = k - ends[j], k - ends[j + 1]
+            s[k, j] = (answer[since] if since >= 0 else 0.0) - (answer[till] if till >= 0 else 0.0)
+    d = np.eye(4) - np.eye(4, k=-1)
+    mu = 0.5 * (10 - 1) / 10
+    plan = np.linalg.solve(s.T @ s / 10 + 2 * mu * d.T @ d, s.T @ np.full(10, sp) / 10)
+    assert mv.item() == pytest.approx(plan[0], rel=1e-6)
+
+
+# ---------------------------------------------------------------------- observer
+@given(seed=seeds)
+@few
+def test_the_filter_is_the_textbook_s_on_a_linear_model(seed: int) -> None:
+    """Corrections one output after another equal the joint one; the load's variance grows as the formula says."""
+    model = random_model(seed, n_y=2, n_mv=1, n_hidden=0)
+    q_x, q_d, rng = 0.02, 1e-3, np.random.default_rng(seed)
+    observer, n_a = Observer(model, Noises(q_x, q_d)), 6
+    r = np.diag(model.noise.numpy() ** 2)
+    f = np.block([[model.a.numpy(), np.eye(4, 2)], [np.zeros((2, 4)), np.eye(2)]])
+    b, c, h = np.vstack([model.b, np.zeros((2, 1))]), np.r_[model.c, 0, 0], np.eye(2, n_a)
+    mean, p, drift = np.zeros(n_a), observer.first.numpy(), np.zeros(2)
+    assert p[4, 4] == FIRST_LOAD**2
+    found = Estimate(torch.zeros(1, n_a, dtype=torch.float64), observer.first, torch.zeros(1, 2, dtype=torch.float64))
+    for k in range(30):
+        y, v = 0.02 * rng.normal(size=2) + (k > 15), rng.normal(size=1)
+        mean, p = f @ mean + b @ v + c, f @ p @ f.T + np.diag([*(q_x * np.diag(r)), 0, 0, *(q_d * np.diag(r))])
+        error = y - h @ mean
+        drift = drift + FORGETTING * (error / np.sqrt(np.diag(h @ p @ h.T + r)) - drift)
+        boost = np.clip(drift**2 * (2 - FORGETTING) / (RISE * FORGETTING) - 1, 0, FULL) / FULL
+        p = p + np.diag([0, 0, 0, 0, *(BOOST * q_d * np.diag(r) * boost)])
+        gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
+        mean, p = mean + gain @ error, p - gain @ h @ p
+        found, shown = observer(torch.from_numpy(y)[None], torch.from_numpy(v)[None], found)
+        np.testing.assert_allclose(found.mean[0], mean, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(found.covariance, p, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(shown[0], boost, atol=1e-7)
+
+
+def test_the_covariance_goes_by_the_jacobian_of_the_network() -> None:
+    model = random_model(1, n_y=1, n_hidden=5)
+    observer, x, v = Observer(model, Noises(0.01, 2e-4)), torch.linspace(-1, 1, 4).double(), row(0.3)
+    f = np.eye(5)
+    f[:4, :4] = torch.autograd.functional.jacobian(lambda x: model(torch.cat([x, v])), x)
+    f[0, 4] = 1.0
+    past = Estimate(torch.cat([x, row(0.0)])[None], observer.first, row(0.0)[None])
+    mean, covariance = observer.predicted(v[None], past)
+    torch.testing.assert_close(mean[0, :4], model(torch.cat([x, v])))
+    np.testing.assert_allclose(covariance, f @ observer.first.numpy() @ f.T + observer.q.numpy(), rtol=1e-9, atol=1e-12)
+
+
+# ---------------------------------------------------------------------- settling
+def test_the_horizon_is_the_settling_time() -> None:
+    """A lag of pole a settles to 10 % in ln .1/ln a samples, and later by its dead time; a level takes the longest."""
+    for pole, dead, samples in ((0.9, 0, 22), (0.9, 4, 26), (0.5, 0, 12), (0.995, 0, 50), (1.0, 0, 50)):
+        model = first_order(pole=min(pole, 0.999), dead=dead)
+        if pole == 1.0:
+            model.a[0, 0], model.b[0, 0] = 1.0, 0.05
+        assert horizon_for(model, same) == samples
+    answers = step_responses(first_order(pole=0.8), same)
+    np.testing.assert_allclose(settling_times(answers), np.ceil(np.log(0.1) / np.log(0.8)))
+
+
+@pytest.mark.parametrize("n_hidden", [0, 3])
+def test_an_unstable_model_is_refused(n_hidden: int) -> None:
+    model = random_model(0, n_hidden=n_hidden)
+    model.a *= 1.1 / 0.85
+    with pytest.raises(LawError, match="identified model is unstable"):
+        law_of(model)
+
+
+# ---------------------------------------------------------------------- closed loops
+def closed(law: Predictive, plant: Identified, sp: np.ndarray, *, load=None, dv=None, noise=0.0, seed=0, mv=None):
+    """PVs and MVs (n, .) of a loop over a plant that starts at rest at zero, and the law's info."""
+    n, rng = len(sp), np.random.default_rng(seed)
+    x, state = torch.zeros(plant.n_x, dtype=torch.float64), torch.zeros(law.n_state, dtype=torch.float64)
+    applied = torch.zeros(plant.n_mv, dtype=torch.float64) if mv is None else mv
+    ys, mvs, infos = [], [], []
+    with torch.no_grad():
+        for k in range(n):
+            y = plant.measured(x)
+            disturbance = NONE if dv is None else row(dv[k])
+            seen = y + noise * torch.from_numpy(rng.normal(size=plant.n_y))
+            applied, state, info = law(torch.from_numpy(sp[k]), seen, disturbance, applied, state)
+            ys.append(y.numpy())
+            mvs.append(applied.numpy())
+            infos.append(info.numpy())
+            x = plant(torch.cat([x, applied, disturbance]))
+            if load is not None:
+                x[: plant.n_y] += torch.from_numpy(np.atleast_1d(load[k]))
+    return np.array(ys), np.array(mvs), np.array(infos)
+
+
+@given(gain=st.floats(0.6, 1.6), load=st.floats(-0.1, 0.1), sp=st.floats(-1.0, 1.0))
+@few
+def test_a_wrong_gain_and_a_load_leave_no_offset(gain: float, load: float, sp: float) -> None:
+    law, plant = law_of(first_order(gain=2.0, dead=1)), first_order(gain=2.0 * gain, dead=1)
+    reach = 2.0 * gain - abs(load) / 0.1
+    y, _, info = closed(law, plant, np.full((150, 1), sp), load=np.full(150, load))
+    if abs(sp) < 0.95 * reach:
+        assert abs(y[-1, 0] - sp) < 1e-3
+        assert info[-1, law.info.index("next_y0")] == pytest.approx(y[-1, 0], abs=2e-3)
+
+
+def test_a_network_leaves_no_offset_either() -> None:
+    model, plant = random_model(5, n_y=2, n_mv=2), random_model(5, n_y=2, n_mv=2)
+    plant.b *= 1.2
+    plant.c += 0.02
+    reachable = [plant.measured(x) for x in (settled(plant, row(0.3, -0.2)), settled(plant, row(-0.4, 0.1)))]
+    sp = np.repeat(np.array([y.numpy() for y in reachable]), 200, axis=0)
+    y, _, _ = closed(law_of(model), plant, sp)
+    np.testing.assert_allclose(y[[199, 399]], sp[[199, 399]], atol=3e-3)
+
+
+def settled(plant: Identified, mv: Tensor) -> Tensor:
+    x = torch.zeros(plant.n_x, dtype=torch.float64)
+    for _ in range(300):
+        x = plant(torch.cat([x, mv]))
+    return x
+
+
+def test_noise_and_a_gain_error_lead_to_no_lock_up() -> None:
+    """Gain +20 %, noise of 5 % of a set point's step: the MV stays off its limits, the PV near its set points."""
+    law, plant = law_of(first_order(gain=2.0, dead=2)), first_order(gain=2.4, dead=2)
+    sp = np.repeat([0.5, -0.5, 1.0, 0.0], 80)[:, None]
+    y, mv, _ = closed(law, plant, sp, noise=0.05)
+    late = (np.arange(len(sp)) % 80) >= 30
+    assert np.abs(y - sp)[late].mean() < 0.05
+    assert (np.abs(mv[late]) < 0.99).all()
+
+
+def test_a_load_that_steps_is_followed_at_once_and_noise_is_not() -> None:
+    law, plant = law_of(first_order()), first_order()
+    load = np.where(np.arange(160) >= 80, 0.1, 0.0)
+    _, _, info = closed(law, plant, np.zeros((160, 1)), load=load, noise=0.01)
+    found, boost = info[:, law.info.index("load_y0")], info[:, law.info.index("boost_y0")]
+    assert np.abs(found[20:80]).max() < 0.02
+    assert boost[20:80].max() < 0.2
+    assert boost[80:84].max() > 0.9
+    np.testing.assert_allclose(found[90:], 0.1, atol=0.03)
+
+
+def test_a_measured_disturbance_is_met_before_it_is_seen_in_the_output() -> None:
+    model = first_order(pole=0.8, dead=0, disturbance=1.0)
+    dv = np.where(np.arange(60) >= 20, 0.5, 0.0)
+    y, mv, _ = closed(law_of(model), model, np.zeros((60, 1)), dv=dv)
+    assert abs(mv[20, 0] + 0.25) < 0.05
+    assert np.abs(y).max() < 0.02
+
+
+def test_an_unreachable_set_point_winds_nothing_up() -> None:
+    law, plant = law_of(first_order()), first_order(gain=1.8)
+    sp = np.repeat([2.9, 0.5], [200, 60])[:, None]
+    y, mv, _ = closed(law, plant, sp)
+    assert mv[150, 0] == pytest.approx(1.0, abs=1e-6)
+    assert mv[200, 0] < 0.5
+    assert abs(y[220, 0] - 0.5) < 0.05
+
+
+def test_a_slow_actuator_is_planned_for() -> None:
+    """With a rate the plan brakes in time: less overshoot than of a law that is only cut to the rate."""
+    plant = first_order(pole=0.9, gain=4.0, dead=2)
+    sp = np.full((120, 1), 2.0)
+    signals = made_signals()
+    knowing, cut = (Predictive(signals, plant, Predictive.Params(mv_rate=r)).eval() for r in (0.04, None))
+    cut.rate = row(0.04)
+    (y, mv, _), (loose, _, _) = (closed(law, plant, sp) for law in (knowing, cut))
+    assert np.abs(np.diff(mv[:, 0], prepend=0.0)).max() <= 0.04 * (1 + 1e-12)
+    assert y.max() < loose.max()
+    assert y.max() < 2.1
+    assert abs(y[-1, 0] - 2.0) < 1e-3
+
+
+def test_speed_moves_faster_and_caution_follows_loads_slower() -> None:
+    model, sp = first_order(), np.repeat([[0.5]], 40, axis=0)
+    moved = [closed(law_of(model, speed=s, passes=4), model, sp)[1][0, 0] for s in (0.03, 0.1, 0.3)]
+    assert moved[0] < moved[1] < moved[2]
+    load = np.full(40, 0.02)
+    found = [closed(law_of(model, caution=c), model, 0 * sp, load=load)[2][8, 0] for c in (1.0, 5.0)]
+    assert found[1] < found[0]
+
+
+def test_more_mvs_disturbances_and_a_rate_export(tmp_path) -> None:
+    model = random_model(2, n_y=2, n_mv=2, n_dv=1, n_x=5, n_hidden=4)
+    law = law_of(model, horizon=10, moves=3, passes=1, sweeps=2, mv_rate=0.1)
+    manifest = export(law, tmp_path / "law.onnx", case="made", provenance={})
+    assert manifest.info == ("load_y0", "load_y1", "next_y0", "next_y1", "boost_y0", "boost_y1")
+    assert Controller(tmp_path / "law.onnx").cold_state().shape == (law.n_state,)
+
+
+# ---------------------------------------------------------------------- refusals
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(n, v) for n in ("speed", "caution", "move_weight", "eps", "q_x", "q_d") for v in (0.0, -1.0, float("nan"))]
+    + [("horizon", 7), ("moves", 0), ("passes", 0), ("sweeps", 0)],
+)
+def test_numbers_that_make_no_plan_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} is {value}; it must be"):
+        Predictive.Params(**{name: value})
+
+
+def test_what_does_not_fit_is_refused_in_words() -> None:
+    model = first_order()
+    with pytest.raises(LawError, match="has 2 weights; give one for each set point"):
+        law_of(model, weights=(1.0, 2.0))
+    with pytest.raises(ValueError, match="each must be above 0"):
+        Predictive.Params(weights=(0.0,))
+    with pytest.raises(LawError, match="1 outputs, 1 MVs and 0 measured disturbances; the plant has 2 set points"):
+        Predictive(made_signals(2, 2), model, Predictive.Params())
+    with pytest.raises(LawError, match=r"needs a part 'identified' .* is of kind mlp"):
+        Predictive.design(Predictive.Params(), {"identified": MLP(2)}, made_signals(), None)
+    valve = made_signals()
+    discrete = type(valve)(1.0, valve.sp, valve.pv, (), (Signal("valve", "-", 0.0, 1.0, (0.0, 1.0)),))
+    with pytest.raises(LawError, match="valve has only the values"):
+        Predictive.design(Predictive.Params(), {"identified": model}, discrete, None)
+
+
+def test_a_model_that_hides_its_scaling_gives_the_same_law() -> None:
+    """Other units, and a model scaled to another MV range than the signal's: the same loop."""
+    plain = first_order()
+    other = scaled_model(
+        1, 1, 0, 1, a=plain.a, b=plain.b * 0.5, c=plain.b[:, 0] * 0.1, rest=plain.rest,
+        v_scale=np.array([0.5]), v_center=np.array([0.1]),
+    )  # fmt: skip
+    sp = np.repeat([0.5, -0.8], 30)[:, None]
+    runs = [closed(law_of(model, horizon=20), plain, sp)[1] for model in (plain, other)]
+    np.testing.assert_allclose(runs[0], runs[1], atol=2e-3)
