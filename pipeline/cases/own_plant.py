@@ -24,7 +24,7 @@ from serving.errors import ArtifactError
 from serving.manifest import Signal
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
-MEMBER_NUMBERS = (1, 2, 3)
+MEMBER_NUMBERS = (1, 2)
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
 VISITED = (0.1, 0.9)  # quantiles of the record's MV between which tests move
 LEVELS = 6  # set points of a sequence
