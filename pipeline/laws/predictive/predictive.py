@@ -56,7 +56,7 @@ class Predictive(ControlLaw):
         ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
         by their size. ``weights`` > 0 of the CVs in units of their standard deviation; None: all 1. ``q_x`` and
         ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's.
-        ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more. ``mv_rate`` [mv]: largest MV change a
+        ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more. ``mv_rate`` [mv]: largest MV change a
         sample, which the plan knows; None: unlimited.
         """
 
@@ -64,11 +64,12 @@ class Predictive(ControlLaw):
         caution: float = 1.0
         horizon: int | None = None
         moves: int | None = None
-        move_weight: float = 0.03
+        move_weight: float = 0.1
         eps: float = 0.1
         weights: tuple[float, ...] | None = None
         q_x: float = 0.01
-        q_d: float = 2e-4
+        q_d: float = 5e-4
+        damping: float = 0.5
         passes: int = 2
         sweeps: int = 4
         mv_rate: float | None = None
@@ -77,6 +78,8 @@ class Predictive(ControlLaw):
             for name in ("speed", "caution", "move_weight", "eps", "q_x", "q_d"):
                 if not 0 < getattr(self, name) < np.inf:
                     raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0, and finite")
+            if not 0 <= self.damping < np.inf:
+                raise ValueError(f"damping is {self.damping}; it must be 0 or above, and finite")
             for name, least in (("horizon", 8), ("moves", 1), ("passes", 1), ("sweeps", 1)):
                 value = getattr(self, name)
                 if value is not None and value < least:
@@ -108,7 +111,7 @@ class Predictive(ControlLaw):
         count = (8 if n_mv == 1 else 5) if params.moves is None else params.moves
         self.moves = Moves.over(horizon, count, n_mv, ramps=self.rate is not None)
         dead = min(float(model.dead.min()), horizon - 1.0)
-        cost = Cost(weights, params.move_weight / params.speed**2 * (horizon - dead) / 10, params.eps)
+        cost = Cost(weights, params.move_weight / params.speed**2 * (horizon - dead) / 10, params.eps, params.damping)
         self.observer = Observer(model, Noises(params.q_x, params.q_d / params.caution**2))
         rate = None if self.rate is None else self.rate / half
         run = horizon_of(model, self.moves, mv_of, n_cv)
@@ -137,8 +140,8 @@ class Predictive(ControlLaw):
             v = (torch.cat([p["mv"], p["dv"]], dim=-1) - model.v_center) / model.v_scale
             z = (p["mv"] - middle) / half
             one = torch.ones_like(z[..., :1])
-            rest = torch.cat([y, v, one], dim=-1) @ model.rest.T
-            past = [rest, 0 * y, one * first, 0 * y, z.repeat(*(1 for _ in z.shape[:-1]), count // z.shape[-1])]
+            rest = torch.cat([y, v, one], dim=-1) @ model.rest[n_y:].T
+            past = [y, rest, 0 * y, one * first, 0 * y, z.repeat(*(1 for _ in z.shape[:-1]), count // z.shape[-1])]
             sp = (p["sp"] - y_center[:n_cv]) / y_scale[:n_cv]
             return {"y": y, "sp": sp, "z": z, "v": v, "past": torch.cat(past, dim=-1), "one": one}
 
