@@ -152,7 +152,7 @@ def courses(plant: Plant, seed: int) -> tuple[Array, Array]:
 
 
 def scores(plant: Plant, sp: Array, y: Array) -> tuple[Array, Array]:
-    """nMAE [%] of the half with set points and of the half with loads."""
+    """Errors nMAE [%] of the half with set points and of the half with loads."""
     error = 100 * (np.abs(y - sp) / plant.span).mean(axis=-1)
     half = len(sp) // 2
     return error[:half].mean(axis=0), error[half + HOLD // 2 :].mean(axis=0)
@@ -164,7 +164,7 @@ def pid_loop(plant: Plant, settings: Array, seed: int) -> tuple[Array, Array]:
     rng, n = np.random.default_rng(seed + 1), len(plant.sp)
     kc, ti, td = settings.reshape(n, 3).T
     x, u = plant.start, np.full(n, 50.0)
-    y1 = y2 = plant.output(x)
+    y1 = plant.output(x)
     e1, d1 = np.zeros(n), np.zeros(n)
     ys, us = np.empty_like(sp), np.empty_like(sp)
     for k in range(len(sp)):
@@ -173,7 +173,7 @@ def pid_loop(plant: Plant, settings: Array, seed: int) -> tuple[Array, Array]:
         e = sp[k] - y
         d = (0.1 * td * d1 + td * (y - y1)) / (0.1 * td + 1)  # filtered with a tenth of Td
         u = np.clip(u + kc * (e - e1 + e / ti - (d - d1)), 0, 100)
-        e1, y1, y2, d1, us[k] = e, y, y1, d, u
+        e1, y1, d1, us[k] = e, y, d, u
         x = plant.advance(x, u, load[k])
     return ys, us
 

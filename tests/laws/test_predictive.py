@@ -19,6 +19,7 @@ from pipeline.laws.predictive.observer import BOOST, FIRST_LOAD, FORGETTING, FUL
 from pipeline.laws.predictive.plan import Cost, Planner
 from pipeline.laws.predictive.predictive import Predictive
 from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
+from pipeline.laws.predictive.tuning import Trials, searched
 from pipeline.models.identified.identified import Identified
 from pipeline.models.static.mlp import MLP
 from serving import Controller
@@ -323,6 +324,44 @@ def test_more_mvs_disturbances_and_a_rate_export(tmp_path) -> None:
     manifest = export(law, tmp_path / "law.onnx", case="made", provenance={})
     assert manifest.info == ("load_y0", "load_y1", "next_y0", "next_y1", "boost_y0", "boost_y1")
     assert Controller(tmp_path / "law.onnx").cold_state().shape == (law.n_state,)
+
+
+# ---------------------------------------------------------------------- tuning
+class Bowl:
+    """Trials whose cost is known: the numbers' logarithms from their best values."""
+
+    def cost(self, law: dict[str, float]) -> float:
+        best = {"move_weight": 0.03, "q_d": 0.002, "q_x": 0.01, "horizon": 20.0}
+        return float(sum(np.log(law[n] / best[n]) ** 2 for n in law))
+
+
+def test_the_search_takes_the_best_factor_of_each_number() -> None:
+    start = {"move_weight": 0.1, "q_d": 5e-4, "q_x": 0.01, "horizon": 20.0}
+    best, tried = searched(Bowl(), dict, start)  # type: ignore[arg-type]
+    assert best.numbers == pytest.approx({"move_weight": 0.03, "q_d": 0.002, "q_x": 0.01, "horizon": 20.0})
+    assert tried[0].numbers == start
+    assert len({tuple(c.numbers.values()) for c in tried}) == len(tried)
+
+
+def test_trials_tell_a_good_law_from_a_sluggish_one_and_are_the_same_again() -> None:
+    model = first_order(pole=0.6)
+    signals, law = made_signals(), law_of(model, horizon=12)
+    trials, again = (Trials.draw([model], signals, 12, seed=1) for _ in range(2))
+    cost = trials.cost(law)
+    assert cost == again.cost(law)
+    assert trials.cost(law_of(model, horizon=12, move_weight=300.0)) > 1.2 * cost
+    assert trials.cost(law_of(model, horizon=12, caution=1e4)) > cost
+    assert torch.equal(trials.gain[0, [0, 4]], torch.ones(2, 1, dtype=torch.float64))
+    assert not torch.equal(trials.load, torch.zeros_like(trials.load))
+
+
+def test_a_searched_law_costs_no_more_than_the_given_one() -> None:
+    params = Predictive.Params(tuning="search", horizon=8, moves=3, passes=1, sweeps=2)
+    law = Predictive.design(params, {"identified": first_order(pole=0.5)}, made_signals(), None)
+    figures = law.analysis(None).figures
+    assert figures["cost"] <= figures["cost_given"]
+    assert figures["horizon"] == law.moves.horizon
+    assert not law_of(first_order()).analysis(None).figures
 
 
 # ---------------------------------------------------------------------- refusals
