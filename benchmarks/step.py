@@ -40,11 +40,13 @@ NETWORK = Limits(40.0, 80.0, 100.0)  # the law is its network
 # Laws that adapt or blend within the step, on plants whose NMPC is quicker: as their cases' reports ask.
 ADAPTIVE = Limits(80.0, 160.0, 20.0)
 SEARCHING = Limits(np.inf, 200.0, 20.0)
+PLANNING = Limits(np.inf, 500.0, 20.0)  # two passes over a horizon, several MVs
 LIMITS = {
     **dict.fromkeys(("inc", "incad", "incadec", "inverse_dob"), NETWORK),
     **dict.fromkeys(("linearized_pid", "recursive_pid", "self_tuning_pid"), ADAPTIVE),
     **dict.fromkeys(("local_pid_network", "auto_pid_network"), ADAPTIVE),
     **dict.fromkeys(("fuzzy_feedforward", "fuzzy_feedforward_pi", "fuzzy_feedforward_observer"), ADAPTIVE),
+    "predictive": PLANNING,
     **dict.fromkeys(("gauss_newton_pid", "minimum_variance"), SEARCHING),
 }
 

@@ -52,7 +52,7 @@ def audit(data: bytes) -> GraphSummary:
     Refused: a file over 64 MiB; bytes that are not a protobuf in canonical form, or hold a field
     that no controller has; IR outside 8 to 10 or opset outside 18 to 21; an operator off the list;
     a subgraph, a function, training data, sparse or external tensors; values without a static
-    shape; a step of more than 5 million multiply-adds.
+    shape; a step of more than 20 million multiply-adds.
     """
     if len(data) > MAX_BYTES:
         raise ArtifactError(f"the file has {len(data)} bytes; a controller has at most {MAX_BYTES}")

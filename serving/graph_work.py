@@ -19,8 +19,9 @@ Shape: TypeAlias = tuple[int, ...]
 FLOAT, INT32, INT64, BOOL, DOUBLE = 1, 6, 7, 9, 11  # TensorProto.DataType
 ITEM_BYTES = {FLOAT: 4, INT32: 4, INT64: 8, BOOL: 1, DOUBLE: 8}
 MAX_RANK = 8
-# At most 50 ms of ordinary numbers and half a second of subnormal ones; the largest shipped controller has .5 million.
-MAX_WORK = 5_000_000
+# At most 200 ms of ordinary numbers and two seconds of subnormal ones. A predictive law with one loop has 3 million,
+# which take .2 ms: most of its elements are only moved. One with three loops has up to 20.
+MAX_WORK = 20_000_000
 # An element read or written counts as so many multiply-adds: a power or a cosine takes 10 to 50 ns,
 # a multiply-add in a product of matrices .3 to 1 ns.
 ELEMENT_WORK = 32

@@ -95,9 +95,10 @@ class Observer(nn.Module):
         place = torch.zeros(self.n_y, n_a, n_a, dtype=torch.float64)
         for o in range(self.n_y):
             place[o, self.n_x + o, self.n_x + o] = BOOST / FULL * noises.loads * r[o]
-        by_y = model.rest[:, : self.n_y]
+        by_y = torch.cat([torch.eye(self.n_y, dtype=torch.float64), model.rest[self.n_y :, : self.n_y]])
         first = torch.zeros(n_a, n_a, dtype=torch.float64)
-        first[: self.n_x, : self.n_x] = model.rest_cov + (by_y * r) @ by_y.T
+        first[self.n_y : self.n_x, self.n_y : self.n_x] = model.rest_cov[self.n_y :, self.n_y :]
+        first[: self.n_x, : self.n_x] += (by_y * r) @ by_y.T
         first[self.n_x :, self.n_x :] = FIRST_LOAD**2 * torch.eye(self.n_y, dtype=torch.float64)
         for name, values in {"q": torch.diag(q), "r": r, "place": place.flatten(1), "first": first}.items():
             self.register_buffer(name, values.contiguous())

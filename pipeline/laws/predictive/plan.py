@@ -17,7 +17,7 @@ from pipeline.laws.predictive.product import product
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Numbers of the cost: ``weights`` of the CVs, ``move`` of a squared change, ``eps`` where an error counts least.
+    """Numbers of the cost: ``weights`` q of the CVs, ``move`` mu of a squared change, ``eps``; and the ``damping``.
 
     All for outputs and MVs in scaled units.
     """
@@ -25,6 +25,7 @@ class Cost:
     weights: Sequence[float]
     move: float
     eps: float
+    damping: float = 0.0
 
 
 class Planner(nn.Module):
@@ -35,11 +36,13 @@ class Planner(nn.Module):
     z_0 is the applied MV. Each pass takes the free run y and its slopes S at the present plan, the weights
     w = q/sqrt(e^2 + eps^2) of the errors e = y - r, and the plan that is best for the quadratic cost
 
-        sum w (e + S dz)^2/2 + mu sum_j |z_j - z_{j-1}|^2
+        sum w (e + S dz)^2/2 + mu sum_j |z_j - z_{j-1}|^2 + kappa sum_p H_pp dz_p^2/2
 
-    within its bounds, by ``sweeps`` rounds of coordinate descent. A fixed point is a minimum of the cost itself. An
-    error counts by its size, not by its square: large ones do not decide alone. With ``rate`` (n_mv,) each move
-    differs from the one before by at most its length in samples times the rate.
+    within its bounds, by ``sweeps`` rounds of coordinate descent; H_pp is the curvature of the other terms. A fixed
+    point is a minimum of the cost itself, whatever the damping kappa. Without damping full steps over a strongly
+    bent model can throw the plan from pass to pass, and the loop then amplifies rounding. An error counts by its
+    size, not by its square: large ones do not decide alone. With ``rate`` (n_mv,) each move differs from the one
+    before by at most its length in samples times the rate.
 
     Source: iteratively reweighted least squares, Huber, Robust Statistics, section 7.8; coordinate descent, Wright,
     Mathematical Programming 151 (2015) 3.
@@ -53,6 +56,8 @@ class Planner(nn.Module):
     before: Tensor  # (m, m)
     columns: Tensor  # (m, m, m) ones in column p of matrix p
     eye: Tensor  # (m, m)
+    stiff: Tensor  # (m, m) ones, and 1 + kappa on the diagonal
+    damping: Tensor  # (1,) kappa
 
     def __init__(
         self,
@@ -74,10 +79,11 @@ class Planner(nn.Module):
             "before": torch.from_numpy(moves.before),
             "columns": eye.unsqueeze(-2).repeat(1, self.m, 1),
             "eye": eye,
+            "stiff": 1.0 + cost.damping * eye,
         }
         for name, values in buffers.items():
             self.register_buffer(name, values)
-        hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2)
+        hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
 
     def forward(self, start: Tensor, sp: Tensor, applied: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
         """The plan (..., 1, m), and the outputs (..., 1, n_cv) that it gives at the next sample.
@@ -95,7 +101,8 @@ class Planner(nn.Module):
             curvature = product(run.slopes * weight, run.slopes_t, self.moved)
             pull = product(weight * (plan @ run.slopes - error), run.slopes_t, held)
             before = plan
-            plan = self.descended(curvature, pull, plan, at)
+            diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
+            plan = self.descended(curvature * self.stiff, pull + self.damping * diagonal * plan, plan, at)
         ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
         return plan, ahead
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, Stepped, require_kind
+from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
 from pipeline.laws.predictive.horizon import horizon_of
 from pipeline.laws.predictive.moves import Moves
 from pipeline.laws.predictive.observer import Estimate, Noises, Observer
 from pipeline.laws.predictive.plan import Cost, Planner
 from pipeline.laws.predictive.settling import horizon_for, refuse_unstable
+from pipeline.laws.predictive.tuning import Candidate, Trials, searched
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Named, Stage
@@ -56,27 +57,36 @@ class Predictive(ControlLaw):
         ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
         by their size. ``weights`` > 0 of the CVs in units of their standard deviation; None: all 1. ``q_x`` and
         ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's.
-        ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more. ``mv_rate`` [mv]: largest MV change a
-        sample, which the plan knows; None: unlimited.
+        ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more.
+        ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses move_weight, q_d, horizon
+        and q_x in closed loops over the model with wrong gains and loads, drawn by ``seed``. ``mv_rate`` [mv]:
+        largest MV change a sample, which the plan knows; None: unlimited.
         """
 
         speed: float = 1.0
         caution: float = 1.0
         horizon: int | None = None
         moves: int | None = None
-        move_weight: float = 0.03
+        move_weight: float = 0.1
         eps: float = 0.1
         weights: tuple[float, ...] | None = None
         q_x: float = 0.01
-        q_d: float = 2e-4
+        q_d: float = 5e-4
+        damping: float = 0.5
         passes: int = 2
         sweeps: int = 4
+        tuning: Literal["given", "search"] = "given"
+        seed: int = 0
         mv_rate: float | None = None
 
         def __post_init__(self) -> None:
             for name in ("speed", "caution", "move_weight", "eps", "q_x", "q_d"):
                 if not 0 < getattr(self, name) < np.inf:
                     raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0, and finite")
+            if self.tuning not in ("given", "search"):
+                raise ValueError(f"tuning is {self.tuning!r}; allowed are given, search")
+            if not 0 <= self.damping < np.inf:
+                raise ValueError(f"damping is {self.damping}; it must be 0 or above, and finite")
             for name, least in (("horizon", 8), ("moves", 1), ("passes", 1), ("sweeps", 1)):
                 value = getattr(self, name)
                 if value is not None and value < least:
@@ -84,6 +94,7 @@ class Predictive(ControlLaw):
             if any(not 0 < w < np.inf for w in self.weights or ()):
                 raise ValueError(f"weights are {list(self.weights or ())}; each must be above 0, and finite")
 
+    tried: tuple[Candidate, ...] = ()  # of a search, the numbers that it started from first
     shift: Tensor  # (m, m) of a plan to the next sample
     upper: Tensor  # where the flat covariance's upper half stands
     whole: Tensor  # (n_a n_a,) the flat covariance's entries in its upper half
@@ -108,7 +119,7 @@ class Predictive(ControlLaw):
         count = (8 if n_mv == 1 else 5) if params.moves is None else params.moves
         self.moves = Moves.over(horizon, count, n_mv, ramps=self.rate is not None)
         dead = min(float(model.dead.min()), horizon - 1.0)
-        cost = Cost(weights, params.move_weight / params.speed**2 * (horizon - dead) / 10, params.eps)
+        cost = Cost(weights, params.move_weight / params.speed**2 * (horizon - dead) / 10, params.eps, params.damping)
         self.observer = Observer(model, Noises(params.q_x, params.q_d / params.caution**2))
         rate = None if self.rate is None else self.rate / half
         run = horizon_of(model, self.moves, mv_of, n_cv)
@@ -137,8 +148,8 @@ class Predictive(ControlLaw):
             v = (torch.cat([p["mv"], p["dv"]], dim=-1) - model.v_center) / model.v_scale
             z = (p["mv"] - middle) / half
             one = torch.ones_like(z[..., :1])
-            rest = torch.cat([y, v, one], dim=-1) @ model.rest.T
-            past = [rest, 0 * y, one * first, 0 * y, z.repeat(*(1 for _ in z.shape[:-1]), count // z.shape[-1])]
+            rest = torch.cat([y, v, one], dim=-1) @ model.rest[n_y:].T
+            past = [y, rest, 0 * y, one * first, 0 * y, z.repeat(*(1 for _ in z.shape[:-1]), count // z.shape[-1])]
             sp = (p["sp"] - y_center[:n_cv]) / y_scale[:n_cv]
             return {"y": y, "sp": sp, "z": z, "v": v, "past": torch.cat(past, dim=-1), "one": one}
 
@@ -160,7 +171,36 @@ class Predictive(ControlLaw):
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The law over part ``identified``; raises LawError."""
         _refuse_discrete(signals)
-        return cls(signals, require_kind(models, Identified, cls.name, ""), params)
+        model = require_kind(models, Identified, cls.name, "")
+        law = cls(signals, model, params)
+        return law if params.tuning == "given" else law._searched(model, params)
+
+    def _searched(self, model: Identified, params: Params) -> Self:
+        """The law with the best numbers of a search that starts from this one's."""
+        horizon = self.moves.horizon
+
+        def law_of(n: Mapping[str, float]) -> Any:
+            given = {"move_weight": n["move_weight"], "q_d": n["q_d"], "q_x": n["q_x"], "horizon": int(n["horizon"])}
+            changed: Any = replace(params, **given)  # type: ignore[arg-type]  # of mixed numbers
+            return type(self)(self.signals, model, changed).eval()
+
+        start = {n: float(getattr(params, n)) for n in ("move_weight", "q_d", "q_x")} | {"horizon": float(horizon)}
+        best, tried = searched(Trials.draw([model], self.signals, horizon, params.seed), law_of, start)
+        law: Self = law_of(best.numbers)
+        law.tried = tuple(tried)
+        return law
+
+    def analysis(self, plant: Simulator | None) -> Analysis:
+        """The numbers that a search chose, and its cost at first and at last; empty without one."""
+        if not self.tried:
+            return Analysis()
+        best = min(self.tried, key=lambda c: c.cost)
+        figures = {**best.numbers, "cost": best.cost, "cost_given": self.tried[0].cost, "tried": len(self.tried)}
+        note = (
+            f"{len(self.tried)} sets of numbers were tried in closed loops over the model with wrong gains and loads; "
+            f"the cost fell from {self.tried[0].cost:.3g} to {best.cost:.3g} %."
+        )
+        return Analysis(figures, notes=(note,))
 
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
