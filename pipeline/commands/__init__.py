@@ -9,6 +9,7 @@ import argparse
 from typing import NoReturn
 
 COMMANDS = {
+    "new": "make a record of a historian's export: read, screened, judged, and added to params.yaml",
     "run": "run the pipeline, or a part of it, and say beforehand what runs and why",
     "check": "read every section of params.yaml and list its mistakes",
     "results": "show the figures of every controller, and where to look",

@@ -21,6 +21,7 @@ from pipeline.config.params import (
     read_section,
     sections,
 )
+from pipeline.config.plants import PlantParams, own_plants
 from pipeline.errors import ParamsError, PipelineError
 from pipeline.evaluation.case import Case
 from pipeline.laws import LAWS
@@ -43,6 +44,11 @@ def mistakes() -> list[str]:
                 check(name)
             except (PipelineError, OSError, np.linalg.LinAlgError) as error:
                 lines.append(" ".join(str(error).split()))
+    for name in own_plants():
+        try:
+            _plant(name)
+        except (PipelineError, OSError) as error:
+            lines.append(" ".join(str(error).split()))
     return list(dict.fromkeys(lines))  # a record that cannot be read is met by every model set
 
 
@@ -138,6 +144,12 @@ def _controller(name: str) -> None:
             law.check(settings, parts, plant)
         except PipelineError as error:
             raise ParamsError(f"{place}: {error}") from None
+
+
+def _plant(name: str) -> None:
+    params = PlantParams.read(name)
+    if not params.data.is_file():
+        raise ParamsError(f"plants.{name}.data is {params.data}, which is not there; `loopwright new` writes it")
 
 
 def _known_case(case: str, where: str) -> None:

@@ -1,0 +1,159 @@
+"""``loopwright new``: a historian's export -> a screened record, its report, and a section of params.yaml."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from pipeline.config.plants import append_plant, check_name
+from pipeline.errors import PipelineError, RecordError
+from pipeline.files import draft_folder_of, write_json, write_text
+from pipeline.historian.findings import Screening
+from pipeline.historian.guessing import guesses
+from pipeline.historian.reading import read_export, units_of
+from pipeline.historian.screening import Screened, screened
+from pipeline.historian.step_test import StepTest, planned
+from pipeline.historian.tags import ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
+from pipeline.plants.signals import Signals
+from pipeline.records.record import Record
+from pipeline.report.screening import write_page
+
+DATA = Path("data")
+WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
+         "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    add = parser.add_argument
+    add("name", metavar="NAME", help="of the plant: small letters, digits and _")
+    add("files", metavar="FILE", type=Path, nargs="+", help="exports: .csv, .txt, .gz, .parquet")
+    for role in ROLES:
+        form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"
+        add(f"--{role}", metavar=form, action="append", default=[], help=f"{WORDS[role]}; may be given again")
+    add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
+    add("--period", metavar="S", type=_positive, help="sampling period of the record (default: from the data)")
+    add("--hold", metavar="S", type=_positive, help="longest time that a reading is held or drawn on over")
+    add("--without-mode", metavar="MODE", action="append", default=[], help="leave rows of this mode out")
+    add("--time", metavar="COLUMN", default="", help="the column of times (default: found by name and content)")
+    add("--time-format", metavar="FORM", default="", help="of the times, as in '%%d/%%m/%%Y %%H:%%M:%%S'")
+
+
+def run(options: argparse.Namespace) -> int:
+    """0 where the plant was added or a table of tags written; 2 where the record cannot be used, after the report."""
+    name: str = options.name
+    check_name(name)
+    folder = DATA / name
+    if folder.exists():
+        raise RecordError(f"{folder} is there already; choose another name, or remove the folder")
+    given = [parse_tag(text, role) for role in ROLES for text in getattr(options, role)]
+    if given and options.tags:
+        raise RecordError("--tags and options of roles are both given; give one of them")
+    if not given and not options.tags:
+        return _table(name, options)
+    where = str(options.tags) if options.tags else "the options"
+    tags = read_tags(options.tags) if options.tags else tuple(given)
+    check_tags(tags, where)
+    units = units_of(options.files)
+    tags = named([t if t.unit or t.role == "mode" else _with_unit(t, units) for t in tags])
+    values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
+    export = read_export(options.files, values, modes, options.time, options.time_format)
+    found = screened(name, export, tags, options.period, options.hold, options.without_mode)
+    return _write(name, folder, found)
+
+
+def _table(name: str, options: argparse.Namespace) -> int:
+    path = Path(f"{name}-tags.csv")
+    export = read_export(options.files, (), (), options.time, options.time_format)
+    rows = guesses(export, units_of(options.files))
+    write_tags(path, rows)
+    roles = {r: [g.tag.tag for g in rows if g.tag.role == r] for r in ROLES}
+    print(f"{path}: {len(rows)} tags with guessed roles; nothing else was written")
+    for role, tags in roles.items():
+        print(f"  {role:5} {', '.join(tags) or '-'}")
+    files = " ".join(map(str, options.files))
+    print(f"correct role, unit, low and high there (an empty role leaves a tag out), then:\n"
+          f"  loopwright new {name} {files} --tags {path}")  # fmt: skip
+    return 0
+
+
+def _write(name: str, folder: Path, found: Screened) -> int:
+    """All files at once, then the section; neither without the other."""
+    report, verdict = found.report, found.report.verdict
+    usable = _usable(found.record)
+    test = planned(verdict.inputs, found.record.mv[-1], report.period_s) if verdict.carries != "yes" else None
+    with draft_folder_of(folder) as draft:
+        if not usable:
+            found.record.write(draft / "record.parquet")
+        write_json(draft / "screening.json", report.to_dict())
+        if test:
+            write_text(draft / "step_test.csv", test.table())
+        write_page(draft / "screening.html", found, test)
+    if not usable:
+        try:
+            append_plant(name, entry(found.record, report, folder))
+        except PipelineError:
+            shutil.rmtree(folder)
+            raise
+    _tell(name, folder, report, test)
+    if usable:
+        print(f"loopwright new: {name} was not added to params.yaml: {usable}", file=sys.stderr)
+    return 2 if usable else 0
+
+
+def _usable(record: Record) -> str:
+    """Why no model can be trained on the record at all; empty where one can."""
+    for signal, values in zip(record.mv_signals, record.mv.T, strict=True):
+        if float(values.max() - values.min()) <= 1e-9 * (signal.high - signal.low):
+            return f"{signal.name} is {values[0]:g} {signal.unit} in every row; run the step test in step_test.csv"
+    return ""
+
+
+def entry(record: Record, report: Screening, folder: Path) -> dict[str, Any]:
+    """``plants.<name>`` as params.yaml holds it."""
+    groups = {"pv": record.pv_signals, "mv": record.mv_signals, "dv": record.dv_signals}
+    return {
+        "period_s": record.period_s,
+        **{role: [s.to_dict() for s in signals] for role, signals in groups.items()},
+        "data": (folder / "record.parquet").as_posix(),
+        "source": [dict(f) for f in report.files],
+    }
+
+
+def signals_of(record: Record) -> Signals:
+    """The plant's signals; every PV has a set point until a law says otherwise."""
+    return Signals(record.period_s, record.pv_signals, record.pv_signals, record.dv_signals, record.mv_signals)
+
+
+def _tell(name: str, folder: Path, report: Screening, test: StepTest | None) -> None:
+    kept = 100 * report.kept_rows / report.grid_rows
+    print(f"{name}: {report.file_rows} rows of {len(report.files)} file(s) -> {report.grid_rows} rows of "
+          f"{report.period_s:g} s, {report.kept_rows} kept ({kept:.1f} %) in {report.runs} run(s)")  # fmt: skip
+    for reason, rows in report.dropped_rows.items():
+        print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
+    for finding in report.findings:
+        print(f"  {finding.tag}: {finding.words}")
+    print(f"can these data carry a model: {report.verdict.carries}")
+    for reason in report.verdict.reasons:
+        print(f"  {reason}")
+    print(f"look at {folder}/screening.html: trends with every mask")
+    if test:
+        print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h")
+
+
+def _with_unit(tag: Tag, units: dict[str, str]) -> Tag:
+    return Tag(tag.tag, tag.role, units.get(tag.tag, ""), tag.low, tag.high, tag.name)
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (value > 0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no positive number of seconds")
+    return value

@@ -1,0 +1,210 @@
+"""Readings that are no measurements: codes for missing values, other units, single outliers.
+
+Each function takes the series of one tag and returns where they are; the values of what it saw go into the report.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from pipeline.historian.character import runs_of
+from pipeline.metrics import Array
+
+Where = NDArray[np.bool_]
+
+CODES = (-9999.0, 9999.0, -999.0, -999.25, -99999.0, 99999.0, -999999.0, 32767.0, -32768.0, 65535.0, 2147483647.0)
+AWAY = 0.25  # spans of the usual values between them and zero, from which zero is a dead sensor
+FAR = 2.0  # spans of the usual values between them and a code
+REPEATED, REPEATED_SHARE = 3, 2e-4  # readings of one value far outside, from which it is a code
+MAINLY = 0.3  # of all values that far
+SAMPLE = 200_000  # readings that a distribution is estimated from
+WINDOW = 9  # readings of the running median
+SPIKE_SD, SPIKE_SPAN = 8.0, 0.03  # of the residual's robust sd, and of the usual span
+LONGEST_SPIKE = 4  # readings
+CONVERSIONS: dict[str, tuple[float, float]] = {
+    "degC to degF": (1.8, 32.0),
+    "degF to degC": (1 / 1.8, -32 / 1.8),
+    "degC to K": (1.0, 273.15),
+    "K to degC": (1.0, -273.15),
+    "x 1000": (1e3, 0.0),
+    "/ 1000": (1e-3, 0.0),
+    "x 100": (1e2, 0.0),
+    "/ 100": (1e-2, 0.0),
+    "x 10": (10.0, 0.0),
+    "/ 10": (0.1, 0.0),
+    "bar to psi": (14.5038, 0.0),
+    "psi to bar": (1 / 14.5038, 0.0),
+    "x 60": (60.0, 0.0),
+    "/ 60": (1 / 60, 0.0),
+    "x 3.6": (3.6, 0.0),
+    "/ 3.6": (1 / 3.6, 0.0),
+}
+JUMP_SD, JUMP_SPAN = 15.0, 0.5  # a change of unit moves the value by more than these
+MATCH_SD, MATCH_SHARE = 6.0, 0.05  # how near the conversion must come: noise, and share of the jump
+
+
+def usual(values: Array) -> tuple[float, float]:
+    """1 % and 99 % quantile of finite values; (0, 0) where there are none."""
+    step = max(1, len(values) // SAMPLE)
+    sample = values[::step]
+    sample = sample[np.isfinite(sample)]
+    if not sample.size:
+        return 0.0, 0.0
+    low, high = np.quantile(sample, [0.01, 0.99])
+    return float(low), float(high)
+
+
+def core(values: Array) -> tuple[float, float]:
+    """Where the middle 90 % lie after values that are more than ten of their spans away have gone."""
+    sample = values[:: max(1, len(values) // SAMPLE)]
+    sample = sample[np.isfinite(sample)]
+    if not sample.size:
+        return 0.0, 0.0
+    q1, q3 = np.quantile(sample, [0.25, 0.75])
+    spread = max(float(q3 - q1), 1e-9 * max(abs(float(q1)), abs(float(q3)), 1e-300))
+    near = sample[np.abs(sample - np.median(sample)) <= 10 * spread]
+    low, high = np.quantile(near, [0.01, 0.99]) if near.size else (q1, q3)
+    return float(low), float(high)
+
+
+def sentinels(values: Array) -> tuple[Where, Counter[str]]:
+    """Where (n,) codes for a missing value stand, and how often each.
+
+    A code is one of CODES, zero, or a value that comes again exactly, farther from the usual ones than FAR of their
+    spans. Zero is a dead sensor only where no other value lies between it and the usual ones.
+    """
+    low, high = core(values[values != 0.0])  # zeros of a dead sensor must not widen it
+    span = max(high - low, 1e-6 * max(abs(low), abs(high), 1e-9))
+    out = (values < low - FAR * span) | (values > high + FAR * span)
+    away = max(low, -high)  # from zero
+    found: Counter[str] = Counter()
+    where = np.zeros(len(values), dtype=bool)
+    if away > AWAY * span:
+        zero = values == 0.0
+        between = (np.abs(values) < 0.5 * away) & ~zero & np.isfinite(values)
+        if zero.any() and np.count_nonzero(between) <= 0.2 * np.count_nonzero(zero):
+            where |= zero
+            found["0"] = int(np.count_nonzero(zero))
+    far = values[out & ~where]
+    for value, times in zip(*np.unique(far, return_counts=True), strict=True):
+        many = times >= max(REPEATED, REPEATED_SHARE * len(values), MAINLY * len(far))
+        if value in CODES or abs(value) > 1e15 or many:
+            where |= values == value
+            found[f"{value:g}"] = int(times)
+    return where, found
+
+
+def noise_sd(values: Array) -> float:
+    """Standard deviation of white noise on a slow signal: robust, from second differences / sqrt 6."""
+    second = np.diff(values, 2)
+    second = second[np.isfinite(second)]
+    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0)) if second.size else 0.0
+
+
+def unit_slips(values: Array) -> tuple[Where, Counter[str]]:
+    """Where (n,) the values are in another unit for a while: a jump by a known conversion, and the jump back.
+
+    values (n,) must be finite. A jump counts where the conversion of the value before it meets the value after it
+    within the noise; the shorter of the two stretches is the one in the other unit.
+    """
+    n = len(values)
+    where, found = np.zeros(n, dtype=bool), Counter[str]()
+    if n < 20:
+        return where, found
+    step = np.diff(values)
+    low, high = core(values)
+    noise = max(noise_sd(values), 1e-12)
+    jumps = np.flatnonzero(np.abs(step) > max(JUMP_SD * noise, JUMP_SPAN * (high - low) * 0.5))
+    slack = MATCH_SD * noise + float(np.quantile(np.abs(step[:: max(1, n // SAMPLE)]), 0.99))
+    kinds = [(int(k), _conversion(values[k], values[k + 1], slack)) for k in jumps[:2000]]
+    taken = -1
+    for i, (k, kind) in enumerate(kinds):
+        if not kind or k < taken:
+            continue
+        back = next((j for j, other in kinds[i + 1 :] if _returns(kind, other)), None)
+        if back is not None:
+            stretch = slice(k + 1, back + 1)
+        elif taken < 0:  # it never comes back: the shorter side is the other unit
+            stretch = slice(k + 1, n) if n - k - 1 <= k + 1 else slice(0, k + 1)
+            kind = kind if stretch.start else _inverse(kind)
+        else:
+            continue
+        length = stretch.stop - stretch.start
+        if LONGEST_SPIKE < length <= n // 2 and _plausible(values, stretch, kind):
+            where[stretch] = True
+            found[kind] += length
+            taken = stretch.stop
+    return where, found
+
+
+def _plausible(values: Array, stretch: slice, kind: str) -> bool:
+    """Whether the stretch, converted back, lies where the other values are, and does not as it stands."""
+    factor, offset = CONVERSIONS[kind]
+    others = np.r_[values[: stretch.start], values[stretch.stop :]]
+    low, high = np.quantile(others[:: max(1, len(others) // SAMPLE)], [0.05, 0.95])
+    pad = 0.5 * (high - low)
+
+    def inside(v: Array) -> float:
+        return float(np.mean((v >= low - pad) & (v <= high + pad)))
+
+    return inside((values[stretch] - offset) / factor) > 0.9 > 0.5 > inside(values[stretch])
+
+
+def _inverse(kind: str) -> str:
+    return next(k for k in CONVERSIONS if _returns(kind, k))
+
+
+def _conversion(before: float, after: float, slack: float) -> str:
+    best, best_error = "", np.inf
+    for name, (factor, offset) in CONVERSIONS.items():
+        error = abs(after - factor * before - offset)
+        allowed = min(slack * (1 + abs(factor)), MATCH_SHARE * abs(after - before)) + 1e-9 * abs(after)
+        if error <= allowed and error < best_error:
+            best, best_error = name, error
+    return best
+
+
+def _returns(kind: str, other: str) -> bool:
+    if not other:
+        return False
+    (f, o), (g, p) = CONVERSIONS[kind], CONVERSIONS[other]
+    return abs(f * g - 1) < 0.01 and abs(g * o + p) < 0.5
+
+
+def outliers(values: Array) -> Where:
+    """Where (n,) a reading stands alone: far from the running median of WINDOW readings, for at most LONGEST_SPIKE.
+
+    values (n,) finite. Far is more than 8 robust standard deviations of such residuals and 3 % of the usual span, so
+    that a smooth peak without noise is none.
+    """
+    if len(values) < WINDOW:
+        return np.zeros(len(values), dtype=bool)
+    residual = np.abs(values - median_filter(values, WINDOW, mode="nearest"))
+    sample = residual[:: max(1, len(residual) // SAMPLE)]
+    low, high = core(values)
+    limit = max(SPIKE_SD * 1.4826 * float(np.median(sample)), SPIKE_SPAN * (high - low), SPIKE_SD * noise_sd(values))
+    limit = max(limit, 1e-12 * max(abs(low), abs(high)))
+    where = residual > limit
+    for a, b in zip(*runs_of(where), strict=True):
+        if b - a > LONGEST_SPIKE:
+            # On a slope an outlier moves the median of its neighbours; what goes on is a new level, and stays.
+            peak = residual[a:b] > 0.5 * residual[a:b].max()
+            where[a:b] = peak if peak.sum() <= LONGEST_SPIKE else False
+    for a, b in zip(*runs_of(where), strict=True):
+        # What goes on from the left or the right is the edge of a step, not an outlier.
+        first, last = int(a), int(b) - 1
+        while first <= last and first > 1 and _goes_on(values, first, -1, limit):
+            first += 1
+        while last >= first and last < len(values) - 2 and _goes_on(values, last, 1, limit):
+            last -= 1
+        where[a:first] = where[last + 1 : b] = False
+    return where
+
+
+def _goes_on(values: Array, k: int, way: int, limit: float) -> bool:
+    """Whether reading k lies on the line through its two neighbours on one side."""
+    return abs(float(values[k] - 2 * values[k + way] + values[k + 2 * way])) <= limit

@@ -1,0 +1,114 @@
+"""What a signal's values look like: steps of a converter, compression, stuck and clipped stretches."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.metrics import Array
+
+SAMPLE = 50_000
+STUCK_CHANCE = 1e-4  # of a stretch as long by chance anywhere in the record
+SHORTEST_STUCK, LONGEST_STUCK = 8, 400  # rows
+CLIPPED_ROWS = 5
+LINEAR_ROWS = 5  # of a stretch that a compressed signal's interpolation makes straight
+
+Where = NDArray[np.bool_]
+
+
+def quantum(values: Array) -> float:
+    """Step of which all differences are multiples; 0 where there is none (a plain float).
+
+    The smallest difference q of two values, if at least 99 % of the distances between neighbouring values are whole
+    multiples of it, to 5 %.
+    """
+    sample = values[np.isfinite(values)][:SAMPLE]
+    levels = np.unique(sample)
+    if len(levels) < 2:
+        return 0.0
+    apart = np.diff(levels)
+    apart = apart[apart > 1e-9 * max(float(levels[-1] - levels[0]), 1e-300)]
+    if not apart.size:
+        return 0.0
+    q = float(apart.min())
+    whole = np.abs(apart / q - np.round(apart / q)) < 0.05
+    # Few levels of a signal that was hardly moved prove nothing; as many as readings are plain floats.
+    q = float(f"{q:.6g}")
+    return q if whole.mean() >= 0.99 and len(levels) < 0.9 * len(sample) else 0.0
+
+
+def runs_of(mask: Where) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First row and first row after each stretch of True, both (m,)."""
+    edge = np.diff(np.r_[False, mask, False].astype(np.int8))
+    return np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
+
+
+def stuck(values: Array, others: Array, same_piece: Where) -> Where:
+    """Where (n,) a sensor repeats one value for longer than chance allows, while others move.
+
+    values (n,); others (n, m): all other signals over their usual spans; same_piece (n-1,): no gap between the rows.
+    With p the share of equal neighbours outside the longest stretches, a stretch of L rows comes by chance
+    n p^L times; L is where this is STUCK_CHANCE. Others move where one leaves its mean over the stretch's first
+    quarter by more than 5 % of its span.
+    """
+    scale = max(float(np.nanmax(np.abs(values), initial=0.0)), 1e-300)
+    same = (np.abs(np.diff(values)) <= 1e-12 * scale) & same_piece
+    where = np.zeros(len(values), dtype=bool)
+    start, end = runs_of(same)
+    if not start.size:
+        return where
+    length = end - start
+    usual = length <= max(SHORTEST_STUCK, np.quantile(length, 0.9))
+    rest = len(values) - int(length[~usual].sum())
+    p = min(max(int(length[usual].sum()) / max(rest, 1), 1e-3), 0.999)
+    least = np.clip(np.log(STUCK_CHANCE / len(values)) / np.log(p), SHORTEST_STUCK, LONGEST_STUCK)
+    for a, b in zip(start[length >= least], end[length >= least], strict=True):
+        quarter = max((b - a) // 4, 1)
+        with np.errstate(invalid="ignore"):
+            moved = np.abs(others[a : b + 1] - np.mean(others[a : a + quarter], axis=0))
+        if np.any(moved > 0.05):
+            where[a + 1 : b + 1] = True
+    return where
+
+
+def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where, str]:
+    """Where (n,) a sensor stands at the end of its range, and the end in words.
+
+    An end is the range that was given, or the largest (smallest) value, where that is repeated at least CLIPPED_ROWS
+    rows on end and three times as often as all values within the next 2 % of the span.
+    """
+    where, words = np.zeros(len(values), dtype=bool), []
+    finite = values[np.isfinite(values)]
+    if finite.size < 10 * CLIPPED_ROWS or np.ptp(finite) == 0:
+        return where, ""
+    span = float(np.ptp(finite))
+    for end, given, sign in ((float(finite.max()), high, 1), (float(finite.min()), low, -1)):
+        at = np.abs(values - end) <= 1e-9 * span
+        start, stop = runs_of(at)
+        longest = int((stop - start).max())
+        near = int(np.count_nonzero((sign * (end - finite) > 1e-9 * span) & (sign * (end - finite) <= 0.02 * span)))
+        at_given = given is not None and abs(end - given) <= 1e-6 * span
+        if longest >= CLIPPED_ROWS and (at_given or at.sum() > 3 * near):
+            where |= at
+            words.append(f"{end:g} in {int(at.sum())} rows")
+    return where, " and ".join(words)
+
+
+def straight_share(values: Array) -> float:
+    """Share of the rows inside straight lines of LINEAR_ROWS rows or more.
+
+    Interpolation of a compressed signal (swinging door) leaves them; noise and smooth curves have next to none.
+    """
+    v = values[np.isfinite(values)][:SAMPLE]
+    if len(v) < 50:
+        return 0.0
+    q = quantum(v)
+    first = np.diff(v)
+    moving = np.abs(first) > max(1e-9 * float(np.ptp(v)), 0.0)
+    tolerance = max(1e-6 * float(np.quantile(np.abs(first), 0.9)), 1e-12 * float(np.abs(v).max()))
+    if q > 0.2 * float(np.quantile(np.abs(first[moving]), 0.5) if moving.any() else 1.0):
+        return 0.0  # the converter's steps hide it
+    straight = (np.abs(np.diff(v, 2)) <= max(tolerance, 1.01 * q)) & moving[1:]
+    start, end = runs_of(straight)
+    long = (end - start) >= LINEAR_ROWS - 2
+    return float((end - start)[long].sum() / len(v))

@@ -1,0 +1,148 @@
+"""Can these rows carry a model: moves of the inputs, answers of the PVs, correlation, feedback."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.historian.findings import InputReport, Verdict
+from pipeline.historian.linear import Linear
+from pipeline.metrics import Array
+from pipeline.records.record import Record
+
+Runs = NDArray[np.int64]
+
+MOVE_SHARE = 0.02  # of an input's own span: a move that counts
+FEW_MOVES, ENOUGH_MOVES = 6, 20
+SEEN = 4.0  # strength of an answer
+FOLLOWS, FOLLOWS_CLOSELY = 0.15, 0.9  # share of the moves that the PVs' past explains
+ALIKE, THE_SAME = 0.9, 0.98  # correlation of two inputs
+NARROW = 0.05  # of an MV's range
+ROWS_A_PARAMETER, LEAST_ROWS_A_PARAMETER = 20, 4
+HELD = 0.6  # share of rows without a move, from which an input is moved in steps
+
+
+def moves_of(u: Array, run: Runs) -> Array:
+    """Sizes of the moves of an input u (n,), each at least MOVE_SHARE of its span.
+
+    A move goes from one turning point to the next; in a record of steps each step is one.
+    """
+    span = float(np.ptp(u)) if len(u) else 0.0
+    if span <= 0:
+        return np.zeros(0)
+    inside = run[1:] == run[:-1]
+    step = np.diff(u)[inside]
+    if np.mean(np.abs(step) <= 1e-9 * span) >= HELD:
+        return np.abs(step[np.abs(step) >= MOVE_SHARE * span])
+    # Ends of a rise or fall; small reversals belong to it.
+    sizes, pivot, extreme, way = [], float(u[0]), float(u[0]), 0
+    reversal = max(MOVE_SHARE, 0.05) * span
+    for v in u.tolist():
+        if (way >= 0 and v > extreme) or (way <= 0 and v < extreme):
+            extreme, way = v, (1 if v > pivot else -1)
+        elif abs(v - extreme) >= reversal:
+            sizes.append(abs(extreme - pivot))
+            pivot, extreme, way = extreme, v, (1 if v > extreme else -1)
+    sizes.append(abs(extreme - pivot))
+    return np.array([s for s in sizes if s >= reversal])
+
+
+def follows(u: Array, y: Array, run: Runs) -> float:
+    """Share of the variance of u(k) - u(k-1) that y(k) .. y(k-2) explain beyond u's own past: feedback.
+
+    Both (n,); 0 where the input never moves.
+    """
+    k = np.arange(3, len(u))
+    k = k[(run[k] == run[k - 3])]
+    k = k[:: max(1, len(k) // 60_000)]
+    if len(k) < 60:
+        return 0.0
+    move = u[k] - u[k - 1]
+    own = np.column_stack([u[k - 1], u[k - 1] - u[k - 2], u[k - 2] - u[k - 3], np.ones(len(k))])
+    more = np.column_stack([own, y[k], y[k - 1], y[k - 2]])
+    total, both = (_rest(x, move) for x in (own, more))
+    if total <= 1e-12 * float(np.var(u)) or total <= 0:
+        return 0.0
+    share = 1.0 - both / total
+    return float(share) if share * (len(k) - 7) / max(1 - share, 1e-9) / 3 > 10 else 0.0
+
+
+def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int) -> Verdict:
+    """The verdict over a record; ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points."""
+    signals = [(s, "mv") for s in record.mv_signals] + [(s, "dv") for s in record.dv_signals]
+    u = np.hstack([record.mv, record.dv])
+    inputs = []
+    for i, (signal, role) in enumerate(signals):
+        moves = moves_of(u[:, i], record.run)
+        span = float(np.ptp(u[:, i])) if len(u) else 0.0
+        still = np.abs(np.diff(u[:, i])) <= 1e-9 * span if span > 0 else np.ones(max(len(u) - 1, 1))
+        answers = {n: m.strength[i] if m else 0.0 for n, m in models.items()}
+        settling = max((m.settling(i) for n, m in models.items() if m and answers[n] > SEEN), default=0)
+        names = [s.name for s in record.pv_signals]
+        loops = {n: follows(u[:, i], record.pv[:, j], record.run) for j, n in enumerate(names)} if role == "mv" else {}
+        median, largest = (float(np.median(moves)), float(moves.max())) if moves.size else (0.0, 0.0)
+        inputs.append(
+            InputReport(
+                signal.name, role, signal.unit, signal.low, signal.high, len(moves), median, largest,
+                float(np.mean(still)), answers, loops, settling * record.period_s,
+            )
+        )  # fmt: skip
+    correlation = _correlation(u, [s.name for s, _ in signals])
+    parameters = 3 * len(record.pv_signals) + 7 * len(signals) + 1
+    used = max((len(m.rows) for m in models.values() if m), default=0)
+    reasons, level = _reasons(record, inputs, correlation, parameters, moved_sp)
+    carries = ("yes", "doubtful", "no")[level]
+    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, len(record), parameters, used)
+
+
+def _reasons(
+    record: Record, inputs: list[InputReport], correlation: Mapping[str, float], parameters: int, moved_sp: int
+) -> tuple[list[str], int]:
+    found: list[tuple[int, str]] = []
+    n = len(record)
+    if n < LEAST_ROWS_A_PARAMETER * parameters:
+        found.append((2, f"{n} rows for {parameters} parameters of a linear model: too few; record longer"))
+    elif n < ROWS_A_PARAMETER * parameters:
+        found.append((1, f"{n} rows for {parameters} parameters of a linear model are few"))
+    for i, values in zip((i for i in inputs if i.role == "mv"), record.mv.T, strict=True):
+        span = float(np.ptp(values)) if n else 0.0
+        if i.moves < FEW_MOVES:
+            found.append((2, f"{i.name} made {i.moves} moves of {100 * MOVE_SHARE:g} % of its span or more: too few"))
+        elif i.moves < ENOUGH_MOVES:
+            found.append((1, f"{i.name} made {i.moves} informative moves; {ENOUGH_MOVES} are wanted"))
+        if i.moves >= FEW_MOVES and not any(a > SEEN for a in i.answers.values()):
+            found.append((2, f"no process variable answers to {i.name}: check the tag, its times, and the PVs"))
+        if 0 < span < NARROW * (i.high - i.low):
+            found.append((1, f"{i.name} moved over {100 * span / (i.high - i.low):.1f} % of its range"))
+        followed = {pv: s for pv, s in i.follows.items() if s > FOLLOWS}
+        if followed and i.held_share < HELD:
+            pv, share = max(followed.items(), key=lambda item: item[1])
+            words = f"{i.name} follows {pv} (feedback explains {100 * share:.0f} % of its moves)"
+            alone = moved_sp < FEW_MOVES
+            if alone:
+                words += ", and no set point was moved: the record shows the controller more than the plant"
+            found.append((2 if alone and share > FOLLOWS_CLOSELY else 1 if alone else 0, words))
+    for pair, r in correlation.items():
+        if abs(r) > ALIKE:
+            end = ": their effects cannot be told apart" if abs(r) > THE_SAME else ""
+            found.append((2 if abs(r) > THE_SAME else 1, f"{pair} move together (correlation {r:.2f}){end}"))
+    return [words for _, words in sorted(found, key=lambda f: -f[0])], max((level for level, _ in found), default=0)
+
+
+def _correlation(u: Array, names: list[str]) -> dict[str, float]:
+    if len(u) < 3:
+        return {}
+    moving = np.ptp(u, axis=0) > 0
+    found = {}
+    for i, j in combinations(range(len(names)), 2):
+        if moving[i] and moving[j]:
+            found[f"{names[i]} and {names[j]}"] = float(np.corrcoef(u[:, i], u[:, j])[0, 1])
+    return found
+
+
+def _rest(x: Array, target: Array) -> float:
+    theta = np.linalg.lstsq(x / np.maximum(np.abs(x).max(axis=0), 1e-300), target, rcond=None)[0]
+    return float(np.var(target - x / np.maximum(np.abs(x).max(axis=0), 1e-300) @ theta))

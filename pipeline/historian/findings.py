@@ -1,0 +1,95 @@
+"""The typed report of a screening: what was read, what was left out and why, what was seen, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pipeline.historian.grid import Sampling
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that a person should know; ``drops`` where readings or rows were left out for it."""
+
+    kind: str
+    tag: str
+    words: str
+    drops: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TagReport:
+    """One tag: its readings by reason (together they are all), and the rows that it has no value for, by reason."""
+
+    tag: str
+    name: str
+    role: str
+    unit: str
+    low: float
+    high: float
+    readings: dict[str, int]
+    texts: dict[str, int]
+    rows_lost: dict[str, int]
+    rows_bridged: int
+    step: float  # of the converter or of the export's digits; 0 where there is none
+    sampling: Sampling
+
+
+@dataclass(frozen=True, slots=True)
+class InputReport:
+    """How one MV or measured disturbance moved, and what answered."""
+
+    name: str
+    role: str
+    unit: str
+    low: float
+    high: float
+    moves: int
+    median_move: float
+    largest_move: float
+    held_share: float  # of the rows
+    answers: dict[str, float]  # PV -> strength of its answer; above 4 it is seen
+    follows: dict[str, float]  # PV -> share of the moves that its past explains
+    settling_s: float  # [s] of the slowest PV that answers; 0 where none does
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the record can carry a model: yes, doubtful or no, and the reasons."""
+
+    carries: str
+    reasons: tuple[str, ...]
+    inputs: tuple[InputReport, ...]
+    correlation: dict[str, float]  # "A, B" -> correlation of two inputs
+    rows: int
+    parameters: int  # of a plain linear model, to compare the rows with
+    rows_used: int  # by the quick models, in windows spread evenly
+
+
+@dataclass(frozen=True, slots=True)
+class Screening:
+    """The whole report of one `loopwright new`."""
+
+    plant: str
+    files: tuple[dict[str, str], ...]
+    layout: str
+    file_rows: int
+    unreadable_rows: int
+    timeless_rows: int
+    period_s: float
+    gaps: int  # stretches without any reading; runs end there
+    gap_s: float  # [s] their length together
+    grid_rows: int
+    kept_rows: int
+    dropped_rows: dict[str, int]  # by reason; with kept_rows they are grid_rows
+    runs: int
+    longest_run_rows: int
+    tags: tuple[TagReport, ...]
+    modes: dict[str, dict[str, int]]  # mode tag -> mode -> rows
+    findings: tuple[Finding, ...]
+    verdict: Verdict
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return asdict(self)

@@ -1,0 +1,217 @@
+"""Readings at their own times -> rows at one period."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RecordError
+from pipeline.historian.export import Series
+from pipeline.historian.numbers import Codes
+from pipeline.historian.reason import Reason
+from pipeline.metrics import Array
+
+NICE_S = (
+    *(0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.5, 1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30),
+    *(60, 120, 300, 600, 900, 1800, 3600),
+)
+NICE_SHARE = 0.02
+HOLD_PERIODS = 3.2
+IRREGULAR = 2.5  # 90 % over 10 % quantile of the steps, above which a tag reports by exception
+MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
+THINNED = 1.9  # readings a period from which PVs are averaged
+LEAST_PIECE = 2  # rows
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """How one tag was sampled, and over what time a reading is held or a line drawn between two."""
+
+    tag: str
+    step_s: float  # [s] median
+    irregular: bool
+    hold_s: float  # [s]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """Rows at one period. Row k: PVs at ``time_s`` [k], what is held over the period from there on."""
+
+    period_s: float
+    time_s: Array  # (n,) [s] as the export counts
+    piece: NDArray[np.int64]  # (n,) number of the piece between two gaps in time
+    value: Mapping[str, Array]  # (n,) NaN where there is no value
+    code: Mapping[str, Codes]  # (n,) why there is none; GOOD where there is one
+    bridged: Mapping[str, int]  # rows whose value was drawn or held over a bad or missing reading
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+
+def sampling(series: Series, period_s: float | None = None, hold_s: float | None = None) -> Sampling:
+    """Median step of a tag, whether it reports by exception, and its hold [s] unless ``hold_s`` states it.
+
+    Without a stated one, three steps of a tag sampled regularly; of one that reports by exception, twice the 99 %
+    quantile of its steps.
+    """
+    step = np.diff(series.time_s[series.code != Reason.DUPLICATE])
+    step = step[step > 0]
+    if not step.size:
+        return Sampling(series.tag, 0.0, False, hold_s or HOLD_PERIODS * (period_s or 1.0))
+    low, median, high = np.quantile(step[:: max(1, len(step) // 200_000)], [0.1, 0.5, 0.9])
+    irregular = bool(high > IRREGULAR * low)
+    own = 2.0 * float(np.quantile(step, 0.99)) if irregular else HOLD_PERIODS * float(median)
+    return Sampling(series.tag, float(median), irregular, hold_s or max(own, HOLD_PERIODS * (period_s or 0.0)))
+
+
+def proposed_period(series: Sequence[Series]) -> float:
+    """The period [s] that the PVs' own steps propose: the median step, the slowest PV's, rounded to a usual number."""
+    steps = [s for s in (sampling(one).step_s for one in series) if s > 0]
+    if not steps:
+        raise RecordError("no process variable has two readings of different times; export a longer time")
+    step = max(steps)
+    near = min(NICE_S, key=lambda n: abs(n / step - 1))
+    return float(near) if abs(near / step - 1) < NICE_SHARE else float(f"{step:.6g}")
+
+
+def resampled(
+    pv: Sequence[Series],
+    held: Sequence[Series],
+    period_s: float,
+    hold_s: float | None = None,
+) -> tuple[Grid, tuple[Sampling, ...]]:
+    """All series on one grid: PVs and measured disturbances (``pv``) drawn or averaged, the others held.
+
+    Grid: pieces of the PVs' time without a gap longer than their hold, each with the phase of its own stamps.
+    PVs: a straight line between two good readings no farther apart than the hold; where two or more readings fall
+    into a period, the mean over (t - h, t], against aliasing. Held ones: the reading that holds at the middle of
+    [t, t + h), so that jitter of less than half a period does not matter; the mean over it where they are thinned out.
+    """
+    if not period_s > 0:
+        raise RecordError(f"the period is {period_s:g} s; it must be positive")
+    rates = {s.tag: sampling(s, period_s, hold_s) for s in (*pv, *held)}
+    time_s, piece = _times(pv, period_s, max(rates[s.tag].hold_s for s in pv))
+    value, code, bridged = {}, {}, {}
+    for s in (*pv, *held):
+        rate = rates[s.tag]
+        good = s.good
+        t, v = (s.time_s, s.value) if good.all() else (s.time_s[good], s.value[good])
+        thin = 0 < rate.step_s * THINNED <= period_s and not s.categories and not rate.irregular
+        if s in pv:
+            out, over = _mean(time_s, t, v, period_s) if thin else _line(time_s, t, v, period_s, rate.hold_s)
+        else:
+            out, over = _held(time_s, t, v, period_s, rate.hold_s, thin)
+        value[s.tag], code[s.tag] = out, _reasons(time_s, s, out, period_s)
+        bridged[s.tag] = 0 if rate.irregular else int(np.count_nonzero(over))
+    return Grid(period_s, time_s, piece, value, code, bridged), tuple(rates.values())
+
+
+def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray[np.int64]]:
+    clock = (
+        pv[0].time_s if all(s.time_s is pv[0].time_s for s in pv) else np.unique(np.concatenate([s.time_s for s in pv]))
+    )
+    if not clock.size:
+        raise RecordError("the process variables have no reading with a time; export a longer time")
+    cuts = np.flatnonzero(np.diff(clock) > gap_s) + 1
+    starts, ends = np.r_[0, cuts], np.r_[cuts, len(clock)]
+    rows = (clock[ends - 1] - clock[starts]) / h + 1
+    if rows.sum() > min(MOST_ROWS, MOST_ROWS_A_READING * len(clock)):
+        raise RecordError(
+            f"a period of {h:g} s gives {rows.sum():.3g} rows from {len(clock)} readings; give a longer --period"
+        )
+    times: list[Array] = []
+    pieces: list[NDArray[np.int64]] = []
+    for start, end in zip(starts, ends, strict=True):
+        part = clock[start:end]
+        first = _phase(part[:1000], h)
+        n = int(np.floor((part[-1] - first) / h + 0.5)) + 1
+        if n >= LEAST_PIECE:
+            times.append(first + h * np.arange(n, dtype=np.float64))
+            pieces.append(np.full(n, len(pieces), dtype=np.int64))
+    if not times:
+        raise RecordError(
+            f"no stretch of the export is longer than {LEAST_PIECE} periods of {h:g} s; give a shorter --period"
+        )
+    return np.concatenate(times), np.concatenate(pieces)
+
+
+def _phase(t: Array, h: float) -> float:
+    """First time of a grid that runs through the middle of jittered stamps."""
+    angle = 2j * np.pi * (t - t[0]) / h
+    mean = np.exp(angle).mean()
+    shift = float(np.angle(mean) / (2 * np.pi)) if abs(mean) > 0.5 else 0.0
+    return float(t[0]) + (shift * h if abs(shift) > 1e-6 else 0.0)
+
+
+def _line(at: Array, t: Array, v: Array, h: float, hold_s: float) -> tuple[Array, NDArray[np.bool_]]:
+    out = np.full(len(at), np.nan)
+    if not t.size:
+        return out, np.zeros(len(at), dtype=bool)
+    slack = 1e-6 * h
+    right = np.searchsorted(t, at - slack, "left")
+    left = np.clip(np.searchsorted(t, at + slack, "right") - 1, 0, len(t) - 1)
+    right = np.clip(right, 0, len(t) - 1)
+    gap = t[right] - t[left]
+    share = np.where(gap > slack, (at - t[left]) / np.where(gap > slack, gap, 1.0), 0.0)
+    inside = (gap >= -slack) & (gap <= hold_s) & (share >= 0) & (share <= 1)
+    exact = np.abs(at - t[left]) <= slack
+    out[inside] = (v[left] + share * (v[right] - v[left]))[inside]
+    out[exact] = v[left][exact]
+    # At the ends of a stretch the nearest reading of the same period counts.
+    near = np.where(np.abs(at - t[left]) <= np.abs(at - t[right]), left, right)
+    distance = np.abs(at - t[near])
+    edge = np.isnan(out) & (distance <= 0.5 * h)
+    out[edge] = v[near][edge]
+    return out, np.isfinite(out) & (distance > 0.5 * h + slack)
+
+
+def _mean(at: Array, t: Array, v: Array, h: float) -> tuple[Array, NDArray[np.bool_]]:
+    row = np.searchsorted(at, t - 1e-6 * h, "left")
+    inside = row < len(at)
+    inside[inside] = at[row[inside]] - t[inside] < h * (1 - 1e-6)
+    count = np.bincount(row[inside], minlength=len(at))
+    total = np.bincount(row[inside], weights=v[inside], minlength=len(at))
+    usual = np.median(count[count > 0]) if count.any() else 1.0
+    enough = count >= max(1.0, 0.3 * usual)
+    return np.where(enough, total / np.maximum(count, 1), np.nan), enough & (count < 0.7 * usual)
+
+
+def _held(at: Array, t: Array, v: Array, h: float, hold_s: float, thin: bool) -> tuple[Array, NDArray[np.bool_]]:
+    if not t.size:
+        return np.full(len(at), np.nan), np.zeros(len(at), dtype=bool)
+    middle = at + 0.5 * h
+    last = np.searchsorted(t, middle, "right") - 1
+    age = middle - t[np.maximum(last, 0)]
+    ok = (last >= 0) & (age <= hold_s + 0.5 * h)
+    out = np.where(ok, v[np.maximum(last, 0)], np.nan)
+    if thin:
+        area = np.r_[0.0, np.cumsum(v[:-1] * np.diff(t))]
+
+        def integral(x: Array) -> Array:
+            k = np.clip(np.searchsorted(t, x, "right") - 1, 0, len(t) - 1)
+            return area[k] + v[k] * (x - t[k])
+
+        mean = (integral(at + h) - integral(at)) / h
+        out = np.where(ok & (at >= t[0]), mean, out)
+    return out, ok & (age > 1.1 * h)
+
+
+def _reasons(at: Array, s: Series, out: Array, h: float) -> Codes:
+    """Of rows without a value, the reason of the bad reading nearest to them within a period; else GAP."""
+    code = np.zeros(len(at), np.uint8)
+    lost = np.flatnonzero(~np.isfinite(out))
+    if not lost.size:
+        return code
+    code[lost] = Reason.GAP
+    bad = np.flatnonzero(~s.good & (s.code != Reason.DUPLICATE))
+    if bad.size:
+        t = s.time_s[bad]
+        right = np.clip(np.searchsorted(t, at[lost]), 0, len(t) - 1)
+        left = np.maximum(right - 1, 0)
+        near = np.where(np.abs(t[left] - at[lost]) <= np.abs(t[right] - at[lost]), left, right)
+        close = np.abs(t[near] - at[lost]) <= 1.05 * h
+        code[lost[close]] = s.code[bad[near[close]]]
+    return code

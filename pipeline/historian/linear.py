@@ -1,0 +1,156 @@
+"""A quick linear model of one PV: not for control, but to tell an outlier from an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.metrics import Array
+
+Y_LAGS = 3
+BLOCKS = ((0, 1), (1, 2), (2, 3), (3, 6), (6, 11), (11, 21), (21, 41))  # lags of an input that share a coefficient
+SLOW = ((41, 81), (81, 161), (161, 321))  # cut where the record begins
+AHEAD = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
+MOST_ROWS, WINDOW_ROWS = 60_000, 3_000  # of the fit, in windows spread evenly over the record
+OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
+LEAST_ROWS = 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """y(k+1) = sum a_i y(k-i) + sum_j b_j mean(u over block j) + c, fitted by least squares.
+
+    ``strength`` is the Wald statistic of an input's coefficients over their number, about 1 without an effect.
+    """
+
+    a: Array  # (Y_LAGS,)
+    b: Array  # (n_inputs, len(blocks)) per block
+    c: float
+    blocks: tuple[tuple[int, int], ...]
+    sd: float  # of the residual, robust
+    strength: Mapping[int, float]  # input -> statistic
+    ahead: Mapping[int, tuple[float, int]]  # input -> statistic of lags ahead, and by how many rows they lead
+    explained: float  # share of the variance of y(k+1) - y(k)
+    rows: NDArray[np.int64]  # (n,) rows k of the fit
+    residual: Array  # (n,)
+    unexplained: Array  # (n,) what is left of y when only the inputs explain it, their slow parts too
+
+    def step_response(self, i: int, length: int = 600) -> Array:
+        """Answer of y to a unit step of input ``i`` at k = 0, (length,)."""
+        y = np.zeros(length + Y_LAGS)
+        drive = np.zeros(length)
+        for (first, last), b in zip(self.blocks, self.b[i], strict=True):
+            for lag in range(first, last):
+                drive[lag:] += b / (last - first)
+        for k in range(length - 1):
+            past = y[k + Y_LAGS - 1 - np.arange(Y_LAGS)] if k >= 0 else y[:Y_LAGS]
+            y[k + Y_LAGS] = self.a @ past + drive[k]
+        return y[Y_LAGS - 1 : -1]
+
+    def settling(self, i: int, length: int = 600) -> int:
+        """Rows after which the answer to input ``i`` stays within 10 % of its end; 0 where it has none."""
+        answer = self.step_response(i, length)
+        if not np.isfinite(answer).all() or abs(answer[-1]) <= 1e-12:
+            return 0
+        outside = np.flatnonzero(np.abs(answer - answer[-1]) > 0.1 * abs(answer[-1]))
+        return int(outside[-1]) + 1 if outside.size else 1
+
+
+def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
+    """The model of y (n,) from inputs u (n, m) within runs (n,); None where too few rows or no motion are there.
+
+    Rows with NaN take no part. At most MOST_ROWS rows are used, in windows spread evenly.
+    """
+    blocks: tuple[tuple[int, int], ...] = BLOCKS
+    while True:
+        rows = _rows(y, u, run, blocks[-1][1] - 1)
+        parameters = Y_LAGS + 1 + u.shape[1] * (len(blocks) + len(AHEAD))
+        if len(rows) >= max(LEAST_ROWS, 3 * parameters):
+            break
+        if len(blocks) <= 3:
+            return None
+        blocks = blocks[:-1]
+    target = y[rows + 1]
+    past = np.column_stack([y[rows - i] for i in range(Y_LAGS)])
+    if np.ptp(target) <= 0:
+        return None
+    inputs = [_blocks(u[:, i], rows, blocks) for i in range(u.shape[1])]
+    ahead = [_blocks(u[:, i], rows, AHEAD) for i in range(u.shape[1])]
+    x = np.column_stack([past, *inputs, np.ones(len(rows))])
+    theta, cov, keep = _least_squares(x, target)
+    residual = target - x @ theta
+    sd = _robust_sd(residual[keep])
+    m = len(blocks)
+    places = {i: slice(Y_LAGS + i * m, Y_LAGS + (i + 1) * m) for i in range(u.shape[1])}
+    strength = {i: _wald(theta[p], cov[p, p]) for i, p in places.items()}
+    growth = np.var((target - past[:, 0])[keep])
+    explained = 1.0 - np.var(residual[keep]) / growth if growth > 0 else 0.0
+    b = np.array([theta[p] for p in places.values()]).reshape(u.shape[1], m)
+    slow = [_blocks(u[:, i], rows, SLOW) for i in range(u.shape[1])]
+    static = np.column_stack([*inputs, *slow, np.ones(len(rows))])
+    unexplained = target - static @ _least_squares(static, target)[0]
+    early = {i: _early(x, ahead[i], target) for i in range(u.shape[1])}
+    return Linear(
+        theta[:Y_LAGS], b, float(theta[-1]), blocks, sd, strength, early, float(explained), rows, residual, unexplained
+    )
+
+
+def _rows(y: Array, u: Array, run: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
+    """Rows k with lag rows before and five after in their run, without NaN, in windows spread evenly."""
+    after = -AHEAD[-1][0]
+    lag = max(lag, Y_LAGS - 1)
+    ok = np.isfinite(y) & np.isfinite(u).all(axis=1)
+    bad = np.r_[0, np.cumsum(~ok)]
+    k = np.arange(lag, len(y) - after)
+    k = k[(run[k - lag] == run[k + after]) & (bad[k + after + 1] == bad[k - lag])]
+    if len(k) > MOST_ROWS:
+        starts = np.linspace(0, len(k) - WINDOW_ROWS, MOST_ROWS // WINDOW_ROWS).astype(np.int64)
+        k = k[np.unique((starts[:, None] + np.arange(WINDOW_ROWS)).ravel())]
+    return k
+
+
+def _blocks(u: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
+    """Means of u over lags first .. last-1 of each row, (n, blocks)."""
+    total = np.r_[0.0, np.cumsum(np.nan_to_num(u - np.nanmean(u)))]
+    return np.column_stack(
+        [(total[np.maximum(rows - a + 1, 0)] - total[np.maximum(rows - b + 1, 0)]) / (b - a) for a, b in blocks]
+    )
+
+
+def _least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Coefficients and their covariance, from the rows whose residual is within OUTSIDE_SD of a first fit."""
+    scale = np.abs(x).max(axis=0)
+    scale[scale == 0] = 1.0  # an input that never moves
+    z = x / scale
+    keep = np.ones(len(z), dtype=bool)
+    for _ in range(2):
+        gram = z[keep].T @ z[keep]
+        gram[np.diag_indices_from(gram)] += 1e-9 * np.trace(gram) / len(gram)
+        inverse = np.linalg.pinv(gram, hermitian=True)
+        theta = inverse @ (z[keep].T @ target[keep])
+        residual = target - z @ theta
+        used, sd = keep, _robust_sd(residual)
+        keep = np.abs(residual) <= max(OUTSIDE_SD * sd, 1e-12 * np.abs(target).max())
+    variance = float(np.mean(residual[used] ** 2)) * used.sum() / max(used.sum() - z.shape[1], 1)
+    return theta / scale, variance * inverse / np.outer(scale, scale), used
+
+
+def _wald(theta: Array, cov: Array) -> float:
+    value = float(theta @ np.linalg.pinv(cov, hermitian=True) @ theta) / len(theta)
+    return value if np.isfinite(value) and value > 0 else 0.0
+
+
+def _early(x: Array, ahead: Array, target: Array) -> tuple[float, int]:
+    """Whether moves still to come improve the fit: their Wald statistic, and the lead [rows] of the strongest."""
+    theta, cov, _ = _least_squares(np.column_stack([x, ahead]), target)
+    m = x.shape[1]
+    t = np.abs(theta[m:]) / np.sqrt(np.maximum(np.diag(cov)[m:], 1e-300))
+    best = int(np.argmax(t)) if np.isfinite(t).all() else 0
+    return _wald(theta[m:], cov[m:, m:]), -AHEAD[best][1] + 1
+
+
+def _robust_sd(residual: Array) -> float:
+    return float(1.4826 * np.median(np.abs(residual - np.median(residual))))

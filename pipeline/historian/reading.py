@@ -1,0 +1,253 @@
+"""Files of an export -> series, in blocks, so that a file much larger than its series can be read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
+
+from pipeline.errors import RecordError, nearest
+from pipeline.files import sha256
+from pipeline.historian.dialect import Dialect, sniff
+from pipeline.historian.export import Export, Series, joined
+from pipeline.historian.layout import Layout, layout_of
+from pipeline.historian.numbers import numbers
+from pipeline.historian.quality import good_quality
+from pipeline.historian.reason import Reason
+from pipeline.historian.times import Clock
+from pipeline.records.record_file import split_column
+
+BLOCK_BYTES = 1 << 24
+BLOCK_ROWS = 1 << 17
+PARQUET = {".parquet", ".pq"}
+
+
+@dataclass(slots=True)
+class Source:
+    """One file: its columns, its first rows, and its blocks of chosen columns."""
+
+    path: Path
+    header: tuple[str, ...]
+    sample: Mapping[str, Sequence[Any]]
+    units: Mapping[str, str]
+    decimal: str
+    blocks: Callable[[Sequence[str]], Iterator[Any]]
+    unreadable: Counter[str]  # "rows": lines of another length than the header's
+
+
+def open_source(path: Path) -> Source:
+    """The file's header and first rows; RecordError where it cannot be read as a table."""
+    if path.is_dir():
+        raise RecordError(f"{path} is a folder; give the files in it, as in {path}/*.csv")
+    if not path.exists():
+        raise RecordError(f"{path}: no such file; give the path of an export")
+    try:
+        return _parquet(path) if path.suffix.lower() in PARQUET else _text(path, sniff(path))
+    except (pa.ArrowException, OSError, UnicodeError, LookupError, EOFError) as error:
+        raise RecordError(f"{path} cannot be read: {str(error).splitlines()[0]}; export the file again") from None
+
+
+def read_export(
+    paths: Sequence[Path],
+    tags: Sequence[str] = (),
+    modes: Sequence[str] = (),
+    time_column: str = "",
+    time_format: str = "",
+) -> Export:
+    """The series of ``tags`` and ``modes`` (texts allowed) of all files; of every column where none is named.
+
+    Raises RecordError for a file that cannot be read, a tag that none of them has, time that cannot be read.
+    """
+    if not paths:
+        raise RecordError("no file is named; give one or more exports")
+    parts: dict[str, list[Series]] = {}
+    files, kinds, totals = [], [], Counter[str]()
+    known: set[str] = set()
+    tags, modes = [bare(t) for t in tags], [bare(t) for t in modes]
+    for path in paths:
+        source = open_source(path)
+        layout = layout_of(source.path, source.header, source.sample, time_column, time_format)
+        found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
+        for name, series in found.items():
+            parts.setdefault(name, []).append(series)
+        totals += counts + source.unreadable
+        kinds.append(layout.kind)
+        files.append((str(path), sha256(path)))
+        known |= set(found) if layout.kind == "long" else set(map(bare, layout.values))
+    for tag in (*tags, *modes):
+        if tag not in parts:
+            raise RecordError(f"{', '.join(map(str, paths))}: no tag {tag!r}{nearest(tag, known)}")
+    if not totals["rows_read"]:
+        raise RecordError(f"{', '.join(map(str, paths))}: no row of data; export a longer time")
+    together = {name: joined(p) for name, p in parts.items()}
+    layouts = " and ".join(dict.fromkeys(kinds))
+    return Export(
+        together, tuple(files), layouts, totals["rows_read"] + totals["rows"], totals["rows"], totals["timeless"]
+    )
+
+
+def units_of(paths: Sequence[Path]) -> dict[str, str]:
+    """Column -> the unit that a row below the header or brackets in the header name."""
+    found: dict[str, str] = {}
+    for path in paths:
+        found |= {bare(k): v for k, v in open_source(path).units.items() if v}
+    return found
+
+
+def bare(column: str) -> str:
+    """The tag that a header names, without its unit."""
+    return split_column(column)[0]
+
+
+# ---------------------------------------------------------------------- one file
+def _read(source: Source, layout: Layout, wanted: set[str], modes: set[str]) -> tuple[dict[str, Series], Counter[str]]:
+    gather = _Gather(modes, source.decimal, layout.clock)
+    counts: Counter[str] = Counter()
+    values = {v: bare(v) for v in layout.values if not wanted or {v, bare(v)} & wanted or layout.kind == "long"}
+    qualities = {v: layout.quality[v] for v in values if v in layout.quality}
+    names = [n for n in dict.fromkeys((layout.time, layout.tag, *values, *qualities.values())) if n]
+    try:
+        for block in source.blocks(names):
+            counts["rows_read"] += block.num_rows
+            seconds = gather.times(block.column(layout.time), counts)
+            if layout.kind == "wide":
+                for v, name in values.items():
+                    gather.add(name, seconds, block.column(v), block.column(qualities[v]) if v in qualities else None)
+            else:
+                _long_block(gather, layout, block, seconds, wanted)
+    except (pa.ArrowException, OSError, UnicodeError, EOFError) as error:
+        raise RecordError(
+            f"{source.path} cannot be read: {str(error).splitlines()[0]}; export the file again"
+        ) from None
+    if counts["rows_read"] and counts["timeless"] == counts["rows_read"]:
+        raise RecordError(
+            f"{source.path}: no time of column {layout.time!r} can be read; name the column with --time, its form with "
+            "--time-format"
+        )
+    return gather.series(), counts
+
+
+def _long_block(gather: _Gather, layout: Layout, block: Any, seconds: Any, wanted: set[str]) -> None:
+    """Share a block of (tag, time, value, quality) out among the tags."""
+    tags = block.column(layout.tag)
+    tags = tags if pa.types.is_dictionary(tags.type) else tags.cast(pa.string()).dictionary_encode()
+    tags = tags.combine_chunks() if isinstance(tags, pa.ChunkedArray) else tags
+    index = np.asarray(tags.indices.fill_null(-1).to_numpy(zero_copy_only=False))
+    (value,) = layout.values
+    quality = layout.quality.get(value)
+    for i, name in enumerate(tags.dictionary.to_pylist()):
+        name = str(name).strip()
+        rows = np.flatnonzero(index == i)
+        if rows.size and (not wanted or name in wanted):
+            part = block.take(pa.array(rows))
+            gather.add(name, seconds[rows], part.column(value), part.column(quality) if quality else None)
+
+
+class _Gather:
+    """Blocks of readings, put together at the end."""
+
+    def __init__(self, modes: set[str], decimal: str, clock: Clock) -> None:
+        self.modes, self.decimal, self.clock = modes, decimal, clock
+        self.parts: dict[str, list[tuple[Any, Any, Any]]] = {}
+        self.texts: dict[str, Counter[str]] = {}
+        self.names: dict[str, dict[str, int]] = {}
+
+    def times(self, column: Any, counts: Counter[str]) -> Any:
+        seconds = self.clock.seconds(column)
+        counts["timeless"] += int(np.count_nonzero(~np.isfinite(seconds)))
+        return seconds
+
+    def add(self, name: str, seconds: Any, column: Any, quality: Any) -> None:
+        if name in self.modes:
+            known = self.names.setdefault(name, {})
+            cells = [("" if c is None else str(c).strip()) for c in column.to_pylist()]
+            values = np.array([known.setdefault(c, len(known)) if c else np.nan for c in cells], dtype=np.float64)
+            codes = np.where(np.isnan(values), np.uint8(Reason.EMPTY), np.uint8(Reason.GOOD))
+        else:
+            values, codes, texts = numbers(column, self.decimal)
+            self.texts.setdefault(name, Counter()).update(texts)
+        if quality is not None:
+            codes[~good_quality(quality) & (codes == Reason.GOOD)] = Reason.QUALITY
+        timed = np.isfinite(seconds)
+        if not timed.all():
+            seconds, values, codes = seconds[timed], values[timed], codes[timed]
+        self.parts.setdefault(name, []).append((seconds, values, codes))
+
+    def series(self) -> dict[str, Series]:
+        found, shared = {}, _Shared()
+        for name in list(self.parts):
+            times, values, codes = zip(*self.parts.pop(name), strict=True)
+            found[name] = Series(
+                name,
+                shared.joined(times),
+                np.concatenate(values),
+                np.concatenate(codes),
+                self.texts.get(name, Counter()),
+                tuple(self.names.get(name, ())),
+            )
+        return found
+
+
+class _Shared:
+    """The time of a wide file stands once in memory, however many columns it has."""
+
+    def __init__(self) -> None:
+        self.last: tuple[Any, ...] = ()
+        self.whole: Any = None
+
+    def joined(self, times: tuple[Any, ...]) -> Any:
+        if len(times) != len(self.last) or any(a is not b for a, b in zip(times, self.last, strict=True)):
+            self.last, self.whole = times, np.concatenate(times)
+        return self.whole
+
+
+# ---------------------------------------------------------------------- formats
+def _parquet(path: Path) -> Source:
+    file = pq.ParquetFile(path)
+    header = tuple(file.schema_arrow.names)
+    if not header:
+        raise RecordError(f"{path}: the file has no columns")
+    first = next(file.iter_batches(batch_size=200), None)
+    sample = {n: first.column(i).to_pylist() if first is not None else [] for i, n in enumerate(header)}
+
+    def blocks(names: Sequence[str]) -> Iterator[Any]:
+        return pq.ParquetFile(path).iter_batches(batch_size=BLOCK_ROWS, columns=list(names))
+
+    return Source(path, header, sample, {n: split_column(n)[1] for n in header}, ".", blocks, Counter())
+
+
+def _text(path: Path, dialect: Dialect) -> Source:
+    sample = {n: [row[i] for row in dialect.rows] for i, n in enumerate(dialect.header)}
+    unreadable: Counter[str] = Counter()
+
+    def skip(_row: Any) -> str:
+        unreadable["rows"] += 1
+        return "skip"
+
+    def blocks(names: Sequence[str]) -> Iterator[Any]:
+        stream = pa.input_stream(str(path), compression="gzip" if path.suffix.lower() == ".gz" else None)
+        encoding = "utf8" if dialect.encoding in {"utf-8", "utf-8-sig"} else dialect.encoding
+        yield from pa_csv.open_csv(
+            stream,
+            read_options=pa_csv.ReadOptions(
+                block_size=BLOCK_BYTES,
+                column_names=list(dialect.header),
+                skip_rows=dialect.first_line,
+                encoding=encoding,
+                use_threads=False,
+            ),
+            parse_options=pa_csv.ParseOptions(delimiter=dialect.separator, invalid_row_handler=skip),
+            convert_options=pa_csv.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.string()), include_columns=list(names), strings_can_be_null=False
+            ),
+        )
+
+    units = {n: unit or split_column(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
+    return Source(path, dialect.header, sample, units, dialect.decimal, blocks, unreadable)

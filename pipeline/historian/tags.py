@@ -1,0 +1,157 @@
+"""Tags: which column is which signal, as options (`TIC-101.PV[degC]=0..200`) and as a table for a person to correct."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pipeline.errors import RecordError, nearest
+from pipeline.files import write_text
+from serving.manifest import MAX_NAME, Signal
+
+ROLES = ("pv", "mv", "dv", "sp", "mode")
+SIGNAL_ROLES = ("pv", "mv", "dv")
+COLUMNS = ("tag", "role", "name", "unit", "low", "high", "step", "good_percent", "remark")
+OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
+UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """A column of the export and what it is in the plant; the range is None where the data give it."""
+
+    tag: str
+    role: str  # pv, mv, dv, sp, mode; "" is not used
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    name: str = ""  # of the signal; "" is the tag's own, made safe
+
+    def signal(self, low: float, high: float) -> Signal:
+        """The signal of the tag; ``low`` and ``high`` count where the tag has none."""
+        low, high = (low if self.low is None else self.low), (high if self.high is None else self.high)
+        return Signal(self.name or safe_name(self.tag), self.unit, low, high)
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """One line of the table: the tag as guessed, and what its readings look like."""
+
+    tag: Tag
+    step: float  # smallest step between two values; 0 where it has none
+    good: float  # share of good readings
+    remark: str
+
+
+def safe_name(tag: str) -> str:
+    """A name that a manifest, a column `NAME [unit]` and a picture can hold: Latin letters, digits, and _ . - / : #."""
+    plain = unicodedata.normalize("NFKD", tag.replace("ß", "ss").replace("µ", "u"))
+    plain = "".join(c for c in plain if not unicodedata.combining(c))
+    name = UNSAFE.sub("-", plain).strip("-")[:MAX_NAME]
+    return name or "signal"
+
+
+def named(tags: Sequence[Tag]) -> tuple[Tag, ...]:
+    """The tags with safe names, no two of them the same."""
+    taken: set[str] = set()
+    found = []
+    for tag in tags:
+        base = safe_name(tag.name or tag.tag)
+        name, i = base, 2
+        while name in taken:
+            name, i = f"{base}-{i}", i + 1
+        taken.add(name)
+        found.append(replace(tag, name=name))
+    return tuple(found)
+
+
+def parse_tag(text: str, role: str) -> Tag:
+    """A tag of an option: ``TAG``, ``TAG[unit]``, ``TAG[unit]=LOW..HIGH``; RecordError for another form."""
+    match = OPTION.match(text.strip())
+    if match is None or "]" in match["tag"]:
+        raise RecordError(
+            f"--{role} {text}: write TAG, TAG[unit] or TAG[unit]=LOW..HIGH, as in TIC-101.PV[degC]=0..200"
+        )
+    low, high = (_number(match[key], f"--{role} {text}") if match[key] else None for key in ("low", "high"))
+    tag = Tag(match["tag"].strip(), role, (match["unit"] or "").strip(), low, high)
+    _check_range(tag, f"--{role} {text}")
+    return tag
+
+
+def check_tags(tags: Sequence[Tag], where: str) -> None:
+    """RecordError unless there are a PV and an MV, and every tag has one role."""
+    for role, words in (("pv", "process variable"), ("mv", "manipulated variable")):
+        if not any(t.role == role for t in tags):
+            raise RecordError(f"{where}: no {words} is named; give at least one --{role} TAG, or role {role} in --tags")
+    names = [t.tag for t in tags]
+    twice = [n for n in names if names.count(n) > 1]
+    if twice:
+        raise RecordError(f"{where}: {twice[0]!r} is named twice; each tag has one role")
+
+
+def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
+    """The table of all tags, for a person to correct; RecordError where the file is there already."""
+    if path.exists():
+        raise RecordError(f"{path} is there already; correct it and give --tags {path}, or remove it for a new one")
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(COLUMNS)
+    for g in guesses:
+        t = g.tag
+        low, high = ("" if v is None else f"{v:.6g}" for v in (t.low, t.high))
+        good = f"{100 * g.good:.2f}"
+        rows.writerow([t.tag, t.role, safe_name(t.tag), t.unit, low, high, f"{g.step:.6g}", good, g.remark])
+    write_text(path, out.getvalue())
+
+
+def read_tags(path: Path) -> tuple[Tag, ...]:
+    """The tags that have a role in a corrected table; RecordError names line and column of a mistake.
+
+    A spreadsheet's semicolons and decimal commas are read too.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise RecordError(f"{path}: no such file; `loopwright new NAME FILE` without roles writes one") from None
+    except UnicodeDecodeError:
+        text = path.read_text(encoding="cp1252")
+    separator = max(",;\t", key=text.partition("\n")[0].count)
+    rows = list(csv.reader(io.StringIO(text), delimiter=separator))
+    header = [h.strip().lower() for h in rows[0]] if rows else []
+    for column in ("tag", "role"):
+        if column not in header:
+            raise RecordError(f"{path}: column {column!r} is missing; the table has {', '.join(COLUMNS)}")
+    found = []
+    for line, row in enumerate(rows[1:], start=2):
+        cells = dict(zip(header, (c.strip() for c in row), strict=False))
+        role = cells.get("role", "").lower()
+        if not cells.get("tag") or role in {"", "-", "ignore", "none"}:
+            continue
+        where = f"{path}, line {line} ({cells['tag']})"
+        if role not in ROLES:
+            raise RecordError(f"{where}: role {role!r}{nearest(role, ROLES)}; leave it empty for a tag without one")
+        low, high = (_number(cells[k], f"{where}, {k}") if cells.get(k) else None for k in ("low", "high"))
+        tag = Tag(cells["tag"], role, cells.get("unit", ""), low, high, cells.get("name", ""))
+        _check_range(tag, where)
+        found.append(tag)
+    return tuple(found)
+
+
+def _check_range(tag: Tag, where: str) -> None:
+    if tag.low is not None and tag.high is not None and not tag.low < tag.high:
+        raise RecordError(f"{where}: the range is {tag.low:g} to {tag.high:g}; low must be below high")
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        value = float(text.strip().replace(",", "."))
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise RecordError(f"{where}: {text!r} is no finite number")
+    return value

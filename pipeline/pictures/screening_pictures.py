@@ -1,0 +1,215 @@
+"""Pictures of a screening: trends with their masks, the first stretch of every fault, readings by reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from pipeline.historian.character import runs_of
+from pipeline.historian.findings import TagReport
+from pipeline.historian.reason import Reason
+from pipeline.historian.screening import Screened
+from pipeline.metrics import Array
+from pipeline.pictures.drawing import SIZE, STYLE, axis_label, legend_below, time_axis
+
+COLOURS = {
+    Reason.EMPTY: "#bbbbbb", Reason.TEXT: "#8c564b", Reason.QUALITY: "#332288", Reason.SENTINEL: "#d55e00",
+    Reason.RANGE: "#882255", Reason.UNIT_SLIP: "#cc79a7", Reason.OUTLIER: "#e69f00", Reason.DUPLICATE: "#dddddd",
+    Reason.CLOCK: "#44aa99", Reason.GAP: "#999999", Reason.STUCK: "#009e73", Reason.SATURATED: "#56b4e9",
+    Reason.MODE: "#ddcc77", Reason.SHORT_RUN: "#777777",
+}  # fmt: skip
+LINE = "#0072b2"
+POINTS = 3000  # of a line; more are drawn by their extremes
+PANEL, HEAD = 1.35, 1.0  # inches
+MOST_PANELS, MOST_DETAILS = 8, 6
+MOST_SPANS = 400
+AROUND, AROUND_SHARE = 25, 0.6  # rows beside a detail, or this share of its length
+
+
+def trends(found: Screened) -> Canvas:
+    """Every signal over time: what is kept as a line, rows left out shaded by reason, bad readings as ticks below."""
+    tags = [t for t in found.report.tags if t.role != "mode"][:MOST_PANELS]
+    with rc_context(STYLE):
+        canvas = Canvas(figsize=(SIZE[0] * 1.25, HEAD + PANEL * len(tags)), layout="constrained")
+        panels = canvas.subplots(len(tags), 1, sharex=True, squeeze=False)[:, 0]
+        start = found.grid.time_s[0]
+        _, label = time_axis(found.grid.time_s - start)
+        seen: set[Reason] = set()
+        for axes, tag in zip(panels, tags, strict=True):
+            seen |= _trend(axes, found, tag, start)
+        panels[-1].set_xlabel(label)
+        if seen:
+            _reason_legend(canvas, seen)
+        return canvas
+
+
+def _trend(axes: Axes, found: Screened, tag: TagReport, start: float) -> set[Reason]:
+    grid, series = found.grid, found.series[tag.tag]
+    at = _in_unit(grid.time_s - start, grid.time_s[-1] - start)
+    values = grid.value[tag.tag]
+    fresh = np.r_[True, np.diff(grid.piece) > 0]
+    for mask, colour in ((found.code > 0, "#c8c8c8"), (found.code == 0, LINE)):
+        axes.plot(*_stretches(at, values, mask, fresh), color=colour, linewidth=0.9)
+    seen = _shade(axes, at, found.code)
+    for k in np.flatnonzero(fresh[1:])[:MOST_SPANS]:
+        axes.axvspan(at[k], at[k + 1], color=COLOURS[Reason.GAP], alpha=0.3, linewidth=0)
+        seen.add(Reason.GAP)
+    finite = values[np.isfinite(values)]
+    if finite.size:
+        low, high = np.quantile(finite, [0.001, 0.999])
+        pad = 0.08 * (high - low) or 1.0
+        axes.set_ylim(low - 2 * pad, high + pad)
+    bad = np.flatnonzero((series.code > 0) & (series.code != Reason.DUPLICATE))
+    bad = bad[:: max(1, len(bad) // POINTS)]
+    for reason in np.unique(series.code[bad]):
+        own = bad[series.code[bad] == reason]
+        x = _in_unit(series.time_s[own] - start, grid.time_s[-1] - start)
+        axes.plot(x, np.full(len(x), 0.05), "|", color=COLOURS[Reason(reason)], transform=axes.get_xaxis_transform(),
+                  markersize=7, markeredgewidth=1.2, zorder=4)  # fmt: skip
+        seen.add(Reason(reason))
+    # In the picture's own words; a name may hold any sign.
+    axes.set_title(f"{axis_label(tag.name, tag.unit)}  ({tag.role.upper()})", fontsize=9.5, parse_math=False)
+    axes.margins(x=0.005)
+    return seen
+
+
+def details(found: Screened) -> Canvas | None:
+    """Readings around the first stretch of every reason of every tag, at most MOST_DETAILS; None without any."""
+    wanted = [
+        (tag, Reason(r))
+        for r in sorted(Reason)
+        for tag in found.report.tags
+        if r not in {Reason.GOOD, Reason.DUPLICATE, Reason.MODE, Reason.SHORT_RUN, Reason.GAP} and tag.role != "mode"
+        and (np.any(found.series[tag.tag].code == r) or np.any(found.grid.code[tag.tag] == r))
+    ][:MOST_DETAILS]  # fmt: skip
+    if not wanted:
+        return None
+    rows = (len(wanted) + 1) // 2
+    with rc_context(STYLE):
+        canvas = Canvas(figsize=(SIZE[0] * 1.25, 0.3 + 2.0 * rows), layout="constrained")
+        panels = canvas.subplots(rows, 2, squeeze=False).ravel()
+        for axes, (tag, reason) in zip(panels, wanted, strict=False):
+            _detail(axes, found, tag, reason)
+        for axes in panels[len(wanted) :]:
+            axes.set_axis_off()
+        return canvas
+
+
+def _detail(axes: Axes, found: Screened, tag: TagReport, reason: Reason) -> None:
+    series, grid = found.series[tag.tag], found.grid
+    raw = bool(np.any(series.code == reason))
+    times = series.time_s if raw else grid.time_s
+    start, end = runs_of(series.code == reason if raw else grid.code[tag.tag] == reason)
+    longest = int(np.argmax(end - start))
+    a, b = int(start[longest]), int(end[longest]) - 1
+    around = max(AROUND, int(AROUND_SHARE * (b - a)))
+    first, last = times[max(a - around, 0)], times[min(b + around, len(times) - 1)]
+    near = (series.time_s >= first) & (series.time_s <= last)
+    t = series.time_s[near] - grid.time_s[0]
+    x, label = time_axis(t)
+    v, code = series.value[near], series.code[near]
+    good = code == Reason.GOOD
+    axes.plot(x[good], v[good], ".-", color=LINE, linewidth=0.8, markersize=3)
+    # A code for a missing value has no place on the axis of the others.
+    bad = (code == reason) & np.isfinite(v) & (reason is not Reason.SENTINEL)
+    axes.plot(x[bad], v[bad], "o", color=COLOURS[reason], markersize=4)
+    lost = (code == reason) & ~bad
+    axes.plot(x[lost], np.full(lost.sum(), 0.04), "|", color=COLOURS[reason], transform=axes.get_xaxis_transform(),
+              markersize=9, markeredgewidth=1.5)  # fmt: skip
+    if not raw:
+        own = (grid.time_s >= first) & (grid.time_s <= last) & (grid.code[tag.tag] == reason)
+        scale = (x[-1] - x[0]) / max(t[-1] - t[0], 1e-9)
+        masked = (grid.time_s[own] - grid.time_s[0]) * scale, grid.value[tag.tag][own]
+        axes.plot(*masked, "o", color=COLOURS[reason], markersize=3)
+    axes.set_title(f"{tag.name}: {reason.words}", fontsize=9.5, parse_math=False)
+    axes.set_xlabel(label, fontsize=8.5)
+    axes.tick_params(labelsize=8.5)
+
+
+def readings(found: Screened) -> Canvas:
+    """Bad readings of every tag by reason, in percent of its readings."""
+    tags = list(found.report.tags)
+    with rc_context(STYLE):
+        canvas = Canvas(figsize=(SIZE[0] * 1.25, HEAD + 0.6 + 0.32 * len(tags)), layout="constrained")
+        axes = canvas.subplots()
+        left = np.zeros(len(tags))
+        seen: set[Reason] = set()
+        for reason in Reason:
+            if reason is Reason.GOOD:
+                continue
+            key = reason.name.lower()
+            share = np.array([100 * _count(t, key) / max(sum(t.readings.values()), 1) for t in tags])
+            if share.any():
+                axes.barh(range(len(tags)), share, left=left, color=COLOURS[reason], height=0.65)
+                left += share
+                seen.add(reason)
+        axes.set_yticks(range(len(tags)), [t.name for t in tags], parse_math=False)
+        axes.invert_yaxis()
+        axes.set_xlabel("readings or rows left out [% of the tag's readings]")
+        axes.set_xlim(0, max(float(left.max()) * 1.05, 1e-3))
+        axes.grid(axis="y", visible=False)
+        if seen:
+            _reason_legend(canvas, seen)
+        return canvas
+
+
+def _count(tag: TagReport, key: str) -> int:
+    return tag.readings.get(key, 0) or tag.rows_lost.get(key, 0)
+
+
+def _shade(axes: Axes, at: Array, code: NDArray[np.uint8]) -> set[Reason]:
+    seen = set()
+    for reason in np.unique(code[code > 0]):
+        start, end = runs_of(code == reason)
+        order = np.argsort(start - end)[:MOST_SPANS]
+        for a, b in zip(start[order], end[order], strict=True):
+            axes.axvspan(at[a], at[min(b, len(at) - 1)], color=COLOURS[Reason(reason)], alpha=0.3, linewidth=0)
+        seen.add(Reason(reason))
+    return seen
+
+
+def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
+    """At most about 2 POINTS points with the same extremes."""
+    if len(x) <= 2 * POINTS:
+        return x, y
+    block = len(x) // POINTS
+    n = len(x) // block * block
+    shaped = y[:n].reshape(-1, block)
+    empty = np.isnan(shaped).all(axis=1)
+    filled = np.where(np.isnan(shaped), np.inf, shaped)
+    low = np.where(empty, np.nan, filled.min(axis=1))
+    high = np.where(empty, np.nan, np.where(np.isinf(filled), -np.inf, filled).max(axis=1))
+    return np.repeat(x[:n:block], 2), np.column_stack([low, high]).ravel()
+
+
+def _stretches(x: Array, y: Array, mask: NDArray[np.bool_], fresh: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """The points of every stretch of ``mask``, with a break between two; ``fresh`` rows begin a stretch."""
+    rows = np.flatnonzero(mask)
+    if not rows.size:
+        return np.zeros(0), np.zeros(0)
+    cuts = np.flatnonzero((np.diff(rows) > 1) | fresh[rows[1:]]) + 1
+    if len(cuts) > MOST_SPANS:
+        return _thinned(x, np.where(mask, y, np.nan))
+    parts = [_thinned(x[part], y[part]) for part in np.split(rows, cuts)]
+    end = np.array([np.nan])
+    columns = ([np.concatenate([part[i], end]) for part in parts] for i in (0, 1))
+    first, second = (np.concatenate(column) for column in columns)
+    return first, second
+
+
+def _in_unit(time_s: Array, whole_s: float) -> Array:
+    """Times in the unit of an axis of length ``whole_s``."""
+    scale = time_axis(np.array([0.0, whole_s]))[0][1] / whole_s if whole_s > 0 else 1.0
+    return np.asarray(time_s * scale)
+
+
+def _reason_legend(canvas: Canvas, seen: set[Reason]) -> None:
+    order = sorted(seen)
+    patches: list[Any] = [Patch(color=COLOURS[r]) for r in order]
+    legend_below(canvas, patches, [r.words for r in order], most=4)

@@ -1,0 +1,43 @@
+"""The page of a screening: one HTML file with its pictures inside."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+
+from matplotlib.figure import Figure as Canvas
+
+from pipeline.files import write_text
+from pipeline.historian.reason import Reason
+from pipeline.historian.screening import Screened
+from pipeline.historian.step_test import StepTest
+from pipeline.pictures.screening_pictures import details, readings, trends
+from pipeline.report.templating import render
+
+VERDICTS = {
+    "yes": "These data can carry a model.",
+    "doubtful": "A model of these data is doubtful.",
+    "no": "These data cannot carry a model.",
+}
+
+
+def write_page(path: Path, found: Screened, test: StepTest | None) -> None:
+    """Write the page of a screening, whole or not at all."""
+    report = found.report
+    pictures = {"trends": trends(found), "details": details(found), "readings": readings(found)}
+    content = {
+        "r": report,
+        "verdict": VERDICTS[report.verdict.carries],
+        "words": {r.name.lower(): r.words for r in Reason},
+        "pictures": {name: _inline(canvas) for name, canvas in pictures.items() if canvas is not None},
+        "kept_percent": 100.0 * report.kept_rows / report.grid_rows,
+        "test": test,
+    }
+    write_text(path, render("screening.html.j2", content))
+
+
+def _inline(canvas: Canvas) -> str:
+    buffer = io.BytesIO()
+    canvas.savefig(buffer, format="png", dpi=100, facecolor="white", metadata={"Software": None})
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,172 @@
+"""``loopwright new``: from an export to a record and a section of params.yaml, or one line and nothing written."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dirty_plant import TAGS, cells, clean, write
+
+from pipeline.__main__ import main
+from pipeline.config.plants import PlantParams
+from pipeline.files import sha256
+from pipeline.plants.signals import Signals
+from pipeline.records.record import Record
+from serving.manifest import Signal
+
+ROOT = Path(__file__).parents[2]
+ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]"]
+Tell = Callable[[], pytest.CaptureFixture[str]]
+
+
+@pytest.fixture(autouse=True)
+def _repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("params.yaml").write_text("cases:\n  taken: {}\n")
+
+
+def files() -> set[str]:
+    return {p.as_posix() for p in Path().rglob("*") if p.is_file()}
+
+
+def read_back(name: str) -> tuple[PlantParams, Record]:
+    params = PlantParams.read(name)
+    pv, dv, mv = (tuple(Signal(s.name, s.unit, s.low, s.high) for s in g) for g in (params.pv, params.dv, params.mv))
+    return params, Record.read(params.data, Signals(params.period_s, pv, pv, dv, mv))
+
+
+def test_an_export_becomes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
+    data = clean()
+    path = write(Path("x.csv"), cells(data))
+    assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    assert files() == {
+        "params.yaml", "x.csv", "data/tank/record.parquet", "data/tank/screening.json", "data/tank/screening.html",
+    }  # fmt: skip
+    params, record = read_back("tank")
+    assert (params.period_s, params.pv[0].low, params.pv[0].high) == (6.0, 0.0, 120.0)
+    assert (params.source[0].file, params.source[0].sha256) == ("x.csv", sha256(path))
+    np.testing.assert_allclose(record.pv[:, 0], data.pv)
+    report = json.loads(Path("data/tank/screening.json").read_text())
+    assert report["kept_rows"] == len(record)
+    page = Path("data/tank/screening.html").read_text()
+    assert 'src="data:image/png' in page
+    assert "http://" not in page
+    assert "https://" not in page
+    assert "can these data carry a model: yes" in capsys.readouterr().out
+
+
+def test_the_same_export_gives_the_same_bytes() -> None:
+    write(Path("x.csv"), cells(clean()))
+    for name in ("plant_a", "plant_b"):
+        assert main(["new", name, "x.csv", *ROLES]) == 0
+    assert sha256(Path("data/plant_a/record.parquet")) == sha256(Path("data/plant_b/record.parquet"))
+    pages = [Path(f"data/{n}/screening.html").read_text().replace(n, "") for n in ("plant_a", "plant_b")]
+    assert pages[0] == pages[1]
+
+
+def test_without_roles_a_table_is_written_corrected_and_read(capsys: pytest.CaptureFixture[str]) -> None:
+    header = ("timestamp", "TIC-101.PV [degC]", "TIC-101.OP [%]", "FI-7 [kg/h]")
+    write(Path("x.csv"), cells(clean()), header)
+    assert main(["new", "tank", "x.csv"]) == 0
+    assert files() == {"params.yaml", "x.csv", "tank-tags.csv"}
+    table = Path("tank-tags.csv")
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [(r["tag"], r["role"], r["unit"]) for r in rows] == [
+        ("TIC-101.PV", "pv", "degC"), ("TIC-101.OP", "mv", "%"), ("FI-7", "", "kg/h"),
+    ]  # fmt: skip
+    assert main(["new", "tank", "x.csv"]) == 2  # a corrected table is not lost
+    assert "is there already" in capsys.readouterr().err
+    table.write_text(table.read_text().replace("FI-7,,FI-7,", "FI-7,dv,Flow,"))
+    assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 0
+    params, _ = read_back("tank")
+    assert [s.name for s in (*params.pv, *params.mv, *params.dv)] == ["TIC-101.PV", "TIC-101.OP", "Flow"]
+    assert params.mv[0].high == 100.0
+
+
+def test_a_constant_mv_gets_a_step_test_and_no_section(capsys: pytest.CaptureFixture[str]) -> None:
+    data = clean()
+    write(Path("x.csv"), cells(data.with_(mv=np.full(len(data.mv), 40.0))))
+    before = Path("params.yaml").read_bytes()
+    assert main(["new", "tank", "x.csv", *ROLES]) == 2
+    assert "was not added to params.yaml: TIC-101.OP is 40 % in every row" in capsys.readouterr().err
+    assert Path("params.yaml").read_bytes() == before
+    rows = list(csv.DictReader(Path("data/tank/step_test.csv").read_text().splitlines()))
+    values = np.array([float(r["TIC-101.OP [%]"]) for r in rows])
+    assert len(rows) > 20
+    assert np.all((values >= 0) & (values <= 100))
+    assert np.ptp(values) > 10
+    at, hold = (np.array([float(r[c]) for r in rows]) for c in ("at [s]", "hold [min]"))
+    np.testing.assert_allclose(np.diff(at), 60 * hold[:-1], rtol=1e-3)
+
+
+BAD: dict[str, tuple[list[str], str]] = {
+    "no file": (["tank", "none.csv", *ROLES], "none.csv: no such file"),
+    "a folder": (["tank", ".", *ROLES], "is a folder"),
+    "a name that a case has": (["taken", "x.csv", *ROLES], "cases has 'taken' already"),
+    "no name": (["Tank 1", "x.csv", *ROLES], "cannot be a plant's"),
+    "no MV": (["tank", "x.csv", "--pv", "TIC-101.PV"], "no manipulated variable is named"),
+    "no PV": (["tank", "x.csv", "--mv", "TIC-101.OP"], "no process variable is named"),
+    "an unknown tag": (["tank", "x.csv", "--pv", "TIC-101.PW", "--mv", "TIC-101.OP"], "did you mean 'TIC-101.PV'?"),
+    "one tag twice": (["tank", "x.csv", "--pv", "FI-7", "--mv", "FI-7"], "'FI-7' is named twice"),
+    "a bad form": (["tank", "x.csv", "--pv", "T[degC", "--mv", "TIC-101.OP"], "no tag 'T[degC'"),
+    "a bad range": (["tank", "x.csv", "--pv", "FI-7=5..2", "--mv", "TIC-101.OP"], "low must be below high"),
+    "a range of texts": (["tank", "x.csv", "--pv", "FI-7=a..b", "--mv", "TIC-101.OP"], "no finite number"),
+    "a wrong range": (["tank", "x.csv", "--pv", "FI-7=0..1", "--mv", "TIC-101.OP"], "correct the range or the unit"),
+    "tags and roles": (["tank", "x.csv", "--tags", "t.csv", *ROLES], "give one of them"),
+    "no tags": (["tank", "x.csv", "--tags", "t.csv"], "t.csv: no such file"),
+    "another time": (["tank", "x.csv", *ROLES, "--time", "when"], "no column 'when'"),
+    "too fine": (["tank", "x.csv", *ROLES, "--period", "0.0001"], "longer --period"),
+    "too coarse": (["tank", "x.csv", *ROLES, "--period", "1e9"], "shorter --period"),
+    "a text column": (["tank", "x.csv", "--pv", "note", "--mv", "TIC-101.OP"], "has no good reading"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_is_one_line_and_writes_nothing(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, says = BAD[name]
+    header = ("timestamp", *(t.tag for t in TAGS), "note")
+    write(Path("x.csv"), [[*row, "fine"] for row in cells(clean(200))], header)
+    before = files(), Path("params.yaml").read_bytes()
+    assert main(["new", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert (files(), Path("params.yaml").read_bytes()) == before
+
+
+def test_a_folder_that_is_there_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean(200)))
+    Path("data/tank").mkdir(parents=True)
+    assert main(["new", "tank", "x.csv", *ROLES]) == 2
+    assert "data/tank is there already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--period", "--hold"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "x"])
+def test_times_are_positive(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["new", "tank", "x.csv", f"{option}={value}"])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_example_of_the_repository(capsys: pytest.CaptureFixture[str]) -> None:
+    """The simulated export with its dirt: every fault is named, the record is good."""
+    script = ROOT / "examples" / "own_plant" / "make_export.py"
+    subprocess.run([sys.executable, str(script), "export.csv"], check=True, timeout=60)
+    arguments = ["--pv", "TIC-101.PV", "--mv", "TIC-101.OP", "--dv", "FI-7", "--sp", "TIC-101.SP"]
+    assert main(["new", "tank", "export.csv", *arguments, "--mode", "TIC-101.MODE"]) == 0
+    report = json.loads(Path("data/tank/screening.json").read_text())
+    kinds = {f["kind"] for f in report["findings"]}
+    assert {"text", "sentinel", "outlier", "stuck", "unit_slip", "duplicate", "quantization"} <= kinds
+    assert report["verdict"]["carries"] == "yes"
+    assert report["kept_rows"] / report["grid_rows"] > 0.95
+    params, record = read_back("tank")
+    assert [s.unit for s in (*params.pv, *params.mv, *params.dv)] == ["degC", "%", "kg/h"]
+    assert 25 < record.pv.min() < record.pv.max() < 90

@@ -1,0 +1,78 @@
+"""Resampling: exact where it can be, means against aliasing, moves where they happened."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import RecordError
+from pipeline.historian.export import Series
+from pipeline.historian.grid import proposed_period, resampled, sampling
+
+
+def series(tag: str, t: np.ndarray, v: np.ndarray) -> Series:
+    return Series(tag, np.asarray(t, dtype=np.float64), np.asarray(v, dtype=np.float64), np.zeros(len(t), np.uint8))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(20, 300), st.floats(0.05, 900), st.floats(0, 0.22), st.integers(0, 1000))
+def test_jitter_moves_no_row_and_no_move(n: int, h: float, share: float, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    t = 1.7e9 + h * np.arange(n) + share * h * random.uniform(-1, 1, n)
+    u = random.integers(0, 5, n).astype(float)
+    grid, _ = resampled([series("y", t, t - t[0])], [series("u", t, u)], h)
+    assert abs(len(grid) - n) <= 1
+    m = min(len(grid), n)
+    assert np.mean(grid.value["u"][:m] == u[:m]) > 0.97
+    inside = np.isfinite(grid.value["y"])
+    np.testing.assert_allclose(grid.value["y"][inside], (grid.time_s - t[0])[inside], atol=0.8 * h)
+
+
+def test_thinned_pvs_are_means_against_aliasing_and_mvs_means_over_their_period() -> None:
+    t = np.arange(6000.0)
+    ripple = np.sin(2 * np.pi * t / 10.0 + 0.3)  # period of the grid: plain picking would give a constant offset
+    u = np.where(t < 3005, 0.0, 1.0)
+    grid, _ = resampled([series("y", t, 5 + ripple)], [series("u", t, u)], 10.0)
+    inner = slice(2, -2)
+    np.testing.assert_allclose(grid.value["y"][inner], 5.0, atol=1e-9)
+    k = int(np.searchsorted(grid.time_s, 3000.0))
+    assert grid.value["u"][k] == pytest.approx(0.5)
+    assert set(np.round(np.delete(grid.value["u"], k), 12)) == {0.0, 1.0}
+
+
+def test_exception_reports_are_held_and_not_for_ever() -> None:
+    t = np.arange(0, 4000.0, 5.0)
+    at = np.array([0.0, 300.0, 310.0, 900.0, 930.0, 1500.0, 1510.0, 2000.0])
+    u = np.arange(8.0)
+    rate = sampling(series("u", at, u))
+    assert rate.irregular
+    grid, _ = resampled([series("y", t, np.sin(t / 50))], [series("u", at, u)], 5.0)
+    held = grid.value["u"]
+    assert held[grid.time_s == 250.0] == 0.0
+    assert held[grid.time_s == 1000.0] == 4.0
+    assert np.isnan(held[grid.time_s > 2000.0 + rate.hold_s + 5.0]).all()
+    short, _ = resampled([series("y", t, np.sin(t / 50))], [series("u", at, u)], 5.0, hold_s=100.0)
+    assert np.isnan(short.value["u"][short.time_s == 250.0]).all()
+
+
+def test_a_grid_begins_anew_after_a_gap() -> None:
+    t = np.r_[np.arange(0, 100.0, 2.0), np.arange(500.7, 600, 2.0)]
+    grid, _ = resampled([series("y", t, t)], [], 2.0)
+    assert set(grid.piece) == {0, 1}
+    np.testing.assert_allclose(grid.value["y"], grid.time_s)
+    assert grid.time_s[grid.piece == 1][0] == pytest.approx(500.7)
+
+
+@pytest.mark.parametrize(("step", "period"), [(1.0, 1.0), (9.998, 10.0), (59.97, 60.0), (7.3, 7.3), (0.1, 0.1)])
+def test_the_period_is_the_median_step(step: float, period: float) -> None:
+    assert proposed_period([series("y", step * np.arange(200), np.arange(200.0))]) == pytest.approx(period)
+
+
+def test_what_cannot_be_resampled_is_told() -> None:
+    y = series("y", np.arange(0, 1e6, 10.0), np.zeros(100_000))
+    with pytest.raises(RecordError, match="longer --period"):
+        resampled([y], [], 1e-3)
+    with pytest.raises(RecordError, match="no process variable has two readings"):
+        proposed_period([series("y", np.array([1.0]), np.array([1.0]))])
