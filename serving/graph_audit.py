@@ -31,7 +31,7 @@ class GraphSummary:
     """Content of the file: versions, operators with their counts, metadata, and the work of a step.
 
     ``work`` is an upper bound in multiply-adds: those of products of matrices, and 32 for each
-    element that any operator reads or writes.
+    element that any operator reads or writes, 4 where it only copies them.
     """
 
     ir_version: int

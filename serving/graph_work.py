@@ -19,12 +19,13 @@ Shape: TypeAlias = tuple[int, ...]
 FLOAT, INT32, INT64, BOOL, DOUBLE = 1, 6, 7, 9, 11  # TensorProto.DataType
 ITEM_BYTES = {FLOAT: 4, INT32: 4, INT64: 8, BOOL: 1, DOUBLE: 8}
 MAX_RANK = 8
-# At most 200 ms of ordinary numbers and two seconds of subnormal ones. A predictive law with one loop has 3 million,
-# which take .2 ms: most of its elements are only moved. One with three loops has up to 20.
+# At most 200 ms of ordinary numbers and two seconds of subnormal ones. A predictive law has 1 to 2 million with one
+# loop, which take .2 ms, and up to 10 with three.
 MAX_WORK = 20_000_000
 # An element read or written counts as so many multiply-adds: a power or a cosine takes 10 to 50 ns,
 # a multiply-add in a product of matrices .3 to 1 ns.
 ELEMENT_WORK = 32
+MOVED_WORK = 4  # of an element that is only copied: 1 to 2 ns, whatever its value
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +106,7 @@ def results(node: Node) -> tuple[list[Value], int]:
         elements = written
     else:
         elements = written + sum(v.size for v in node.present)
-    work = elements * ELEMENT_WORK
+    work = elements * (MOVED_WORK if node.op in MOVES else ELEMENT_WORK)
     if node.op in PRODUCTS:
         a = node.input(0).shape
         work += written * a[0 if node.op == "Gemm" and node.integer("transA", 0) else -1]
@@ -336,6 +337,12 @@ REDUCTIONS = frozenset(
     {
         "ReduceL1", "ReduceL2", "ReduceLogSumExp", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceProd",
         "ReduceSum", "ReduceSumSquare",
+    }
+)
+MOVES = frozenset(
+    {
+        "Concat", "Expand", "Flatten", "Gather", "GatherElements", "Reshape", "Slice", "Split", "Squeeze", "Tile",
+        "Transpose", "Unsqueeze",
     }
 )
 # fmt: on
