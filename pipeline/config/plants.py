@@ -35,7 +35,7 @@ class SignalParams:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class SourceParams:
+class RawFileParams:
     """A raw file that the record was made from."""
 
     file: str
@@ -51,7 +51,7 @@ class PlantParams:
     mv: tuple[SignalParams, ...]
     dv: tuple[SignalParams, ...]
     data: Path
-    source: tuple[SourceParams, ...]
+    source: tuple[RawFileParams, ...]
 
     def __post_init__(self) -> None:
         if not self.period_s > 0:

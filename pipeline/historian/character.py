@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,10 +45,10 @@ def runs_of(mask: Where) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.flatnonzero(edge == 1), np.flatnonzero(edge == -1)
 
 
-def stuck(values: Array, others: Array, same_piece: Where) -> Where:
+def stuck(values: Array, others: Sequence[tuple[Array, float]], same_piece: Where) -> Where:
     """Where (n,) a sensor repeats one value for longer than chance allows, while others move.
 
-    values (n,); others (n, m): all other signals over their usual spans; same_piece (n-1,): no gap between the rows.
+    values (n,); others: all other signals, (n,) each, with their usual spans; same_piece (n-1,): no gap between rows.
     With p the share of equal neighbours outside the longest stretches, a stretch of L rows comes by chance
     n p^L times; L is where this is STUCK_CHANCE. Others move where one leaves its mean over the stretch's first
     quarter by more than 5 % of its span.
@@ -64,11 +66,14 @@ def stuck(values: Array, others: Array, same_piece: Where) -> Where:
     least = np.clip(np.log(STUCK_CHANCE / len(values)) / np.log(p), SHORTEST_STUCK, LONGEST_STUCK)
     for a, b in zip(start[length >= least], end[length >= least], strict=True):
         quarter = max((b - a) // 4, 1)
-        with np.errstate(invalid="ignore"):
-            moved = np.abs(others[a : b + 1] - np.mean(others[a : a + quarter], axis=0))
-        if np.any(moved > 0.05):
+        if any(_moved(other[a : b + 1], quarter) > 0.05 * span for other, span in others if span > 0):
             where[a + 1 : b + 1] = True
     return where
+
+
+def _moved(values: Array, first: int) -> float:
+    """How far values leave the mean of their first ones."""
+    return float(np.nanmax(np.abs(values - np.mean(values[:first])), initial=0.0))
 
 
 def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where, str]:

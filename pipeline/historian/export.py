@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipeline.historian.character import runs_of
 from pipeline.historian.numbers import Codes
 from pipeline.historian.reason import Reason
 from pipeline.metrics import Array
@@ -39,6 +40,16 @@ class Series:
         """Number of readings by reason, GOOD too; together they are all of them."""
         found = np.bincount(self.code, minlength=len(Reason))
         return {r.name.lower(): int(found[r]) for r in Reason if found[r]}
+
+    def lighten(self, around: int = 400) -> None:
+        """Keep the bad readings, and the others only near the longest stretch of each reason: what pictures show."""
+        keep = ~self.good
+        for reason in np.unique(self.code[keep]):
+            start, end = runs_of(self.code == reason)
+            longest = int(np.argmax(end - start))
+            around_it = max(around, int(end[longest] - start[longest]))
+            keep[max(int(start[longest]) - around_it, 0) : int(end[longest]) + around_it] = True
+        self.time_s, self.value, self.code = self.time_s[keep], self.value[keep], self.code[keep]
 
     def flag(self, where: np.ndarray[tuple[int], np.dtype[np.bool_]], reason: Reason) -> int:
         """Give good readings a reason; how many have it now for the first time."""

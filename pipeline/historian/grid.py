@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ IRREGULAR = 2.5  # 90 % over 10 % quantile of the steps, above which a tag repor
 MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
 THINNED = 1.9  # readings a period from which PVs are averaged
 LEAST_PIECE = 2  # rows
+CHUNK = 500_000  # rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +101,12 @@ def resampled(
         good = s.good
         t, v = (s.time_s, s.value) if good.all() else (s.time_s[good], s.value[good])
         thin = 0 < rate.step_s * THINNED <= period_s and not s.categories and not rate.irregular
-        if s in pv:
-            out, over = _mean(time_s, t, v, period_s) if thin else _line(time_s, t, v, period_s, rate.hold_s)
-        else:
+        if s in pv and thin:
+            out, over = _mean(time_s, t, v, period_s)
+        elif thin:
             out, over = _held(time_s, t, v, period_s, rate.hold_s, thin)
+        else:
+            out, over = _in_chunks(_line if s in pv else _held, time_s, t, v, period_s, rate.hold_s)
         value[s.tag], code[s.tag] = out, _reasons(time_s, s, out, period_s)
         bridged[s.tag] = 0 if rate.irregular else int(np.count_nonzero(over))
     return Grid(period_s, time_s, piece, value, code, bridged), tuple(rates.values())
@@ -146,6 +149,17 @@ def _phase(t: Array, h: float) -> float:
     return float(t[0]) + (shift * h if abs(shift) > 1e-6 else 0.0)
 
 
+def _in_chunks(
+    rule: Callable[..., tuple[Array, NDArray[np.bool_]]], at: Array, t: Array, v: Array, h: float, hold_s: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The rule over CHUNK rows at a time: its steps need several times the memory of its result."""
+    out, over = np.empty(len(at)), np.empty(len(at), dtype=bool)
+    for i in range(0, len(at), CHUNK):
+        own = slice(i, i + CHUNK)
+        out[own], over[own] = rule(at[own], t, v, h, hold_s)
+    return out, over
+
+
 def _line(at: Array, t: Array, v: Array, h: float, hold_s: float) -> tuple[Array, NDArray[np.bool_]]:
     out = np.full(len(at), np.nan)
     if not t.size:
@@ -179,7 +193,9 @@ def _mean(at: Array, t: Array, v: Array, h: float) -> tuple[Array, NDArray[np.bo
     return np.where(enough, total / np.maximum(count, 1), np.nan), enough & (count < 0.7 * usual)
 
 
-def _held(at: Array, t: Array, v: Array, h: float, hold_s: float, thin: bool) -> tuple[Array, NDArray[np.bool_]]:
+def _held(
+    at: Array, t: Array, v: Array, h: float, hold_s: float, thin: bool = False
+) -> tuple[Array, NDArray[np.bool_]]:
     if not t.size:
         return np.full(len(at), np.nan), np.zeros(len(at), dtype=bool)
     middle = at + 0.5 * h

@@ -14,7 +14,7 @@ Y_LAGS = 3
 BLOCKS = ((0, 1), (1, 2), (2, 3), (3, 6), (6, 11), (11, 21), (21, 41))  # lags of an input that share a coefficient
 SLOW = ((41, 81), (81, 161), (161, 321))  # cut where the record begins
 AHEAD = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
-MOST_ROWS, WINDOW_ROWS = 60_000, 3_000  # of the fit, in windows spread evenly over the record
+MOST_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly over the record
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
 LEAST_ROWS = 60
 
@@ -28,7 +28,8 @@ class Linear:
 
     a: Array  # (Y_LAGS,)
     b: Array  # (n_inputs, len(blocks)) per block
-    c: float
+    c: float  # over inputs as distances from ``centre``
+    centre: Array  # (n_inputs,)
     blocks: tuple[tuple[int, int], ...]
     sd: float  # of the residual, robust
     strength: Mapping[int, float]  # input -> statistic
@@ -37,6 +38,19 @@ class Linear:
     rows: NDArray[np.int64]  # (n,) rows k of the fit
     residual: Array  # (n,)
     unexplained: Array  # (n,) what is left of y when only the inputs explain it, their slow parts too
+
+    def predicted(self, y: Array, u: Array, k: NDArray[np.int64]) -> Array:
+        """y(k+1) (m,) from the rows up to k (m,) of y (n,) and u (n, n_inputs); NaN where one is missing.
+
+        k must increase and leave as many rows before it as the blocks reach back.
+        """
+        out = self.c + sum(a * y[k - i] for i, a in enumerate(self.a))
+        back = self.blocks[-1][1]
+        first = int(k[0]) - back
+        for i, row in enumerate(self.b):
+            part = u[first : int(k[-1]) + 1, i] - self.centre[i]
+            out = out + _blocks(part, k - first, self.blocks) @ row
+        return np.asarray(out)
 
     def step_response(self, i: int, length: int = 600) -> Array:
         """Answer of y to a unit step of input ``i`` at k = 0, (length,)."""
@@ -77,8 +91,9 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
     past = np.column_stack([y[rows - i] for i in range(Y_LAGS)])
     if np.ptp(target) <= 0:
         return None
-    inputs = [_blocks(u[:, i], rows, blocks) for i in range(u.shape[1])]
-    ahead = [_blocks(u[:, i], rows, AHEAD) for i in range(u.shape[1])]
+    centre = np.array([np.nanmean(u[:, i]) for i in range(u.shape[1])])
+    inputs = [_blocks(u[:, i] - centre[i], rows, blocks) for i in range(u.shape[1])]
+    ahead = [_blocks(u[:, i] - centre[i], rows, AHEAD) for i in range(u.shape[1])]
     x = np.column_stack([past, *inputs, np.ones(len(rows))])
     theta, cov, keep = _least_squares(x, target)
     residual = target - x @ theta
@@ -89,12 +104,23 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
     growth = np.var((target - past[:, 0])[keep])
     explained = 1.0 - np.var(residual[keep]) / growth if growth > 0 else 0.0
     b = np.array([theta[p] for p in places.values()]).reshape(u.shape[1], m)
-    slow = [_blocks(u[:, i], rows, SLOW) for i in range(u.shape[1])]
+    slow = [_blocks(u[:, i] - centre[i], rows, SLOW) for i in range(u.shape[1])]
     static = np.column_stack([*inputs, *slow, np.ones(len(rows))])
     unexplained = target - static @ _least_squares(static, target)[0]
     early = {i: _early(x, ahead[i], target) for i in range(u.shape[1])}
     return Linear(
-        theta[:Y_LAGS], b, float(theta[-1]), blocks, sd, strength, early, float(explained), rows, residual, unexplained
+        theta[:Y_LAGS],
+        b,
+        float(theta[-1]),
+        centre,
+        blocks,
+        sd,
+        strength,
+        early,
+        float(explained),
+        rows,
+        residual,
+        unexplained,
     )
 
 
@@ -114,7 +140,7 @@ def _rows(y: Array, u: Array, run: NDArray[np.int64], lag: int) -> NDArray[np.in
 
 def _blocks(u: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
     """Means of u over lags first .. last-1 of each row, (n, blocks)."""
-    total = np.r_[0.0, np.cumsum(np.nan_to_num(u - np.nanmean(u)))]
+    total = np.r_[0.0, np.cumsum(np.nan_to_num(u))]
     return np.column_stack(
         [(total[np.maximum(rows - a + 1, 0)] - total[np.maximum(rows - b + 1, 0)]) / (b - a) for a, b in blocks]
     )

@@ -30,7 +30,7 @@ PARQUET = {".parquet", ".pq"}
 
 
 @dataclass(slots=True)
-class Source:
+class Opened:
     """One file: its columns, its first rows, and its blocks of chosen columns."""
 
     path: Path
@@ -42,7 +42,7 @@ class Source:
     unreadable: Counter[str]  # "rows": lines of another length than the header's
 
 
-def open_source(path: Path) -> Source:
+def opened(path: Path) -> Opened:
     """The file's header and first rows; RecordError where it cannot be read as a table."""
     if path.is_dir():
         raise RecordError(f"{path} is a folder; give the files in it, as in {path}/*.csv")
@@ -72,7 +72,7 @@ def read_export(
     known: set[str] = set()
     tags, modes = [bare(t) for t in tags], [bare(t) for t in modes]
     for path in paths:
-        source = open_source(path)
+        source = opened(path)
         layout = layout_of(source.path, source.header, source.sample, time_column, time_format)
         found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
         for name, series in found.items():
@@ -97,7 +97,7 @@ def units_of(paths: Sequence[Path]) -> dict[str, str]:
     """Column -> the unit that a row below the header or brackets in the header name."""
     found: dict[str, str] = {}
     for path in paths:
-        found |= {bare(k): v for k, v in open_source(path).units.items() if v}
+        found |= {bare(k): v for k, v in opened(path).units.items() if v}
     return found
 
 
@@ -107,7 +107,7 @@ def bare(column: str) -> str:
 
 
 # ---------------------------------------------------------------------- one file
-def _read(source: Source, layout: Layout, wanted: set[str], modes: set[str]) -> tuple[dict[str, Series], Counter[str]]:
+def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> tuple[dict[str, Series], Counter[str]]:
     gather = _Gather(modes, source.decimal, layout.clock)
     counts: Counter[str] = Counter()
     values = {v: bare(v) for v in layout.values if not wanted or {v, bare(v)} & wanted or layout.kind == "long"}
@@ -209,7 +209,7 @@ class _Shared:
 
 
 # ---------------------------------------------------------------------- formats
-def _parquet(path: Path) -> Source:
+def _parquet(path: Path) -> Opened:
     file = pq.ParquetFile(path)
     header = tuple(file.schema_arrow.names)
     if not header:
@@ -220,10 +220,10 @@ def _parquet(path: Path) -> Source:
     def blocks(names: Sequence[str]) -> Iterator[Any]:
         return pq.ParquetFile(path).iter_batches(batch_size=BLOCK_ROWS, columns=list(names))
 
-    return Source(path, header, sample, {n: split_column(n)[1] for n in header}, ".", blocks, Counter())
+    return Opened(path, header, sample, {n: split_column(n)[1] for n in header}, ".", blocks, Counter())
 
 
-def _text(path: Path, dialect: Dialect) -> Source:
+def _text(path: Path, dialect: Dialect) -> Opened:
     sample = {n: [row[i] for row in dialect.rows] for i, n in enumerate(dialect.header)}
     unreadable: Counter[str] = Counter()
 
@@ -250,4 +250,4 @@ def _text(path: Path, dialect: Dialect) -> Source:
         )
 
     units = {n: unit or split_column(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
-    return Source(path, dialect.header, sample, units, dialect.decimal, blocks, unreadable)
+    return Opened(path, dialect.header, sample, units, dialect.decimal, blocks, unreadable)

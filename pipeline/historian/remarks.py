@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.historian.cells import noise_sd, usual
 from pipeline.historian.character import quantum, straight_share
-from pipeline.historian.excitation import HELD, SEEN
+from pipeline.historian.excitation import HELD
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.grid import Sampling
@@ -58,22 +58,21 @@ def of_series(series: Series, rate: Sampling) -> list[Finding]:
 def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Finding]:
     """Moves that a PV answers before they happen, and offsets that wander; both from the quick linear models."""
     found = []
-    inputs = [s.name for s in (*record.mv_signals, *record.dv_signals)]
+    for i, signal in enumerate(record.mv_signals):
+        span = max(float(np.ptp(record.mv[:, i])), 1e-300)
+        held = float(np.mean(np.abs(np.diff(record.mv[:, i])) <= 1e-9 * span))
+        early = {name: m.ahead[i] for name, m in models.items() if m is not None and m.ahead[i][0] > AHEAD}
+        # In a loop the MV follows the PV at every row; an MV that holds does not know what comes.
+        if early and held >= HELD:
+            lead = max(early.values())[1]
+            words = (
+                f"{', '.join(early)} answers about {lead} row{'s' if lead > 1 else ''} before {signal.name} moves: the "
+                f"export stores {signal.name} late, or an operator moves it at once when the other changes"
+            )
+            found.append(Finding("shifted", signal.name, words))
     for (name, model), y in zip(models.items(), record.pv.T, strict=True):
-        if model is None:
-            continue
-        for i in range(record.mv.shape[1]):
-            strength, lead = model.ahead[i]
-            step = np.diff(record.mv[:, i])
-            held = float(np.mean(np.abs(step) <= 1e-9 * max(float(np.ptp(record.mv[:, i])), 1e-300)))
-            # In a loop the MV follows the PV at every row; an MV that holds does not know what comes.
-            if strength > AHEAD and strength > SEEN * 2 and held >= HELD:
-                words = (
-                    f"{name} answers about {lead} rows before {inputs[i]} moves: the times of the two do not agree, or "
-                    f"an operator moves {inputs[i]} at once when {name} changes"
-                )
-                found.append(Finding("shifted", inputs[i], words))
-        found += _drift(name, model, float(np.ptp(np.quantile(y, [0.01, 0.99]))))
+        if model is not None:
+            found += _drift(name, model, float(np.ptp(np.quantile(y, [0.01, 0.99]))))
     return found
 
 

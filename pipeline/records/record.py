@@ -100,7 +100,7 @@ class Record:
     def write(self, path: Path) -> None:
         """Write the record as ``.parquet`` or ``.csv``; no half-written file is left under that name."""
         columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {"run": self.run, "time_s": self.time_s}
-        columns |= dict(zip(self.columns, np.hstack([self.pv, self.mv, self.dv]).T, strict=True))
+        columns |= dict(zip(self.columns, (*self.pv.T, *self.mv.T, *self.dv.T), strict=True))
         signals = {"pv": self.pv_signals, "mv": self.mv_signals, "dv": self.dv_signals}
         described = {kind: [s.to_dict() for s in group] for kind, group in signals.items()}
         write_table(path, columns, {"period_s": self.period_s, **described})

@@ -1,0 +1,97 @@
+"""The readings of one tag: every bad one gets its reason, and every kind of fault a finding."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.errors import RecordError
+from pipeline.historian.cells import outliers, sentinels, unit_slips, usual
+from pipeline.historian.export import Series
+from pipeline.historian.findings import Finding
+from pipeline.historian.reason import Reason
+from pipeline.historian.tags import Tag
+from pipeline.metrics import Array
+
+RANGE_SLACK = 0.1  # of a PV's given range: noise at its ends
+MOSTLY = 0.5  # of the readings outside the given range: then the range or its unit is wrong
+
+
+def clean(series: Series, tag: Tag) -> list[Finding]:
+    """Give every bad reading of one tag its reason; what was found."""
+    found = []
+    counts = series.counts()
+    if series.texts:
+        words = ", ".join(f"{t!r} {n} times" for t, n in series.texts.most_common(3))
+        found.append(Finding("text", tag.tag, f"text where a number belongs: {words}", True))
+    if counts.get("quality"):
+        found.append(Finding("quality", tag.tag, f"quality is not good in {counts['quality']} readings", True))
+    if counts.get("duplicate"):
+        words = f"{counts['duplicate']} readings came a second time; the last good one of each stays"
+        found.append(Finding("duplicate", tag.tag, words, True))
+    if counts.get("clock"):
+        words = f"the clock was set back: {counts['clock']} readings have an ambiguous time; export UTC"
+        found.append(Finding("clock", tag.tag, words, True))
+    where, codes = sentinels(np.where(series.good, series.value, np.nan))
+    if series.flag(where, Reason.SENTINEL):
+        words = ", ".join(f"{c} {n} times" for c, n in codes.most_common(3))
+        found.append(Finding("sentinel", tag.tag, f"codes for a missing value: {words}", True))
+    found += _out_of_range(series, tag)
+    if tag.role in {"pv", "dv"}:
+        found += _unlike_the_rest(series, tag)
+    return found
+
+
+def _out_of_range(series: Series, tag: Tag) -> list[Finding]:
+    if tag.low is None and tag.high is None:
+        return []
+    low, high = (-np.inf if tag.low is None else tag.low), (np.inf if tag.high is None else tag.high)
+    span = high - low if np.isfinite(high - low) else abs(high if np.isfinite(high) else low)
+    slack = span * (1e-9 if tag.role == "mv" else RANGE_SLACK)
+    with np.errstate(invalid="ignore"):
+        outside = (series.value < low - slack) | (series.value > high + slack)
+    good = int(series.good.sum())
+    n = series.flag(outside, Reason.RANGE)
+    if n > MOSTLY * good:
+        example = series.value[np.flatnonzero(outside)[0]]
+        raise RecordError(
+            f"{tag.tag}: {n} of {good} good readings, such as {example:.6g}, are outside its range {low:g} to {high:g} "
+            f"{tag.unit}; correct the range or the unit"
+        )
+    words = f"{n} readings outside the range {low:g} to {high:g} {tag.unit} that was given"
+    return [Finding("range", tag.tag, words, True)] if n else []
+
+
+def _unlike_the_rest(series: Series, tag: Tag) -> list[Finding]:
+    found = []
+    place = np.flatnonzero(series.good)
+    values = series.value[place]
+    calm = ~outliers(values)
+    slipped = np.zeros(len(values), dtype=bool)
+    slipped[calm], kinds = unit_slips(values[calm])
+    if slipped.any():
+        series.code[place[slipped]] = Reason.UNIT_SLIP
+        words = ", ".join(f"{k} in {n} readings" for k, n in kinds.most_common())
+        found.append(Finding("unit_slip", tag.tag, f"the level jumps as if the unit had changed: {words}", True))
+        place, values = place[~slipped], values[~slipped]
+    alone = outliers(values)
+    if alone.any():
+        series.code[place[alone]] = Reason.OUTLIER
+        words = f"{int(alone.sum())} readings stand alone, {_example(values[alone])}; usual are {_usual(values)}"
+        found.append(Finding("outlier", tag.tag, words, True))
+    return found
+
+
+def _example(values: Array) -> str:
+    return f"from {values.min():.5g} to {values.max():.5g}"
+
+
+def _usual(values: Array) -> str:
+    low, high = usual(values)
+    return f"{low:.5g} to {high:.5g}"
+
+
+def reasons_of(series: Series) -> str:
+    """The end of a message about a tag without a good reading: its reasons and texts."""
+    texts = ", ".join(repr(t) for t, _ in series.texts.most_common(2))
+    reasons = ", ".join(f"{n} x {Reason[k.upper()].words}" for k, n in series.counts().items())
+    return f"{reasons}{f' ({texts})' if texts else ''}; choose another tag or export it again"

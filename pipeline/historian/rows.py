@@ -1,0 +1,113 @@
+"""Rows of the grid: stuck and saturated stretches, the reason of each row, and the record of those that have none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RecordError
+from pipeline.historian.cells import usual
+from pipeline.historian.character import clipped, runs_of, stuck
+from pipeline.historian.export import Series
+from pipeline.historian.findings import Finding
+from pipeline.historian.grid import Grid
+from pipeline.historian.reason import Reason
+from pipeline.historian.tags import Tag
+from pipeline.metrics import Array
+from pipeline.records.record import Record
+from serving.manifest import Signal
+
+SHORTEST_RUN = 20  # rows
+PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
+
+
+def stretches(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
+    """Mask stuck and saturated rows of PVs and measured disturbances; changes the grid's codes in place."""
+    found = []
+    spans = {t.tag: float(np.ptp(usual(grid.value[t.tag]))) for t in signals}
+    together = grid.piece[1:] == grid.piece[:-1]
+    for tag in signals:
+        if tag.role == "mv":
+            continue
+        values, code = grid.value[tag.tag], grid.code[tag.tag]
+        others = [(grid.value[name], span) for name, span in spans.items() if name != tag.tag]
+        for reason, where, words in (
+            (Reason.SATURATED, *clipped(values, tag.low, tag.high)),
+            (Reason.STUCK, stuck(values, others, together), ""),
+        ):
+            new = where & (code == 0)
+            if new.any():
+                code[new] = reason
+                start, end = runs_of(where)
+                own = f"repeats one value in {len(start)} stretches, the longest of {int((end - start).max())} rows"
+                text = f"stands at the end of its range: {words}" if words else f"{own}, while others move"
+                found.append(Finding(reason.name.lower(), tag.tag, text, True))
+    return found
+
+
+def row_codes(
+    grid: Grid, signals: Sequence[Tag], tags: Sequence[Tag], own: Mapping[str, Series], without: Sequence[str]
+) -> NDArray[np.uint8]:
+    """The first reason of each row over all signals, then of the modes, then of runs that are too short."""
+    code = np.zeros(len(grid), np.uint8)
+    for t in signals:
+        code = np.where(code == 0, grid.code[t.tag], code)
+    for t in (t for t in tags if t.role == "mode"):
+        names = own[t.tag].categories
+        unknown = [w for w in without if w not in names]
+        if unknown and sum(x.role == "mode" for x in tags) == 1:
+            raise RecordError(f"--without-mode {unknown[0]}: {t.tag} has the modes {', '.join(names)}")
+        left_out = np.isin(grid.value[t.tag], [names.index(w) for w in without if w in names])
+        code[left_out & (code == 0)] = Reason.MODE
+    start, end = runs_of(code == 0)
+    cut = np.flatnonzero(np.diff(grid.piece)) + 1
+    for a, b in zip(start, end, strict=True):
+        edges = np.r_[a, cut[(cut > a) & (cut < b)], b]
+        for first, last in pairwise(edges):
+            if last - first < SHORTEST_RUN:
+                code[first:last] = Reason.SHORT_RUN
+    return code
+
+
+def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Record:
+    """The rows without a reason as a record: a run ends at a gap and at every row that was left out."""
+    kept = np.flatnonzero(code == 0)
+    if not kept.size:
+        counts = np.bincount(code, minlength=len(Reason))
+        words = ", ".join(f"{int(counts[r])} x {r.words}" for r in Reason if counts[r])
+        raise RecordError(f"no row of {len(code)} is good in all signals: {words}; name fewer tags, or a longer --hold")
+    fresh = np.r_[True, (np.diff(kept) > 1) | (np.diff(grid.piece[kept]) > 0)]
+    run = np.cumsum(fresh) - 1
+    values = {t.tag: grid.value[t.tag][kept] for t in signals}
+    groups = {r: [t for t in signals if t.role == r] for r in ("pv", "mv", "dv")}
+    columns = {r: np.column_stack([np.empty((len(kept), 0)), *(values[t.tag] for t in g)]) for r, g in groups.items()}
+    own = {r: tuple(_signal(t, values[t.tag]) for t in g) for r, g in groups.items()}
+    position = np.arange(len(run)) - np.maximum.accumulate(np.where(fresh, np.arange(len(run)), 0))
+    time_s = position.astype(np.float64) * grid.period_s
+    return Record(
+        grid.period_s, own["pv"], own["mv"], own["dv"], run, time_s, columns["pv"], columns["mv"], columns["dv"]
+    )
+
+
+def _signal(tag: Tag, values: Array) -> Signal:
+    """The tag's signal.
+
+    A range that was not given is what the values show: of a percentage 0 to 100, of another MV what was seen, of a
+    PV a tenth more.
+    """
+    low, high = float(values.min()), float(values.max())
+    if tag.unit == "%" and low >= 0 and high <= 100:
+        low, high = 0.0, 100.0
+    elif tag.role != "mv":
+        pad = PAD * (high - low)
+        low, high = (float(f"{v:.3g}") for v in (low - pad, high + pad))
+    # A given end may lie on the wrong side of values that nothing forbids.
+    if not (low if tag.low is None else tag.low) < (high if tag.high is None else tag.high):
+        wide = max(1.0, 0.1 * abs(high))
+        low, high = (low if tag.low is None else tag.low) - wide, (high if tag.high is None else tag.high) + wide
+        tag = replace(tag, low=None, high=None)
+    return tag.signal(low, high)
