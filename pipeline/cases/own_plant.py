@@ -270,7 +270,7 @@ def entries_of(name: str, plant: Mapping[str, Any]) -> dict[str, dict[str, Any]]
         "cases": {name: {"held_out_seeds": [9001, 9002, 9003], "noise_seed": 1}},
         "models": {f"{name}-{MODEL_SET}": {**own, "data": plant["data"], "parts": parts}},
         "controllers": {
-            f"{name}-predictive": {**own, "name": "predictive", "law": "predictive"},
+            f"{name}-predictive": {**own, "name": "predictive", "law": "predictive", "tuning": "search"},
             f"{name}-pid": {**own, "name": "pid", "law": "pid"},
         },
     }

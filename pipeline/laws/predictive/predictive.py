@@ -197,8 +197,8 @@ class Predictive(ControlLaw):
         best = min(self.tried, key=lambda c: c.cost)
         figures = {**best.numbers, "cost": best.cost, "cost_given": self.tried[0].cost, "tried": len(self.tried)}
         note = (
-            f"{len(self.tried)} sets of numbers were tried in closed loops over the model with wrong gains and loads; "
-            f"the cost fell from {self.tried[0].cost:.3g} to {best.cost:.3g} %."
+            f"{len(self.tried)} sets of numbers were tried in closed loops over the model with errors of gain and "
+            f"dead time, with loads and noise; the cost fell from {self.tried[0].cost:.3g} to {best.cost:.3g} %."
         )
         return Analysis(figures, notes=(note,))
 

@@ -48,6 +48,8 @@ class Candidate:
 class Trials:
     """Closed loops side by side: the members with wrong gains, half of the loops with set points, half with loads.
 
+    In every second loop the plant answers one sample later than its model does.
+
     The loads are biases of the valves and loads at the outputs, in steps and in random walks. A law's model must not
     be all that it is tuned on: without errors of gain and drifting loads the search makes the observer too slow.
     """
@@ -116,6 +118,7 @@ class Trials:
         more = torch.tensor([s.middle for s in self.signals.pv[n_y:]]).double().expand(m, loops, -1)
         dv = torch.stack([member.v_center[len(low) :] for member in self.members])[:, None].expand(m, loops, -1)
         error, travel, x = torch.zeros(m, loops, dtype=torch.float64), 0.0, list(self.x0)
+        late = torch.arange(loops)[:, None] % 2 == 1
         scale = torch.stack([member.y_scale[:n_cv] for member in self.members])[:, None]
         for k in range(n):
             y = torch.stack([member.measured(at) for member, at in zip(self.members, x, strict=True)])
@@ -123,7 +126,7 @@ class Trials:
             before = mv
             mv, state, _ = law(self.sp[k], torch.cat([y + self.noise[k], more], dim=-1), dv, mv, state)
             travel += float(((mv - before).abs() / (high - low)).mean())
-            acting = middle + self.gain * (mv - middle) + self.bias[k]
+            acting = middle + self.gain * (torch.where(late, before, mv) - middle) + self.bias[k]
             for i, member in enumerate(self.members):
                 x[i] = member(torch.cat([x[i], acting[i], dv[i]], dim=-1))
                 x[i] = torch.cat([x[i][:, :n_y] + self.load[k, i], x[i][:, n_y:]], dim=-1)
