@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.config.params import PlantParams
-from pipeline.errors import ParamsError, PlantError
+from pipeline.config.plants import PlantParams, SignalParams
+from pipeline.errors import PlantError
 from pipeline.evaluation.case import Array, Case
 from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from pipeline.plants.signals import Signals
@@ -20,7 +20,6 @@ from pipeline.plants.spoilt import SpoiltPlant
 from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.simulation.simulate import simulate_batch
-from serving.errors import ArtifactError
 from serving.manifest import Signal
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
@@ -224,41 +223,26 @@ class OwnCase(Case):
 
 
 def own_case(name: str) -> Case:
-    """The case of ``plants.<name>``; ParamsError for signals that cannot be, or more than one set point."""
-    params, where = PlantParams.read(name), f"plants.{name}"
-    signals = signals_of(params, where)
-    title = params.title or name.replace("_", " ")
-    models = Path("work") / name / "models" / MODEL_SET / "seed0"
+    """The case of ``plants.<name>`` of params.yaml."""
+    params = PlantParams.read(name)
+    pv, mv, dv = (tuple(map(_signal, group)) for group in (params.pv, params.mv, params.dv))
+    signals = Signals(params.period_s, pv[:1], pv, dv, mv)  # one variable is controlled so far, the first
+    models, title = Path("work") / name / "models" / MODEL_SET / "seed0", name.replace("_", " ").capitalize()
     described = {f"{group}_signals": getattr(signals, group) for group in ("sp", "pv", "mv", "dv")}
-    described["period_s"] = signals.period_s
+    described |= {"name": name, "title": title, "period_s": signals.period_s, "needs": models}
     own: dict[str, Any] = {
         "name": name,
         "title": title,
         "signals": signals,
-        "plant_class": type("OwnPlant", (Untrained,), {**described, "name": name, "title": title, "needs": models}),
+        "plant_class": type("OwnPlant", (Untrained,), described),
         "models": models,
         "data": params.data,
     }
     return type("OwnPlantCase", (OwnCase,), own)((9001, 9002, 9003))
 
 
-def signals_of(params: PlantParams, where: str) -> Signals:
-    """The signals that the section of a plant states."""
-    groups: dict[str, tuple[Signal, ...]] = {}
-    for group in ("sp", "pv", "mv", "dv"):
-        try:
-            groups[group] = tuple(Signal.from_dict(dict(row)) for row in getattr(params, group))
-        except (ArtifactError, KeyError, TypeError, ValueError) as error:
-            raise ParamsError(f"{where}.{group}: {error}; each signal has name, unit, low and high") from None
-    names = [s.name for s in groups["pv"]]
-    if not groups["pv"] or not groups["mv"] or [s.name for s in groups["sp"]] != names[: len(groups["sp"])]:
-        raise ParamsError(f"{where}: give at least one pv and one mv, and a set point for the first PVs, {names}")
-    if len(groups["sp"]) != 1:
-        raise ParamsError(
-            f"{where}.sp has {len(groups['sp'])} set points; own plants are validated with one controlled variable "
-            "so far"
-        )
-    return Signals(params.period_s, **groups)
+def _signal(params: SignalParams) -> Signal:
+    return Signal(params.name, params.unit, params.low, params.high)
 
 
 def entries_of(name: str, plant: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

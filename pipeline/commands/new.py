@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.plants import append_plant, check_name
+from pipeline.cases.own_plant import entries_of
+from pipeline.config.entries import add_entries
+from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
 from pipeline.files import draft_folder_of, write_json, write_text
 from pipeline.historian.findings import Screening
@@ -95,7 +97,7 @@ def _write(name: str, folder: Path, found: Screened) -> int:
         write_page(draft / "screening.html", found, test)
     if not usable:
         try:
-            append_plant(name, entry(found.record, report, folder))
+            add_entries(entries_of(name, entry(found.record, report, folder)))
         except PipelineError:
             shutil.rmtree(folder)
             raise
@@ -141,6 +143,8 @@ def _tell(name: str, folder: Path, report: Screening, test: StepTest | None) -> 
     for reason in report.verdict.reasons:
         print(f"  {reason}")
     print(f"look at {folder}/screening.html: trends with every mask")
+    if report.verdict.carries != "no":
+        print(f"then: loopwright run {name}")
     if test:
         print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import yaml
 
 from pipeline.config.params import PARAMS_FILE
 from pipeline.errors import ParamsError
-from pipeline.files import write_text
+from pipeline.files import write_bytes
 
 Entries = Mapping[str, Mapping[str, Any]]
 """Section -> name of the entry -> its values."""
@@ -21,16 +22,21 @@ def add_entries(entries: Entries, path: Path = PARAMS_FILE) -> None:
 
     Raises ParamsError where an entry of that name exists, or where a section is not written as a block.
     """
-    text = path.read_text(encoding="utf-8")
-    before = yaml.safe_load(text) or {}
-    wanted = dict(before)
+    try:
+        text = path.read_bytes().decode("utf-8")
+        before = yaml.safe_load(text) or {}
+    except FileNotFoundError:
+        raise ParamsError(f"{path} is not here; run from the repository's root") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ParamsError(f"{path} is not YAML in UTF-8: {' '.join(str(error).split())}") from None
+    wanted, end = dict(before), "\r\n" if "\r\n" in text else "\n"
     for section, added in entries.items():
         there = wanted.get(section) or {}
         taken = sorted(set(there) & set(added))
         if taken:
-            raise ParamsError(f"{path}: {section}.{taken[0]} exists already; remove it, or choose another name")
+            raise ParamsError(f"{path}: {section} has {taken[0]!r} already; remove it, or choose another name")
         wanted[section] = {**there, **added}
-        text = _with_block(text, section, _block(added))
+        text = _with_lines(text, section, _lines(added), end)
     try:
         after = yaml.safe_load(text)
     except yaml.YAMLError:
@@ -40,28 +46,29 @@ def add_entries(entries: Entries, path: Path = PARAMS_FILE) -> None:
             f"{path}: {', '.join(entries)} cannot be extended: write each of these sections as a block, a line for "
             "each entry, without braces"
         )
-    write_text(path, text)
+    mode = path.stat().st_mode & 0o777
+    write_bytes(path.resolve(), text.encode("utf-8"))
+    os.chmod(path, mode)
 
 
-def _block(added: Mapping[str, Any]) -> str:
-    text: str = yaml.safe_dump(dict(added), sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
-    return "".join(f"  {line}\n" for line in text.splitlines())
+def _lines(added: Mapping[str, Any]) -> list[str]:
+    text: str = yaml.safe_dump(dict(added), sort_keys=False, allow_unicode=True, default_flow_style=None, width=10_000)
+    return [f"  {line}" for line in text.splitlines()]
 
 
-def _with_block(text: str, section: str, block: str) -> str:
-    """The text with lines behind the last one of a section; a new section where there is none."""
+def _with_lines(text: str, section: str, added: list[str], end: str) -> str:
+    """The text with lines behind the last one of a section; with a new section where there is none."""
     lines = text.splitlines(keepends=True)
     heads = [i for i, line in enumerate(lines) if line[:1].isalpha()]
-    at = next((i for i in heads if lines[i].split(":")[0] == section), None)
+    at = next((i for i in heads if lines[i].split(":")[0].strip() == section), None)
     if at is None:
-        end = "" if not text or text.endswith("\n") else "\n"
-        return f"{text}{end}\n{section}:\n{block}"
+        return text + ("" if not text or text.endswith("\n") else end) + end.join(["", f"{section}:", *added, ""])
     stop = next((i for i in heads if i > at), len(lines))
     # Blank lines and comments at the margin belong to the next section.
     while stop > at + 1 and (not lines[stop - 1].strip() or lines[stop - 1].startswith("#")):
         stop -= 1
     if not lines[stop - 1].endswith("\n"):
-        lines[stop - 1] += "\n"
+        lines[stop - 1] += end
     if stop == at + 1 and lines[at].rstrip().endswith("{}"):
-        lines[at] = lines[at].rstrip()[:-2].rstrip() + "\n"
-    return "".join([*lines[:stop], block, *lines[stop:]])
+        lines[at] = lines[at].rstrip()[:-2].rstrip() + end
+    return "".join([*lines[:stop], end.join([*added, ""]), *lines[stop:]])

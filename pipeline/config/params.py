@@ -159,29 +159,6 @@ class CaseParams:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class PlantParams:
-    """``plants.<name>``: a person's own plant, known by its record alone; ``loopwright new`` writes the section.
-
-    ``sp``, ``pv``, ``mv``, ``dv``: signals, each a mapping of name, unit, low and high; the PVs with a set point
-    come first. ``data``: the record. ``source``: the raw files with their digests.
-    """
-
-    period_s: float
-    sp: tuple[Mapping[str, Any], ...]
-    pv: tuple[Mapping[str, Any], ...]
-    mv: tuple[Mapping[str, Any], ...]
-    data: Path
-    dv: tuple[Mapping[str, Any], ...] = ()
-    title: str = ""
-    source: tuple[Mapping[str, Any], ...] = ()
-
-    @classmethod
-    def read(cls, name: str) -> PlantParams:
-        """The section of one plant."""
-        return parse(cls, read_section("plants", name), f"plants.{name}")
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
 class RecordParams:
     """``records.<name>``: whose data, which seeds, and which excitation with its own numbers."""
 

@@ -21,11 +21,11 @@ TEMPERATURE = {"name": "TIC-101.PV", "unit": "degC", "low": 20.0, "high": 90.0}
 VALVE = {"name": "TIC-101.OP", "unit": "%", "low": 0.0, "high": 100.0}
 SECTION: dict[str, Any] = {
     "period_s": 10.0,
-    "title": "Heater",
-    "sp": [TEMPERATURE],
     "pv": [TEMPERATURE],
     "mv": [VALVE],
+    "dv": [],
     "data": "data/heater/record.parquet",
+    "source": [],
 }
 
 
@@ -128,11 +128,10 @@ def test_before_training_the_signals_are_known_and_the_rest_is_asked_for(heater:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"mv": []}, "at least one pv and one mv"),
-        ({"mv": [{**VALVE, "high": 0.0}]}, "low < high"),
-        ({"mv": [{"name": "u", "unit": "%"}]}, "each signal has name, unit, low and high"),
-        ({"sp": [VALVE]}, "a set point for the first PVs"),
-        ({"sp": [TEMPERATURE, VALVE], "pv": [TEMPERATURE, VALVE]}, "one controlled variable so far"),
+        ({"mv": []}, "pv and mv need one signal or more each"),
+        ({"mv": [{**VALVE, "high": 0.0}]}, "low must be below high"),
+        ({"mv": [{"name": "u", "unit": "%"}]}, "missing"),
+        ({"mv": [TEMPERATURE]}, "is there twice"),
         ({"perod_s": 1.0}, "unknown key 'perod_s'"),
     ],
 )

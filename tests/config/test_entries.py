@@ -43,6 +43,21 @@ def test_entries_stand_at_the_ends_of_their_sections_and_nothing_else_changes(tm
     assert after.index("  b:\n") < after.index("\n# The models.")
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("tail", ["", "\n\n", "# the end"])
+def test_every_byte_before_a_new_section_stays(end: str, tail: str, tmp_path: Path) -> None:
+    before = (Path(__file__).parents[2] / "params.yaml").read_bytes() + tail.encode()
+    before = before.replace(b"\n", end.encode())
+    path = tmp_path / "params.yaml"
+    path.write_bytes(before)
+    add_entries({"plants": NEW["plants"]}, path)
+    add_entries({"plants": {"second": {"period_s": 2}}}, path)
+    after = path.read_bytes()
+    assert after.startswith(before)
+    assert after.replace(b"\r\n", b"").count(b"\n") == (0 if end == "\r\n" else after.count(b"\n"))
+    assert list(yaml.safe_load(after)["plants"]) == ["b", "second"]
+
+
 @pytest.mark.parametrize("end", ["", "\n", "\n\n# The end."])
 def test_a_file_may_end_as_it_likes(tmp_path: Path, end: str) -> None:
     path = tmp_path / "params.yaml"
@@ -63,7 +78,9 @@ def test_the_project_s_own_file_takes_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("cases:\n  b: 1\n", "cases.b exists already"),
+        ("cases:\n  b: 1\n", "cases has 'b' already"),
+        ("cases: [1\n", "is not YAML in UTF-8"),
+        ("cases:\n  a: 1\n...\n", "cannot be extended"),
         ("cases: {a: 1}\n", "write each of these sections as a block"),
     ],
 )
