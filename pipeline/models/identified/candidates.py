@@ -74,6 +74,7 @@ class Training:
     folds: tuple[Fold, ...]
     budget: Budget
     seed: int = 0
+    judged: float = 0.0  # correction of the free runs over held-out rows, by which all candidates are compared
     _shifted: dict[tuple[int, ...], ScaledRecord] = field(default_factory=dict)
     _realizations: dict[tuple[tuple[int, ...], int], Realizations] = field(default_factory=dict)
     _linear: dict[tuple[Structure, int], Fitted] = field(default_factory=dict)
@@ -111,7 +112,7 @@ class Training:
                 free = model.mask(b=True, c=True)
                 begun = OutputError(iterations=3, correction=structure.correction).fit(model, train, free=free)
                 model, starts = begun.model, begun.starts
-        fit = OutputError(iterations=iterations, correction=structure.correction)
+        fit = OutputError(iterations=iterations, correction=structure.correction, judged=self.judged)
         self._linear[key] = self._spend(fit.fit(model, train, held, starts=starts), train)
         return self._linear[key]
 
@@ -130,19 +131,19 @@ class Training:
         states = visited(linear, train, 1.0 if starts is None else structure.correction)
         model = with_units(linear, states, np.concatenate([s.v for s in train]), structure.n_hidden, draw)
         if starts is None:
-            one_step = OutputError(iterations=15, correction=1.0, ridge=structure.ridge, patience=5)
+            one_step = OutputError(iterations=15, correction=1.0, judged=self.judged, ridge=structure.ridge, patience=5)
             free = output_rows(model, self.data.y.shape[1])
             model = self._spend(one_step.fit(model, train, held, free=free), train).model
-        fit = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
+        fit = OutputError(
+            iterations=iterations,
+            correction=structure.correction,
+            judged=self.judged,
+            ridge=structure.ridge,
+            patience=15,
+        )
         return self._spend(fit.fit(model, train, held, starts=starts), train)
 
-    def more(self, structure: Structure, fitted: Fitted, fold: int, iterations: int) -> Fitted:
-        """A fit that goes on."""
-        train, held = self.stretches(structure, fold)
-        fit = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
-        return self._spend(fit.fit(fitted.model, train, held, starts=fitted.starts), train)
-
-    def on_all_rows(self, structure: Structure, fitted: Fitted, iterations: int = 15) -> Fitted:
+    def on_all_rows(self, structure: Structure, fitted: Fitted, iterations: int = 30) -> Fitted:
         """The fit gone on over all rows; the fit as it is where that makes a rest explode."""
         whole = self.part(structure.delays, slice(None)).stretches()
         fit = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)

@@ -38,13 +38,13 @@ class IdentifiedPart(Part):
     """A linear or nonlinear state-space model of all controlled variables, its structure chosen by held-out free runs.
 
     The outputs are the controlled variables; the inputs all MVs and measured disturbances. ``member`` numbers the
-    models of an ensemble: 0 is fitted to all rows, 1 and 2 to the rows of one fold each, with other seeds.
-    ``orders`` are the numbers of states tried, from the least to the most (None: 2 to 8, and two more for each further
-    output); ``units`` the numbers of tanh units tried, none for linear models only. ``correction`` is the share of
-    the output's error that each sample of a training run takes back, None: .05 for integrating or drifting records,
-    else 0. ``minutes`` is the budget of the search on one core, counted in nominal work so that results are
-    reproducible; the best so far is kept. ``rows`` is the most rows that are fitted; of longer records the
-    stretches in which the inputs move most.
+    models of an ensemble: 0 is fitted to all rows, 1 and 2 to the rows of one fold each, with other seeds. ``orders``
+    are the least and the most states tried (None: 2 to 8, and two more for each further output); ``units`` the
+    numbers of tanh units tried, none for linear models only. ``correction`` is the share of the output's error that
+    each sample of a training run takes back, None: 0, or .05 where that does better in plain free runs; a number
+    given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
+    one core, counted in nominal work so that results are reproducible; the best so far is kept. ``rows`` is the most
+    rows that are fitted; of longer records the stretches in which the inputs move most.
     """
 
     model: ClassVar[type[Model]] = Identified
@@ -126,7 +126,8 @@ class _Key:
 def _searched(key: _Key) -> tuple[Training, Selection, Scales]:
     scales = Scales.of(key.record, key.n_y)
     data = ScaledRecord.of(key.record, scales)
-    training = Training(data, folds(key.record), Budget(60 * key.part.minutes), key.seed)
+    judged = key.part.correction or 0.0
+    training = Training(data, folds(key.record), Budget(60 * key.part.minutes), key.seed, judged)
     least, most = key.part.orders or (max(2, key.n_y), 8 + 2 * (key.n_y - 1))
     orders = range(max(least, key.n_y), max(most, key.n_y) + 1)
     return training, select(training, orders=orders, units=key.part.units, correction=key.part.correction), scales

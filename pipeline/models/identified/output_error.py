@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from pipeline.models.identified.dynamics import Dynamics, Stretch
+from pipeline.models.identified.dynamics import EXPLODED, Dynamics, Stretch
 from pipeline.plants.simulator import Array
 
 CHUNK = 512  # rows whose sensitivities are held at a time
@@ -149,17 +149,19 @@ def fit_starts(
     data: Sequence[Stretch],
     correction: float = 0.0,
     starts: Sequence[Array] | None = None,
-    iterations: int = 3,
+    iterations: int = 10,
 ) -> list[Array]:
     """The initial state (n_x,) of each stretch that fits its free run best, by damped Gauss-Newton.
 
-    It starts from ``starts``, or from the first outputs with the hidden states at zero.
+    It starts from ``starts``; or from the first outputs with the hidden states at zero, or where they settle under
+    the first inputs, whichever fits better.
     """
     nothing = np.zeros(len(model.vector()), dtype=bool)
     found = []
     for i, stretch in enumerate(data):
-        x0 = starts[i] if starts is not None else np.r_[stretch.y[0], np.zeros(model.n_x - stretch.y.shape[1])]
-        best = squares(model, [x0], [stretch], correction)
+        guesses = _guesses(model, stretch) if starts is None else [starts[i]]
+        errors = [squares(model, [x], [stretch], correction) for x in guesses]
+        best, x0 = min(errors), guesses[int(np.argmin(errors))]
         for _ in range(iterations if np.isfinite(best) else 0):
             sums = sensitivity_sums(model, [x0], [stretch], nothing, correction)
             if sums is None:
@@ -180,6 +182,17 @@ def fit_starts(
     return found
 
 
+def _guesses(model: Dynamics, stretch: Stretch, periods: int = 100) -> list[Array]:
+    """Initial states (n_x,) with the first outputs: hidden states at zero, and settled under the first inputs."""
+    n_y = stretch.y.shape[1]
+    x = zero = np.r_[stretch.y[0], np.zeros(model.n_x - n_y)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(periods):
+            x = model.advance(x, stretch.v[0])
+    settled = np.r_[stretch.y[0], x[n_y:]]
+    return [zero, settled] if np.all(np.abs(settled) < EXPLODED) else [zero]
+
+
 def free_run_error(
     model: Dynamics, data: Sequence[Stretch], correction: float = 0.0, starts: Sequence[Array] | None = None
 ) -> tuple[Array, list[Array]]:
@@ -187,7 +200,7 @@ def free_run_error(
 
     From ``starts`` that fitted a model nearby one step is enough.
     """
-    starts = fit_starts(model, data, correction, starts, iterations=3 if starts is None else 1)
+    starts = fit_starts(model, data, correction, starts, iterations=10 if starts is None else 1)
     found = residuals(model, starts, data, correction)
     if found is None:
         return np.full(data[0].y.shape[1], np.inf), starts
@@ -215,9 +228,9 @@ class Fitted:
 class OutputError:
     """Levenberg-Marquardt for min over theta, x0 of mean (y - y_hat)^2 + ridge |theta_ridged|^2.
 
-    The ridge weight is ``ridge`` times the variance of the present residual over the number of residuals, and
-    acts on W1 and W2 alone. Damping follows Nielsen's rule. ``patience`` iterations without a better held-out
-    error end the fit; the best model is kept.
+    The ridge weight is ``ridge`` times the variance of the present residual over the number of residuals, and acts on
+    W1 and W2 alone. Damping follows Nielsen's rule. Held-out rows are judged by free runs with the correction
+    ``judged``. ``patience`` iterations without a better held-out error end the fit; the best model is kept.
 
     Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2nd ed.,
     DTU 2004, algorithm 3.16; L. Ljung, System identification, 2nd ed., 1999, section 10.3 (output error).
@@ -225,9 +238,10 @@ class OutputError:
 
     iterations: int = 30
     correction: float = 0.0
+    judged: float = 0.0
     ridge: float = 0.0
     patience: int = 10
-    tolerance: float = 1e-5  # relative gain of an iteration below which four in a row end the fit
+    tolerance: float = 1e-4  # relative gain of an iteration below which three in a row end the fit
 
     def fit(
         self,
@@ -263,7 +277,7 @@ class OutputError:
             since = 0 if error < best.held_out else since + 1
             if error < best.held_out or not held:
                 best = Fitted(model, starts, float(np.sqrt(loss / n)), error, iteration)
-            if flat >= 4 or (held and since >= self.patience):
+            if flat >= 3 or (held and since >= self.patience):
                 break
         return best
 
@@ -273,7 +287,7 @@ class OutputError:
         def error(model: Dynamics) -> float:
             if not held:
                 return np.inf
-            errors, starts = free_run_error(model, held, self.correction, memory[0])
+            errors, starts = free_run_error(model, held, self.judged, memory[0])
             if np.all(np.isfinite(errors)):
                 memory[0] = starts
             return overall(errors)

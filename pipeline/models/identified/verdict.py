@@ -70,8 +70,8 @@ def free_run_figures(
     """
     best = trial.of_fold(fold)[0]
     held = training.stretches(trial.structure, fold)[1]
-    starts = fit_starts(best.model, held, trial.structure.correction)
-    runs = [best.model.free_run(x, s, trial.structure.correction) for x, s in zip(starts, held, strict=True)]
+    starts = fit_starts(best.model, held, training.judged)
+    runs = [best.model.free_run(x, s, training.judged) for x, s in zip(starts, held, strict=True)]
     actual = np.concatenate([s.y for s in held])
     n_y = actual.shape[1]
     predicted = np.concatenate(

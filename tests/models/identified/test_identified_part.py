@@ -18,8 +18,8 @@ from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.identified_part import IdentifiedPart
 from pipeline.models.part import Learnt, Source
 
-LINEAR = IdentifiedPart(orders=(2, 4), units=())
-SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.08)
+LINEAR = IdentifiedPart(orders=(2, 3), units=())
+SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.15)
 
 
 def identified(learnt: Learnt) -> Identified:
@@ -56,8 +56,7 @@ def test_two_by_two_with_a_measured_disturbance() -> None:
 
 
 def test_an_integrator_keeps_its_slope_and_its_poles_inside() -> None:
-    learnt = LINEAR.learn(Source(made_plants.integrator(1000), made_plants.signals_of(1, 1)))
-    assert learnt.metrics["structure"]["correction"] == 0.05
+    learnt = LINEAR.learn(Source(made_plants.integrator(800), made_plants.signals_of(1, 1)))
     assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.05, rel=0.03)
     assert 0.995 < learnt.metrics["spectral_radius"] <= 1 + 1e-6
     assert noise_sd(learnt) == pytest.approx(0.1, rel=0.1)
@@ -79,7 +78,7 @@ def test_several_runs_each_with_its_own_start() -> None:
 
 
 def test_a_gain_that_changes_needs_a_network() -> None:
-    record, signals = made_plants.hammerstein(800), made_plants.signals_of(1, 1)
+    record, signals = made_plants.hammerstein(600), made_plants.signals_of(1, 1)
     learnt = SMALL.learn(Source(record, signals))
     structure = learnt.metrics["structure"]
     assert structure["hidden"] == 6
@@ -98,7 +97,7 @@ def test_a_gain_that_changes_needs_a_network() -> None:
 
 def test_members_differ_and_share_their_structure() -> None:
     source = Source(made_plants.second_order(800), made_plants.signals_of(1, 1))
-    learnt = [IdentifiedPart(orders=(2, 4), units=(), member=k).learn(source) for k in range(3)]
+    learnt = [IdentifiedPart(orders=(2, 2), units=(), member=k).learn(source) for k in range(3)]
     arrays = [identified(one).a for one in learnt]
     assert not torch.equal(arrays[0], arrays[1])
     assert not torch.equal(arrays[1], arrays[2])
