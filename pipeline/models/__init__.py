@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pipeline.models.base import Model, load_model
 from pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
+from pipeline.models.identified.identified_part import IdentifiedPart
 from pipeline.models.lagged.arx import ArxPart
 from pipeline.models.lagged.nnarx_part import NnarxPart
 from pipeline.models.local.linearized import LinearizedPart
@@ -24,6 +25,7 @@ MODELS: dict[str, type[Part]] = {
     LinearizedPart.model.kind: LinearizedPart,
     LocalModelsPart.model.kind: LocalModelsPart,
     HybridFuzzyPart.model.kind: HybridFuzzyPart,
+    IdentifiedPart.model.kind: IdentifiedPart,
 }
 
 __all__ = ["MODELS", "Learnt", "Model", "Part", "Source", "load_model"]

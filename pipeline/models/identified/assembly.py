@@ -15,8 +15,8 @@ from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
 
-ANSWERS = 0.03
-"""Share of the largest step response below which an output has not answered yet."""
+ANSWERS = 0.1
+"""Share of the fastest change of an output in a step response below which it has not answered yet."""
 
 
 def remembering(model: Dynamics, delays: Sequence[int]) -> Dynamics:
@@ -71,13 +71,14 @@ def assembled(
 def dead_periods(model: Dynamics, data: ScaledRecord, length: int = 60) -> Array:
     """Fewest periods (n_v,) without an answer at any output to a small step of each input, at the centre of the data.
 
-    An answer is more than 3 % of the largest value of that output's response over ``length`` periods.
+    An answer is a change within one period of more than a tenth of the fastest one over ``length`` periods.
     """
     middle = np.median(data.v, axis=0)
     start = rest_map(model, data.y, data.v, 0)[0] @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
     size = 0.5 * data.v.std(axis=0)
     response = step_responses(model, start, middle, size, length)[..., : data.y.shape[1]]
-    answers = np.abs(response) > ANSWERS * np.abs(response).max(axis=1, keepdims=True)
+    change = np.abs(np.diff(response, axis=1, prepend=0.0))
+    answers = change > ANSWERS * change.max(axis=1, keepdims=True)
     return np.asarray(answers.any(axis=2).argmax(axis=1), dtype=np.float64)
 
 

@@ -46,14 +46,14 @@ def output_rows(model: Dynamics, n_y: int) -> NDArray[np.bool_]:
     return model.mask(a=rows[:, None], b=rows[:, None], c=rows, w1=True, b1=True, w2=rows[:, None])
 
 
-def with_units(model: Dynamics, data: ScaledRecord, states: Array, n_hidden: int, seed: int) -> Dynamics:
+def with_units(model: Dynamics, states: Array, v: Array, n_hidden: int, seed: int) -> Dynamics:
     """A linear model with ``n_hidden`` tanh units that do nothing yet: W1 drawn, W2 zero.
 
-    W1 is drawn in the space of [x, v] whitened over the rows of the free run, states (N, n_x); deviations below
-    2 % of the largest count as that, so that directions without data draw no steep units.
+    W1 is drawn in the space of [x, v] whitened over visited rows, states (N, n_x) under v (N, n_v); deviations
+    below 2 % of the largest count as that, so that directions without data draw no steep units.
     """
     rng = np.random.default_rng(seed)
-    z = np.hstack([states, data.v])
+    z = np.hstack([states, v])
     middle = z.mean(axis=0)
     _, spread, rows = np.linalg.svd(z - middle, full_matrices=False)
     spread = np.maximum(spread, 0.02 * spread[0]) / np.sqrt(len(z))

@@ -149,8 +149,8 @@ class Realizations:
         """
         root = np.sqrt(self.singular[:n])
         observability, controllability = self.left[:, :n] * root, root[:, None] * self.right[:n]
-        a: Array = np.linalg.lstsq(observability[: -self.n_y], observability[self.n_y :], rcond=None)[0]
-        a, b = within_unit_circle(a), controllability[:, : len(self.weight)] / self.weight
+        shift = np.linalg.lstsq(observability[: -self.n_y], observability[self.n_y :], rcond=None)[0]
+        a, b = within_unit_circle(shift.astype(np.float64)), controllability[:, : len(self.weight)] / self.weight
         c = observability[: self.n_y]
         _, spread, rows = np.linalg.svd(c)
         if n < self.n_y or spread[-1] < 1e-6 * spread[0]:

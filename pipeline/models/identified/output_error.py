@@ -166,11 +166,16 @@ def fit_starts(
                 break
             weight = 1e-7 * float(np.trace(sums.of_starts[0][1])) + 1e-9
             step = sums.solve(0.0, weight)[1][0]
-            trials = [(squares(model, [x0 + f * step], [stretch], correction), f) for f in (1.0, 0.3)]
-            error, factor = min(trials)
-            if not error < best * (1 - 1e-6):
+            trial = x0 + step
+            error = squares(model, [trial], [stretch], correction)
+            if not error < best:
+                trial = x0 + 0.3 * step
+                error = squares(model, [trial], [stretch], correction)
+            if not error < best:
                 break
-            best, x0 = error, x0 + factor * step
+            settled, best, x0 = error > best * (1 - 1e-5), error, trial
+            if settled:
+                break
         found.append(x0)
     return found
 
@@ -178,8 +183,11 @@ def fit_starts(
 def free_run_error(
     model: Dynamics, data: Sequence[Stretch], correction: float = 0.0, starts: Sequence[Array] | None = None
 ) -> tuple[Array, list[Array]]:
-    """(rms of each output's residual (n_y,), initial states) over ``data``, the initial states fitted to it."""
-    starts = fit_starts(model, data, correction, starts)
+    """(rms of each output's residual (n_y,), initial states) over ``data``, the initial states fitted to it.
+
+    From ``starts`` that fitted a model nearby one step is enough.
+    """
+    starts = fit_starts(model, data, correction, starts, iterations=3 if starts is None else 1)
     found = residuals(model, starts, data, correction)
     if found is None:
         return np.full(data[0].y.shape[1], np.inf), starts

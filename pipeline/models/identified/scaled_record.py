@@ -119,3 +119,25 @@ def folds(record: Record) -> tuple[Fold, Fold]:
     late = len(split_in_time(record, 1 - HELD_OUT)[0])
     early = len(split_in_time(record, HELD_OUT)[0])
     return Fold(slice(0, late), slice(late, n)), Fold(slice(early, n), slice(0, early))
+
+
+def informative(record: Record, most: int, block: int = 500) -> Record:
+    """The record, or of a longer one ``most`` rows: the blocks in which the inputs move most, in their order.
+
+    A block's score is the sum of squared moves of all inputs, each over its own mean; gaps between blocks become
+    ends of runs.
+    """
+    n = len(record)
+    if n <= most:
+        return record
+    block = min(block, most // 5)
+    moves = np.diff(np.hstack([record.mv, record.dv]), axis=0, prepend=np.nan) ** 2
+    moves[0] = 0.0
+    moves[1:][record.run[1:] != record.run[:-1]] = 0.0
+    score = (moves / np.maximum(moves.mean(axis=0), 1e-300)).sum(axis=1)
+    blocks = np.add.reduceat(score, np.arange(0, n, block))
+    best = np.sort(np.argsort(-blocks, kind="stable")[: most // block])
+    rows = np.concatenate([np.arange(i * block, min((i + 1) * block, n)) for i in best])
+    cut = np.r_[True, (np.diff(rows) > 1) | (np.diff(record.run[rows]) != 0)]
+    taken = {name: getattr(record, name)[rows] for name in ("time_s", "pv", "mv", "dv")}
+    return replace(record, run=np.cumsum(cut, dtype=np.int64) - 1, **taken)

@@ -1,0 +1,239 @@
+"""The verdict on an identified model: free run, gains and dead times with bands, residual, stability."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.metrics import fit_percent
+from pipeline.models.identified.assembly import dead_periods, step_responses
+from pipeline.models.identified.candidates import Training
+from pipeline.models.identified.dynamics import Dynamics
+from pipeline.models.identified.output_error import fit_starts
+from pipeline.models.identified.rests import rest_map, settle, steady_gain
+from pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from pipeline.models.identified.selection import INTEGRATES, Selection, Trial
+from pipeline.plants.simulator import Array
+from serving.manifest import Signal
+
+LAGS = 25
+"""Lags of the residual's correlations."""
+
+QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Places of an input over its data at which the local gain is taken."""
+
+SURE = 2.0
+"""Standard deviations from zero beyond which a gain's sign is certain."""
+
+POINTS = 60
+LONGEST = 960
+"""Points of a step response, and the most periods that it spans."""
+
+
+def structure_figures(selection: Selection) -> dict[str, Any]:
+    """The chosen structure, the errors of both classes, and the verdict in words."""
+    chosen, network = selection.chosen, selection.network
+    s = chosen.structure
+    if network is None:
+        words = "linear is enough: its residual is as small as the noise, or no network could be trained"
+    elif selection.nonlinear:
+        words = f"nonlinear by a factor of {selection.factor:.3g} in the held-out free run"
+    else:
+        words = f"linear is enough: a network changes the held-out free run by a factor of {selection.factor:.3g} only"
+    return {
+        "start": s.start,
+        "order": s.order,
+        "lags": list(s.lags),
+        "delays": list(s.delays),
+        "hidden": s.n_hidden,
+        "ridge": s.ridge,
+        "correction": s.correction,
+        "held_out_error": chosen.error,
+        "held_out_spread": chosen.spread,
+        "linear_error": selection.linear.error,
+        "network_error": None if network is None else network.error,
+        "network_spread": None if network is None else network.spread,
+        "nonlinear_factor": selection.factor,
+        "verdict": words,
+        "nominal_seconds": selection.spent,
+    }
+
+
+def free_run_figures(
+    training: Training, trial: Trial, scales: Scales, names: Sequence[str], fold: int = 0
+) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
+    """(figures of each PV, {measured, free run} of the first) of a fold's best fit over the rows that it never saw.
+
+    ``rmse`` in the PV's unit, ``fit_percent``, and ``rmse_by_third``: where the PV was low, in the middle and high.
+    """
+    best = trial.of_fold(fold)[0]
+    held = training.stretches(trial.structure, fold)[1]
+    starts = fit_starts(best.model, held, trial.structure.correction)
+    runs = [best.model.free_run(x, s, trial.structure.correction) for x, s in zip(starts, held, strict=True)]
+    actual = np.concatenate([s.y for s in held])
+    n_y = actual.shape[1]
+    predicted = np.concatenate(
+        [np.full(s.y.shape, np.nan) if r is None else r[0][:, :n_y] for r, s in zip(runs, held, strict=True)]
+    )
+    actual, predicted = (z * scales.y_scale + scales.y_center for z in (actual, predicted))
+    figures = {}
+    for i, name in enumerate(names):
+        y, error = actual[:, i], actual[:, i] - predicted[:, i]
+        edges = np.quantile(y, [1 / 3, 2 / 3])
+        thirds = [error[np.searchsorted(edges, y) == j] for j in range(3)]
+        figures[name] = {
+            "free_run_rmse": float(np.sqrt(np.mean(error**2))),
+            "fit_percent": fit_percent(y, predicted[:, i]) if np.all(np.isfinite(error)) else None,
+            "rmse_by_third": [float(np.sqrt(np.mean(e**2))) if len(e) else None for e in thirds],
+        }
+    return figures, {"measured": actual[:, 0], "free run": predicted[:, 0]}
+
+
+# ---------------------------------------------------------------------- what the plant does
+def rests_of(model: Dynamics, data: ScaledRecord) -> tuple[Array, Array]:
+    """(states (n, n_x), inputs (n, n_v)) of rests: each input at its quantiles, the others at their medians."""
+    middle = np.median(data.v, axis=0)
+    places = [
+        np.where(np.arange(len(middle)) == j, np.quantile(data.v[:, j], q), middle)
+        for j in range(len(middle))
+        for q in QUANTILES
+    ]
+    v = np.array(places)
+    table, _ = rest_map(model, data.y, data.v, 0)
+    start = np.column_stack([np.zeros((len(v), data.y.shape[1])), v, np.ones(len(v))]) @ table.T
+    x, still = settle(model, v, start)
+    return np.where(still[:, None], x, start), v
+
+
+def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, float]:
+    """(local steady gains (n_v, quantiles, n_y), scaled; the largest spectral radius at these rests).
+
+    For an integrating output the slope of the response to a step, a period, stands in place of the gain.
+    """
+    n_y, n_v = data.y.shape[1], data.v.shape[1]
+    x, v = rests_of(model, data)
+    gain, radius = steady_gain(model, x, v)
+    found = np.empty((n_v, len(QUANTILES), n_y))
+    for j in range(n_v):
+        for q in range(len(QUANTILES)):
+            at = j * len(QUANTILES) + q
+            if radius[at] > INTEGRATES or not np.all(np.isfinite(gain[at])):
+                response = step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), 300)[j, :, :n_y] / 1e-3
+                level = np.abs(response[-1] - response[-31]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
+                found[j, q] = np.where(level, (response[-1] - response[-31]) / 30, response[-1])
+            else:
+                found[j, q] = gain[at, :n_y, j]
+    return found, float(radius.max())
+
+
+def gain_figures(
+    members: Sequence[Dynamics], data: ScaledRecord, scales: Scales, pvs: Sequence[Signal], inputs: Sequence[Signal]
+) -> dict[str, Any]:
+    """Of each PV and input: the steady gain [PV/input], its spread over the members, its sign, its range over the data.
+
+    ``sign`` is uncertain where the gain lies within ``SURE`` spreads of zero; ``varies`` is the ratio of the
+    largest to the smallest local gain, None where the gain changes its sign.
+    """
+    local = np.array([gains(m, data)[0] for m in members])  # (members, n_v, quantiles, n_y)
+    table: dict[str, Any] = {}
+    for i, pv in enumerate(pvs):
+        table[pv.name] = {}
+        for j, signal in enumerate(inputs):
+            unit = scales.y_scale[i] / scales.v_scale[j]
+            of = local[:, j, :, i] * unit
+            middle = of[:, len(QUANTILES) // 2]
+            gain, spread = float(np.median(middle)), float(middle.std(ddof=1)) if len(middle) > 1 else 0.0
+            over = np.median(of, axis=0)
+            turns = bool(over.min() < 0 < over.max())
+            table[pv.name][signal.name] = {
+                "gain": gain,
+                "spread": spread,
+                "sign": "uncertain" if abs(gain) <= SURE * spread else "+" if gain > 0 else "-",
+                "low": float(over.min()),
+                "high": float(over.max()),
+                "varies": None if turns else float(np.abs(over).max() / max(np.abs(over).min(), 1e-12)),
+            }
+    return table
+
+
+def response_figures(
+    members: Sequence[Dynamics],
+    delays: Sequence[int],
+    data: ScaledRecord,
+    scales: Scales,
+    pvs: Sequence[Signal],
+    inputs: Sequence[Signal],
+) -> tuple[dict[str, Any], dict[str, float]]:
+    """(step responses of each PV to a unit step of each input, dead time of each input in periods).
+
+    A response holds ``periods``, and over the members the ``middle``, ``low`` and ``high`` in PV/input.
+    """
+    n_y = len(pvs)
+    middle = np.median(data.v, axis=0)
+    size = 0.3 * data.v.std(axis=0)
+    length = 2 * POINTS
+    while True:
+        found = np.array([step_responses(m, _middle_rest(m, data), middle, size, length)[..., :n_y] for m in members])
+        late = np.abs(found[:, :, -1] - found[:, :, -length // 5]).max()
+        if length >= LONGEST or late < 0.02 * np.abs(found).max():
+            break
+        length *= 2
+    every = max(length // POINTS, 1)
+    table: dict[str, Any] = {pv.name: {} for pv in pvs}
+    for j, signal in enumerate(inputs):
+        for i, pv in enumerate(pvs):
+            curves = found[:, j, ::every, i] * scales.y_scale[i] / (scales.v_scale[j] * size[j])
+            table[pv.name][signal.name] = {
+                "periods": [int(k) + 1 + int(delays[j]) for k in range(0, length, every)],
+                "middle": np.median(curves, axis=0).tolist(),
+                "low": curves.min(axis=0).tolist(),
+                "high": curves.max(axis=0).tolist(),
+            }
+    dead = np.median([dead_periods(m, data) for m in members], axis=0) + np.asarray(delays)
+    return table, {signal.name: float(d) for signal, d in zip(inputs, dead, strict=True)}
+
+
+def _middle_rest(model: Dynamics, data: ScaledRecord) -> Array:
+    middle = np.median(data.v, axis=0)
+    start = rest_map(model, data.y, data.v, 0)[0] @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
+    x, still = settle(model, middle[None], start[None])
+    return x[0] if still[0] else start
+
+
+# ---------------------------------------------------------------------- the residual
+def residual_figures(
+    residuals: Sequence[Array], inputs: Sequence[Array], names: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Of each PV's free-run residual: shares of its correlations outside the 99 % band of a white one.
+
+    ``autocorrelated`` over lags 1 .. 25, ``input_correlated`` with the inputs at lags 0 .. 25; .01 is what chance
+    gives. A share of the second far above that says that dynamics are missing; the first also sees coloured noise.
+    """
+    e = np.concatenate([r - r.mean(axis=0) for r in residuals])
+    v = np.concatenate([u - u.mean(axis=0) for u in inputs])
+    n = len(e)
+    if n <= 2 * LAGS:
+        return {}
+    figures = {}
+    for i, name in enumerate(names):
+        own = _correlations(e[:, i], e[:, i])
+        bound = 2.58 / np.sqrt(n)
+        cross = []
+        for u in v.T:
+            # Correlated inputs widen the band: the product of both autocorrelations, after Bartlett.
+            wide = np.sqrt(max(1 + 2 * float(np.sum(own[1:] * _correlations(u, u)[1:])), 1.0))
+            cross.append(np.abs(_correlations(e[:, i], u)) > bound * wide)
+        figures[name] = {
+            "autocorrelated": float(np.mean(np.abs(own[1:]) > bound)),
+            "input_correlated": float(np.mean(cross)),
+        }
+    return figures
+
+
+def _correlations(later: Array, earlier: Array) -> Array:
+    """Correlation coefficients of later(k) and earlier(k - l), l = 0 .. ``LAGS``."""
+    norm = max(float(np.linalg.norm(later) * np.linalg.norm(earlier)), 1e-300)
+    n = len(later)
+    return np.array([float(later[lag:] @ earlier[: n - lag]) for lag in range(LAGS + 1)]) / norm

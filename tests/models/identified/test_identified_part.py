@@ -1,0 +1,155 @@
+"""The part: what it recovers of plants whose truth is known, its verdict, its members, its numbers in params.yaml."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import made_plants
+import numpy as np
+import pytest
+import torch
+
+from pipeline.config.params import parse
+from pipeline.errors import ModelError, ParamsError
+from pipeline.models import MODELS, load_model
+from pipeline.models.identified.assembly import free_run, plant_of
+from pipeline.models.identified.identified import Identified
+from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.part import Learnt, Source
+
+LINEAR = IdentifiedPart(orders=(2, 4), units=())
+SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.08)
+
+
+def identified(learnt: Learnt) -> Identified:
+    assert isinstance(learnt.model, Identified)
+    return learnt.model
+
+
+def noise_sd(learnt: Learnt, name: str = "y0") -> float:
+    return float(learnt.metrics["outputs"][name]["noise_sd"])
+
+
+def test_second_order_with_dead_time() -> None:
+    learnt = LINEAR.learn(Source(made_plants.second_order(1000, delay=4), made_plants.signals_of(1, 1)))
+    assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.01)
+    assert learnt.metrics["gains"]["y0"]["u0"]["sign"] == "+"
+    assert learnt.metrics["free_run_rmse"] < 1.1 * 0.1
+    assert noise_sd(learnt) == pytest.approx(0.1, rel=0.1)
+    assert learnt.metrics["dead_times"]["u0"] == 5  # four, and one through the second lag
+    assert learnt.metrics["spectral_radius"] == pytest.approx(0.9, abs=0.01)
+    assert learnt.metrics["residual"]["y0"]["autocorrelated"] < 0.1
+    assert float(identified(learnt).dead[0]) == 5
+
+
+def test_two_by_two_with_a_measured_disturbance() -> None:
+    record, signals = made_plants.two_by_two(1000, measured=True), made_plants.signals_of(2, 2, 1)
+    learnt = LINEAR.learn(Source(record, signals))
+    gains = learnt.metrics["gains"]
+    found = [[gains[y][v]["gain"] for v in ("u0", "u1", "d0")] for y in ("y0", "y1")]
+    assert np.array(found) == pytest.approx(np.array([[0.5, -0.3, 2.0], [0.2, 0.6, -1.0]]), rel=0.02)
+    assert gains["y0"]["u1"]["sign"] == "-"
+    assert noise_sd(learnt, "y1") == pytest.approx(0.1, rel=0.1)
+    model = identified(learnt)
+    assert (model.n_y, model.n_mv, model.n_dv) == (2, 2, 1)
+
+
+def test_an_integrator_keeps_its_slope_and_its_poles_inside() -> None:
+    learnt = LINEAR.learn(Source(made_plants.integrator(1000), made_plants.signals_of(1, 1)))
+    assert learnt.metrics["structure"]["correction"] == 0.05
+    assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.05, rel=0.03)
+    assert 0.995 < learnt.metrics["spectral_radius"] <= 1 + 1e-6
+    assert noise_sd(learnt) == pytest.approx(0.1, rel=0.1)
+    plant = plant_of(identified(learnt), made_plants.signals_of(1, 1))
+    assert plant.measure(plant.start_at(np.array([52.0]))) == pytest.approx([52.0])
+
+
+def test_a_record_from_a_closed_loop() -> None:
+    learnt = LINEAR.learn(Source(made_plants.closed_loop(1500), made_plants.signals_of(1, 1)))
+    assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.8, rel=0.02)
+    assert learnt.metrics["free_run_rmse"] < 1.1 * 0.1
+
+
+def test_several_runs_each_with_its_own_start() -> None:
+    record = made_plants.second_order(1200, delay=0, runs=6)
+    learnt = LINEAR.learn(Source(record, made_plants.signals_of(1, 1)))
+    assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.01)
+    assert learnt.metrics["free_run_rmse"] < 1.1 * 0.1
+
+
+def test_a_gain_that_changes_needs_a_network() -> None:
+    record, signals = made_plants.hammerstein(800), made_plants.signals_of(1, 1)
+    learnt = SMALL.learn(Source(record, signals))
+    structure = learnt.metrics["structure"]
+    assert structure["hidden"] == 6
+    assert structure["nonlinear_factor"] > 5
+    assert structure["verdict"].startswith("nonlinear by a factor of")
+    assert learnt.metrics["free_run_rmse"] < 1.6 * 0.1
+    assert noise_sd(learnt) == pytest.approx(0.1, rel=0.1)
+    plant = plant_of(identified(learnt), signals)
+    x, _ = plant.start
+    for u in (30.0, 70.0):
+        for _ in range(80):
+            x = plant.step(x, np.array([u]), plant.dv_nominal, plant.parameters())
+        assert plant.measure(x)[0] == pytest.approx(made_plants.curve(u), abs=0.3)
+    assert json.dumps(learnt.metrics)
+
+
+def test_members_differ_and_share_their_structure() -> None:
+    source = Source(made_plants.second_order(800), made_plants.signals_of(1, 1))
+    learnt = [IdentifiedPart(orders=(2, 4), units=(), member=k).learn(source) for k in range(3)]
+    arrays = [identified(one).a for one in learnt]
+    assert not torch.equal(arrays[0], arrays[1])
+    assert not torch.equal(arrays[1], arrays[2])
+    assert learnt[0].metrics["structure"] == learnt[2].metrics["structure"]
+
+
+def test_the_same_record_gives_the_same_bytes(tmp_path: Path) -> None:
+    source = Source(made_plants.hammerstein(150), made_plants.signals_of(1, 1), seed=3)
+    part = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.01)
+    from pipeline.models.identified import identified_part
+
+    models = []
+    for _ in range(2):
+        identified_part._searched.cache_clear()
+        models.append(identified(part.learn(source)).state_dict())
+    assert all(torch.equal(models[0][name], value) for name, value in models[1].items())
+
+
+def test_its_file_and_its_free_run(tmp_path: Path) -> None:
+    record = made_plants.second_order(800)
+    learnt = LINEAR.learn(Source(record, made_plants.signals_of(1, 1)))
+    learnt.model.save(tmp_path / "m.npz")
+    again = load_model(tmp_path / "m.npz")
+    assert type(again) is MODELS["identified"].model is Identified
+    predicted = free_run(again, record.pv, record.mv)
+    assert float(np.sqrt(np.mean((predicted - record.pv) ** 2))) < 1.05 * 0.1
+
+
+def test_a_long_record_gives_its_liveliest_blocks() -> None:
+    record = made_plants.second_order(1500)
+    learnt = IdentifiedPart(orders=(2, 3), units=(), rows=600).learn(Source(record, made_plants.signals_of(1, 1)))
+    assert learnt.metrics["n_train"] <= 600
+    assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"member": 3}, "member is 3; an ensemble has"),
+        ({"orders": [3, 2]}, r"orders are \[3, 2\]; give the least"),
+        ({"units": [0]}, r"units are \[0\]; each must be"),
+        ({"minutes": 0.0}, "minutes is 0; it must be positive"),
+        ({"rows": 10}, "rows is 10; it must be at least 100"),
+        ({"correction": 2.0}, "correction is 2; it must lie"),
+    ],
+)
+def test_numbers_that_cannot_be(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ParamsError, match=message):
+        parse(MODELS["identified"], options, "part")
+
+
+def test_it_needs_a_record() -> None:
+    with pytest.raises(ModelError, match="learns from a record"):
+        LINEAR.learn(Source(None, made_plants.signals_of(1, 1)))
