@@ -131,7 +131,7 @@ def fitted(record: Record, order: int, units: int, seed: int = 0) -> Identified:
     linear = OutputError(iterations=20).fit(Realizations.of(response, data.v.std(axis=0)).order(order), train, held)
     run = linear.model.free_run(linear.starts[0], train[0])
     assert run is not None
-    grown = with_units(linear.model, data.rows(fold.train), run[0], units, seed)
+    grown = with_units(linear.model, run[0], train[0].v, units, seed)
     network = OutputError(iterations=60, ridge=1.0).fit(grown, train, held)
     print(f"  free run, held out: linear {linear.held_out:.4f}, network {network.held_out:.4f} of a standard deviation")
     left = residuals(network.model, network.starts, train)
