@@ -82,10 +82,12 @@ def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Re
         raise RecordError(f"no row of {len(code)} is good in all signals: {words}; name fewer tags, or a longer --hold")
     fresh = np.r_[True, (np.diff(kept) > 1) | (np.diff(grid.piece[kept]) > 0)]
     run = np.cumsum(fresh) - 1
-    values = {t.tag: grid.value[t.tag][kept] for t in signals}
     groups = {r: [t for t in signals if t.role == r] for r in ("pv", "mv", "dv")}
-    columns = {r: np.column_stack([np.empty((len(kept), 0)), *(values[t.tag] for t in g)]) for r, g in groups.items()}
-    own = {r: tuple(_signal(t, values[t.tag]) for t in g) for r, g in groups.items()}
+    columns = {r: np.empty((len(kept), len(g))) for r, g in groups.items()}
+    for role, group in groups.items():
+        for i, tag in enumerate(group):
+            columns[role][:, i] = grid.value[tag.tag][kept]
+    own = {r: tuple(_signal(t, v) for t, v in zip(g, columns[r].T, strict=True)) for r, g in groups.items()}
     position = np.arange(len(run)) - np.maximum.accumulate(np.where(fresh, np.arange(len(run)), 0))
     time_s = position.astype(np.float64) * grid.period_s
     return Record(
