@@ -14,7 +14,7 @@ from pipeline.historian.cells import usual
 from pipeline.historian.character import clipped, runs_of, stuck
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
-from pipeline.historian.grid import Grid
+from pipeline.historian.grid import Grid, Sampling
 from pipeline.historian.reason import Reason
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
@@ -25,13 +25,16 @@ SHORTEST_RUN = 20  # rows
 PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
 
 
-def stretches(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
-    """Mask stuck and saturated rows of PVs and measured disturbances; changes the grid's codes in place."""
+def stretches(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, Sampling]) -> list[Finding]:
+    """Mask stuck and saturated rows of PVs and measured disturbances; changes the grid's codes in place.
+
+    A tag that is stored by exception repeats its value on purpose: it is neither.
+    """
     found = []
     spans = {t.tag: float(np.ptp(usual(grid.value[t.tag]))) for t in signals}
     together = grid.piece[1:] == grid.piece[:-1]
     for tag in signals:
-        if tag.role == "mv":
+        if tag.role == "mv" or rates[tag.tag].irregular:
             continue
         values, code = grid.value[tag.tag], grid.code[tag.tag]
         others = [(grid.value[name], span) for name, span in spans.items() if name != tag.tag]
