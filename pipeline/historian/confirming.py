@@ -36,7 +36,8 @@ def confirm(
     for tag in (t for t in signals if t.role == "pv"):
         series, rate = own[tag.tag], rates[tag.tag]
         y = grid.value[tag.tag]
-        model = fitted(y, u, grid.piece) if rate.step_s > SLOWEST * grid.period_s else None
+        single = rate.step_s > SLOWEST * grid.period_s and not rate.irregular
+        model = fitted(y, u, grid.piece) if single else None
         if model is None:
             continue
         back = _answers(grid, series, model, y, u)

@@ -21,6 +21,7 @@ NICE_S = (
 NICE_SHARE = 0.02
 HOLD_PERIODS = 3.2
 IRREGULAR = 2.5  # 90 % over 10 % quantile of the steps, above which a tag reports by exception
+SMALLEST_MOVE = 0.05  # over the median move, of a tag with a dead band
 MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
 THINNED = 1.9  # readings a period from which PVs are averaged
 LEAST_PIECE = 2  # rows
@@ -33,7 +34,8 @@ class Sampling:
 
     tag: str
     step_s: float  # [s] median
-    irregular: bool
+    irregular: bool  # stored by exception or compressed
+    dead_band: bool  # stored when it had moved by a dead band: it holds in between, it does not go on a line
     hold_s: float  # [s]
 
 
@@ -61,11 +63,19 @@ def sampling(series: Series, period_s: float | None = None, hold_s: float | None
     step = np.diff(series.time_s[series.code != Reason.DUPLICATE])
     step = step[step > 0]
     if not step.size:
-        return Sampling(series.tag, 0.0, False, hold_s or HOLD_PERIODS * (period_s or 1.0))
+        return Sampling(series.tag, 0.0, False, False, hold_s or HOLD_PERIODS * (period_s or 1.0))
     low, median, high = np.quantile(step[:: max(1, len(step) // 200_000)], [0.1, 0.5, 0.9])
     irregular = bool(high > IRREGULAR * low)
     own = 2.0 * float(np.quantile(step, 0.99)) if irregular else HOLD_PERIODS * float(median)
-    return Sampling(series.tag, float(median), irregular, hold_s or max(own, HOLD_PERIODS * (period_s or 0.0)))
+    band = irregular and _has_dead_band(series.value[series.good])
+    return Sampling(series.tag, float(median), irregular, band, hold_s or max(own, HOLD_PERIODS * (period_s or 0.0)))
+
+
+def _has_dead_band(values: Array) -> bool:
+    """Whether no move between two stored values is small: of a compressed signal some are."""
+    moves = np.abs(np.diff(values))
+    moves = moves[moves > 0]
+    return bool(moves.size) and float(np.quantile(moves, 0.02)) > SMALLEST_MOVE * float(np.median(moves))
 
 
 def proposed_period(series: Sequence[Series]) -> float:
@@ -87,9 +97,10 @@ def resampled(
     """All series on one grid: PVs and measured disturbances (``pv``) drawn or averaged, the others held.
 
     Grid: pieces of the PVs' time without a gap longer than their hold, each with the phase of its own stamps.
-    PVs: a straight line between two good readings no farther apart than the hold; where two or more readings fall
-    into a period, the mean over (t - h, t], against aliasing. Held ones: the reading that holds at the middle of
-    [t, t + h), so that jitter of less than half a period does not matter; the mean over it where they are thinned out.
+    PVs: held where they are stored beyond a dead band, else on a straight line between two good readings no farther
+    apart than the hold; where two or more readings fall into a period, the mean over (t - h, t], against aliasing.
+    Held ones: the reading that holds at the middle of [t, t + h), so that jitter of less than half a period does not
+    matter; the mean over it where they are thinned out.
     """
     if not period_s > 0:
         raise RecordError(f"the period is {period_s:g} s; it must be positive")
@@ -106,7 +117,9 @@ def resampled(
         elif thin:
             out, over = _held(time_s, t, v, period_s, rate.hold_s, thin)
         else:
-            out, over = _in_chunks(_line if s in pv else _held, time_s, t, v, period_s, rate.hold_s)
+            out, over = _in_chunks(
+                _line if s in pv and not rate.dead_band else _held, time_s, t, v, period_s, rate.hold_s
+            )
         value[s.tag], code[s.tag] = out, _reasons(time_s, s, out, period_s)
         bridged[s.tag] = 0 if rate.irregular else int(np.count_nonzero(over))
     return Grid(period_s, time_s, piece, value, code, bridged), tuple(rates.values())

@@ -21,11 +21,11 @@ from pipeline.historian.layout import Layout, layout_of
 from pipeline.historian.numbers import numbers
 from pipeline.historian.quality import good_quality
 from pipeline.historian.reason import Reason
-from pipeline.historian.times import Clock
 from pipeline.records.record_file import split_column
 
 BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17
+GROWTH = 1.2  # of an array that is full
 PARQUET = {".parquet", ".pq"}
 
 
@@ -77,6 +77,7 @@ def read_export(
         found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
         for name, series in found.items():
             parts.setdefault(name, []).append(series)
+        pa.default_memory_pool().release_unused()
         totals += counts + source.unreadable
         kinds.append(layout.kind)
         files.append((str(path), sha256(path)))
@@ -108,7 +109,7 @@ def bare(column: str) -> str:
 
 # ---------------------------------------------------------------------- one file
 def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> tuple[dict[str, Series], Counter[str]]:
-    gather = _Gather(modes, source.decimal, layout.clock)
+    gather = _Gather(modes, source.decimal, wide=layout.kind == "wide")
     counts: Counter[str] = Counter()
     values = {v: bare(v) for v in layout.values if not wanted or {v, bare(v)} & wanted or layout.kind == "long"}
     qualities = {v: layout.quality[v] for v in values if v in layout.quality}
@@ -116,7 +117,11 @@ def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> 
     try:
         for block in source.blocks(names):
             counts["rows_read"] += block.num_rows
-            seconds = gather.times(block.column(layout.time), counts)
+            seconds = layout.clock.seconds(block.column(layout.time))
+            timed = np.isfinite(seconds)
+            if not timed.all():
+                counts["timeless"] += int(np.count_nonzero(~timed))
+                block, seconds = block.filter(pa.array(timed)), seconds[timed]
             if layout.kind == "wide":
                 for v, name in values.items():
                     gather.add(name, seconds, block.column(v), block.column(qualities[v]) if v in qualities else None)
@@ -151,18 +156,15 @@ def _long_block(gather: _Gather, layout: Layout, block: Any, seconds: Any, wante
 
 
 class _Gather:
-    """Blocks of readings, put together at the end."""
+    """Blocks of readings, put together; of a wide file the time stands once in memory."""
 
-    def __init__(self, modes: set[str], decimal: str, clock: Clock) -> None:
-        self.modes, self.decimal, self.clock = modes, decimal, clock
-        self.parts: dict[str, list[tuple[Any, Any, Any]]] = {}
+    def __init__(self, modes: set[str], decimal: str, *, wide: bool) -> None:
+        self.modes, self.decimal, self.wide = modes, decimal, wide
+        self.time: dict[str, Growing] = {}
+        self.value: dict[str, Growing] = {}
+        self.code: dict[str, Growing] = {}
         self.texts: dict[str, Counter[str]] = {}
         self.names: dict[str, dict[str, int]] = {}
-
-    def times(self, column: Any, counts: Counter[str]) -> Any:
-        seconds = self.clock.seconds(column)
-        counts["timeless"] += int(np.count_nonzero(~np.isfinite(seconds)))
-        return seconds
 
     def add(self, name: str, seconds: Any, column: Any, quality: Any) -> None:
         if name in self.modes:
@@ -175,37 +177,45 @@ class _Gather:
             self.texts.setdefault(name, Counter()).update(texts)
         if quality is not None:
             codes[~good_quality(quality) & (codes == Reason.GOOD)] = Reason.QUALITY
-        timed = np.isfinite(seconds)
-        if not timed.all():
-            seconds, values, codes = seconds[timed], values[timed], codes[timed]
-        self.parts.setdefault(name, []).append((seconds, values, codes))
+        if not self.wide or name == next(iter(self.value), name):
+            self.time.setdefault("" if self.wide else name, Growing(np.float64)).append(seconds)
+        self.value.setdefault(name, Growing(np.float64)).append(values)
+        self.code.setdefault(name, Growing(np.uint8)).append(codes)
 
     def series(self) -> dict[str, Series]:
-        found, shared = {}, _Shared()
-        for name in list(self.parts):
-            times, values, codes = zip(*self.parts.pop(name), strict=True)
-            found[name] = Series(
+        times = {name: grown.whole() for name, grown in self.time.items()}
+        return {
+            name: Series(
                 name,
-                shared.joined(times),
-                np.concatenate(values),
-                np.concatenate(codes),
+                times["" if self.wide else name],
+                value.whole(),
+                self.code[name].whole(),
                 self.texts.get(name, Counter()),
                 tuple(self.names.get(name, ())),
             )
-        return found
+            for name, value in self.value.items()
+        }
 
 
-class _Shared:
-    """The time of a wide file stands once in memory, however many columns it has."""
+class Growing:
+    """An array that grows in place: many blocks leave no copies behind."""
 
-    def __init__(self) -> None:
-        self.last: tuple[Any, ...] = ()
-        self.whole: Any = None
+    def __init__(self, dtype: type) -> None:
+        self.values: Any = np.empty(0, dtype)
+        self.length = 0
 
-    def joined(self, times: tuple[Any, ...]) -> Any:
-        if len(times) != len(self.last) or any(a is not b for a, b in zip(times, self.last, strict=True)):
-            self.last, self.whole = times, np.concatenate(times)
-        return self.whole
+    def append(self, block: Any) -> None:
+        """Add the values of ``block`` (m,)."""
+        end = self.length + len(block)
+        if end > len(self.values):
+            self.values.resize(max(end, int(GROWTH * end)), refcheck=False)
+        self.values[self.length : end] = block
+        self.length = end
+
+    def whole(self) -> Any:
+        """All values, (n,); nothing may be appended afterwards."""
+        self.values.resize(self.length, refcheck=False)
+        return self.values
 
 
 # ---------------------------------------------------------------------- formats

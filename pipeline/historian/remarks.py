@@ -18,7 +18,6 @@ from pipeline.records.record import Record
 
 COARSE = 0.002  # of the usual span: a converter's step that a model feels
 STRAIGHT = 0.3  # share of rows in straight lines, from which a signal was compressed
-CONSTANT_MOVE = 0.3  # smallest over median move of an exception-reported tag with a dead band
 PARTS, DRIFT_SE, DRIFT_SPAN = 8, 6.0, 0.1
 AHEAD = 25.0  # strength of moves still to come
 
@@ -32,10 +31,7 @@ def of_series(series: Series, rate: Sampling) -> list[Finding]:
     low, high = usual(values)
     span = high - low
     if rate.irregular:
-        moves = np.abs(np.diff(values))
-        moves = moves[moves > 0]
-        held = moves.size and float(np.quantile(moves, 0.02)) > CONSTANT_MOVE * float(np.median(moves))
-        kind = "by exception, beyond a dead band" if held else "by exception, or compressed (swinging door)"
+        kind = "by exception, beyond a dead band" if rate.dead_band else "by exception, or compressed (swinging door)"
         words = (
             f"stored {kind}: a reading every {rate.step_s:.4g} s in the median; used for at most {rate.hold_s:.4g} s"
         )

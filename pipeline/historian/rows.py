@@ -14,7 +14,7 @@ from pipeline.historian.cells import usual
 from pipeline.historian.character import clipped, runs_of, stuck
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
-from pipeline.historian.grid import Grid
+from pipeline.historian.grid import Grid, Sampling
 from pipeline.historian.reason import Reason
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
@@ -25,13 +25,16 @@ SHORTEST_RUN = 20  # rows
 PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
 
 
-def stretches(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
-    """Mask stuck and saturated rows of PVs and measured disturbances; changes the grid's codes in place."""
+def stretches(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, Sampling]) -> list[Finding]:
+    """Mask stuck and saturated rows of PVs and measured disturbances; changes the grid's codes in place.
+
+    A tag that is stored by exception repeats its value on purpose: it is neither.
+    """
     found = []
     spans = {t.tag: float(np.ptp(usual(grid.value[t.tag]))) for t in signals}
     together = grid.piece[1:] == grid.piece[:-1]
     for tag in signals:
-        if tag.role == "mv":
+        if tag.role == "mv" or rates[tag.tag].irregular:
             continue
         values, code = grid.value[tag.tag], grid.code[tag.tag]
         others = [(grid.value[name], span) for name, span in spans.items() if name != tag.tag]
@@ -82,10 +85,12 @@ def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Re
         raise RecordError(f"no row of {len(code)} is good in all signals: {words}; name fewer tags, or a longer --hold")
     fresh = np.r_[True, (np.diff(kept) > 1) | (np.diff(grid.piece[kept]) > 0)]
     run = np.cumsum(fresh) - 1
-    values = {t.tag: grid.value[t.tag][kept] for t in signals}
     groups = {r: [t for t in signals if t.role == r] for r in ("pv", "mv", "dv")}
-    columns = {r: np.column_stack([np.empty((len(kept), 0)), *(values[t.tag] for t in g)]) for r, g in groups.items()}
-    own = {r: tuple(_signal(t, values[t.tag]) for t in g) for r, g in groups.items()}
+    columns = {r: np.empty((len(kept), len(g))) for r, g in groups.items()}
+    for role, group in groups.items():
+        for i, tag in enumerate(group):
+            columns[role][:, i] = grid.value[tag.tag][kept]
+    own = {r: tuple(_signal(t, v) for t, v in zip(g, columns[r].T, strict=True)) for r, g in groups.items()}
     position = np.arange(len(run)) - np.maximum.accumulate(np.where(fresh, np.arange(len(run)), 0))
     time_s = position.astype(np.float64) * grid.period_s
     return Record(

@@ -71,7 +71,7 @@ def screened(
     for s in own.values():
         if len(s) > LARGE:
             s.lighten()
-    findings += stretches(grid, signals)
+    findings += stretches(grid, signals, by_tag)
     code = row_codes(grid, signals, tags, own, without_modes)
     record = record_of(grid, code, signals)
     models = models_of(record)

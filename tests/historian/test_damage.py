@@ -259,3 +259,21 @@ def test_inputs_that_move_together_are_told(tmp_path: Path) -> None:
     )
     assert found.report.verdict.carries == "no"
     assert "cannot be told apart" in " ".join(found.report.verdict.reasons)
+
+
+def test_exception_reports_with_a_dead_band_are_held(tmp_path: Path) -> None:
+    """In the long format: nothing is stuck, and no line through a hold answers before the MV moves."""
+    data = clean(3000)
+    rows = []
+    for name, values, band in zip([t.tag for t in TAGS], (data.pv, data.mv, data.dv), (0.3, 1e-9, 2.0), strict=True):
+        last = np.inf
+        for t, v in zip(data.time_s, values, strict=True):
+            if abs(v - last) > band:
+                rows.append([name, f"{t:.0f}", f"{v}"])
+                last = v
+    path = write(tmp_path / "x.csv", rows, ("tag", "time", "value"))
+    found = screen(path, period_s=PERIOD_S, hold_s=3600.0)
+    assert kinds(found) == {"compression"}, found.report.findings
+    assert found.report.kept_rows > 2900
+    assert worst_error(found, data) < 0.4
+    assert found.report.verdict.carries == "yes"
