@@ -20,7 +20,6 @@ from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
 from pipeline.historian.step_test import StepTest, planned
 from pipeline.historian.tags import ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
-from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
 
@@ -124,11 +123,6 @@ def entry(record: Record, report: Screening, folder: Path) -> dict[str, Any]:
         "data": (folder / "record.parquet").as_posix(),
         "source": [dict(f) for f in report.files],
     }
-
-
-def signals_of(record: Record) -> Signals:
-    """The plant's signals; every PV has a set point until a law says otherwise."""
-    return Signals(record.period_s, record.pv_signals, record.pv_signals, record.dv_signals, record.mv_signals)
 
 
 def _tell(name: str, folder: Path, report: Screening, test: StepTest | None) -> None:
