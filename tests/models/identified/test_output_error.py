@@ -9,14 +9,13 @@ from hypothesis import strategies as st
 
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.output_error import (
-    CHUNK,
     OutputError,
     fit_starts,
     free_run_error,
     residuals,
-    sensitivity_sums,
     squares,
 )
+from pipeline.models.identified.sensitivities import CHUNK, sensitivity_sums
 
 
 def drawn(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
