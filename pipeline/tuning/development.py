@@ -19,7 +19,7 @@ LawStep = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tenso
 """A control law or its ``forward``: (sp, pv, dv, mv_applied, state) -> (mv, state_next, info)."""
 
 MARGIN = 0.02  # share of the reachable range of the controlled variable that is left out at either end
-TRAVEL = 0.1  # share of the range of the controlled variable that a move over the MV's range costs
+TRAVEL = 0.05  # share of the range of the controlled variable that a move over the MV's range costs
 CHECK = 25  # samples between two looks at who has arrived
 
 
