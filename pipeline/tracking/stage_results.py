@@ -98,9 +98,9 @@ class Times:
         try:
             row = json.loads(receipt_path(root, result.name).read_text(encoding="utf-8"))
             start, end = float(row["started"]), float(row["started"]) + float(row["seconds"])
+            measured = start - 1.0 <= written <= end + SLACK_S  # a stage may end within the millisecond
         except (OSError, ValueError, KeyError, TypeError):
-            start, end = written, written
-        measured = start < end and start - 1.0 <= written <= end + SLACK_S
+            measured = False
         if not measured:
             start = end = written
         return cls(round(1000 * start), round(1000 * end), measured)

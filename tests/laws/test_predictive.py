@@ -344,7 +344,7 @@ def test_the_search_takes_the_best_factor_of_each_number() -> None:
 
 
 def test_trials_tell_a_good_law_from_a_sluggish_one_and_are_the_same_again() -> None:
-    model = first_order(pole=0.6)
+    model = first_order(pole=0.9)
     signals, law = made_signals(), law_of(model, horizon=12)
     trials, again = (Trials.draw([model], signals, 12, seed=1) for _ in range(2))
     cost = trials.cost(law)
