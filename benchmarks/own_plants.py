@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -28,7 +28,8 @@ from pipeline.models import MODELS
 from pipeline.models.part import Source
 from pipeline.optimal.perfect import PerfectNmpc, run_nmpc
 from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import AdvanceMany, Array, Simulator
+from pipeline.plants.simulator import Array
+from pipeline.plants.spoilt import SpoiltPlant
 from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.simulation.simulate import Trajectory, simulate_closed, simulate_open
@@ -239,45 +240,6 @@ class Oscillating(OwnPlant):
         return ca.vertcat(x[1], omega**2 * (x[2] - x[0]) - 2 * damping * omega * x[1], (force - x[2]) / 15)
 
 
-class Unknown(Simulator):
-    """A plant without its equations, as a search in closed loop sees it."""
-
-    def __init__(self, plant: OwnPlant) -> None:
-        names = ("name", "period_s", "pv_signals", "sp_signals", "mv_signals")
-        vars(self).update({name: getattr(plant, name) for name in names})
-        self.plant = plant
-
-    @property
-    def start(self) -> tuple[Array, Array]:
-        """The start of the plant."""
-        return self.plant.start
-
-    @property
-    def noise_std(self) -> Array:
-        """Standard deviation of the measurement noise, shape (1,)."""
-        return self.plant.noise_std
-
-    def parameters(self, changed: Mapping[str, float] | None = None) -> Array:
-        """The plant's parameters."""
-        return self.plant.parameters(changed)
-
-    def step(self, x: Array, mv: Array, dv: Array, p: Array) -> Array:
-        """The state one period later."""
-        return self.plant.step(x, mv, dv, p)
-
-    def measure(self, x: Array) -> Array:
-        """The output of a state."""
-        return self.plant.measure(x)
-
-    def measured(self, x: Array) -> Array:
-        """Outputs of states."""
-        return self.plant.measured(x)
-
-    def many(self, n: int) -> AdvanceMany:
-        """``step`` of ``n`` runs side by side."""
-        return self.plant.many(n)
-
-
 DEVELOPMENT: tuple[type[OwnPlant], ...] = (Exchanger, Inverse, Tanks, Noisy)
 UNTOUCHED: tuple[type[OwnPlant], ...] = (Turning, Recycle, Delayed, Oscillating)
 
@@ -336,7 +298,7 @@ def row_of(plant: OwnPlant, rows: int, settings: dict[str, Any]) -> str:
     fitted = time.perf_counter() - began
     predictive = LAWS["predictive"]
     laws = {
-        "pid": LAWS["pid"].design(LAWS["pid"].Params(), {}, plant.signals, Unknown(plant)).eval(),
+        "pid": LAWS["pid"].design(LAWS["pid"].Params(), {}, plant.signals, SpoiltPlant(plant, {})).eval(),
         "predictive": predictive.design(
             predictive.Params(**settings), {"identified": model}, plant.signals, None
         ).eval(),

@@ -194,13 +194,14 @@ class OwnCase(Case):
         """Set points on the other models; the same on spoilt ones; and a load, upwards and downwards."""
         members, cv = self.members, self.plant.pv_signals[0]
         pairs = [(seed, members[i % len(members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
+        sp = {seed: self._sequence(seed) for seed in self.held_out_seeds}
         held_out = "Set points, on models identified from the record"
         spoilt = "Set points, on such models with errors of gain, speed and dead time"
         loads = f"A load worth {LOAD:g} standard deviations of the record's {cv.name}"
         errors = errors_of(self._nominal)
         return {
-            "held_out": tuple(self._test("held_out", held_out, self._sequence(s), p, s) for s, p, _ in pairs),
-            "spoilt": tuple(self._test("spoilt", spoilt, self._sequence(s), p, s, **errors[i]) for s, p, i in pairs),
+            "held_out": tuple(self._test("held_out", held_out, sp[s], p, s) for s, p, _ in pairs),
+            "spoilt": tuple(self._test("spoilt", spoilt, sp[s], p, s, **errors[i]) for s, p, i in pairs),
             "load": tuple(
                 self._test(
                     "load",

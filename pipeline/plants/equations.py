@@ -133,14 +133,14 @@ class EquationPlant(Simulator):
         flat = x.reshape(-1, x.shape[-1])
         return np.array(self.measurement(flat.T)).T.reshape(*x.shape[:-1], -1)
 
-    def many(self, n: int) -> AdvanceMany:
+    def many(self, n: int, p: Array | None = None) -> AdvanceMany:
         """``step`` of ``n`` runs side by side through one CasADi map; as in Simulator."""
         batch = self.transition.map(n)
         dv = np.tile(self.dv_nominal[:, None], (1, n))
-        p = np.tile(self.parameters()[:, None], (1, n))
+        columns = np.tile((self.parameters() if p is None else p)[:, None], (1, n))
 
         def advance(x: Array, mv: Array) -> Array:
-            return np.array(batch(x.T, mv.T, dv, p)).T
+            return np.array(batch(x.T, mv.T, dv, columns)).T
 
         return advance
 

@@ -17,11 +17,8 @@ SETTLE = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class IdentifiedArrays:
-    """The equation x+ = A x + B v + c + W2 tanh(W1 [x, v] + b1) in scaled numbers, and its scales.
-
-    The first n_y states are the scaled outputs; v is [mv, dv], scaled.
-    """
+class StateEquation:
+    """x+ = A x + B v + c + W2 tanh(W1 [x, v] + b1) in scaled numbers, with v = [mv, dv]."""
 
     a: Array  # (n_x, n_x)
     b: Array  # (n_x, n_v)
@@ -29,16 +26,22 @@ class IdentifiedArrays:
     w1: Array  # (n_hidden, n_x + n_v)
     b1: Array  # (n_hidden,)
     w2: Array  # (n_x, n_hidden)
-    y_center: Array  # (n_y,)
-    y_scale: Array  # (n_y,)
-    v_center: Array  # (n_v,)
-    v_scale: Array  # (n_v,)
-    rest: Array  # (n_x, n_y + n_v + 1) state of a rest from [y, v, 1], scaled
 
     def advance(self, x: Array, v: Array) -> Array:
         """The next states (..., n_x) of scaled states (..., n_x) under scaled inputs (..., n_v)."""
         z = np.concatenate([x, v], axis=-1)
         return x @ self.a.T + v @ self.b.T + self.c + np.tanh(z @ self.w1.T + self.b1) @ self.w2.T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IdentifiedArrays(StateEquation):
+    """The equation whose first n_y states are the scaled outputs, and its scales."""
+
+    y_center: Array  # (n_y,)
+    y_scale: Array  # (n_y,)
+    v_center: Array  # (n_v,)
+    v_scale: Array  # (n_v,)
+    rest: Array  # (n_x, n_y + n_v + 1) state of a rest from [y, v, 1], scaled
 
 
 class IdentifiedPlant(Simulator):
@@ -156,10 +159,10 @@ class IdentifiedPlant(Simulator):
         """Outputs (..., n_y) of states (..., n_x), in their units."""
         return x[..., : len(self.arrays.y_scale)] * self.arrays.y_scale + self.arrays.y_center
 
-    def many(self, n: int) -> AdvanceMany:
-        """``step`` of ``n`` runs side by side, in one product."""
-        dv, p = self.dv_nominal, self.parameters()
-        return lambda x, mv: self.step(x, mv, dv, p)
+    def many(self, n: int, p: Array | None = None) -> AdvanceMany:
+        """``step`` of ``n`` runs side by side, in one product; as in Simulator."""
+        dv, known = self.dv_nominal, self.parameters() if p is None else p
+        return lambda x, mv: self.step(x, mv, dv, known)
 
     # ------------------------------------------------------------------ parameters
     def parameter_names(self) -> tuple[str, ...]:  # type: ignore[override]  # they follow the signals of the record

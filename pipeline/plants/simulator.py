@@ -110,12 +110,12 @@ class Simulator(ABC):
         """``step`` for a loop over many samples."""
         return self.step
 
-    def many(self, n: int) -> AdvanceMany:
-        """``step`` of ``n`` runs side by side, measured disturbances and parameters its own."""
-        dv, p = self.dv_nominal, self.parameters()
+    def many(self, n: int, p: Array | None = None) -> AdvanceMany:
+        """``step`` of ``n`` runs side by side under its own measured disturbances and p (n_p,), by default its own."""
+        dv, known = self.dv_nominal, self.parameters() if p is None else p
 
         def advance(x: Array, mv: Array) -> Array:
-            return np.array([self.step(a, b, dv, p) for a, b in zip(x, mv, strict=True)], dtype=np.float64)
+            return np.array([self.step(a, b, dv, known) for a, b in zip(x, mv, strict=True)], dtype=np.float64)
 
         return advance
 

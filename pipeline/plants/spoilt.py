@@ -1,17 +1,16 @@
-"""An identified plant with errors: what a tuning must suit beside the model itself."""
+"""A plant under other parameters: what a tuning must suit beside the model itself."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import AdvanceMany, Array, Simulator
 
 
 class SpoiltPlant(Simulator):
-    """An identified plant whose parameters are others from the start on, such as a gain of 1.25."""
+    """A plant whose parameters are others from the start on, such as a gain of 1.25; its equations are not seen."""
 
-    def __init__(self, plant: IdentifiedPlant, changed: Mapping[str, float]) -> None:
+    def __init__(self, plant: Simulator, changed: Mapping[str, float]) -> None:
         # The attributes that other plants have by their class, this one has by the plant that it spoils.
         names = ("name", "period_s", "pv_signals", "sp_signals", "mv_signals", "dv_signals")
         vars(self).update({name: getattr(plant, name) for name in names})
@@ -52,7 +51,6 @@ class SpoiltPlant(Simulator):
         """Process variables (..., n_pv) of states (..., n_x)."""
         return self.plant.measured(x)
 
-    def many(self, n: int) -> AdvanceMany:
-        """``step`` of ``n`` runs side by side."""
-        dv, p = self.dv_nominal, self.parameters()
-        return lambda x, mv: self.plant.step(x, mv, dv, p)
+    def many(self, n: int, p: Array | None = None) -> AdvanceMany:
+        """``step`` of ``n`` runs side by side; as in Simulator."""
+        return self.plant.many(n, self.parameters() if p is None else p)

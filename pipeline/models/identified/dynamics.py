@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.plants.identified import StateEquation
 from pipeline.plants.simulator import Array
 
 EXPLODED = 1e4
@@ -26,15 +27,8 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Dynamics:
-    """x+ = A x + B v + c + W2 tanh(W1 [x, v] + b1), y = x[:n_y]; all scaled. The fields are its parameters."""
-
-    a: Array  # (n_x, n_x)
-    b: Array  # (n_x, n_v)
-    c: Array  # (n_x,)
-    w1: Array  # (n_hidden, n_x + n_v)
-    b1: Array  # (n_hidden,)
-    w2: Array  # (n_x, n_hidden)
+class Dynamics(StateEquation):
+    """The state equation with y = x[:n_y], while it is being fitted; the fields are its parameters."""
 
     @classmethod
     def linear(cls, a: Array, b: Array, c: Array | None = None) -> Self:
@@ -82,11 +76,6 @@ class Dynamics:
         return np.concatenate(parts)
 
     # ------------------------------------------------------------------ running
-    def advance(self, x: Array, v: Array) -> Array:
-        """The next states (..., n_x) of states (..., n_x) under inputs (..., n_v)."""
-        z = np.concatenate([x, v], axis=-1)
-        return x @ self.a.T + v @ self.b.T + self.c + np.tanh(z @ self.w1.T + self.b1) @ self.w2.T
-
     def slopes(self, x: Array, v: Array) -> tuple[Array, Array]:
         """(dx+/dx (..., n_x, n_x), dx+/dv (..., n_x, n_v)) at states (..., n_x) under inputs (..., n_v)."""
         t = np.tanh(np.concatenate([x, v], axis=-1) @ self.w1.T + self.b1)
