@@ -9,11 +9,11 @@ import made_plants
 import numpy as np
 import pytest
 import torch
+from finished import free_run, plant_of
 
 from pipeline.config.params import parse
 from pipeline.errors import ModelError, ParamsError
 from pipeline.models import MODELS, load_model
-from pipeline.models.identified.assembly import free_run, plant_of
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.identified_part import IdentifiedPart
 from pipeline.models.part import Learnt, Source
