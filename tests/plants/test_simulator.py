@@ -210,8 +210,8 @@ def test_what_needs_equations_says_so() -> None:
         with pytest.raises(PlantError, match=r"needs a plant's equations.*EquationPlant"):
             ask()
     with pytest.raises(PlantError, match="not at rest at its start"):
-        PID.design(PID.Params(**QUICK), {}, plant.signals, Restless())
+        PID.design(PID.Params(tuning="imc"), {}, plant.signals, Restless())
     with pytest.raises(PlantError, match="not stable at its start"):
-        PID.design(PID.Params(**QUICK), {}, plant.signals, Filling())
+        PID.design(PID.Params(tuning="imc"), {}, plant.signals, Filling())
     with pytest.raises(PlantError, match="has no parameter 'K'; it has area, k"):
         plant.parameters({"K": 1.0})

@@ -234,9 +234,9 @@ def test_optimized_imc_finds_the_cheapest(middle: Linearization) -> None:
 
 def test_development_loops_start_at_rest(plant: EquationPlant) -> None:
     loops = DevelopmentLoops.draw(plant, (1, 2), 3, 5)
-    assert loops.sp.shape == (15, 2)
-    assert (np.diff(loops.sp.reshape(3, 5, 2), axis=1) == 0).all()
-    np.testing.assert_allclose(loops.x0[:, 0], loops.sp[0], rtol=1e-9)
+    assert loops.sp.shape == (15, 2, 1)
+    assert (np.diff(loops.sp[..., 0].reshape(3, 5, 2), axis=1) == 0).all()
+    np.testing.assert_allclose(loops.x0[:, 0], loops.sp[0, :, 0], rtol=1e-9)
     still = DevelopmentLoops.draw(plant, (1,), 1, 4)
 
     def hold(sp, pv, dv, mv_applied, state):
@@ -253,7 +253,7 @@ def test_time_weighted_errors_count_what_comes_late(plant: EquationPlant) -> Non
         return mv_applied, state, mv_applied
 
     plain, weighted = (loops.error(hold, 0, time_weighted=w)[0] for w in (False, True))
-    step = abs(loops.sp[6, 0] - loops.sp[0, 0])
+    step = abs(loops.sp[6, 0, 0] - loops.sp[0, 0, 0])
     assert plain == pytest.approx(step / 2, rel=1e-3)
     assert weighted == pytest.approx(step / 2 * 2.5, rel=1e-3)  # mean of 0..5 over the hold with an error
 

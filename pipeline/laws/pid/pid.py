@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
@@ -20,10 +20,15 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning import rules as tuning
 from pipeline.tuning.development import DevelopmentLoops
+from pipeline.tuning.loop_search import Loops, searched
+from pipeline.tuning.pairing import Pairs, pairings
 from pipeline.tuning.reduction import LagWithDeadTime, start_lag
+from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
 
+HOLD = 100  # samples of a development set point
+HOLDS = (30, 400)  # where it follows the plant's settling time
 EXAMINED = 40  # linear closed loops over a range of the CV
 
 
@@ -36,7 +41,7 @@ class HoldsLinearization(Protocol):
 
 
 class PID(ControlLaw):
-    """Velocity-form PID for one loop, derivative on the measurement.
+    """Velocity-form PID, derivative on the measurement; one loop, or one for each pair of a CV and an MV.
 
         mv(k) = mv(k-1) + Kc [ p(k) - p(k-1) + (h/Ti) (r - y) - (d(k) - d(k-1)) ],   p = b r - y
         d(k)  = (Tf d(k-1) + Td (y(k) - y(k-1))) / (Tf + h)
@@ -51,6 +56,9 @@ class PID(ControlLaw):
     move and the set point then returns to the process variable, the law does not subtract a
     proportional action that the actuator never received (``never_given``).
 
+    Of several loops each has its own numbers; the pairs are those whose relative gains are nearest to 1
+    (``pairings``). An MV that no loop moves stays where it is.
+
     Source: the PID that [inverse_rbf, section 4.3] compares with; the tracking
     is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
     """
@@ -64,14 +72,16 @@ class PID(ControlLaw):
         """The tuning of the PID.
 
         ``tuning``: ``optimized`` chooses the IMC filter and the set-point weight in closed loop, by the
-        ``criterion``, ``mae`` (mean absolute error) or ``itae`` (time-weighted); ``imc`` and ``simc`` use
+        ``criterion``, ``mae`` (mean absolute error) or ``itae`` (time-weighted); over a plant that is known by
+        simulation alone, and over one with several loops, it chooses all numbers; ``imc`` and ``simc`` use
         ``lambda_s`` [s] (None: a robust value); ``itae`` is the minimum-ITAE rule for a set-point step;
         ``manual`` uses ``kc`` [mv/pv], ``ti_s`` [s], ``td_s`` [s] and the derivative filter ``filter_s`` [s].
         ``tracking_s`` [s]: tracking time; None is sqrt(Ti Td). ``set_point_weight``: None is 1, or
         optimized with the filter. ``operating_cv`` [pv]: steady state of the linearization if the model
         set has no part ``linearized``; None is the middle of the set-point range.
         ``development_seeds``, ``development_set_points``, ``development_hold``: random set points for
-        ``optimized``; each seed gives so many, each held for so many samples. ``sampling``: share of a
+        ``optimized``; each seed gives so many, each held for so many samples (None: 100, or twice the settling time
+        of a plant that is known by simulation alone, 30 to 400). ``sampling``: share of a
         period that ``itae`` counts as dead time; 0.5 is the textbook value, 1 is more cautious.
         ``examined_cv`` [pv]: range of the stability analysis; None: no analysis. ``mv_rate`` [mv]:
         largest MV change per sample; None: unlimited.
@@ -89,7 +99,7 @@ class PID(ControlLaw):
         operating_cv: float | None = None
         development_seeds: tuple[int, ...] = (1, 2, 3)
         development_set_points: int = 12
-        development_hold: int = 100
+        development_hold: int | None = None
         sampling: float = 0.5
         examined_cv: tuple[float, float] | None = None
         mv_rate: float | None = None
@@ -102,39 +112,60 @@ class PID(ControlLaw):
             kc, ti_s, weight = (1.0 if v is None else v for v in (self.kc, self.ti_s, self.set_point_weight))
             return PidSettings(kc, ti_s, self.td_s, self.filter_s, weight, self.tracking_s)
 
-    kc: Tensor  # (..., 1)
+    kc: Tensor  # (..., loops)
     integral: Tensor  # h/Ti
     keep: Tensor  # Tf/(Tf + h)
     derivative: Tensor  # Td/(Tf + h)
     weight: Tensor  # b
     fade: Tensor  # 1 - h/Tt
     near: Tensor  # [mv] an actuator this close to the limited request has followed it
+    cvs: Tensor | None  # (loops,) of each loop; None: one loop, the first CV
+    mvs: Tensor | None  # (loops,) of each loop; None: all MVs, in their order
+    places: Tensor | None  # (n_mv,) of each MV among [the loops' MVs, all applied MVs]; None: as the loops
 
     examined_cv: tuple[float, float] | None = None
+    relative_gains: tuple[float, ...] = ()  # of the pairs, of several loops
 
     def __init__(
-        self, signals: Signals, settings: PidSettings | Sequence[PidSettings], mv_rate: float | None = None
+        self,
+        signals: Signals,
+        settings: PidSettings | Loops | list[PidSettings] | list[Loops],
+        mv_rate: float | None = None,
+        pairs: Pairs = ((0, 0),),
     ) -> None:
+        """The law with ``settings`` of its loop, or of each of ``pairs`` (CV, MV), which are in the order of the MVs.
+
+        A list holds candidates in one module: they broadcast over a leading dimension.
+        """
         super().__init__(signals, mv_rate)
-        require_single_loop(signals, self.name)
-        # Several settings are candidates in one module: they broadcast over a leading dimension.
-        rows = [settings] if isinstance(settings, PidSettings) else list(settings)
+        if len(pairs) == 1:
+            require_single_loop(signals, self.name)
+        candidates = settings if isinstance(settings, list) else [settings]
+        rows = [(c,) if isinstance(c, PidSettings) else c for c in candidates]
         h = signals.period_s
-        numbers = {
-            "kc": [s.kc for s in rows],
-            "integral": [h / s.ti_s for s in rows],
-            "keep": [s.filter_s / (s.filter_s + h) for s in rows],
-            "derivative": [s.td_s / (s.filter_s + h) for s in rows],
-            "weight": [s.set_point_weight for s in rows],
-            "fade": [max(0.0, 1 - h / s.tracking_time_s) for s in rows],
+        formulas: dict[str, Callable[[PidSettings], float]] = {
+            "kc": lambda s: s.kc,
+            "integral": lambda s: h / s.ti_s,
+            "keep": lambda s: s.filter_s / (s.filter_s + h),
+            "derivative": lambda s: s.td_s / (s.filter_s + h),
+            "weight": lambda s: s.set_point_weight,
+            "fade": lambda s: max(0.0, 1 - h / s.tracking_time_s),
         }
-        shape = (1,) if isinstance(settings, PidSettings) else (len(rows), 1, 1)
-        for name, values in numbers.items():
-            self.register_buffer(name, torch.tensor(values, dtype=torch.float64).reshape(shape))
-        self.register_buffer("near", 1e-3 * (self.high - self.low))
-        self.settings = rows[0]
-        self.n_state = 7  # started, p(k-1), y(k-1), d(k-1), the last request, the same limited, mv_applied(k-1)
-        self.info = ("mv_requested",)
+        for name, of in formulas.items():
+            values = torch.tensor([[of(s) for s in row] for row in rows], dtype=torch.float64)
+            self.register_buffer(name, values[:, None] if isinstance(settings, list) else values[0])
+        cvs, mvs = ([pair[i] for pair in pairs] for i in range(2))
+        idle = [j for j in range(len(signals.mv)) if j not in mvs]
+        # Where the loops' MVs are all MVs, they stand in their order already.
+        places = [mvs.index(j) if j in mvs else len(mvs) + j for j in range(len(signals.mv))]
+        self.register_buffer("cvs", torch.tensor(cvs) if len(pairs) > 1 else None)
+        self.register_buffer("mvs", torch.tensor(mvs) if idle else None)
+        self.register_buffer("places", torch.tensor(places) if idle else None)
+        self.register_buffer("near", 1e-3 * _of(self.high - self.low, self.mvs))
+        self.settings, self.pairs = rows[0][0], pairs
+        self.n_state = 1 + 6 * len(pairs)  # started; p, y, d, the last request, the same limited, mv_applied, all k-1
+        names = [signals.mv[j].name for j in mvs]
+        self.info = ("mv_requested",) if len(pairs) == 1 else tuple(f"{name}_requested" for name in names)
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
@@ -146,16 +177,20 @@ class PID(ControlLaw):
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
-        require_single_loop(plant.signals, cls.name)
-        if params.tuning == "optimized":
+        if _simulated(params, plant):
+            pairings(StepResponses.near_start(plant).share)
+        elif params.tuning == "optimized":
+            require_single_loop(plant.signals, cls.name)
             AllPole.near(_linearization(params, models, plant))
         else:
             cls._tuned(params, models, plant.signals, plant)
 
     @classmethod
     def _tuned(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        require_single_loop(signals, cls.name)
         p, given = params, params.given()
+        if plant is not None and _simulated(p, plant):
+            return cls._searched(p, signals, plant)
+        require_single_loop(signals, cls.name)
         if p.tuning == "manual":
             if p.kc is None or p.ti_s is None:
                 raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
@@ -172,15 +207,13 @@ class PID(ControlLaw):
         elif p.tuning == "optimized":
             if plant is None:
                 raise LawError("PID tuning `optimized` needs a simulator; take manual, imc, simc or itae")
-            drawn = (p.development_seeds, p.development_set_points, p.development_hold)
-            plants = [DevelopmentLoops.draw(variation, *drawn) for variation in plant.variations()]
+            known, hold = equations(plant, "PID tuning `optimized` on a linearized plant"), p.development_hold or HOLD
+            loops = DevelopmentLoops.draw(known, p.development_seeds, p.development_set_points, hold)
             free = p.set_point_weight is None
 
             def cost(rows: Sequence[PidSettings]) -> Array:
-                law = cls(signals, rows, p.mv_rate)
-                weighted = p.criterion == "itae"
-                each = [loops.error(law, law.n_state, len(rows), time_weighted=weighted) for loops in plants]
-                return np.asarray(np.mean(each, axis=0))
+                law = cls(signals, list(rows), p.mv_rate)
+                return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
 
             settings = tuning.optimized_imc(AllPole.near(lin), signals.period_s, cost, given, optimize_weight=free)
             return cls(signals, settings, p.mv_rate)
@@ -189,27 +222,62 @@ class PID(ControlLaw):
         rest = {name: getattr(given, name) for name in ("filter_s", "tracking_s", "set_point_weight")}
         return cls(signals, replace(settings, **rest), p.mv_rate)
 
+    @classmethod
+    def _searched(cls, params: Any, signals: Signals, plant: Simulator) -> Self:
+        """The cheapest numbers in closed loop over the plant and its variations, of the best two pairings."""
+        responses = StepResponses.near_start(plant)
+        hold = params.development_hold or int(np.clip(2 * responses.settling, *HOLDS))
+        drawn = (params.development_seeds, params.development_set_points, hold)
+        plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
+        found: tuple[float, Loops] = (np.inf, ())
+        for pairs, table in pairings(responses.share)[:2]:
+
+            def cost(rows: Sequence[Loops], pairs: Pairs = pairs) -> Array:
+                law = cls(signals, list(rows), params.mv_rate, pairs)
+                weighted = params.criterion == "itae"
+                each = [loops.error(law, law.n_state, len(rows), time_weighted=weighted) for loops in plants]
+                return np.asarray(np.mean(each, axis=0))
+
+            processes = [responses.process(*pair) for pair in pairs]
+            tried = searched(processes, signals.period_s, cost, params.given(), params.set_point_weight)
+            if tried[0] < found[0]:
+                found, best, gains = tried, pairs, table
+        law = cls(signals, found[1], params.mv_rate, best)
+        if len(best) > 1:
+            law.relative_gains = tuple(float(gains[cv, cv]) for cv, _ in best)
+        return law
+
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        y = pv[..., :1]
+        n = len(self.pairs)
+        sp, y = (v[..., :1] if self.cvs is None else v.index_select(-1, self.cvs) for v in (sp, pv))
+        applied = _of(mv_applied, self.mvs)
         p = self.weight * sp - y
-        fresh = torch.cat([p, y, torch.zeros_like(p), mv_applied, mv_applied, mv_applied], dim=-1)
+        fresh = torch.cat([p, y, torch.zeros_like(p), applied, applied, applied], dim=-1)
         past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
-        p1, y1, d1, requested1, limited1, applied1 = (past[..., i : i + 1] for i in range(6))
+        p1, y1, d1, requested1, limited1, applied1 = (past[..., i * n : (i + 1) * n] for i in range(6))
         # An actuator that is not at the limited request was moved by something else: no part is unmet.
-        followed = (mv_applied - limited1).abs() <= self.near
+        followed = (applied - limited1).abs() <= self.near
         unmet = torch.where(followed, requested1 - limited1, torch.zeros_like(requested1))
         d = self.keep * d1 + self.derivative * (y - y1)
-        still = stood_still(mv_applied, applied1, limited1, self.near)
+        still = stood_still(applied, applied1, limited1, self.near)
         # The state holds no set point; b (r - r1) and b (r1 - y1) follow from p.
         spared = never_given(p - p1 + (y - y1), p1 + (1 - self.weight) * y1)
         move = p - p1 + torch.where(still, spared, torch.zeros_like(p)) + self.integral * (sp - y) - (d - d1)
-        requested = mv_applied + self.fade * unmet + self.kc * move
-        mv = self.limited(requested, mv_applied)
-        return mv, torch.cat([torch.ones_like(p), p, y, d, requested, mv, mv_applied], dim=-1), requested
+        requested = applied + self.fade * unmet + self.kc * move
+        asked = (
+            requested
+            if self.places is None
+            else torch.cat([requested, mv_applied], dim=-1).index_select(-1, self.places)
+        )
+        mv = self.limited(asked, mv_applied)
+        started = torch.ones_like(p[..., :1])
+        return mv, torch.cat([started, p, y, d, requested, _of(mv, self.mvs), applied], dim=-1), requested
 
     def analysis(self, plant: Simulator | None) -> Analysis:
-        """Stability and gain margin of the linear closed loops over ``examined_cv``; empty if that is None."""
+        """Stability and gain margin of the linear closed loops over ``examined_cv``; the pairs of several loops."""
+        if self.relative_gains:
+            return self._pairing()
         if self.examined_cv is None:
             return Analysis()
         known = equations(plant, "law 'pid' with `examined_cv`")
@@ -217,6 +285,24 @@ class PID(ControlLaw):
         radius = spectral_radius(loops.matrices())
         figures = {"frozen_radius": float(radius.max()), "gain_margin": loops.gain_margin()}
         return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius})
+
+    def _pairing(self) -> Analysis:
+        cvs, mvs = self.signals.sp, self.signals.mv
+        rows = [(cvs[i].name, mvs[j].name, gain) for (i, j), gain in zip(self.pairs, self.relative_gains, strict=True)]
+        held = ", ".join(f"{cv} by {mv} ({gain:.2f})" for cv, mv, gain in rows)
+        note = f"A loop for each pair, its relative gain beside it (1: the other loops leave it alone): {held}."
+        return Analysis({f"relative_gain_{cv}": gain for cv, _, gain in rows}, notes=(note,))
+
+
+def _of(values: Tensor, which: Tensor | None) -> Tensor:
+    """The entries ``which`` of the last dimension; all of them for None."""
+    return values if which is None else values.index_select(-1, which)
+
+
+def _simulated(params: Any, plant: Simulator) -> bool:
+    """Whether the numbers are searched over the plant as it is, because it has no equations or several loops."""
+    known = isinstance(plant, EquationPlant) and len(plant.sp_signals) == len(plant.mv_signals) == 1
+    return params.tuning == "optimized" and params.operating_cv is None and not known
 
 
 def _linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:

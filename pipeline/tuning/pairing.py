@@ -1,0 +1,72 @@
+"""Which MV holds which controlled variable when each has a loop of its own."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+
+from pipeline.errors import LawError
+from pipeline.plants.simulator import Array
+
+Pairs = tuple[tuple[int, int], ...]
+"""(CV, MV) of each loop, in the order of the MVs."""
+
+INDEPENDENT = 1e-6  # least ratio of singular values, of gains in shares of their largest, at which CVs can be held
+
+
+def relative_gains(gain: Array) -> Array:
+    """The relative gain array of a square gain matrix (n_cv, n_mv), same shape; no units.
+
+        Lambda = K o (K^-1)'      element by element
+
+    It is 1 for a pair that the other loops leave alone; at a negative one the sign of the gain turns when the other
+    loops are closed. Raises LawError where no MVs hold the CVs independently.
+
+    Source: Bristol, On a new measure of interaction for multivariable process control, 1966.
+    """
+    size = np.abs(gain).max(axis=1, keepdims=True)
+    scaled = gain / np.where(size > 0, size, 1.0)
+    values = np.linalg.svd(scaled, compute_uv=False)
+    if not values[-1] > INDEPENDENT * values[0]:
+        raise LawError(
+            "the MVs do not hold the controlled variables independently (the matrix of gains is singular): control "
+            "fewer variables, or give another MV"
+        )
+    return np.asarray(scaled * np.linalg.inv(scaled).T)
+
+
+def pairings(gain: Array) -> list[tuple[Pairs, Array]]:
+    """Pairings of the CVs with as many MVs, the best first, and the relative gains of their MVs (n_cv, n_cv).
+
+    ``gain`` is in shares of the signals' ranges. Of more MVs than CVs those that do most come first, by the column
+    sums of K o (K^+)'; among these, relative gains nearest to 1, sum |Lambda_ij - 1|. Pairings with a negative
+    relative gain or a negative Niederlinski index det K / prod K_ii are left out: with integral action they are
+    unstable, or become so when one loop is opened. Raises LawError where none is left, or there are fewer MVs than CVs.
+
+    Source: Skogestad and Postlethwaite, Multivariable Feedback Control, sections 3.4 and 10.6.
+    """
+    n_cv, n_mv = gain.shape
+    if n_mv < n_cv:
+        raise LawError(f"{n_cv} controlled variables need as many MVs; there are {n_mv}: control fewer variables")
+    found: list[tuple[float, float, Pairs, Array]] = []
+    part = (gain * np.linalg.pinv(gain).T).sum(axis=0)  # of each MV, 1 where there are as many as CVs
+    refused: LawError | None = None
+    for mvs in permutations(range(n_mv), n_cv):
+        own = gain[:, mvs]
+        try:
+            table = relative_gains(own)
+        except LawError as error:
+            refused = error
+            continue
+        index = np.linalg.det(own / np.diag(own)) if np.diag(own).all() else -1.0
+        if np.diag(table).min() > 0 and index > 0:
+            pairs = tuple(sorted(enumerate(mvs), key=lambda pair: pair[1]))
+            spared = round(n_cv - float(part[list(mvs)].sum()), 9)
+            found.append((spared, float(np.abs(np.diag(table) - 1).sum()), pairs, table))
+    if not found:
+        raise refused or LawError(
+            "no pairing of controlled variables and MVs has positive relative gains and a positive Niederlinski index: "
+            "single loops do not hold this plant, choose law 'predictive'"
+        )
+    return [(pairs, table) for _, _, pairs, table in sorted(found, key=lambda f: f[:2])]

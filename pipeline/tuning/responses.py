@@ -1,0 +1,153 @@
+"""What a plant does after a small step of each MV, found by simulation, and the process that resembles it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import LawError
+from pipeline.plants.simulator import Array, Simulator
+
+STEP = 0.01  # of an MV's range
+SHORTEST, LONGEST = 100, 3200  # samples of a response
+STILL = 0.01  # of its largest change, over its last fifth: a response that has settled
+EVEN = 0.05  # relative difference of two slopes that are the same
+SETTLED = 0.05  # of the end
+ANSWERS = 0.1  # of the fastest change in a period
+
+
+@dataclass(frozen=True, slots=True)
+class FirstOrder:
+    """The transfer function rate exp(-theta s) / (s + 1/tau); an integrator with dead time where tau is infinite."""
+
+    rate: float  # [pv/mv/s]
+    tau_s: float
+    dead_time_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepResponses:
+    """Changes of each controlled variable after a step of each MV, near the start of a plant.
+
+    ``y[i, j, k]`` [pv/mv]: of CV i, k + 1 periods after a unit step of MV j. ``slope[i, j]`` [pv/mv a period]: of
+    its last fifth, 0 where it has settled.
+    """
+
+    y: Array  # (n_cv, n_mv, n)
+    slope: Array  # (n_cv, n_mv)
+    period_s: float
+    spans: tuple[Array, Array]  # ranges of the CVs (n_cv,) and the MVs (n_mv,)
+
+    @classmethod
+    def near_start(cls, plant: Simulator) -> Self:
+        """Central differences of runs with each MV a little above and below, one-sided at the end of a range.
+
+        They are as long as it takes to settle, or to rise or fall evenly. LawError where a run is not finite.
+        """
+        x0, mv0 = plant.start
+        low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
+        span, n_cv = np.diag(STEP * (high - low)), len(plant.sp_signals)
+        ends = [np.clip(mv0 + sign * span, low, high) for sign in (1, -1)]
+        size = np.diag(ends[0] - ends[1])
+        mv = np.concatenate(ends)
+        x, advance = np.tile(x0, (len(mv), 1)), plant.many(len(mv))
+        rows: list[Array] = []
+        n = SHORTEST
+        while True:
+            while len(rows) < n:
+                x = advance(x, mv)
+                rows.append(plant.measured(x)[:, :n_cv])
+            up, down = np.split(np.array(rows), 2, axis=1)  # (n, n_mv, n_cv)
+            y = ((up - down) / size[:, None]).transpose(2, 1, 0)
+            if not np.all(np.isfinite(y)):
+                raise LawError(f"a step response of plant {plant.name!r} is not finite within {n} periods of its start")
+            slope = _slopes(y)
+            if n >= LONGEST or _known(y, slope):
+                spans = (np.array([s.high - s.low for s in plant.sp_signals]), high - low)
+                return cls(y, np.where(_settled(y), 0.0, slope[-1]), plant.period_s, spans)
+            n *= 2
+
+    @property
+    def integrates(self) -> NDArray[np.bool_]:
+        """Which CVs (n_cv,) do not come to rest after a step of an MV."""
+        return np.asarray((self.slope != 0).any(axis=1))
+
+    @property
+    def gain(self) -> Array:
+        """Steady gains (n_cv, n_mv) [pv/mv]; of an integrating CV the slopes [pv/mv a period]."""
+        return np.where(self.integrates[:, None], self.slope, self.y[..., -1])
+
+    @property
+    def share(self) -> Array:
+        """``gain`` in shares of the signals' ranges, (n_cv, n_mv)."""
+        cv, mv = self.spans
+        return self.gain * mv / cv[:, None]
+
+    @property
+    def settling(self) -> int:
+        """Samples until the slowest response that comes to rest stays within 5 % of its end; 0 where none does."""
+        rests = self.y[self.slope == 0]
+        away = [np.flatnonzero(np.abs(y - y[-1]) > SETTLED * np.abs(y).max()) for y in rests if np.abs(y).max() > 0]
+        return max((int(at[-1]) + 2 for at in away if at.size), default=1 if len(rests) else 0)
+
+    def answers_after(self, cv: int, mv: int) -> int:
+        """Samples from the step to the first one at which the CV has answered: 1 without a dead time.
+
+        An answer is a change within a period of more than a tenth of the fastest.
+        """
+        change = np.abs(np.diff(self.y[cv, mv], prepend=0.0))
+        return int((change > ANSWERS * change.max()).argmax()) + 1
+
+    def starts_inverse(self, cv: int, mv: int) -> bool:
+        """Whether the response first goes the other way, by more than a tenth of its end."""
+        y = self.y[cv, mv] * np.sign(self.gain[cv, mv])
+        return bool(y.min() < -ANSWERS * abs(y[-1]))
+
+    def process(self, cv: int, mv: int) -> FirstOrder:
+        """The lag with dead time through 28 % and 63 % of the response, or the ramp that an integrating one ends on.
+
+            tau = 1.5 (t63 - t28),  theta = t63 - tau;      integrating: theta = t_end - y_end / slope
+
+        Raises LawError where the MV does not act on the CV.
+
+        Source: Smith and Corripio, Principles and Practice of Automatic Process Control, section 7-2.3.
+        """
+        y, h, slope = self.y[cv, mv], self.period_s, float(self.slope[cv, mv])
+        end = float(y[-1])
+        if slope:
+            return FirstOrder(slope / h, inf, max(0.0, h * (len(y) - end / slope)))
+        if not abs(end) > 1e-9 * float(np.abs(self.y).max()):
+            raise LawError("the MV does not act on the controlled variable at rest; check the pairing")
+        t28, t63 = (h * _reached(y / end, share) for share in (0.283, 0.632))
+        tau = max(1.5 * (t63 - t28), h / 2)
+        return FirstOrder(end / tau, tau, max(0.0, t63 - tau))
+
+
+def _reached(rising: Array, share: float) -> float:
+    """Samples, between two where it lies there, until a response is at ``share`` for the first time."""
+    k = int((rising >= share).argmax())
+    before = float(rising[k - 1]) if k else 0.0
+    return k + (share - before) / (float(rising[k]) - before)
+
+
+def _slopes(y: Array) -> Array:
+    """Mean slopes (2, n_cv, n_mv) a period over the last but one and the last fifth of responses (n_cv, n_mv, n)."""
+    n = y.shape[-1]
+    a, b = n - 1 - 2 * (n // 5), n - 1 - n // 5
+    return np.stack([(y[..., b] - y[..., a]) / (b - a), (y[..., -1] - y[..., b]) / (n - 1 - b)])
+
+
+def _settled(y: Array) -> NDArray[np.bool_]:
+    n = y.shape[-1]
+    moved = np.abs(y[..., n - 1 - n // 5 :] - y[..., -1:]).max(axis=-1)
+    return np.asarray(moved <= STILL * np.abs(y).max(axis=-1))
+
+
+def _known(y: Array, slope: Array) -> bool:
+    """Whether each response has settled, or goes on as evenly as it did before."""
+    even = np.abs(slope[1] - slope[0]) <= EVEN * np.abs(slope[1])
+    return bool((_settled(y) | even).all())
