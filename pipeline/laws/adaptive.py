@@ -259,6 +259,7 @@ class AdaptivePid(ControlLaw):
     """
 
     incremental = True
+    looks_ahead = 1
     model: Any
 
     def __init__(

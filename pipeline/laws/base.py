@@ -102,6 +102,9 @@ class ControlLaw(nn.Module, ABC):
     incremental: ClassVar[bool] = False
     # True if the law starts from an estimate of the plant's state, which the applied MV is a part of.
     estimates: ClassVar[bool] = False
+    one_loop: ClassVar[bool] = True  # whether it controls one variable by one
+    # Samples after a move within which the plant must have answered, the right way; None: any dead time suits.
+    looks_ahead: ClassVar[int | None] = None
     parts: ClassVar[Mapping[str, str]] = {}  # what `design` needs of the model set: part name -> what it must be
     n_state: int
     info: tuple[str, ...]

@@ -25,6 +25,7 @@ from pipeline.config.plants import PlantParams, own_plants
 from pipeline.errors import ParamsError, PipelineError
 from pipeline.evaluation.case import Case
 from pipeline.laws import LAWS
+from pipeline.laws.fitting import require_fit
 from pipeline.models.local.linearized import LinearizedPart
 from pipeline.models.part import Source
 from pipeline.models.training.network_parts import trainer_of
@@ -141,6 +142,7 @@ def _controller(name: str) -> None:
         if not case.ready:
             continue
         try:
+            require_fit(law, plant)
             law.check(settings, parts, plant)
         except PipelineError as error:
             raise ParamsError(f"{place}: {error}") from None

@@ -23,6 +23,7 @@ from pipeline.evaluation.law_evidence import BASE
 from pipeline.export.gate import export
 from pipeline.files import digest, read_json, write_json
 from pipeline.laws import LAWS, ControlLaw
+from pipeline.laws.fitting import require_fit
 from pipeline.models import load_model
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder
@@ -39,6 +40,10 @@ def design(name: str) -> None:
     seeds = sorted(int(p.name.removeprefix("seed")) for p in models.glob("seed*"))
     if not seeds:
         raise LawError(f"{where}: {models} holds no models; run the fit stage of that model set first")
+    try:
+        require_fit(law, case.plant)
+    except LawError as error:
+        raise LawError(f"{where}: {error}") from None
     data = read_json(models / "metrics.json").get("data", {})
     folder = design_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)

@@ -90,6 +90,7 @@ class MinimumVariance(ControlLaw):
     title: ClassVar[str] = "Minimum variance by the NNARX, no PID"
     parts: ClassVar[Mapping[str, str]] = {"nnarx": "kind nnarx"}
     incremental: ClassVar[bool] = True
+    looks_ahead: ClassVar[int | None] = 1
 
     @dataclass(frozen=True, slots=True)
     class Params:

@@ -44,6 +44,7 @@ class Predictive(ControlLaw):
     name: ClassVar[str] = "predictive"
     title: ClassVar[str] = "Predictive control"
     estimates: ClassVar[bool] = True
+    one_loop: ClassVar[bool] = False
     parts: ClassVar[Mapping[str, str]] = {"identified": "kind identified"}
 
     @dataclass(frozen=True, slots=True)

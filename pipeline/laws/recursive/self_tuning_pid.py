@@ -48,6 +48,7 @@ class SelfTuningPid(ControlLaw):
     title: ClassVar[str] = "Self-tuning PID"
     parts: ClassVar[Mapping[str, str]] = {"arx": "kind arx"}
     incremental: ClassVar[bool] = True
+    looks_ahead: ClassVar[int | None] = 1
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params:
