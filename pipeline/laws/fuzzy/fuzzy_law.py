@@ -74,6 +74,7 @@ class FuzzyLaw(ControlLaw):
     Raises LawError for a model whose gain is 0 or changes its sign, as no inverse exists there.
     """
 
+    one_loop: ClassVar[bool] = False  # one variable by two MVs
     parts: ClassVar[Mapping[str, str]] = {"PART": "kind hybrid_fuzzy, of the name that `part` gives"}
     info: tuple[str, ...] = ("adjusted_reference", "wanted_jacket", "reached_jacket", "mode")
     model: HybridFuzzy
