@@ -61,7 +61,9 @@ def _here(function: Callable[[Item], Result], work: list[Item], label: str) -> l
     left = deque(range(len(work)))
     futures: list[Future[Result]] = [Future() for _ in work]
     # Before the bar, whose thread could hold a lock that a fork would then never see released.
-    helpers = [_Helper(function, label) for _ in range(min(len(work), os.cpu_count() or 1) - 1)]
+    # A helper has no helpers: it runs the pieces of a piece by itself.
+    cores = 1 if multiprocessing.current_process().daemon else os.cpu_count() or 1
+    helpers = [_Helper(function, label) for _ in range(min(len(work), cores) - 1)]
     finished = False
     try:
         with progress_bar() as bar:

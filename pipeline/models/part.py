@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from pipeline.records.record import Record
 if TYPE_CHECKING:
     from pipeline.models.static.sweep import SweepResult
 Regions = Mapping[str, tuple[float, float]]
+Result_co = TypeVar("Result_co", covariant=True)
 ROWS = 8192  # predicted in one call
 
 
@@ -38,6 +39,11 @@ class Source:
     regions: Regions = field(default_factory=dict)
     seed: int = 0
     plant: Simulator | None = None
+    groundwork: Mapping[Groundwork[Any], Any] = field(default_factory=dict)  # what is done already, and its results
+
+    def result(self, work: Groundwork[Result_co]) -> Result_co:
+        """The result of a groundwork, which is done now where nobody has done it before."""
+        return self.groundwork[work] if work in self.groundwork else work.done(self, work.kind)
 
     def data(self, kind: str) -> Record:
         """The record, for a part of this kind; ModelError without one."""
@@ -49,6 +55,19 @@ class Source:
         """Index of a process variable, None for the controlled variable; ParamsError for an unknown name."""
         names = {s.name: i for i, s in enumerate(self.signals.pv)}
         return 0 if name is None else choose(names, name, "process variable", "target")
+
+
+class Groundwork(ABC, Generic[Result_co]):
+    """Work that several parts of a set need. Equal ones are done once a data seed, before the parts are learnt.
+
+    Its pieces may be spread over the cores by ``parallel_map``; its result can be pickled.
+    """
+
+    kind: str  # of the parts that need it
+
+    @abstractmethod
+    def done(self, source: Source, label: str) -> Result_co:
+        """The result; ``label`` names its progress. Raises ModelError without the needed data."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +85,10 @@ class Part(ABC):
     """One model of a set, as params.yaml describes it."""
 
     model: ClassVar[type[Model]]
+
+    def groundwork(self) -> Groundwork[Any] | None:
+        """Work that this part shares with others of its set; None for a part that stands alone."""
+        return None
 
     @abstractmethod
     def learn(self, source: Source) -> Learnt:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import shutil
 import statistics
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
 from pipeline.files import write_json
 from pipeline.models import MODELS, Part, Source
+from pipeline.models.part import Groundwork
 from pipeline.records.record import Record
 from pipeline.stages.paths import model_folder
 
@@ -32,8 +34,10 @@ def fit(name: str) -> None:
     folder = model_folder(params.case, params.model)
     shutil.rmtree(folder, ignore_errors=True)
     data = data_files(params.data)
+    label = f"fit {name}"
+    shared = {seed: _shared(parts.values(), _source(data, case, seed), label) for seed in data}
     work = [(seed, part) for seed in data for part in parts]
-    learnt = parallel_map(partial(_learn, parts, data, case, folder), work, f"fit {name}")
+    learnt = parallel_map(partial(_learn, parts, data, case, shared, folder), work, label)
     results = dict(zip(work, learnt, strict=True))
     digests = {str(seed): digest for (seed, _), (digest, _, _) in results.items()}
     metrics: dict[str, Any] = {"model": params.model, "data": digests, "parts": {}}
@@ -74,19 +78,34 @@ def data_files(data: Path) -> dict[int, Path | None]:
     return dict(sorted(files.items()))
 
 
+def _shared(parts: Iterable[Part], source: Source, label: str) -> dict[Groundwork[Any], Any]:
+    """The results of the work that parts share, each done once."""
+    needed = dict.fromkeys(work for part in parts if (work := part.groundwork()) is not None)
+    return {work: work.done(source, label) for work in needed}
+
+
 def _learn(
-    parts: Mapping[str, Part], data: Mapping[int, Path | None], case: Case, folder: Path, item: tuple[int, str]
+    parts: Mapping[str, Part],
+    data: Mapping[int, Path | None],
+    case: Case,
+    shared: Mapping[int, Mapping[Groundwork[Any], Any]],
+    folder: Path,
+    item: tuple[int, str],
 ) -> tuple[str | None, dict[str, Any], Mapping[str, Any] | None]:
     seed, name = item
-    record = _record(data[seed], case)
-    learnt = parts[name].learn(Source(record, case.plant.signals, case.regions, seed, case.plant))
+    source = replace(_source(data, case, seed), groundwork=shared[seed])
+    learnt = parts[name].learn(source)
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:
         from pipeline.pictures.sweep_plot import draw  # here, because matplotlib takes a second to load
 
         learnt.sweep.save(folder / "sweep.json")
         draw(learnt.sweep, folder / "sweep.png")
-    return None if record is None else record.digest(), learnt.metrics, learnt.predictions
+    return None if source.record is None else source.record.digest(), learnt.metrics, learnt.predictions
+
+
+def _source(data: Mapping[int, Path | None], case: Case, seed: int) -> Source:
+    return Source(_record(data[seed], case), case.plant.signals, case.regions, seed, case.plant)
 
 
 @lru_cache(maxsize=1)

@@ -64,6 +64,11 @@ def test_a_time_constant_keeps_the_rests() -> None:
     assert moved[1] - x == pytest.approx((moved[0] - x) / 2)
 
 
+def test_a_faster_plant_stays_stable() -> None:
+    plant = made(hidden=False, pole=-0.7)
+    assert settled(plant, 70.0, time_constant=0.7) == pytest.approx(settled(plant, 70.0), rel=1e-9)
+
+
 def test_a_load_is_added_to_its_output_each_period() -> None:
     plant = made(hidden=False)
     x, mv = plant.start

@@ -1,9 +1,9 @@
-"""Candidates of the structure search: what one is, and how it is trained on a fold."""
+"""How one candidate is fitted on one fold: pieces of work on values, which any process can do."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from pipeline.models.identified.lagged_start import lagged_start, output_rows, w
 from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
 from pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
 from pipeline.models.identified.rests import settle
-from pipeline.models.identified.scaled_record import Fold, ScaledRecord
+from pipeline.models.identified.structure import Problem, Structure
 from pipeline.plants.simulator import Array
 
 RESPONSE = 120
@@ -23,162 +23,133 @@ WILD = 20.0
 """Scaled state that no rest of a usable network exceeds."""
 
 
-@dataclass(frozen=True, slots=True)
-class Structure:
-    """The choices of a candidate.
+RESTS = 0.9
+"""Least share of constant inputs under which a usable network comes to rest."""
 
-    ``start`` balanced: realization of ``order`` states; lagged: companion form of ``lags`` (of the outputs, of the
-    inputs). ``delays`` are the dead times of the inputs in periods. ``correction`` is the share of the output's error
-    that each sample of the training run takes back: for drift and integrating levels.
+
+# ---------------------------------------------------------------------- starts
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Where the balanced candidates of a fold start from, and the dead times that its impulse response shows."""
+
+    realizations: Realizations
+    dead_times: tuple[int, ...]
+
+
+def find_start(problem: Problem, task: tuple[Structure, int]) -> Start | str:
+    """The start of a fold's balanced candidates under a structure's shifts; the reason where there is none."""
+    structure, fold = task
+    try:
+        train = problem.part(structure, problem.folds[fold].train)
+        response = high_order_arx(train).impulse_response(RESPONSE)
+        weight = train.v.std(axis=0)
+        return Start(Realizations.of(response, weight), tuple(dead_times(response, weight)))
+    except ModelError as error:
+        return str(error)
+
+
+# ---------------------------------------------------------------------- fits
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """A fit of a structure on a fold: ``iterations`` more from ``begun``.
+
+    Without ``begun`` a balanced candidate starts from ``start``, a lagged one from its least squares; a network from
+    the linear model ``base``, its units drawn with ``seed``.
     """
 
-    start: Literal["balanced", "lagged"]
-    order: int
-    lags: tuple[int, int]
-    delays: tuple[int, ...]
-    n_hidden: int = 0
-    ridge: float = 1.0
-    correction: float = 0.0
-
-    @property
-    def base(self) -> Structure:
-        """The linear candidate that this one starts from."""
-        return replace(self, n_hidden=0, ridge=0.0)
-
-
-@dataclass(slots=True)
-class Budget:
-    """Work in nominal seconds of one core, so that the same record and budget always do the same work.
-
-    An iteration over N rows counts N (5 + .011 n_x P) 1e-6 s, with P the number of parameters.
-    """
-
-    seconds: float
-    spent: float = 0.0
-
-    @property
-    def left(self) -> bool:
-        """Whether more work may begin."""
-        return self.spent < self.seconds
-
-    def cost(self, model: Dynamics, rows: int) -> float:
-        """Nominal seconds of one iteration."""
-        return rows * (5 + 0.011 * model.n_x * len(model.vector())) * 1.5e-6
-
-
-@dataclass(slots=True, eq=False)
-class Training:
-    """Fits of candidates on the folds of one record; what candidates share is computed once."""
-
-    data: ScaledRecord
-    folds: tuple[Fold, ...]
-    budget: Budget
+    structure: Structure
+    fold: int
+    iterations: int
     seed: int = 0
-    judged: float = 0.0  # correction of the free runs over held-out rows, by which all candidates are compared
-    _shifted: dict[tuple[int, ...], ScaledRecord] = field(default_factory=dict)
-    _realizations: dict[tuple[tuple[int, ...], int], Realizations] = field(default_factory=dict)
-    _linear: dict[tuple[Structure, int], Fitted] = field(default_factory=dict)
+    start: Start | None = None
+    base: Fitted | None = None
+    begun: Fitted | None = None
 
-    def part(self, delays: tuple[int, ...], rows: slice) -> ScaledRecord:
-        """Some rows with the inputs late by ``delays``."""
-        if delays not in self._shifted:
-            self._shifted[delays] = self.data.delayed(delays)
-        return self._shifted[delays].rows(rows)
 
-    def stretches(self, structure: Structure, fold: int) -> tuple[list[Stretch], list[Stretch]]:
-        """(training, held-out) stretches of a fold."""
-        train, held = (self.part(structure.delays, rows) for rows in (self.folds[fold].train, self.folds[fold].held))
-        return train.stretches(), held.stretches()
+def fit(problem: Problem, task: Task) -> Fitted | str:
+    """The fitted candidate; the reason where the data cannot carry it.
 
-    def delay_options(self) -> list[tuple[int, ...]]:
-        """No dead time, and where the first fold's impulse response shows one, that."""
-        none = (0,) * self.data.v.shape[1]
-        train = self.part(none, self.folds[0].train)
-        found = dead_times(high_order_arx(train).impulse_response(RESPONSE), train.v.std(axis=0))
-        return [none, tuple(found)] if max(found) > 0 else [none]
+    A network that explodes or swings under constant inputs, where the plant settles, counts as exploded.
+    """
+    try:
+        fitted = (_network if task.structure.n_hidden else _linear)(problem, task)
+    except ModelError as error:
+        return str(error)
+    if task.structure.n_hidden and problem.settles and wild(fitted.model, problem.data.v):
+        return replace(fitted, held_out=np.inf)
+    return fitted
 
-    def linear(self, structure: Structure, fold: int, iterations: int) -> Fitted:
-        """The fitted linear model of a structure; a later call goes on where an earlier one ended.
 
-        Raises ModelError where the data cannot carry it.
-        """
-        key = (structure.base, fold)
-        train, held = self.stretches(structure, fold)
-        if key in self._linear:
-            model, starts = self._linear[key].model, self._linear[key].starts
-        else:
-            model, starts = self._begin(structure, fold), None
-            if structure.start == "balanced":
-                free = model.mask(b=True, c=True)
-                begun = OutputError(iterations=3, correction=structure.correction).fit(model, train, free=free)
-                model, starts = begun.model, begun.starts
-        fit = OutputError(iterations=iterations, correction=structure.correction, judged=self.judged)
-        self._linear[key] = self._spend(fit.fit(model, train, held, starts=starts), train)
-        return self._linear[key]
+def _linear(problem: Problem, task: Task) -> Fitted:
+    s = task.structure
+    train, held = problem.train(s, task.fold), problem.held(s, task.fold)
+    if task.begun is not None:
+        model, starts = task.begun.model, task.begun.starts
+    elif s.start == "lagged":
+        model, starts = lagged_start(problem.part(s, problem.folds[task.fold].train), *s.lags), None
+    else:
+        if task.start is None:
+            raise ModelError("the record shows no impulse response to start from")
+        model = task.start.realizations.order(s.order)
+        first = OutputError(iterations=3, correction=s.correction).fit(model, train, free=model.mask(b=True, c=True))
+        model, starts = first.model, first.starts
+    fitter = OutputError(iterations=task.iterations, correction=s.correction, judged=problem.judged)
+    return fitter.fit(model, train, held, starts=starts)
 
-    def network(self, structure: Structure, fold: int, seed: int, iterations: int) -> Fitted:
-        """The fitted network of a structure, begun as its linear model with units that do nothing.
 
-        A lagged start first trains one step ahead (correction 1, output rows only), then frees all rows.
-        """
-        train, held = self.stretches(structure, fold)
-        draw = 1000 * self.seed + seed
-        if structure.start == "lagged":
-            linear, starts = self._begin(structure, fold), None
-        else:
-            base = self.linear(structure, fold, 0)
-            linear, starts = base.model, base.starts
-        states = visited(linear, train, 1.0 if starts is None else structure.correction)
-        model = with_units(linear, states, np.concatenate([s.v for s in train]), structure.n_hidden, draw)
-        if starts is None:
-            one_step = OutputError(iterations=15, correction=1.0, judged=self.judged, ridge=structure.ridge, patience=5)
-            free = output_rows(model, self.data.y.shape[1])
-            model = self._spend(one_step.fit(model, train, held, free=free), train).model
-        fit = OutputError(
-            iterations=iterations,
-            correction=structure.correction,
-            judged=self.judged,
-            ridge=structure.ridge,
-            patience=15,
-        )
-        return self._spend(fit.fit(model, train, held, starts=starts), train)
+def _network(problem: Problem, task: Task) -> Fitted:
+    """A network, begun as its linear model with units that do nothing.
 
-    def on_all_rows(self, structure: Structure, fitted: Fitted, iterations: int = 30) -> Fitted:
-        """The fit gone on over all rows; the fit as it is where that makes a rest explode."""
-        whole = self.part(structure.delays, slice(None)).stretches()
-        fit = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
-        found = self._spend(fit.fit(fitted.model, whole), whole)
-        return found if not wild(found.model, self.data.v) or wild(fitted.model, self.data.v) else fitted
+    A lagged start first trains one step ahead (correction 1, output rows only), then frees all rows.
+    """
+    s = task.structure
+    train, held = problem.train(s, task.fold), problem.held(s, task.fold)
+    fitter = OutputError(
+        iterations=task.iterations, correction=s.correction, judged=problem.judged, ridge=s.ridge, patience=15
+    )
+    if task.begun is not None:
+        return fitter.fit(task.begun.model, train, held, starts=task.begun.starts)
+    starts: Sequence[Array] | None = None
+    if s.start == "lagged":
+        linear = lagged_start(problem.part(s, problem.folds[task.fold].train), *s.lags)
+    else:
+        if task.base is None:
+            raise ModelError("the linear model of this network could not be fitted")
+        linear, starts = task.base.model, task.base.starts
+    states = visited(linear, train, 1.0 if starts is None else s.correction)
+    inputs = np.concatenate([part.v for part in train])
+    model = with_units(linear, states, inputs, s.n_hidden, 1000 * problem.seed + task.seed)
+    if starts is None:
+        one_step = OutputError(iterations=15, correction=1.0, judged=problem.judged, ridge=s.ridge, patience=5)
+        model = one_step.fit(model, train, held, free=output_rows(model, problem.data.y.shape[1])).model
+    return fitter.fit(model, train, held, starts=starts)
 
-    def within_limits(self, structure: Structure, fitted: Fitted) -> Fitted:
-        """A linear fit with no pole outside the unit circle: those are put on it, and B and c fitted again.
 
-        Others are returned as they are.
-        """
-        model = fitted.model
-        if model.n_hidden or np.abs(np.linalg.eigvals(model.a)).max() <= 1:
-            return fitted
-        inside = replace(model, a=within_unit_circle(model.a, 1 - 1e-9))
-        whole = self.part(structure.delays, slice(None)).stretches()
-        again = OutputError(iterations=5, correction=structure.correction)
-        return again.fit(inside, whole, free=inside.mask(b=True, c=True))
+def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
+    """The fit gone on over all rows, by fewer iterations where more end in a network that does not settle."""
+    whole = problem.whole(structure)
+    for iterations in (30, 8, 2):
+        fitter = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
+        found = fitter.fit(fitted.model, whole)
+        if not (problem.settles and found.model.n_hidden and wild(found.model, problem.data.v)):
+            return found
+    return fitted
 
-    def _begin(self, structure: Structure, fold: int) -> Dynamics:
-        train = self.part(structure.delays, self.folds[fold].train)
-        if structure.start == "lagged":
-            return lagged_start(train, *structure.lags)
-        key = (structure.delays, fold)
-        if key not in self._realizations:
-            response = high_order_arx(train).impulse_response(RESPONSE)
-            self._realizations[key] = Realizations.of(response, train.v.std(axis=0))
-        return self._realizations[key].order(structure.order)
 
-    def _spend(self, fitted: Fitted, train: list[Stretch]) -> Fitted:
-        rows = sum(len(s) for s in train)
-        self.budget.spent += (fitted.iterations + 2) * self.budget.cost(fitted.model, rows)
+def within_limits(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
+    """A linear fit with no pole outside the unit circle: those are put on it, and B and c fitted again.
+
+    Others are returned as they are.
+    """
+    model = fitted.model
+    if model.n_hidden or np.abs(np.linalg.eigvals(model.a)).max() <= 1:
         return fitted
+    inside = replace(model, a=within_unit_circle(model.a, 1 - 1e-9))
+    again = OutputError(iterations=5, correction=structure.correction)
+    return again.fit(inside, problem.whole(structure), free=inside.mask(b=True, c=True))
 
 
+# ---------------------------------------------------------------------- what a fit shows
 def visited(model: Dynamics, train: list[Stretch], correction: float) -> Array:
     """States (N, n_x) of the run over all rows in the order of ``train``; ModelError where it explodes."""
     found = []
@@ -191,11 +162,10 @@ def visited(model: Dynamics, train: list[Stretch], correction: float) -> Array:
 
 
 def wild(model: Dynamics, v: Array) -> bool:
-    """Whether a network that stands on a stable linear model goes beyond all bounds under some constant input."""
-    if np.abs(np.linalg.eigvals(model.a)).max() > 0.9995:
-        return False  # an integrator goes anywhere
-    rows = np.linspace(0, len(v) - 1, 50).astype(np.int64)
-    return bool(np.abs(settle(model, v[rows])[0]).max() > WILD)
+    """Whether the model goes beyond all bounds under constant inputs of the data, or swings under a tenth of them."""
+    rows = np.linspace(0, len(v) - 1, 60).astype(np.int64)
+    x, still = settle(model, v[rows])
+    return not np.abs(x).max() < WILD or bool(still.mean() < RESTS)
 
 
 def misses(model: Dynamics, starts: list[Array], train: list[Stretch], ratio: float, correction: float) -> bool:

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.models.identified.compiled import run_rows
 from pipeline.plants.identified import StateEquation
 from pipeline.plants.simulator import Array
 
@@ -89,20 +90,10 @@ class Dynamics(StateEquation):
 
         With ``correction`` 0 the two are the same, and y is not used; with 1 the outputs are predicted one step ahead.
         """
-        n_x, n_y, w2 = self.n_x, data.y.shape[1], self.w2
+        n_x = self.n_x
         matrix = np.concatenate([self.a, self.w1[:, :n_x]])
         drive = np.concatenate([data.v @ self.b.T + self.c, data.v @ self.w1[:, n_x:].T + self.b1], axis=1)
         before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
-        x, hidden = np.array(start), self.n_hidden > 0
-        with np.errstate(over="ignore", invalid="ignore"):
-            for k, push in enumerate(drive):
-                before[k] = x
-                if correction:
-                    x[:n_y] += correction * (data.y[k] - x[:n_y])
-                    after[k] = x
-                z = matrix @ x
-                z += push
-                x = z[:n_x] + w2 @ np.tanh(z[n_x:]) if hidden else z
-            if not np.all(np.abs(before) < EXPLODED):
-                return None
-        return before, (after if correction else before)
+        y, x = np.ascontiguousarray(data.y), np.asarray(start, dtype=np.float64)
+        kept = run_rows(matrix, np.ascontiguousarray(self.w2), drive, y, correction, x, EXPLODED, before, after)
+        return (before, after) if kept else None

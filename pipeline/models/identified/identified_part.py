@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from pipeline.models.base import Model
 from pipeline.models.identified.assembly import assembled, noise_of
-from pipeline.models.identified.candidates import Budget, Training
+from pipeline.models.identified.candidates import on_all_rows, within_limits
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
+from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative
-from pipeline.models.identified.selection import UNITS, Selection, select
+from pipeline.models.identified.selection import Selection
+from pipeline.models.identified.structure import Problem, Structure
+from pipeline.models.identified.structure_search import StructureSearch
 from pipeline.models.identified.verdict import (
     free_run_figures,
     gain_figures,
@@ -27,7 +28,6 @@ from pipeline.models.identified.verdict import (
 )
 from pipeline.models.part import Learnt, Part, Source
 from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
 
 NEAR = 1.05
 """Held-out error, relative to the chosen one's, up to which a finalist's fits count for the bands."""
@@ -69,20 +69,25 @@ class IdentifiedPart(Part):
         if self.rows < 100:
             raise ValueError(f"rows is {self.rows}; it must be at least 100")
 
+    def groundwork(self) -> StructureSearch:
+        """The search for the structure, which all members share."""
+        return StructureSearch(
+            self.model.kind, self.orders, tuple(self.units), self.correction, self.minutes, self.rows
+        )
+
     def learn(self, source: Source) -> Learnt:
         """Search, fit the member, and report on the class of model over rows that its fold's fits never saw."""
-        record = informative(source.data(self.model.kind), self.rows)
         n_y, n_mv = len(source.signals.sp), len(source.signals.mv)
-        search = replace(self, member=0)
-        training, selection, scales = _searched(_Key(record, search, n_y, source.seed))
+        searched = source.result(self.groundwork())
+        problem, selection, scales = searched.problem, searched.selection, searched.scales
         structure = selection.chosen.structure
-        fitted = training.within_limits(structure, _member(training, selection, self.member))
-        noise, found, whole = _residuals(training, selection, fitted.model)
-        model = assembled(fitted.model, structure.delays, scales, training.data, noise, n_mv, source.seed)
+        fitted = within_limits(problem, structure, _member(problem, selection, self.member))
+        noise, found, whole = _residuals(problem, structure, fitted.model)
+        model = assembled(fitted.model, structure.delays, scales, problem.data, noise, n_mv, source.seed)
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
         bands = _bands(selection)
-        runs, curves = free_run_figures(training, selection.chosen, scales, [s.name for s in pvs])
-        responses, dead = response_figures(bands, structure.delays, training.data, scales, pvs, inputs)
+        runs, curves = free_run_figures(problem, selection.chosen, scales, [s.name for s in pvs])
+        responses, dead = response_figures(bands, structure.delays, problem.data, scales, pvs, inputs)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
         metrics: dict[str, Any] = {
@@ -92,9 +97,9 @@ class IdentifiedPart(Part):
             "member": self.member,
             "outputs": runs,
             "structure": structure_figures(selection),
-            "gains": gain_figures(bands, training.data, scales, pvs, inputs),
+            "gains": gain_figures(bands, problem.data, scales, pvs, inputs),
             "dead_times": dead,
-            "spectral_radius": gains(fitted.model, training.data)[1],
+            "spectral_radius": gains(fitted.model, problem.data)[1],
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
             "step_responses": responses,
             "candidates_tried": _table(selection),
@@ -103,52 +108,21 @@ class IdentifiedPart(Part):
         return Learnt(model, metrics, predictions={"time_s": time_s, **curves})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Key:
-    """What a search depends on; equal keys have the same result, so that members share one search a process."""
-
-    record: Record
-    part: IdentifiedPart
-    n_y: int
-    seed: int
-
-    def _values(self) -> tuple[str, IdentifiedPart, int, int]:
-        return self.record.digest(), self.part, self.n_y, self.seed
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self._values() == other._values()
-
-    def __hash__(self) -> int:
-        return hash(self._values())
-
-
-@lru_cache(maxsize=1)
-def _searched(key: _Key) -> tuple[Training, Selection, Scales]:
-    scales = Scales.of(key.record, key.n_y)
-    data = ScaledRecord.of(key.record, scales)
-    judged = key.part.correction or 0.0
-    training = Training(data, folds(key.record), Budget(60 * key.part.minutes), key.seed, judged)
-    least, most = key.part.orders or (max(2, key.n_y), 8 + 2 * (key.n_y - 1))
-    orders = range(max(least, key.n_y), max(most, key.n_y) + 1)
-    return training, select(training, orders=orders, units=key.part.units, correction=key.part.correction), scales
-
-
-def _member(training: Training, selection: Selection, member: int) -> Fitted:
+def _member(problem: Problem, selection: Selection, member: int) -> Fitted:
     """The first fold's best fit gone on over all rows; the second fold's; the first fold's next one."""
     chosen = selection.chosen
     first, second = (chosen.of_fold(k) for k in range(2))
     if member == 0 or not second:
-        return training.on_all_rows(chosen.structure, first[0])
+        return on_all_rows(problem, chosen.structure, first[0])
     if member == 1:
         return second[0]
     others = [f for f in first[1:] if np.isfinite(f.held_out)]
     return others[0] if others else first[0]
 
 
-def _residuals(training: Training, selection: Selection, model: Dynamics) -> tuple[Array, list[Array], list[Stretch]]:
+def _residuals(problem: Problem, structure: Structure, model: Dynamics) -> tuple[Array, list[Array], list[Stretch]]:
     """(scaled noise (n_y,), free-run residuals, stretches) over all rows."""
-    structure = selection.chosen.structure
-    whole = training.part(structure.delays, slice(None)).stretches()
+    whole = problem.whole(structure)
     starts = fit_starts(model, whole, structure.correction)
     found = residuals(model, starts, whole, structure.correction)
     if found is None:

@@ -76,13 +76,16 @@ class ScaledRecord:
         return len(self.y)
 
     def delayed(self, delays: Sequence[int]) -> Self:
-        """The same rows with input j of ``delays[j]`` rows before; a run's first input stands for those before it."""
+        """The same rows with input j of ``delays[j]`` rows before, or after where that is negative.
+
+        A run's first and last inputs stand for those before and after it.
+        """
         if not any(delays):
             return self
         v = self.v.copy()
         for first, last in self.bounds():
             for j, d in enumerate(delays):
-                at = np.maximum(np.arange(first, last) - d, first)
+                at = np.clip(np.arange(first, last) - d, first, last - 1)
                 v[first:last, j] = self.v[at, j]
         return replace(self, v=v)
 

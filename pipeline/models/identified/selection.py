@@ -2,42 +2,23 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.candidates import Structure, Training, misses, wild
-from pipeline.models.identified.output_error import Fitted
-
-SEEDS = 3
-"""Seeds of each network that reaches the last round."""
-
-MOST_STATES = 18
-"""States of a lagged start beyond which it is not tried."""
-
-LONG = 100
-"""Iterations of a fit in the last round."""
-
-UNITS = (4, 8, 12)
-"""Tanh units on offer."""
-
-RIDGES = (1.0, 30.0)
-"""Weights of the ridge on offer: the first in all rounds, the others for the winner."""
-
-LAGS = ((2, 2), (3, 3), (2, 5), (2, 10))
-"""Lags of the outputs and of the inputs on offer."""
+from pipeline.models.identified.candidates import misses
+from pipeline.models.identified.linear_search import LinearSearch
+from pipeline.models.identified.network_search import NetworkSearch
+from pipeline.models.identified.rounds import Rounds
+from pipeline.models.identified.structure import Problem
+from pipeline.models.identified.trial import Trial, best_of
 
 INTEGRATES = 0.999
 """Pole of the linear model beyond which a slow correction of the training run is tried, as for drift."""
 
 SLOW = 0.05
 """That correction."""
-
-NEARLY = 1.02
-"""Relative error up to which candidates of the first round count as equal, the smaller ones first."""
 
 DRIFTS = 1.5
 """Residual over noise of the best network above which the correction is tried."""
@@ -50,39 +31,6 @@ WHITE = 1.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trial:
-    """A candidate and its fits by (fold, seed)."""
-
-    structure: Structure
-    fits: dict[tuple[int, int], Fitted] = field(default_factory=dict)
-
-    def of_fold(self, fold: int) -> list[Fitted]:
-        """The fits of one fold, the best first.
-
-        Held-out and training rows count alike: few held-out rows flatter a seed that missed others.
-        """
-        return sorted((f for (of, _), f in self.fits.items() if of == fold), key=lambda f: f.held_out**2 + f.trained**2)
-
-    @property
-    def error(self) -> float:
-        """The rms over the folds of the median over the seeds of the held-out free-run error, scaled."""
-        medians = [statistics.median(f.held_out for f in self.of_fold(k)) for k in self._folds]
-        return float(np.sqrt(np.mean(np.square(medians))))
-
-    @property
-    def spread(self) -> float:
-        """The rms over the folds of the seeds' standard deviation, exploded ones left out; 0 for one seed."""
-        finite = [[f.held_out for f in self.of_fold(k) if np.isfinite(f.held_out)] for k in self._folds]
-        if not all(finite):
-            return np.inf
-        return float(np.sqrt(np.mean([np.var(errors) for errors in finite])))
-
-    @property
-    def _folds(self) -> list[int]:
-        return sorted({k for k, _ in self.fits})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Selection:
     """The outcome of a search: the best linear candidate, the best network (None without one), and all finalists."""
 
@@ -90,6 +38,7 @@ class Selection:
     network: Trial | None
     finalists: list[Trial]
     spent: float  # nominal seconds
+    settles: bool  # whether the linear model comes to rest by itself
 
     @property
     def nonlinear(self) -> bool:
@@ -110,158 +59,42 @@ class Selection:
 
 
 def select(
-    training: Training, *, orders: Sequence[int], units: Sequence[int] = UNITS, correction: float | None = None
+    rounds: Rounds, *, orders: Sequence[int], units: Sequence[int], correction: float | None = None
 ) -> Selection:
     """The search over one record.
 
     Linear candidates first: balanced starts of each order with and without the dead times that the impulse
-    response shows, and lagged starts. Then networks on the best of them: a short training on one fold ranks them, the
-    best two are trained with ``SEEDS`` seeds on both folds. When the budget is spent, what there is decides.
-    ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses much more than
-    the noise, and the models so trained err less in plain free runs over held-out rows. Raises ModelError where no
-    candidate can be fitted.
+    response shows, and lagged starts. Then networks on the best of them, in rounds that keep fewer and train them
+    longer. When the budget is spent, what there is decides. ``correction`` None: 0, or ``SLOW`` where the linear
+    model integrates or the best network misses much more than the noise, and the models so trained err less in plain
+    free runs over held-out rows. Raises ModelError where no candidate can be fitted.
     """
     given = 0.0 if correction is None else correction
-    linear = _finish_linear(training, _linear_round(training, orders, given))
+    search = LinearSearch.of(rounds)
+    linear = search.finish(search.first_round(orders, given))
     if correction is None and _integrates(linear[0]):
-        corrected = _finish_linear(training, [_linear_trial(training, slow(t.structure), 10) for t in linear])
-        linear = corrected if corrected[0].error < linear[0].error else linear
-    offered = linear if correction is not None else [Trial(fast(t.structure), t.fits) for t in linear]
-    finalists = _networks(training, offered, units) if _misses(training, linear[0], WHITE) else []
+        corrected = search.corrected(linear, SLOW)
+        linear = corrected if corrected and corrected[0].error < linear[0].error else linear
+    offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
+    settles = not _integrates(linear[0])
+    networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
+    finalists = networks.finalists(units) if _misses(rounds.problem, linear[0], WHITE) else []
     best = best_of(finalists)
-    if correction is None and best is not None and _misses(training, best, DRIFTS):
-        finalists += _last_round(training, [slow(best.structure)])
-    return Selection(linear[0], best_of(finalists), [*linear, *finalists], training.budget.spent)
+    if correction is None and best is not None and _misses(rounds.problem, best, DRIFTS):
+        finalists += networks.last_round([replace(best.structure, correction=SLOW)])
+    return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles)
 
 
-def fast(structure: Structure) -> Structure:
-    """The structure, its training runs not corrected."""
-    return replace(structure, correction=0.0)
-
-
-def slow(structure: Structure) -> Structure:
-    """The structure, its training runs corrected slowly."""
-    return replace(structure, correction=SLOW)
-
-
-def best_of(trials: Sequence[Trial]) -> Trial | None:
-    """The trial of the least error that is finite; None without one."""
-    finite = [t for t in trials if np.isfinite(t.error)]
-    return min(finite, key=lambda t: t.error) if finite else None
-
-
-# ---------------------------------------------------------------------- linear models
-def _linear_trial(training: Training, structure: Structure, iterations: int) -> Trial:
-    return Trial(structure, {(0, 0): training.linear(structure, 0, iterations)})
-
-
-def _linear_round(training: Training, orders: Sequence[int], correction: float) -> list[Trial]:
-    """The candidates after a short training on the first fold, best first, those that failed left out."""
-    options = training.delay_options()
-    none = options[0]
-    structures = [Structure("balanced", n, (0, 0), d, correction=correction) for d in options for n in orders]
-    n_y = training.data.y.shape[1]
-    for y_lags, v_lags in LAGS:
-        order = y_lags * n_y + (v_lags - 1) * len(none)
-        if order > MOST_STATES:
-            continue
-        structures.extend(Structure("lagged", order, (y_lags, v_lags), d, correction=correction) for d in options)
-    trials: list[Trial] = []
-    reasons = []
-    for structure in structures:
-        if trials and not training.budget.left:
-            break
-        try:
-            trials.append(_linear_trial(training, replace(structure, ridge=0.0), 10))
-        except ModelError as error:
-            reasons.append(str(error))
-    finite = [t for t in trials if np.isfinite(t.error)]
-    limit = NEARLY * min((t.error for t in finite), default=np.inf)
-    good = sorted(finite, key=lambda t: (t.error, 0) if t.error > limit else (0.0, t.structure.order))
-    if not good:
-        why = reasons[0] if reasons else "every free run over held-out rows explodes"
-        raise ModelError(f"no linear model fits the record: {why}")
-    return good
-
-
-def _finish_linear(training: Training, shortlist: Sequence[Trial], most: int = 3) -> list[Trial]:
-    """The best of the short list, both starts among them where both succeeded, trained to the end on both folds."""
-    kept = list(shortlist[:most])
-    for start in ("balanced", "lagged"):
-        of_start = [t for t in shortlist if t.structure.start == start]
-        kept.extend(t for t in of_start[:2] if t not in kept)
-    finished = []
-    for trial in kept:
-        fits = {}
-        for fold in range(len(training.folds)):
-            try:
-                fits[fold, 0] = training.linear(trial.structure, fold, 30)
-            except ModelError:
-                continue
-        finished.append(Trial(trial.structure, fits) if fits else trial)
-    finished.sort(key=lambda t: (len(t.fits) < len(training.folds), t.error))
-    # Of those within 1 % the smallest: a state less is one less to mislead.
-    near = [t for t in finished if t.error <= 1.01 * finished[0].error and len(t.fits) == len(finished[0].fits)]
-    smallest = min(near, key=lambda t: (t.structure.order + sum(t.structure.delays), t.error))
-    return [smallest, *(t for t in finished if t is not smallest)]
+def _with_correction(trial: Trial, correction: float) -> Trial:
+    return Trial(replace(trial.structure, correction=correction), trial.fits)
 
 
 def _integrates(trial: Trial) -> bool:
-    poles = np.linalg.eigvals(trial.fits[0, 0].model.a)
+    poles = np.linalg.eigvals(trial.of_fold(trial.folds[0])[0].model.a)
     return bool(np.abs(poles).max() > INTEGRATES)
 
 
-# ---------------------------------------------------------------------- networks
-def _networks(training: Training, linear: Sequence[Trial], units: Sequence[int]) -> list[Trial]:
-    """The finalists among the networks; none where the budget is spent or no number of units is given."""
-    if not units or not training.budget.left:
-        return []
-    quick: list[Trial] = []
-    for structure in _offers(linear, units):
-        if quick and training.budget.spent > 0.5 * training.budget.seconds:
-            break
-        try:
-            quick.append(Trial(structure, {(0, 0): training.network(structure, 0, 0, 20)}))
-        except ModelError:
-            continue
-    ranked = sorted((t for t in quick if np.isfinite(t.error)), key=lambda t: t.error)
-    finalists = _last_round(training, [t.structure for t in ranked[:2]])
-    best = best_of(finalists)
-    if best is not None and training.budget.left:
-        finalists += _last_round(training, [replace(best.structure, ridge=ridge) for ridge in RIDGES[1:]])
-    return finalists
-
-
-def _offers(linear: Sequence[Trial], units: Sequence[int]) -> list[Structure]:
-    """Networks to try: units on the best two balanced and the best two lagged candidates."""
-    balanced = [t.structure for t in linear if t.structure.start == "balanced"]
-    lagged = [t.structure for t in linear if t.structure.start == "lagged"]
-    bases = [*balanced[:1], *lagged[:1], *balanced[1:2], *lagged[1:2]]
-    middle = units[len(units) // 2]
-    first = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]
-    rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:3]]
-    return [*first, *rest]
-
-
-def _last_round(training: Training, structures: Sequence[Structure]) -> list[Trial]:
-    """Trials over all folds and seeds; a network that goes wild at a rest counts as exploded."""
-    trials: list[Trial] = []
-    for structure in structures:
-        if trials and not training.budget.left:
-            break
-        fits: dict[tuple[int, int], Fitted] = {}
-        for seed in range(SEEDS):
-            if seed and not training.budget.left:
-                break
-            for fold in range(len(training.folds)):
-                fitted = training.network(structure, fold, seed, LONG)
-                if wild(fitted.model, training.data.v):
-                    fitted = replace(fitted, held_out=np.inf)
-                fits[fold, seed] = fitted
-        trials.append(Trial(structure, fits))
-    return trials
-
-
-def _misses(training: Training, trial: Trial, ratio: float) -> bool:
-    best = trial.of_fold(0)[0]
-    return misses(best.model, best.starts, training.stretches(trial.structure, 0)[0], ratio, trial.structure.correction)
+def _misses(problem: Problem, trial: Trial, ratio: float) -> bool:
+    fold = trial.folds[0]
+    best = trial.of_fold(fold)[0]
+    return misses(best.model, best.starts, problem.train(trial.structure, fold), ratio, trial.structure.correction)

@@ -9,12 +9,13 @@ import numpy as np
 
 from pipeline.metrics import fit_percent
 from pipeline.models.identified.assembly import dead_periods, step_responses
-from pipeline.models.identified.candidates import Training
 from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.output_error import fit_starts
 from pipeline.models.identified.rests import rest_map, settle, steady_gain
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.selection import INTEGRATES, Selection, Trial
+from pipeline.models.identified.selection import INTEGRATES, Selection
+from pipeline.models.identified.structure import Problem
+from pipeline.models.identified.trial import Trial
 from pipeline.plants.simulator import Array
 from serving.manifest import Signal
 
@@ -62,16 +63,16 @@ def structure_figures(selection: Selection) -> dict[str, Any]:
 
 
 def free_run_figures(
-    training: Training, trial: Trial, scales: Scales, names: Sequence[str], fold: int = 0
+    problem: Problem, trial: Trial, scales: Scales, names: Sequence[str], fold: int = 0
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """(figures of each PV, {measured, free run} of the first) of a fold's best fit over the rows that it never saw.
 
     ``rmse`` in the PV's unit, ``fit_percent``, and ``rmse_by_third``: where the PV was low, in the middle and high.
     """
     best = trial.of_fold(fold)[0]
-    held = training.stretches(trial.structure, fold)[1]
-    starts = fit_starts(best.model, held, training.judged)
-    runs = [best.model.free_run(x, s, training.judged) for x, s in zip(starts, held, strict=True)]
+    held = problem.held(trial.structure, fold)
+    starts = fit_starts(best.model, held, problem.judged)
+    runs = [best.model.free_run(x, s, problem.judged) for x, s in zip(starts, held, strict=True)]
     actual = np.concatenate([s.y for s in held])
     n_y = actual.shape[1]
     predicted = np.concatenate(

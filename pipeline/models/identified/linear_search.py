@@ -1,0 +1,107 @@
+"""The linear candidates: balanced and lagged starts, with and without dead times, and the row in which MVs act."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.errors import ModelError
+from pipeline.models.identified.candidates import Start, Task
+from pipeline.models.identified.rounds import Rounds
+from pipeline.models.identified.structure import Structure
+from pipeline.models.identified.trial import Trial
+
+MOST_STATES = 18
+"""States of a lagged start beyond which it is not tried."""
+
+LAGS = ((2, 2), (3, 3), (2, 5), (2, 10))
+"""Lags of the outputs and of the inputs on offer."""
+
+SHORT, LONG = 10, 30
+"""Iterations of the first round, and of the fits that finish it."""
+
+NEARLY = 1.02
+"""Relative error up to which candidates of the first round count as equal, the smaller ones first."""
+
+FINISHED = 3
+"""Candidates of any start that are trained to the end."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearSearch:
+    """The search among linear models of one problem."""
+
+    rounds: Rounds
+    starts: dict[tuple[Structure, int], Start | str]
+
+    @classmethod
+    def of(cls, rounds: Rounds) -> LinearSearch:
+        """With the impulse responses without dead time, and with the one that the first fold shows."""
+        none = Structure("balanced", 0, (0, 0), (0,) * rounds.problem.data.v.shape[1])
+        starts = rounds.starts([none])
+        first = starts[none, 0]
+        if isinstance(first, Start) and max(first.dead_times) > 0:
+            starts |= rounds.starts([replace(none, delays=first.dead_times)])
+        return cls(rounds, starts)
+
+    def first_round(self, orders: Sequence[int], correction: float) -> list[Trial]:
+        """The candidates after a short training on the first fold, best first; ModelError where none can be fitted."""
+        n_y, n_v = self.rounds.problem.data.y.shape[1], self.rounds.problem.data.v.shape[1]
+        options = list(dict.fromkeys(s.delays for s, _ in self.starts))
+        structures = [Structure("balanced", n, (0, 0), d) for d in options for n in orders]
+        for y_lags, v_lags in LAGS:
+            order = y_lags * n_y + (v_lags - 1) * n_v
+            if order <= MOST_STATES:
+                structures.extend(Structure("lagged", order, (y_lags, v_lags), d) for d in options)
+        offered = [replace(s, correction=correction) for s in self.rounds.affordable(structures, SHORT, 0.3)]
+        tasks = [Task(s, 0, SHORT, start=self._start(s, 0)) for s in offered]
+        trials, reasons = self.rounds.trials(tasks, "linear models")
+        finite = [t for t in trials if np.isfinite(t.error)]
+        if not finite:
+            why = reasons[0] if reasons else "every free run over held-out rows explodes"
+            raise ModelError(f"no linear model fits the record: {why}")
+        limit = NEARLY * min(t.error for t in finite)
+        return sorted(finite, key=lambda t: (t.error, 0) if t.error > limit else (0.0, t.structure.order))
+
+    def finish(self, shortlist: Sequence[Trial]) -> list[Trial]:
+        """The best of a short list, both starts among them where both succeeded, trained to the end on all folds."""
+        kept = list(shortlist[:FINISHED])
+        for start in ("balanced", "lagged"):
+            of_start = [t for t in shortlist if t.structure.start == start]
+            kept.extend(t for t in of_start[:2] if t not in kept)
+        folds = range(len(self.rounds.problem.folds))
+        tasks = [
+            Task(t.structure, k, LONG, start=self._start(t.structure, k), begun=t.fits.get((k, 0)))
+            for t in kept
+            for k in folds
+        ]
+        finished = self.rounds.trials(tasks, "linear models, both folds")[0] or kept
+        return smallest_first(finished)
+
+    def corrected(self, trials: Sequence[Trial], correction: float) -> list[Trial]:
+        """The same candidates, trained with another correction of their runs."""
+        folds = range(len(self.rounds.problem.folds))
+        tasks = [
+            Task(replace(t.structure, correction=correction), k, SHORT + LONG, start=self._start(t.structure, k))
+            for t in trials
+            for k in folds
+        ]
+        return smallest_first(self.rounds.trials(tasks, "linear models, corrected")[0])
+
+    def _start(self, structure: Structure, fold: int) -> Start | None:
+        found = (start for (s, k), start in self.starts.items() if s.delays == structure.delays and k == fold)
+        return next((start for start in found if isinstance(start, Start)), None)
+
+
+def smallest_first(trials: Sequence[Trial]) -> list[Trial]:
+    """Best first, those of fewer folds last; of those within 1 % of the best the smallest leads.
+
+    A state less is one less to mislead.
+    """
+    most = max((len(t.fits) for t in trials), default=0)
+    ranked = sorted(trials, key=lambda t: (len(t.fits) < most, t.error))
+    near = [t for t in ranked if t.error <= 1.01 * ranked[0].error and len(t.fits) == len(ranked[0].fits)]
+    first = min(near, key=lambda t: (t.structure.order + sum(t.structure.delays), t.error), default=None)
+    return [] if first is None else [first, *(t for t in ranked if t is not first)]

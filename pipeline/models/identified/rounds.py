@@ -1,0 +1,65 @@
+"""A round of the search: independent fits on the engine, their nominal cost, and what came of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from pipeline.engine.parallel import parallel_map
+from pipeline.models.identified.candidates import Start, Task, find_start, fit
+from pipeline.models.identified.output_error import Fitted
+from pipeline.models.identified.structure import Budget, Problem, Structure
+from pipeline.models.identified.trial import Trial
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rounds:
+    """Runs rounds of fits on one problem under one budget; ``label`` names them while they run.
+
+    What a round does depends on its tasks and on nominal costs alone, never on how many processes share it.
+    """
+
+    problem: Problem
+    budget: Budget
+    label: str
+
+    def starts(self, structures: Sequence[Structure]) -> dict[tuple[Structure, int], Start | str]:
+        """The starts under the shifts of some structures, on each fold."""
+        tasks = [(s, fold) for s in structures for fold in range(len(self.problem.folds))]
+        found = parallel_map(partial(find_start, self.problem), tasks, f"{self.label}: impulse responses")
+        return dict(zip(tasks, found, strict=True))
+
+    def fits(self, tasks: Sequence[Task], name: str) -> list[Fitted | str]:
+        """The outcomes of some fits, in order. The dearest begin first, so that no core is left with one at the end."""
+        costs = [self.budget.of(t.structure, t.iterations) for t in tasks]
+        order = sorted(range(len(tasks)), key=lambda i: (-costs[i], i))
+        found = parallel_map(partial(fit, self.problem), [tasks[i] for i in order], f"{self.label}: {name}")
+        outcomes: list[Fitted | str] = ["not fitted"] * len(tasks)
+        for i, outcome in zip(order, found, strict=True):
+            outcomes[i] = outcome
+            done = 2 if isinstance(outcome, str) else outcome.iterations + 2
+            self.budget.spent += self.budget.of(tasks[i].structure, done)
+        return outcomes
+
+    def trials(self, tasks: Sequence[Task], name: str) -> tuple[list[Trial], list[str]]:
+        """(the candidates with the fits that succeeded, in order of their first task, reasons of the others)."""
+        trials: dict[Structure, Trial] = {}
+        reasons = []
+        for task, outcome in zip(tasks, self.fits(tasks, name), strict=True):
+            if isinstance(outcome, str):
+                reasons.append(outcome)
+            else:
+                trial = trials.setdefault(task.structure, Trial(task.structure))
+                trial.fits[task.fold, task.seed] = outcome
+        return list(trials.values()), reasons
+
+    def affordable(self, structures: Sequence[Structure], iterations: int, share: float) -> list[Structure]:
+        """The first of some structures that ``iterations`` of each fit into ``share`` of the budget, one at least."""
+        left, chosen = self.budget.left(share), list[Structure]()
+        for structure in structures:
+            left -= self.budget.of(structure, iterations)
+            if chosen and left < 0:
+                break
+            chosen.append(structure)
+        return chosen

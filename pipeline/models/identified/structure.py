@@ -1,0 +1,97 @@
+"""The choices of a candidate, the record that candidates are compared on, and what a fit of one costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from pipeline.models.identified.dynamics import Stretch
+from pipeline.models.identified.scaled_record import Fold, ScaledRecord
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """The choices of a candidate.
+
+    ``start`` balanced: realization of ``order`` states; lagged: companion form of ``lags`` (of the outputs, of the
+    inputs). ``delays`` are the dead times of the inputs in periods. ``correction`` is the share of the output's error
+    that each sample of the training run takes back: for drift and integrating levels. ``same_row`` says that the MVs
+    of a row act on the outputs of that row, not of the next one: a logger that stores them late.
+    """
+
+    start: Literal["balanced", "lagged"]
+    order: int
+    lags: tuple[int, int]
+    delays: tuple[int, ...]
+    n_hidden: int = 0
+    ridge: float = 0.0
+    correction: float = 0.0
+    same_row: bool = False
+
+    @property
+    def base(self) -> Structure:
+        """The linear candidate that this one starts from."""
+        return replace(self, n_hidden=0, ridge=0.0)
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters."""
+        n_z = self.order + len(self.delays)
+        return self.order * (n_z + 1) + self.n_hidden * (n_z + 1 + self.order)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """The scaled record of ``n_mv`` MVs, its folds, the seed, and how candidates are judged.
+
+    ``judged`` is the correction of the free runs over held-out rows, the same for all candidates. ``settles`` says
+    that the plant comes to rest by itself, as its linear model does; a network that does not is rejected.
+    """
+
+    data: ScaledRecord
+    folds: tuple[Fold, ...]
+    n_mv: int
+    seed: int = 0
+    judged: float = 0.0
+    settles: bool = False
+
+    def part(self, structure: Structure, rows: slice) -> ScaledRecord:
+        """Some rows, the inputs shifted to where they act in this structure."""
+        shift = [d - int(structure.same_row and j < self.n_mv) for j, d in enumerate(structure.delays)]
+        return self.data.delayed(shift).rows(rows)
+
+    def train(self, structure: Structure, fold: int) -> list[Stretch]:
+        """Training stretches of a fold."""
+        return self.part(structure, self.folds[fold].train).stretches()
+
+    def held(self, structure: Structure, fold: int) -> list[Stretch]:
+        """Held-out stretches of a fold."""
+        return self.part(structure, self.folds[fold].held).stretches()
+
+    def whole(self, structure: Structure) -> list[Stretch]:
+        """All stretches."""
+        return self.part(structure, slice(None)).stretches()
+
+
+@dataclass(slots=True)
+class Budget:
+    """Work in nominal seconds of one core, so that the same record and budget always do the same work.
+
+    An iteration over N rows of a candidate with n_x states, n_h units and P parameters counts
+    N (.3 + .06 n_h + .0018 n_x P + .000018 n_y P^2) 1.5e-6 s.
+    """
+
+    seconds: float
+    rows: int
+    n_y: int
+    spent: float = 0.0
+
+    def of(self, structure: Structure, iterations: int) -> float:
+        """Nominal seconds of some iterations."""
+        p = structure.parameters
+        row = 0.3 + 0.06 * structure.n_hidden + 1.8e-3 * structure.order * p + 1.8e-5 * self.n_y * p * p
+        return iterations * self.rows * row * 1.5e-6
+
+    def left(self, share: float = 1.0) -> float:
+        """Nominal seconds until ``share`` of the budget is spent."""
+        return share * self.seconds - self.spent

@@ -1,0 +1,46 @@
+"""The search for a structure as work that the members of an ensemble share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from pipeline.models.identified.rounds import Rounds
+from pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative
+from pipeline.models.identified.selection import Selection, select
+from pipeline.models.identified.structure import Budget, Problem
+from pipeline.models.part import Groundwork, Source
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Searched:
+    """The problem that was searched, its outcome, and the scales of its record."""
+
+    problem: Problem
+    selection: Selection
+    scales: Scales
+
+
+@dataclass(frozen=True, slots=True)
+class StructureSearch(Groundwork[Searched]):
+    """The choices of params.yaml that decide the search."""
+
+    kind: str
+    orders: tuple[int, int] | None
+    units: tuple[int, ...]
+    correction: float | None
+    minutes: float
+    rows: int
+
+    def done(self, source: Source, label: str) -> Searched:
+        """The search over the source's record; ModelError where it cannot carry a model."""
+        record = informative(source.data(self.kind), self.rows)
+        n_y = len(source.signals.sp)
+        scales = Scales.of(record, n_y)
+        data = ScaledRecord.of(record, scales)
+        problem = Problem(data, folds(record), len(source.signals.mv), source.seed, self.correction or 0.0)
+        budget = Budget(60 * self.minutes, len(data), n_y)
+        least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))
+        orders = range(max(least, n_y), max(most, n_y) + 1)
+        rounds = Rounds(problem, budget, label)
+        selection = select(rounds, orders=orders, units=self.units, correction=self.correction)
+        return Searched(replace(problem, settles=selection.settles), selection, scales)

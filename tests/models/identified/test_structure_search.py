@@ -1,0 +1,64 @@
+"""The search: the same with any number of processes, within its budget, done once for all members."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from dataclasses import replace
+
+import made_plants
+import numpy as np
+import pytest
+
+from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.identified.structure import Budget, Structure
+from pipeline.models.identified.structure_search import Searched
+from pipeline.models.part import Source
+
+PART = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.01)
+
+
+def numbers(searched: Searched) -> list[bytes]:
+    trials = searched.selection.finalists
+    return [f.model.vector().tobytes() for t in trials for _, f in sorted(t.fits.items(), key=lambda kv: kv[0])]
+
+
+@pytest.mark.skipif(multiprocessing.get_start_method() != "fork", reason="a spawned process takes seconds to start")
+def test_the_number_of_processes_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source(made_plants.hammerstein(150), made_plants.signals_of(1, 1), seed=3)
+    found = []
+    for cores in (1, 3):
+        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        found.append(PART.groundwork().done(source, "search"))
+    assert numbers(found[0]) == numbers(found[1])
+    assert found[0].selection.spent == found[1].selection.spent
+
+
+def test_members_share_one_search() -> None:
+    parts = [replace(PART, units=(), member=k) for k in range(3)]
+    works = {part.groundwork() for part in parts}
+    assert len(works) == 1
+    source = Source(made_plants.second_order(400), made_plants.signals_of(1, 1))
+    source = replace(source, groundwork={work: work.done(source, "search") for work in works})
+    learnt = [part.learn(source) for part in parts]
+    arrays = [one.model.state_dict()["a"].numpy() for one in learnt]
+    assert not np.array_equal(arrays[0], arrays[1])
+    assert not np.array_equal(arrays[1], arrays[2])
+    assert all(one.metrics["structure"] == learnt[0].metrics["structure"] for one in learnt)
+    assert PART.groundwork() not in works
+
+
+def test_a_budget_bounds_the_work_and_keeps_the_best_so_far() -> None:
+    source = Source(made_plants.hammerstein(300), made_plants.signals_of(1, 1))
+    small, large = (replace(PART, minutes=m).groundwork().done(source, "search").selection for m in (1e-5, 0.02))
+    assert small.spent < 0.3 * large.spent
+    assert np.isfinite(small.chosen.error)
+    assert large.chosen.error < small.chosen.error
+
+
+def test_a_larger_candidate_costs_more() -> None:
+    budget = Budget(60.0, 1000, 1)
+    sizes = [Structure("balanced", n, (0, 0), (0,), h) for n, h in ((2, 0), (4, 0), (4, 8), (8, 8))]
+    costs = [budget.of(s, 10) for s in sizes]
+    assert costs == sorted(costs)
+    assert budget.of(sizes[0], 20) == 2 * costs[0]
