@@ -157,6 +157,11 @@ class Case(ABC):
         """Standard deviation of each PV's measurement noise, shape (n_pv,)."""
         return np.array([self.noise[s.name] for s in self.plant_class.pv_signals])
 
+    @property
+    def noise_level(self) -> float:
+        """The measurement noise in the unit that the laws' errors have, as a standard deviation."""
+        return float(self.noise_std[0])
+
     def tests(self) -> dict[str, tuple[Scenario, ...]]:
         """``scenarios``; ParamsError if there are none, or if one of them has no sequence."""
         scenarios = self.scenarios()

@@ -162,8 +162,8 @@ class Evidence:
 
     @cached_property
     def noise(self) -> float:
-        """Standard deviation of the controlled variable's measurement noise."""
-        return float(self.case.noise_std[0])
+        """Standard deviation of the controlled variable's measurement noise, in the unit of the laws' errors."""
+        return self.case.noise_level
 
     @cached_property
     def floors(self) -> dict[str, float]:

@@ -126,10 +126,13 @@ def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array 
 
 
 def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
-    """Whether the loop locked up at an end of the MV, or the controller refused a step."""
-    mv, sp = case.plant.mv_signals[0], case.plant.sp_signals[0]
-    limits = {"low": mv.low, "high": mv.high, "span": sp.high - sp.low}
-    return locked_up(loop.sp[:, 0], loop.pv[:, 0], loop.mv[:, 0], test.hold, **limits) or bool(loop.info[:, -1].any())
+    """Whether the loop locked up at an end of an MV, or the controller refused a step."""
+    n = test.sp.shape[1]
+    # As many MVs as set points; a further one may have a part that rests at an end.
+    mvs, spans = case.plant.mv_signals[:n], [s.high - s.low for s in case.plant.sp_signals]
+    limits = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
+    jammed = locked_up(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=spans)
+    return jammed or bool(loop.info[:, -1].any())
 
 
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:

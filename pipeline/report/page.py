@@ -14,7 +14,7 @@ from pipeline.evaluation.model_evidence import candidates, model_rows
 from pipeline.evaluation.validation import FILE
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
-from pipeline.pictures.drawing import CasePicture
+from pipeline.pictures.drawing import CasePicture, axis_label
 from pipeline.pictures.numbers import number, ratio
 from pipeline.pictures.words import law_name, scenario_name
 from pipeline.report.figures import draw_all, main_words
@@ -172,7 +172,8 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
         if late_s := evidence.late_s(name):
             rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", case.criterion.late))
     mv, *others = case.plant_class.mv_signals
-    unit = ", all MVs together" if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
+    together = case.cv_unit if len(case.plant_class.sp_signals) > 1 else ""  # with several CVs all are shares of ranges
+    unit = axis_label(", all MVs together", together) if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
     travel = _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")
     return [*rows, travel | {"winner": None}]
 
