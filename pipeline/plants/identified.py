@@ -95,7 +95,7 @@ class IdentifiedPlant(Simulator):
         self._mv = np.array([s.middle for s in signals.mv]) if mv is None else np.asarray(mv, dtype=np.float64)
         self._dv = arrays.v_center[n_mv:] if dv is None else np.asarray(dv, dtype=np.float64)
         self._v0 = self._scaled(self._mv, self._dv)
-        self._remembers = shift_rows(arrays)
+        self.remembers = shift_rows(arrays)
         self._x0 = self._rest()
 
     def _scaled(self, mv: Array, dv: Array) -> Array:
@@ -147,7 +147,7 @@ class IdentifiedPlant(Simulator):
         spoilt = self._v0[:m] + gain * (acting - self._v0[:m])
         ahead = f.advance(x[..., :n], np.concatenate([spoilt, v[..., m:]], axis=-1))
         if tau != 1.0:
-            ahead = np.where(self._remembers, ahead, x[..., :n] + (ahead - x[..., :n]) / tau)
+            ahead = np.where(self.remembers, ahead, x[..., :n] + (ahead - x[..., :n]) / tau)
         ahead[..., : len(load)] += load / f.y_scale
         return np.concatenate([ahead, held[..., : self.most_dead_time * m]], axis=-1)
 
