@@ -171,6 +171,13 @@ class OwnCase(Case):
         """The record of the plant."""
         return Record.read(self.data, self.signals)
 
+    @cached_property
+    def recorded(self) -> Mapping[str, tuple[float, float]]:
+        """PV or MV -> its lowest and highest value in the record."""
+        groups = ((self.signals.pv, self.record.pv), (self.signals.mv, self.record.mv))
+        pairs = [(s, v) for signals, values in groups for s, v in zip(signals, values.T, strict=True)]
+        return {s.name: (float(v.min()), float(v.max())) for s, v in pairs}
+
     @property
     def noise_std(self) -> Array:
         """Measurement noise as the law's model estimates it, shape (n_pv,)."""

@@ -115,7 +115,7 @@ class Case(ABC):
     effort: ClassVar[Effort] = Effort()  # horizon and resolution of the bounds' search
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
-    on_models: ClassVar[bool] = False  # the tests run on models of the plant's record; they have no bounds
+    on_models: ClassVar[bool] = False  # the tests run on models of the plant's record
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
 
     def __post_init__(self) -> None:
@@ -161,6 +161,11 @@ class Case(ABC):
     def noise_level(self) -> float:
         """The measurement noise in the unit that the laws' errors have, as a standard deviation."""
         return float(self.noise_std[0])
+
+    @property
+    def recorded(self) -> Mapping[str, tuple[float, float]]:
+        """PV or MV -> its lowest and highest value in the plant's record; empty for a plant in equations."""
+        return {}
 
     def tests(self) -> dict[str, tuple[Scenario, ...]]:
         """``scenarios``; ParamsError if there are none, or if one of them has no sequence."""

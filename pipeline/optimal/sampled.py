@@ -14,8 +14,8 @@ from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
 
-HORIZON = (20, 80)  # least and most samples that a plan looks ahead
-EVERY = 6  # parts of the horizon: a plan is followed over one of them while its predictions come true
+HORIZON = (20, 60)  # least and most samples that a plan looks ahead
+EVERY = 4  # parts of the horizon: a plan is followed over one of them while its predictions come true
 CAME_TRUE = 1e-7  # scaled: how far a state may be from its prediction
 ARRIVED = 1e-4  # of the CVs' ranges: a plan whose error from here on is less is followed to its end
 MOST_ITERATIONS = 200
@@ -102,7 +102,7 @@ class SampledHorizon:
             "ipopt.linear_solver": "mumps",
             "ipopt.tol": 1e-7,
             "ipopt.max_iter": MOST_ITERATIONS,
-            "ipopt.mu_init": 1e-4,
+            "ipopt.mu_init": 1e-3,
             "ipopt.warm_start_init_point": "yes",
             "ipopt.warm_start_bound_push": 1e-6,
             "ipopt.warm_start_slack_bound_push": 1e-6,
@@ -115,27 +115,39 @@ class SampledHorizon:
         free = np.concatenate([np.zeros(self._n_x * n), np.full(2 * n_cv * n, np.inf)])
         self._bounds = {"lbx": low.ravel("F"), "ubx": high.ravel("F"), "lbg": np.zeros(free.size), "ubg": free}
 
-    def solve(self, x0: Array, mv: Array, sp: Array, p: Array, before: SampledPlan | None = None) -> SampledPlan:
+    def solve(
+        self, x0: Array, mv: Array, sp: Array, p: Array, before: SampledPlan | None = None, age: int = 0
+    ) -> SampledPlan:
         """The plan from a state x0 (n_x,) to set points sp (n_cv,) under parameters p (n_p,).
 
-        It begins with the rest of the plan ``before``, its last period repeated, else with mv (n_mv,) held.
+        It begins with the rest of the plan ``before`` after ``age`` samples, its last period repeated, else with
+        mv (n_mv,) held.
         """
         arguments: dict[str, Any] = {"p": np.concatenate([x0, sp, p, shares(self.plant, p)]), **self._bounds}
         if before is None:
             arguments["x0"] = self._held(x0, mv, sp, p).ravel("F")
         else:
-            table = before.values.reshape(self._rows, self.n, order="F")
-            arguments["x0"] = np.hstack([table[:, 1:], table[:, -1:]]).ravel("F")
-            arguments |= {"lam_x0": before.multipliers[0], "lam_g0": before.multipliers[1]}
+            at = np.minimum(np.arange(self.n) + age, self.n - 1)
+            arguments["x0"] = self._table(before.values)[:, at].ravel("F")
+            # Of the constraints, those of the states come first, then two groups of slacks.
+            states, n_s = self._n_x * self.n, self._n_cv * self.n
+            of_x, of_g = before.multipliers[0].ravel(), before.multipliers[1].ravel()
+            groups = (of_g[:states], of_g[states : states + n_s], of_g[states + n_s :])
+            shifted = [group.reshape(-1, self.n, order="F")[:, at].ravel("F") for group in groups]
+            arguments |= {"lam_x0": self._table(of_x)[:, at].ravel("F"), "lam_g0": np.concatenate(shifted)}
         result, stats = self._solver(**arguments), self._solver.stats()
         values = np.array(result["x"]).ravel()
-        table = values.reshape(self._rows, self.n, order="F")
+        table = self._table(values)
         x = np.vstack([x0, table[: self._n_x].T])
         moves = self._low + self._span * np.clip(table[self._n_x : self._n_x + self._m].T, 0, 1)
         error = np.abs(sp - self.plant.measured(x[1:])[:, : self._n_cv]) / self._cv_span
         multipliers = (np.array(result["lam_x"]), np.array(result["lam_g"]))
         solved = bool(stats["success"]) and bool(np.all(np.isfinite(values)))
         return SampledPlan(moves, x, error.sum(axis=1), solved, values, multipliers)
+
+    def _table(self, values: Array) -> Array:
+        """All variables as rows (states, moves, slacks) by samples."""
+        return values.reshape(self._rows, self.n, order="F")
 
     def _held(self, x0: Array, mv: Array, sp: Array, p: Array) -> Array:
         """All variables with the MVs held."""
@@ -169,7 +181,7 @@ def run_sampled(
         )
         arrived = plan is not None and age < horizon.n and float(plan.error[age:].max()) <= ARRIVED
         if plan is None or not expected or age >= (horizon.n if arrived else max(horizon.n // EVERY, 1)):
-            found = horizon.solve(x, mv, sp, p, plan if expected else None)
+            found = horizon.solve(x, mv, sp, p, plan if expected else None, age)
             if not found.solved and plan is not None and expected:
                 found = horizon.solve(x, mv, sp, p)
             failures += not found.solved

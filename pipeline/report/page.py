@@ -110,7 +110,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     """The figures at the top of the page: value and words.
 
     They compare the best controller with the bound on the main test and on each test of its
-    requirements, and then with the case's baseline.
+    requirements, say how well the models fit that it was tested on, and compare it with the case's baseline.
     """
     best, case = evidence.best, evidence.case
     if best is None:
@@ -129,6 +129,11 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
             words = f"{case.metrics[need.metric].short} on {name_of(need.scenario)}"
             rows.append((number(late), f"{words}; at most {number(need.high)} is asked"))
     rows = rows[:MOST_HEADLINES]
+    if evidence.grounds is not None:
+        rows += [
+            ("none" if fit is None else f"{fit:.3g} %", f"free-run fit of {name} by the models, over unseen rows")
+            for name, fit in evidence.grounds.fit.items()
+        ]
     late_s = evidence.late_s(evidence.main_test)
     metric = case.criterion.late if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))

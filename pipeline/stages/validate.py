@@ -18,7 +18,9 @@ from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
+from pipeline.evaluation.reached import grounds_of, widest
 from pipeline.evaluation.trial import Metrics, Trial, step_us, try_file
 from pipeline.export.controller_file import with_evidence
 from pipeline.files import read_json, write_json
@@ -27,6 +29,7 @@ from pipeline.stages.paths import (
     analysis_file,
     controller_file,
     design_folder,
+    model_folder,
     step_time_file,
     validation_folder,
 )
@@ -71,7 +74,8 @@ def validate(name: str) -> None:
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)
     _keep_analysis(params, shipped.seed, folder / "analysis.npz")
-    evidence = _evidence(case, base, shipped)
+    models = read_json(model_folder(params.case, params.model) / "metrics.json") if case.on_models else {}
+    evidence = _evidence(case, base, shipped, grounds_of(case, models, [metrics.reached]))
     if (analysis := metrics.forms[BASE].analysis) is not None:
         evidence["analysis"] = analysis.figures
     if locked_up:
@@ -127,6 +131,7 @@ def _metrics(
             name: {seed: _over_seeds({t.seed: t.sequences[name][seed] for t in base}).median for seed in rows}
             for name, rows in base[0].sequences.items()
         },
+        reached=widest(t.reached for t in base),
     )
 
 
@@ -140,13 +145,13 @@ def _over_seeds(rows: Mapping[int, Metrics]) -> OverSeeds:
     return OverSeeds(median, low, high, {str(seed): row for seed, row in rows.items()})
 
 
-def _evidence(case: Case, base: list[Trial], shipped: Trial) -> dict[str, Any]:
+def _evidence(case: Case, base: list[Trial], shipped: Trial, grounds: Grounds | None) -> dict[str, Any]:
     """Evidence in the shipped file's manifest: its own figures, and the median over the data seeds."""
     figures = {
         name: {**row, f"{case.metric}_median": statistics.median(t.metrics[name][case.metric] for t in base)}
         for name, row in shipped.metrics.items()
     }
-    of = {"plant": "identified"} if case.on_models else {}
+    of = {} if grounds is None else {"plant": "identified", "on": grounds.to_dict()}
     return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "scenarios": figures}
 
 
