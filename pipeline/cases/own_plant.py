@@ -179,6 +179,11 @@ class OwnCase(Case):
         return {s.name: (float(v.min()), float(v.max())) for s, v in pairs}
 
     @property
+    def replayed(self) -> tuple[Record, int]:
+        """The record, and the samples in which the slowest CV has half answered."""
+        return self.record, self.reach.halfway
+
+    @property
     def noise_std(self) -> Array:
         """Measurement noise as the law's model estimates it, shape (n_pv,)."""
         return self._nominal.noise_std

@@ -87,6 +87,14 @@ class Reach:
                 needed.append(int(np.flatnonzero(away)[-1]) + 1 if away.any() else 1)
         return int(np.clip(TIMES * max(needed), *HOLD))
 
+    @cached_property
+    def halfway(self) -> int:
+        """Samples in which the strongest MV of the slowest CV has moved it half as far as it will, or as was visited."""
+        size, width = np.abs(self.answers), self.cv[2] - self.cv[0]
+        way = 0.5 * np.minimum(size.max(axis=1), width)  # (n_mv, n_cv)
+        first = [int((size[j, :, i] >= way[j, i]).argmax()) for i, j in enumerate(way.argmax(axis=0))]
+        return max(1, *first)
+
     def rest(self, plant: IdentifiedPlant) -> tuple[Array, Array]:
         """(state (n_x,), mv (n_mv,)) where a plant rests: its own start, or balanced at the CVs' medians."""
         x, mv = plant.start

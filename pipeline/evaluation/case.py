@@ -18,6 +18,7 @@ from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import rmse
 from pipeline.plants.equations import EquationPlant, equations
 from pipeline.plants.simulator import Simulator
+from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -166,6 +167,11 @@ class Case(ABC):
     def recorded(self) -> Mapping[str, tuple[float, float]]:
         """PV or MV -> its lowest and highest value in the plant's record; empty for a plant in equations."""
         return {}
+
+    @property
+    def replayed(self) -> tuple[Record, int] | None:
+        """The record over which laws are replayed, and the samples in which the plant half answers; None: no record."""
+        return None
 
     def tests(self) -> dict[str, tuple[Scenario, ...]]:
         """``scenarios``; ParamsError if there are none, or if one of them has no sequence."""

@@ -6,9 +6,10 @@ import shutil
 import statistics
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from pipeline.evaluation.case import Case
 from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
 from pipeline.evaluation.reached import grounds_of, widest
+from pipeline.evaluation.replay import replay
 from pipeline.evaluation.trial import Metrics, Trial, step_us, try_file
 from pipeline.export.controller_file import with_evidence
 from pipeline.files import read_json, write_json
@@ -64,8 +66,10 @@ def validate(name: str) -> None:
         )
     folder = validation_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     designed = read_json(design_folder(params.case, params.name) / "metrics.json")
-    metrics = _metrics(params, case, designed, trials, shipped)
+    replayed = _replayed(case, source, folder / "replay.npz")
+    metrics = replace(_metrics(params, case, designed, trials, shipped), replay=replayed)
     metrics.write(folder / "metrics.json")
     took = step_us(Controller(source), next(iter(shipped.curves.values())), case.plant.dv_nominal)
     write_json(step_time_file(params.case, params.name), took)
@@ -87,6 +91,16 @@ def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:
     """Test -> data seed -> closed loops that locked up, of those where any did."""
     tests = dict.fromkeys(test for t in base for test in t.locked_up)
     return {test: {str(t.seed): t.locked_up[test] for t in base if test in t.locked_up} for test in tests}
+
+
+def _replayed(case: Case, file: Path, path: Path) -> dict[str, dict[str, float]]:
+    """Figures of the file over the last rows of the plant's record, their curves kept; none without a record."""
+    if case.replayed is None:
+        return {}
+    record, ahead = case.replayed
+    found = replay(Controller(file), record, case.plant.signals, ahead)
+    np.savez_compressed(path, **cast(dict[str, Any], found.arrays()))
+    return found.figures(record)
 
 
 def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:

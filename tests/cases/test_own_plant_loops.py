@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from own_cases import GAINS, RATE, filled_level, section, two_lags
+from own_cases import GAINS, POLES, RATE, filled_level, section, two_lags
 
 from pipeline.cases.own_plant import PERCENT, OwnCase, own_case
 from pipeline.errors import ParamsError
@@ -137,3 +137,7 @@ def test_a_simulation_moves_the_set_point_that_is_named(two: OwnCase) -> None:
     for text, said in (("0.5", "name one: y0=VALUE"), ("y2=0.5", "no set point 'y2'"), ("y0=5", "outside")):
         with pytest.raises(ParamsError, match=said):
             timetable(two.plant, set_points=[parse_event(text, "[NAME=]VALUE[@S]")])
+
+
+def test_halfway_is_the_slower_variable_s_half_time(two: OwnCase) -> None:
+    assert two.reach.halfway == np.ceil(np.log(0.5) / np.log(POLES[0].max()))
