@@ -89,7 +89,7 @@ class Reach:
 
     @cached_property
     def halfway(self) -> int:
-        """Samples in which the strongest MV of the slowest CV has moved it half as far as it will, or as was visited."""
+        """Samples in which the strongest MV has moved the slowest CV half as far as it will, or as was visited."""
         size, width = np.abs(self.answers), self.cv[2] - self.cv[0]
         way = 0.5 * np.minimum(size.max(axis=1), width)  # (n_mv, n_cv)
         first = [int((size[j, :, i] >= way[j, i]).argmax()) for i, j in enumerate(way.argmax(axis=0))]

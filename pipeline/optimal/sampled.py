@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from pipeline.optimal.horizon import MOVE_WEIGHT
-from pipeline.plants.identified import IdentifiedPlant
+from pipeline.plants.identified import IdentifiedPlant, shift_rows
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
 
@@ -48,11 +48,16 @@ def transition(plant: IdentifiedPlant) -> ca.Function:
     acting = sum(delayed[k] * held[k * m : (k + 1) * m] for k in range(most + 1))
     dv = (plant.dv_nominal - f.v_center[m:]) / f.v_scale[m:]
     v = ca.vertcat(first + p[:m] * (acting - first), dv)
-    ahead = ca.mtimes(f.a, x[:n]) + ca.mtimes(f.b, v) + f.c
-    if len(f.b1):
-        ahead += ca.mtimes(f.w2, ca.tanh(ca.mtimes(f.w1, ca.vertcat(x[:n], v)) + f.b1))
-    slowed = x[:n] + (ahead - x[:n]) / p[m]
-    ahead = ca.vertcat(*(ahead[i] if remembers else slowed[i] for i, remembers in enumerate(plant.remembers)))
+    remembers = ca.DM(shift_rows(f).astype(np.float64))
+
+    def advanced(at: Any) -> Any:
+        after = ca.mtimes(f.a, at) + ca.mtimes(f.b, v) + f.c
+        return after + ca.mtimes(f.w2, ca.tanh(ca.mtimes(f.w1, ca.vertcat(at, v)) + f.b1)) if len(f.b1) else after
+
+    ahead = advanced(x[:n])
+    second = advanced(remembers * x[:n] + (1 - remembers) * ahead)
+    slower, faster = x[:n] + (ahead - x[:n]) / p[m], ahead + (1 / p[m] - 1) * (second - ahead)
+    ahead = remembers * ahead + (1 - remembers) * ca.if_else(p[m] < 1, faster, slower)
     load = ca.vertcat(p[m + 2 :] / f.y_scale, np.zeros(n - n_y))
     return ca.Function("transition", [x, mv, p, delayed], [ca.densify(ca.vertcat(ahead + load, held[: most * m]))])
 

@@ -52,6 +52,9 @@ class IdentifiedPlant(Simulator):
 
         x+ = x + (F(x, v0 + gain (v - v0)) - x) / time_constant + load / y_scale   (the load on the outputs only)
 
+    and where ``time_constant`` is below 1, a part of a second step under the same inputs, which leaves a stable plant
+    stable: x+ = F(x) + (1 / time_constant - 1) (F(F(x)) - F(x)).
+
     The parameters are, by name: ``gain_MV`` of each MV (1), ``time_constant`` (1), ``dead_time`` (0, whole or
     fractional periods up to ``most_dead_time``), ``load_PV`` of each output (0, in the PV's unit a period). States
     that only remember an input or another state (a dead time inside the model) are not slowed down.
@@ -95,7 +98,7 @@ class IdentifiedPlant(Simulator):
         self._mv = np.array([s.middle for s in signals.mv]) if mv is None else np.asarray(mv, dtype=np.float64)
         self._dv = arrays.v_center[n_mv:] if dv is None else np.asarray(dv, dtype=np.float64)
         self._v0 = self._scaled(self._mv, self._dv)
-        self.remembers = shift_rows(arrays)
+        self._remembers = shift_rows(arrays)
         self._x0 = self._rest()
 
     def _scaled(self, mv: Array, dv: Array) -> Array:
@@ -145,9 +148,13 @@ class IdentifiedPlant(Simulator):
         if part > 0:
             acting = (1 - part) * acting + part * held[..., (whole + 1) * m : (whole + 2) * m]
         spoilt = self._v0[:m] + gain * (acting - self._v0[:m])
-        ahead = f.advance(x[..., :n], np.concatenate([spoilt, v[..., m:]], axis=-1))
-        if tau != 1.0:
-            ahead = np.where(self.remembers, ahead, x[..., :n] + (ahead - x[..., :n]) / tau)
+        inputs = np.concatenate([spoilt, v[..., m:]], axis=-1)
+        ahead = f.advance(x[..., :n], inputs)
+        if tau > 1.0:
+            ahead = np.where(self._remembers, ahead, x[..., :n] + (ahead - x[..., :n]) / tau)
+        elif tau < 1.0:
+            second = f.advance(np.where(self._remembers, x[..., :n], ahead), inputs)
+            ahead = np.where(self._remembers, ahead, ahead + (1 / tau - 1) * (second - ahead))
         ahead[..., : len(load)] += load / f.y_scale
         return np.concatenate([ahead, held[..., : self.most_dead_time * m]], axis=-1)
 
