@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from pipeline.cases.reach import LOAD, Reach
 from pipeline.config.plants import PlantParams, SignalParams
 from pipeline.errors import PlantError
 from pipeline.evaluation.case import Array, Case
+from pipeline.evaluation.closed_loop import closed_loop_metrics
+from pipeline.evaluation.metric import Metric
+from pipeline.metrics import mae
 from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.plants.spoilt import SpoiltPlant
 from pipeline.records.record import Record
-from pipeline.simulation.scenario import Scenario, held
-from pipeline.simulation.simulate import simulate_batch
+from pipeline.simulation.scenario import Scenario
 from serving.manifest import Signal
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBER_NUMBERS = (1, 2)
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
-VISITED = (0.1, 0.9)  # quantiles of the record's MV between which tests move
-LEVELS = 6  # set points of a sequence
-SETTLED = 0.05  # of a step
-HOLD = (30, 400)  # fewest and most samples of a set point
-LOAD = 0.25  # standard deviations of the record's CV
-RESTING = 2_000  # samples
+LOAD_AT = 5  # sample at which a load begins
+PERCENT = "% of range"
 GAINS, SPEEDS, DELAYS = (0.8, 1.25), (1.25, 0.8), (1.0, 0.0)  # factors of gain and time constant; [periods]
 
 
@@ -38,11 +37,25 @@ class OwnPlant(IdentifiedPlant):
     """A model of an own plant, with the measurement noise of its record and the errors that it may have."""
 
     noise: Array
+    rest: tuple[Array, Array] | None = None
 
     @property
     def noise_std(self) -> Array:
         """Standard deviation of the measurement noise, shape (n_pv,)."""
         return self.noise
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """(state (n_x,), mv (n_mv,)) of a rest."""
+        return super().start if self.rest is None else (self.rest[0].copy(), self.rest[1].copy())
+
+    def begun_at(self, x: Array, mv: Array) -> Self:
+        """The same plant with another start; its errors of gain turn about the MVs there, so that it stays a rest."""
+        other = type(self)(
+            self.signals, self.arrays, name=self.name, mv=mv, dv=self.dv_nominal, most_dead_time=self.most_dead_time
+        )
+        other.noise, other.rest = self.noise, (x, mv)
+        return other
 
     def variations(self) -> tuple[Simulator, ...]:
         """The model itself, and with errors of gain, speed and dead time."""
@@ -86,8 +99,8 @@ class Untrained(Simulator):
 class OwnCase(Case):
     """Tests of an own plant: on models of its record that had no part in tuning, and on such models spoilt.
 
-    Set points are what the law's model reaches at rest under MVs of the record's range. The subclass of a plant
-    states its signals, see ``own_case``.
+    Set points are what the model of each test can hold within the range that the record visited (``Reach``). Errors
+    of several CVs count in % of their ranges. The subclass of a plant states its signals, see ``own_case``.
     """
 
     development_seeds: ClassVar[tuple[int, ...]] = (1, 2)
@@ -111,12 +124,17 @@ class OwnCase(Case):
     @cached_property
     def plant(self) -> Simulator:
         """The law's own model in place of the plant; only its signals are known before it is trained."""
-        return self._member(self._law_file) if self.ready else self.plant_class()
+        return self._resting(self._model) if self.ready else self.plant_class()
 
     @property
     def _nominal(self) -> OwnPlant:
         assert isinstance(self.plant, OwnPlant)
         return self.plant
+
+    @cached_property
+    def _model(self) -> OwnPlant:
+        """The law's own model, begun at the median MVs."""
+        return self._member(self._law_file, np.median(self.record.mv, axis=0))
 
     @cached_property
     def members(self) -> tuple[OwnPlant, ...]:
@@ -127,90 +145,114 @@ class OwnCase(Case):
                 f"{self.models} holds no {MEMBERS}, the models to validate on; add parts plant1, plant2, ... of kind "
                 f"identified to models.{self.name}-{MODEL_SET}, and run its fit stage"
             )
-        return tuple(map(self._member, paths))
+        return tuple(self._resting(self._member(path, self._model.start[1])) for path in paths)
 
-    def _member(self, path: Path) -> OwnPlant:
+    def _member(self, path: Path, mv: Array) -> OwnPlant:
+        """A model that begins at MVs (n_mv,)."""
         with np.load(path, allow_pickle=False) as file:
             arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
             noise = np.asarray(file["noise"] * file["y_scale"])
-        mv, dv = (np.median(values, axis=0) for values in (self.record.mv, self.record.dv))
+        dv = np.median(self.record.dv, axis=0)
         plant = OwnPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=int(max(DELAYS)))
         plant.noise = noise
         return plant
+
+    def _resting(self, plant: OwnPlant) -> OwnPlant:
+        """The plant, begun where it rests; one that settles does so already."""
+        return plant.begun_at(*self.reach.rest(plant)) if self.reach.integrates else plant
+
+    @cached_property
+    def reach(self) -> Reach:
+        """What of its range the record visited, by the law's model."""
+        return Reach(self._model, self.record)
 
     @cached_property
     def record(self) -> Record:
         """The record of the plant."""
         return Record.read(self.data, self.signals)
 
+    @cached_property
+    def recorded(self) -> Mapping[str, tuple[float, float]]:
+        """PV or MV -> its lowest and highest value in the record."""
+        groups = ((self.signals.pv, self.record.pv), (self.signals.mv, self.record.mv))
+        pairs = [(s, v) for signals, values in groups for s, v in zip(signals, values.T, strict=True)]
+        return {s.name: (float(v.min()), float(v.max())) for s, v in pairs}
+
+    @property
+    def replayed(self) -> tuple[Record, int]:
+        """The record, and the samples in which the slowest CV has half answered."""
+        return self.record, self.reach.halfway
+
     @property
     def noise_std(self) -> Array:
         """Measurement noise as the law's model estimates it, shape (n_pv,)."""
         return self._nominal.noise_std
 
-    @cached_property
+    @property
+    def noise_level(self) -> float:
+        """The noise in the unit of the case's metric: of several CVs the mean of their shares of the ranges [%]."""
+        noise = self.noise_std[: len(self.signals.sp)]
+        return float(noise[0]) if len(noise) == 1 else float(np.mean(100 * noise / _spans(self.signals.sp)))
+
+    @property
+    def cv_unit(self) -> str:
+        """The unit of the controlled variable; of several their errors are put together in shares of their ranges."""
+        return self.signals.sp[0].unit if len(self.signals.sp) == 1 else PERCENT
+
+    @property
     def hold(self) -> int:
-        """Samples of a set point: three times what the law's model needs to settle over the visited range."""
-        courses = self._courses(self._visited_mv)
-        (low, high), steps = courses[:, -1], courses[1] - courses[0]
-        # From the same start, the difference of the two courses is the response to a step over the visited range.
-        away = np.flatnonzero(np.abs(steps - (high - low)) > SETTLED * abs(high - low))
-        return int(np.clip(3 * (away[-1] + 1 if away.size else 1), *HOLD))
+        """Samples of a set point."""
+        return self.reach.hold
 
-    @cached_property
-    def _visited_mv(self) -> Array:
-        return np.asarray(np.quantile(self.record.mv, VISITED, axis=0))
-
-    def _courses(self, mvs: Array) -> Array:
-        """The CV (n, samples) of the law's model from its start under constant mvs (n, n_mv)."""
-        starts = np.tile(self.plant.start[0], (len(mvs), 1))
-        x = simulate_batch(self.plant, starts, np.repeat(mvs[:, None], RESTING, axis=1))
-        return self.plant.measured(x)[..., 0]
-
-    def _sequence(self, seed: int) -> Array:
-        """Set points (n, 1) that the law's model reaches at rest, within the range of the set point."""
-        low, high = self._visited_mv
-        sp = self.plant.sp_signals[0]
-        ends = self._courses(np.random.default_rng(seed).uniform(low, high, (LEVELS, len(low))))[:, -1]
-        return held(np.clip(ends, sp.low, sp.high).tolist(), self.hold)
+    def score(self, test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
+        """Figures of one closed loop; of several CVs in % of their ranges, and the MAE of each in its own unit."""
+        signals = self.signals.sp
+        n = len(signals)
+        if n == 1:
+            return super().score(test, pv, mv)
+        spans, moves = _spans(signals), _spans(self.signals.mv)
+        shares = (100 * test.sp / spans, 100 * pv[:, :n] / spans, 100 * mv / moves)
+        figures = closed_loop_metrics(*shares, test.hold, self.signals.period_s, 100.0, test.late_from)
+        return figures | {mae_of(s): mae(test.sp[:, i], pv[:, i]) for i, s in enumerate(signals)}
 
     def _test(
-        self, name: str, title: str, sp: Array, plant: IdentifiedPlant, seed: int | None, **changed: float
+        self, name: str, title: str, sp: Array, plant: IdentifiedPlant, seed: int | None, changed: Mapping[str, float]
     ) -> Scenario:
-        changes = {key: np.full(len(sp), value) for key, value in changed.items()}
+        # A load begins after some samples: a law that begins with it could take it for a part of its start.
+        late: Array = (np.arange(len(sp)) >= LOAD_AT).astype(np.float64)
+        changes = {k: v * late if k.startswith("load_") else np.full(len(sp), float(v)) for k, v in changed.items()}
         x0, mv0 = plant.start
         return Scenario(name, title, sp, x0, mv0, changes, self.hold if seed is not None else 0, seed, plant=plant)
 
-    def _load(self, plant: IdentifiedPlant) -> float:
-        """The load [CV a period] that moves the CV by ``LOAD`` within a hold, if no controller acts."""
-        (x, mv), name = plant.start, f"load_{plant.pv_signals[0].name}"
-        y0, tried = plant.measure(x)[0], 1e-3 * float(self.record.pv[:, 0].std())
-        p = plant.parameters({name: tried})
-        for _ in range(self.hold):
-            x = plant.step(x, mv, plant.dv_nominal, p)
-        return tried * LOAD * float(self.record.pv[:, 0].std()) / abs(float(plant.measure(x)[0] - y0))
-
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
-        """Set points on the other models; the same on spoilt ones; and a load, upwards and downwards."""
-        members, cv = self.members, self.plant.pv_signals[0]
+        """Set points on the other models; the same on spoilt ones; and a load on each CV, upwards and downwards."""
+        return dict(self._scenarios)
+
+    @cached_property
+    def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        members, reach = self.members, self.reach
         pairs = [(seed, members[i % len(members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
-        sp = {seed: self._sequence(seed) for seed in self.held_out_seeds}
         held_out = "Set points, on models identified from the record"
         spoilt = "Set points, on such models with errors of gain, speed and dead time"
-        loads = f"A load worth {LOAD:g} standard deviations of the record's {cv.name}"
+        cvs = self.signals.sp
+        loads = f"A load worth {LOAD:g} standard deviations of the record's {cvs[0].name if len(cvs) == 1 else 'CV'}"
+        loads += "" if len(cvs) == 1 else ", each CV in turn"
         errors = errors_of(self._nominal)
+        known = {i: [(s, p, p.parameters(errors[i])) for s, p, j in pairs if j == i] for i in (0, 1)}
+        wrong = {s: reach.set_points(p, s, q) for rows in known.values() for s, p, q in rows}
         return {
-            "held_out": tuple(self._test("held_out", held_out, sp[s], p, s) for s, p, _ in pairs),
-            "spoilt": tuple(self._test("spoilt", spoilt, sp[s], p, s, **errors[i]) for s, p, i in pairs),
+            "held_out": tuple(self._test("held_out", held_out, reach.set_points(p, s), p, s, {}) for s, p, _ in pairs),
+            "spoilt": tuple(self._test("spoilt", spoilt, wrong[s], p, s, errors[i]) for s, p, i in pairs),
             "load": tuple(
                 self._test(
                     "load",
                     loads,
-                    np.full((2 * self.hold, 1), p.measure(p.start[0])[0]),
+                    np.tile(p.measure(p.start[0])[: len(cvs)], (2 * self.hold, 1)),
                     p,
                     None,
-                    **{f"load_{cv.name}": (1 - 2 * i) * self._load(p)},
+                    {f"load_{cv.name}": (1 - 2 * i) * reach.load(p, j)},
                 )
+                for j, cv in enumerate(cvs)
                 for _, p, i in pairs
             ),
         }
@@ -218,7 +260,7 @@ class OwnCase(Case):
     def development(self) -> tuple[Scenario, ...]:
         """Sequences on the law's own model."""
         return tuple(
-            self._test("development", "Development", self._sequence(s), self._nominal, s)
+            self._test("development", "Development", self.reach.set_points(self._nominal, s), self._nominal, s, {})
             for s in self.development_seeds
         )
 
@@ -227,7 +269,7 @@ def own_case(name: str) -> Case:
     """The case of ``plants.<name>`` of params.yaml."""
     params = PlantParams.read(name)
     pv, mv, dv = (tuple(map(_signal, group)) for group in (params.pv, params.mv, params.dv))
-    signals = Signals(params.period_s, pv[:1], pv, dv, mv)  # one variable is controlled so far, the first
+    signals = Signals(params.period_s, pv[: params.n_controlled], pv, dv, mv)
     models, title = Path("work") / name / "models" / MODEL_SET / "seed0", name.replace("_", " ").capitalize()
     described = {f"{group}_signals": getattr(signals, group) for group in ("sp", "pv", "mv", "dv")}
     described |= {"name": name, "title": title, "period_s": signals.period_s, "needs": models}
@@ -238,8 +280,19 @@ def own_case(name: str) -> Case:
         "plant_class": type("OwnPlant", (Untrained,), described),
         "models": models,
         "data": params.data,
+        "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
     }
     return type("OwnPlantCase", (OwnCase,), own)((9001, 9002, 9003))
+
+
+def mae_of(cv: Signal) -> str:
+    """Name of the figure of one CV among several."""
+    return f"mae_{cv.name}"
+
+
+def _spans(signals: Sequence[Signal]) -> Array:
+    """Widths (n,) of the signals' ranges."""
+    return np.array([s.high - s.low for s in signals])
 
 
 def _signal(params: SignalParams) -> Signal:

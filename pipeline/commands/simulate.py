@@ -45,7 +45,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     positive = partial(_number, above=0)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
-    events("--sp", "VALUE[@S]", "set point from time S on")
+    events("--sp", "[NAME=]VALUE[@S]", "set point from time S on; of several set points with its name")
     add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
     add("--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this CV")
     events("--disturbance", "NAME=VALUE[@S]", "plant parameter from time S on")

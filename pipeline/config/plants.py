@@ -38,7 +38,11 @@ class RawFileParams:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PlantParams:
-    """``plants.<name>``: period, signals, the clean record, and the raw files behind it."""
+    """``plants.<name>``: period, signals, the clean record, and the raw files behind it.
+
+    ``controlled`` is the number of PVs that have a set point, the first ones of ``pv``. None: all of them, and where
+    there are more PVs than MVs, as many as there are MVs.
+    """
 
     period_s: float
     pv: tuple[SignalParams, ...]  # controlled variables first
@@ -46,12 +50,24 @@ class PlantParams:
     dv: tuple[SignalParams, ...]
     data: Path
     source: tuple[RawFileParams, ...]
+    controlled: int | None = None
+
+    @property
+    def n_controlled(self) -> int:
+        """Number of PVs that have a set point."""
+        return min(len(self.pv), len(self.mv)) if self.controlled is None else self.controlled
 
     def __post_init__(self) -> None:
         if not self.period_s > 0:
             raise ValueError(f"period_s is {self.period_s:g}; it must be positive")
         if not self.pv or not self.mv:
             raise ValueError("pv and mv need one signal or more each")
+        most = min(len(self.pv), len(self.mv))
+        if not 1 <= self.n_controlled <= most:
+            raise ValueError(
+                f"controlled is {self.controlled}; {len(self.pv)} PVs and {len(self.mv)} MVs allow 1 to {most}: "
+                "each controlled variable needs an MV of its own"
+            )
         names = [s.name for s in (*self.pv, *self.mv, *self.dv)]
         twice = [n for n in names if names.count(n) > 1]
         if twice:

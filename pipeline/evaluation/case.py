@@ -18,6 +18,7 @@ from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import rmse
 from pipeline.plants.equations import EquationPlant, equations
 from pipeline.plants.simulator import Simulator
+from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -115,7 +116,7 @@ class Case(ABC):
     effort: ClassVar[Effort] = Effort()  # horizon and resolution of the bounds' search
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
-    on_models: ClassVar[bool] = False  # the tests run on models of the plant's record; they have no bounds
+    on_models: ClassVar[bool] = False  # the tests run on models of the plant's record
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
 
     def __post_init__(self) -> None:
@@ -156,6 +157,21 @@ class Case(ABC):
     def noise_std(self) -> Array:
         """Standard deviation of each PV's measurement noise, shape (n_pv,)."""
         return np.array([self.noise[s.name] for s in self.plant_class.pv_signals])
+
+    @property
+    def noise_level(self) -> float:
+        """The measurement noise in the unit that the laws' errors have, as a standard deviation."""
+        return float(self.noise_std[0])
+
+    @property
+    def recorded(self) -> Mapping[str, tuple[float, float]]:
+        """PV or MV -> its lowest and highest value in the plant's record; empty for a plant in equations."""
+        return {}
+
+    @property
+    def replayed(self) -> tuple[Record, int] | None:
+        """The record over which laws are replayed, and the samples in which the plant half answers; None: no record."""
+        return None
 
     def tests(self) -> dict[str, tuple[Scenario, ...]]:
         """``scenarios``; ParamsError if there are none, or if one of them has no sequence."""

@@ -105,21 +105,26 @@ def settling_samples(sp: ArrayLike, pv: ArrayLike, hold: int, span: float = 1.0)
     return np.array(settled)
 
 
-def locked_up(sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, *, low: float, high: float, span: float) -> bool:
-    """Whether the loop locks up in some hold: it stays saturated and far from its set point.
+def locked_up(
+    sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike, span: ArrayLike
+) -> bool:
+    """Whether the loop locks up in some hold: it stays saturated and far from a set point.
 
-    In the whole second half of such a hold the MV is at one end of [low, high], and |r - y| is more
-    than ``FAR`` of ``span``, the CV's range. A slow plant or the heating of a batch may saturate for a
+    In the whole second half of such a hold one MV is at one end of [low, high], and |r - y| of one CV is more
+    than ``FAR`` of its ``span``, the CV's range. A slow plant or the heating of a batch may saturate for a
     long time, but the error is smaller after half a hold (half a batch for a recipe). An inverse model
-    outside its applicability domain can stay saturated for ever. Shapes (n,).
+    outside its applicability domain can stay saturated for ever. Shapes (n,), or (n, n_cv) and (n, n_mv) with ranges
+    (n_mv,) and spans (n_cv,).
     """
     e = np.abs(errors(sp, pv))
-    u = np.asarray(mv, dtype=np.float64).reshape(e.shape)
-    near = 1e-6 * (high - low)
-    for part in holds(e.size, hold):
+    e = e.reshape(len(e), -1)
+    u = np.asarray(mv, dtype=np.float64).reshape(len(e), -1)
+    bottom, top, wide = (np.asarray(values, dtype=np.float64) for values in (low, high, span))
+    near = 1e-6 * (top - bottom)
+    for part in holds(len(e), hold):
         half = slice(part.start + (part.stop - part.start) // 2, part.stop)
-        stuck = bool(np.all(u[half] <= low + near) or np.all(u[half] >= high - near))
-        if stuck and bool(np.all(e[half] > FAR * span)):
+        stuck = np.all(u[half] <= bottom + near, axis=0) | np.all(u[half] >= top - near, axis=0)
+        if stuck.any() and np.all(e[half] > FAR * wide, axis=0).any():
             return True
     return False
 

@@ -11,9 +11,11 @@ from typing import Any, Self
 
 from pipeline.errors import PipelineError, ReportError
 from pipeline.evaluation.case import Case, Curve
+from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.model_evidence import model_figure
+from pipeline.evaluation.reached import grounds_of
 from pipeline.evaluation.typed_json import read_mapping
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
@@ -75,6 +77,13 @@ class Evidence:
         sets = {p.parent.name: p for p in sorted(models.glob("*/metrics.json"))}
         model_sets = {n: read_mapping(p) for n, p in sets.items() if models_of is None or n in models_of}
         return cls(case, bounds, evidence, model_sets, models, own_data)
+
+    @cached_property
+    def grounds(self) -> Grounds | None:
+        """What tests on identified models rest on; None for a case that is tested on its plant's equations."""
+        return grounds_of(
+            self.case, next(iter(self.models.values()), {}), (m.metrics.reached for m in self.laws.values())
+        )
 
     @cached_property
     def tests(self) -> Mapping[str, tuple[Scenario, ...]]:
@@ -162,8 +171,8 @@ class Evidence:
 
     @cached_property
     def noise(self) -> float:
-        """Standard deviation of the controlled variable's measurement noise."""
-        return float(self.case.noise_std[0])
+        """Standard deviation of the controlled variable's measurement noise, in the unit of the laws' errors."""
+        return self.case.noise_level
 
     @cached_property
     def floors(self) -> dict[str, float]:
@@ -184,12 +193,8 @@ class Evidence:
         return None if own is None or bound is None else ratio_to_bound(own, bound, self.floor(scenario))
 
     def gate_ratio(self, law: str, scenario: str) -> float | None:
-        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide.
-
-        A case whose tests run on models has no NMPC; the baseline's error stands in its place.
-        """
-        own = self.figure(law, scenario)
-        bound = self.figure(self.case.baseline, scenario) if self.case.on_models else self.bound(scenario)
+        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide."""
+        own, bound = self.figure(law, scenario), self.bound(scenario)
         return None if own is None or bound is None else gate_ratio(own, bound, self.floor(scenario))
 
     def score(self, law: str) -> float | None:

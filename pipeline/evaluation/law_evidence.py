@@ -63,7 +63,9 @@ class LawMetrics:
     ``development``: data seed -> mean error over the development sequences, in the case's ``metric``;
     ``locked_up``: test -> data seed -> closed loops that got stuck, of those where any did; ``as_printed``: a
     reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
-    ``forms``: the shipped one, BASE, and the variants by their names in params.yaml.
+    ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
+    lowest and highest value in closed loops without noise, where these run on models of a record; ``replay``: MV ->
+    figures of the shipped file over rows of that record.
     """
 
     name: str
@@ -78,6 +80,8 @@ class LawMetrics:
     locked_up: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     as_printed: bool = False
     sequences: Mapping[str, Mapping[str, Row]] = field(default_factory=dict)
+    reached: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    replay: Mapping[str, Row] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
         """Write the file; ValueError for NaN and infinity."""
@@ -161,6 +165,10 @@ class LawEvidence:
         """
         start = f"{scenario}/{self.form_of(setting)}/{self.metrics.shipped_seed}/"
         return arrays(self.trajectories, start) or None
+
+    def replay(self) -> Loop:
+        """Arrays of the replay over the plant's record by name; empty where there was none."""
+        return arrays(self.trajectories.with_name("replay.npz"))
 
 
 def arrays(path: Path, start: str = "") -> Loop:

@@ -84,7 +84,7 @@ def _detectable(noise: float, samples: float) -> float:
     return float(noise * (2 / samples) ** 0.25)
 
 
-_ABSOLUTE = Floor(_deviation, "{noise} (the measurement noise)")
+_ABSOLUTE = Floor(_deviation, "{noise:.4g} (the measurement noise)")
 _SUM = Floor(_sum_of_squares, "the SSE of the measurement noise alone ({noise:g} squared times the samples)")
 _MEAN_SQUARE = Floor(
     _detectable, "the smallest error that the samples can show in their noise ({noise:g} times (2/samples)^(1/4))"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.validation import FILE, Statement, Validation
 from pipeline.simulation import NOISE_SUFFIX
@@ -46,6 +47,7 @@ class Standing:
     requirements: tuple[Statement, ...]
     claims: tuple[Statement, ...]
     reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
+    grounds: Grounds | None = None  # what tests on models of the plant's record rest on
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -77,6 +79,7 @@ class Standing:
             requirements=validation.requirements,
             claims=validation.claims,
             reproduced=(sum(judged), len(judged)),
+            grounds=validation.grounds,
         )
 
     @property

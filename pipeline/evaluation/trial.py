@@ -13,6 +13,7 @@ from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import locked_up
 from pipeline.evaluation.law_evidence import BASE
 from pipeline.evaluation.metric import mean_of_draws, together
+from pipeline.evaluation.reached import reached_by, widest
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from pipeline.simulation.simulate import Trajectory, simulate_closed
@@ -38,6 +39,7 @@ class Trial:
     development: float  # the case's metric, mean over the development sequences
     locked_up: dict[str, int]  # test -> closed loops that locked up, of those where any did; DEVELOPED: development
     curves: dict[str, Trajectory]
+    reached: dict[str, tuple[float, float]]  # by closed loops without noise, PVs and MVs; of a case on models alone
 
     @property
     def lock_ups(self) -> int:
@@ -70,6 +72,7 @@ def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
     sequences: dict[str, dict[str, Metrics]] = {}
     curves: dict[str, Trajectory] = {}
     locked_up: dict[str, int] = {}
+    reached: list[dict[str, tuple[float, float]]] = []
     noisy = (False, True) if form == BASE or case.development_noise else (False,)
     for name, tests in case.scenarios().items():
         if form != BASE and not case.variants_run(tests):
@@ -80,6 +83,7 @@ def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
             metrics[key] = together((one.metrics for one in runs), case.metrics)
             curves[key] = runs[0].first
             locked_up[key] = sum(one.lock_ups for one in runs)
+            reached += [reached_by([one.first for one in runs], case)] if case.on_models and not noise else []
             if len(tests) > 1 and not noise:
                 sequences[name] = {str(test.seed): one.metrics for test, one in zip(tests, runs, strict=True)}
     development = [
@@ -93,7 +97,9 @@ def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
     locked_up[DEVELOPED] = sum(one.lock_ups for one in development)
     locked_up = {name: count for name, count in locked_up.items() if count}
     trajectories = {key: replace(c, info=c.info[:, :-1]) for key, c in curves.items()}
-    return Trial(form, seed, controller.manifest.info, metrics, sequences, mean, locked_up, trajectories)
+    return Trial(
+        form, seed, controller.manifest.info, metrics, sequences, mean, locked_up, trajectories, widest(reached)
+    )
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
@@ -126,10 +132,13 @@ def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array 
 
 
 def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
-    """Whether the loop locked up at an end of the MV, or the controller refused a step."""
-    mv, sp = case.plant.mv_signals[0], case.plant.sp_signals[0]
-    limits = {"low": mv.low, "high": mv.high, "span": sp.high - sp.low}
-    return locked_up(loop.sp[:, 0], loop.pv[:, 0], loop.mv[:, 0], test.hold, **limits) or bool(loop.info[:, -1].any())
+    """Whether the loop locked up at an end of an MV, or the controller refused a step."""
+    n = test.sp.shape[1]
+    # As many MVs as set points; a further one may have a part that rests at an end.
+    mvs, spans = case.plant.mv_signals[:n], [s.high - s.low for s in case.plant.sp_signals]
+    limits = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
+    jammed = locked_up(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=spans)
+    return jammed or bool(loop.info[:, -1].any())
 
 
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:

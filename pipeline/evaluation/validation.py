@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import Analysis, Row
 from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
@@ -95,7 +96,7 @@ class Titles:
 class Validation:
     """The whole file. ``metric`` is the one that laws are compared by, ``main`` the test that weighs most.
 
-    ``on_models``: the tests ran on models of the plant's record, and the gate compares with the baseline.
+    ``on_models``: the tests ran on models of the plant's record; ``grounds`` are what they then rest on.
     ``scenarios``: test -> law -> figures, medians over the data seeds, with ``<criterion>_min`` and
     ``<criterion>_max`` over the seeds and their number, ``seeds``; ``bounds``: test -> bound -> figures.
     """
@@ -113,6 +114,7 @@ class Validation:
     claims: tuple[Statement, ...]
     paper: tuple[PaperResult, ...]
     on_models: bool = False
+    grounds: Grounds | None = None
 
     def to_json(self) -> str:
         """The file's text; ValueError for NaN and infinity."""

@@ -84,7 +84,9 @@ def time_axis(time_s: Array) -> tuple[Array, str]:
 
 
 def symbol(name: str) -> str:
-    """``C_A`` as a formula."""
+    """``C_A`` as a formula; a tag with other signs, such as TIC-101.PV, as it is."""
+    if not name.replace("_", "").isalnum():
+        return name.replace("$", r"\$")
     base, _, index = name.partition("_")
     if len(base) > 1 and not index:
         return name

@@ -53,6 +53,7 @@ ORDERS_FOR_LOG = 2.0  # powers of ten that these must span to be drawn over them
 STRIP = 0.7  # height of a discrete MV's panel, where a continuous one's is 2
 STRIP_ROOM = 0.3  # above and below its values, as a share of their range
 INCHES = 0.84  # that a height of 1 takes
+CV_HEIGHT, SHARED_HEIGHT = 3.0, 2.2  # of the panel of the controlled variable, and of each of several
 MV_HEIGHT, OWN_HEIGHT = 2.0, 1.2  # of the panel of a continuous MV, and of one that a ringing law has for itself
 MV_THINNER = 0.7  # its line beside the controlled variable's
 WINDOWS = 50  # parts of the time axis, each about 15 pixels wide, in which reversals are counted
@@ -63,7 +64,7 @@ FAST = "shaded: swings too fast to draw, with their mean"
 
 
 class LoopPanels:
-    """The controlled variable with its set point, each MV, and the error of the late part where a test has one.
+    """Each controlled variable with its set point, each MV, and the error of the late part where a test has one.
 
     A discrete MV has a narrow strip with its allowed values as ticks. A law whose continuous MV rings
     (``rings``) has a panel of its own for it, so that it hides no other law's. ``loops`` are the curves
@@ -78,20 +79,22 @@ class LoopPanels:
         self.late_from, self.reference = late_from, reference
         # A set point that is held jumps; a recipe's course is sampled from a curve.
         self.sp_style = "default" if case.recipe else "steps-post"
-        cv, self.signals = case.plant_class.sp_signals[0], case.plant_class.mv_signals
+        cvs, self.signals = case.plant_class.sp_signals, case.plant_class.mv_signals
         self.places = self._places(loops)
         self.hidden = False
         ordered = sorted({place for row in self.places.values() for place in row})
-        heights = [3.0, *([1.6] if late_from else []), *(self._height(*place) for place in ordered)]
-        more = 1.2 * bool(late_from) + INCHES * (sum(heights[-len(ordered) :]) - MV_HEIGHT)
+        above = [CV_HEIGHT] if len(cvs) == 1 else [SHARED_HEIGHT] * len(cvs)
+        heights = [*above, *([1.6] if late_from else []), *(self._height(*place) for place in ordered)]
+        more = 1.2 * bool(late_from) + INCHES * (sum(above) - CV_HEIGHT + sum(heights[-len(ordered) :]) - MV_HEIGHT)
         self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + more), layout="constrained")
         panels = list(self.canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}))
-        self.cv: Axes = panels[0]
+        self.cvs: list[Axes] = panels[: len(cvs)]
         self.mvs: dict[tuple[int, str], Axes] = dict(zip(ordered, panels[-len(ordered) :], strict=True))
-        self.error: Axes | None = panels[1] if late_from else None
+        self.error: Axes | None = panels[len(cvs)] if late_from else None
         self.bottom = panels[-1]
-        self.cv.set_title(title)
-        self.cv.set_ylabel(signal_label(cv))
+        self.cvs[0].set_title(title)
+        for axes, cv in zip(self.cvs, cvs, strict=True):
+            axes.set_ylabel(signal_label(cv))
         for (i, owner), axes in self.mvs.items():
             mv = self.signals[i]
             axes.set_ylabel(signal_label(mv))
@@ -99,10 +102,10 @@ class LoopPanels:
                 axes.set_title(owner, loc="right", fontsize="small", fontweight="normal", pad=2.0)
             if mv.values is not None:
                 _allow_only(axes, mv)
-        if len(self.mvs) > 1:
+        if len(self.mvs) > 1 or len(cvs) > 1:
             self.canvas.align_ylabels(panels)
         if self.error is not None:
-            self.error.set_ylabel(axis_label("error", cv.unit))
+            self.error.set_ylabel(axis_label("error", cvs[0].unit))
             self.error.axhline(0.0, color="black", linewidth=0.9, linestyle="--", zorder=2)
 
     def _places(self, loops: Mapping[str, Loop]) -> dict[str, list[tuple[int, str]]]:
@@ -125,7 +128,8 @@ class LoopPanels:
         look = layer(self.ranks[label])
         time, _ = time_axis(loop["time_s"])
         pv = first(loop["pv"])
-        self.cv.plot(time, pv, label=label, color=colour, **look)
+        for i, axes in enumerate(self.cvs):
+            axes.plot(time, _column(loop["pv"], i), label=label, color=colour, **look)
         for place, mv in zip(self.places[label], _columns(loop), strict=True):
             wide = layer(0 if place[1] else self.ranks[label])["linewidth"]
             style = {**look, "color": colour, "linewidth": MV_THINNER * wide}
@@ -149,16 +153,23 @@ class LoopPanels:
     def finish(self, loop: Loop) -> Canvas:
         """The set point, the time axis and the legend."""
         time, words = time_axis(loop["time_s"])
-        self.cv.plot(time, first(loop["sp"]), label="set point", drawstyle=self.sp_style, zorder=2, **SET_POINT)
+        style: dict[str, Any] = {"drawstyle": self.sp_style, "zorder": 2, **SET_POINT}
+        for i, axes in enumerate(self.cvs):
+            axes.plot(time, _column(loop["sp"], i), label="set point", **style)
+            axes.margins(x=0.01)
         if self.reference is not None and len(self.reference) == len(time):
-            self.cv.plot(time, first(self.reference), label="reference", zorder=5, **REFERENCE)
-        self.cv.margins(x=0.01)
+            self.cvs[0].plot(time, first(self.reference), label="reference", zorder=5, **REFERENCE)
         self.bottom.set_xlabel(words)
-        handles, labels = self.cv.get_legend_handles_labels()
+        handles, labels = self.cvs[0].get_legend_handles_labels()
         if self.hidden:
             handles, labels = [*handles, Patch(color="black", alpha=0.25, linewidth=0)], [*labels, FAST]
         legend_below(self.canvas, handles, labels)
         return self.canvas
+
+
+def _column(values: Array, i: int) -> Array:
+    """One signal of several, (n,)."""
+    return values if values.ndim == 1 else values[:, i]
 
 
 def _columns(loop: Loop) -> list[Array]:
@@ -200,8 +211,8 @@ def _allow_only(axes: Axes, signal: Signal) -> None:
 
 
 def first(values: Array) -> Array:
-    """The controlled variable or the first MV, shape (n,)."""
-    return values if values.ndim == 1 else values[:, 0]
+    """The first controlled variable or MV, shape (n,)."""
+    return _column(values, 0)
 
 
 def colours(evidence: Evidence, curves: Sequence[Curve]) -> list[str]:
@@ -286,7 +297,7 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas:
 
 
 def moves(loop: Loop) -> Array:
-    """Times at which a set point that is held moves; none of one that follows a course."""
+    """Times at which the first set point that is held moves; none of one that follows a course."""
     sp, (time, _) = first(loop["sp"]), time_axis(loop["time_s"])
     at = np.flatnonzero(np.diff(sp)) + 1
     return time[at] if len(at) < len(sp) / 4 else time[:0]

@@ -9,8 +9,8 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import BASE
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
-WORDS = frozenset({"two"})
-"""Short words in the names of laws that are no abbreviations."""
+WORDS = frozenset({"predictive", "two"})
+"""Words in the names of laws that are no abbreviations."""
 
 
 def law_name(law: str) -> str:

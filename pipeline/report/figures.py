@@ -17,6 +17,7 @@ from pipeline.evaluation.model_evidence import candidates
 from pipeline.pictures.drawing import STYLE, CasePicture, save
 from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
+from pipeline.pictures.replay_pictures import replay_picture
 from pipeline.pictures.words import scenario_name
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
@@ -49,6 +50,8 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                 if name == evidence.best:
                     shutil.copyfile(folder / f"closed_loop_{name}.png", folder / "closed_loop.png")
                     drawn["closed_loop.png"] = f"{law.title} on {untuned}"
+            with suppress(NotMeasuredError):
+                keep(f"replay_{name}", replay_picture(evidence, name), f"{law.title}, replayed over the record")
         for table in (t for name, model in evidence.models.items() for t in candidates(name, model)):
             words = f"Lags and widths tried for {table['part']} of the model {table['model']}"
             keep(

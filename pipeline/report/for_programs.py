@@ -46,6 +46,7 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
             for row in rows
         ),
         on_models=case.on_models,
+        grounds=evidence.grounds,
     )
 
 

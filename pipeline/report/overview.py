@@ -65,7 +65,12 @@ def _law(standing: Standing, law: LawStanding, out: Path) -> dict[str, Any]:
 
 
 def _verdict(standing: Standing) -> str:
-    """The case in one sentence: its best law beside the bound."""
+    """The case in a sentence or two: its best law beside the bound, and what tests on models rest on."""
+    tested = "" if standing.grounds is None else f" Tested {standing.grounds.words}."
+    return _best(standing) + tested
+
+
+def _best(standing: Standing) -> str:
     best = standing.best
     if best is None:
         return "No law qualifies as best controller."

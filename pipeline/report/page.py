@@ -14,7 +14,7 @@ from pipeline.evaluation.model_evidence import candidates, model_rows
 from pipeline.evaluation.validation import FILE
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
-from pipeline.pictures.drawing import CasePicture
+from pipeline.pictures.drawing import CasePicture, axis_label
 from pipeline.pictures.numbers import number, ratio
 from pipeline.pictures.words import law_name, scenario_name
 from pipeline.report.figures import draw_all, main_words
@@ -62,6 +62,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "own_pictures": {k: v for k, v in pictures.items() if k in own},
         "loops": of_kind("closed_loop_"),
         "sweeps": of_kind("sweep_") | of_kind("candidates_"),
+        "replays": of_kind("replay_"),
+        "replayed": [(name, mv, row) for name, law in evidence.laws.items() for mv, row in law.metrics.replay.items()],
         "overview": pictures.get("closed_loop.png"),
         "main_test": main_words(evidence)[0],
         "tables": judged.tables,
@@ -110,7 +112,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     """The figures at the top of the page: value and words.
 
     They compare the best controller with the bound on the main test and on each test of its
-    requirements, and then with the case's baseline.
+    requirements, say how well the models fit that it was tested on, and compare it with the case's baseline.
     """
     best, case = evidence.best, evidence.case
     if best is None:
@@ -129,6 +131,11 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
             words = f"{case.metrics[need.metric].short} on {name_of(need.scenario)}"
             rows.append((number(late), f"{words}; at most {number(need.high)} is asked"))
     rows = rows[:MOST_HEADLINES]
+    if evidence.grounds is not None:
+        rows += [
+            ("none" if fit is None else f"{fit:.3g} %", f"free-run fit of {name} by the models, over unseen rows")
+            for name, fit in evidence.grounds.fit.items()
+        ]
     late_s = evidence.late_s(evidence.main_test)
     metric = case.criterion.late if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
@@ -172,7 +179,8 @@ def _rows(evidence: Evidence) -> list[dict[str, Any]]:
         if late_s := evidence.late_s(name):
             rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", case.criterion.late))
     mv, *others = case.plant_class.mv_signals
-    unit = ", all MVs together" if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
+    together = case.cv_unit if len(case.plant_class.sp_signals) > 1 else ""  # with several CVs all are shares of ranges
+    unit = axis_label(", all MVs together", together) if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
     travel = _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")
     return [*rows, travel | {"winner": None}]
 

@@ -72,6 +72,9 @@ def overview(standings: Iterable[Standing]) -> Table:
 def _about(standing: Standing) -> list[str]:
     """The first column of a case, a line a row."""
     lines = [f"[bold]{standing.case}[/bold]", f"{standing.metric}, {standing.test}"]
+    if standing.grounds is not None:
+        fits = [fit for fit in standing.grounds.fit.values() if fit is not None]
+        lines += ["on models of your data", f"their fit {min(fits):.3g} %" if fits else "which do not run free"]
     for words, (good, known) in (
         ("requirements", tally(standing.requirements)),
         ("claims reproduce", tally(standing.claims)),

@@ -22,7 +22,7 @@ MAX_SAMPLES = 10_000_000
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A value at a time [s]; ``name`` is empty for a set point."""
+    """A value at a time [s]; ``name`` may be empty for a plant's only set point."""
 
     value: float
     time_s: float = 0.0
@@ -57,8 +57,11 @@ class Timetable:
 
 
 def parse_event(text: str, form: str) -> Event:
-    """An event with a name where the form has ``=``, and with a time where it allows ``@``; ParamsError shows it."""
-    named = "=" in form
+    """An event with a name where the form has ``=``, and with a time where it allows ``@``; ParamsError shows it.
+
+    A form that begins with ``[`` leaves the name to the writer.
+    """
+    named = "=" in (text if form.startswith("[") else form)
     name, equals, rest = text.partition("=") if named else ("", "=", text)
     value, at, time_s = rest.partition("@")
     if not equals or (named and not name) or (at and "@" not in form):
@@ -100,10 +103,9 @@ def timetable(
     steady state of ``start_cv``, or at that in the middle of the set point's range; a plant without
     equations starts at its ``start``. A test that has a plant of its own is run on that.
     """
-    if set_points and len(plant.sp_signals) > 1:
-        raise ParamsError(f"plant {plant.name!r} has {len(plant.sp_signals)} set points; run one of its scenarios")
-    for event in set_points:
-        _check_range("set point", plant.sp_signals[0], event.value)
+    moved = [(_set_point(plant, event), event) for event in set_points]
+    for i, event in moved:
+        _check_range("set point", plant.sp_signals[i], event.value)
     if start_cv is not None:
         _check_range("a start at", plant.pv_signals[0], start_cv)
     changes: dict[str, Array] = {}
@@ -113,9 +115,9 @@ def timetable(
         spans = [t for s in manual for t in (s.start_s, s.end_s) if math.isfinite(t)]
         last = max([*spans, *(e.time_s for e in (*set_points, *disturbances))])
         n = _samples(plant, duration_s, round(last / plant.period_s) + SETTLE_SAMPLES)
-        sp = np.full((n, 1), start)
-        for event in sorted(set_points, key=lambda e: e.time_s):
-            sp[_sample(plant, event, n) :] = event.value
+        sp = np.tile(start, (n, 1))
+        for i, event in sorted(moved, key=lambda e: e[1].time_s):
+            sp[_sample(plant, event, n) :, i] = event.value
     else:
         if test is None:
             raise ParamsError("the plant belongs to no case, so it has no scenarios; give set points (--sp)")
@@ -147,14 +149,24 @@ def timetable(
     return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks)
 
 
-def _rest(plant: Simulator, start_cv: float | None) -> tuple[Array, Array, float]:
-    """(x0, mv0, set point) where a run starts: as ``timetable`` says; where a plant without equations starts."""
+def _set_point(plant: Simulator, event: Event) -> int:
+    """Which of the plant's set points an event moves; ParamsError where it names none of them, or has to name one."""
+    names = [s.name for s in plant.sp_signals]
+    if not event.name and len(names) > 1:
+        raise ParamsError(f"plant {plant.name!r} has the set points {', '.join(names)}; name one: {names[0]}=VALUE")
+    if event.name and event.name not in names:
+        raise ParamsError(f"plant {plant.name!r} has no set point {event.name!r}{nearest(event.name, names)}")
+    return names.index(event.name) if event.name else 0
+
+
+def _rest(plant: Simulator, start_cv: float | None) -> tuple[Array, Array, Array]:
+    """(x0, mv0, set points (n_sp,)) where a run starts: as ``timetable`` says."""
     if start_cv is None and not isinstance(plant, EquationPlant):
         x0, mv0 = plant.start
-        return x0, mv0, float(plant.measure(x0)[0])
+        return x0, mv0, plant.measure(x0)[: len(plant.sp_signals)]
     sp = plant.sp_signals[0]
     cv = (sp.low + sp.high) / 2 if start_cv is None else start_cv
-    return *equations(plant, "a start at a chosen controlled variable").steady_state_at(cv), cv
+    return *equations(plant, "a start at a chosen controlled variable").steady_state_at(cv), np.array([cv])
 
 
 def _check_manual(plant: Simulator, span: ManualSpan) -> None:

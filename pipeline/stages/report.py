@@ -13,6 +13,7 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.verdicts import PLAIN
 from pipeline.files import write_json
 from pipeline.optimal.bounds import bounds_path, stored_bounds
+from pipeline.optimal.model_bounds import model_bounds
 from pipeline.report.page import write_report
 from pipeline.stages.paths import ARTIFACTS, TIMING, WORK, receipt_file
 
@@ -24,6 +25,8 @@ def report(name: str) -> None:
     case.tests()  # raises where there are none
     # A new case has no bounds until `loopwright bounds` has run; stale ones are an error, never shown.
     bounds, missing = stored_bounds(case) if bounds_path(case).exists() else ({}, [])
+    if case.on_models:
+        bounds = model_bounds(case, WORK / name / "bounds.json")
     for line in missing or (
         [] if bounds or case.on_models else [f"no bounds yet; `loopwright bounds {name}` computes them"]
     ):

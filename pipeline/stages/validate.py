@@ -6,9 +6,10 @@ import shutil
 import statistics
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -18,7 +19,10 @@ from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
+from pipeline.evaluation.reached import grounds_of, widest
+from pipeline.evaluation.replay import replay
 from pipeline.evaluation.trial import Metrics, Trial, step_us, try_file
 from pipeline.export.controller_file import with_evidence
 from pipeline.files import read_json, write_json
@@ -27,6 +31,7 @@ from pipeline.stages.paths import (
     analysis_file,
     controller_file,
     design_folder,
+    model_folder,
     step_time_file,
     validation_folder,
 )
@@ -61,8 +66,10 @@ def validate(name: str) -> None:
         )
     folder = validation_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     designed = read_json(design_folder(params.case, params.name) / "metrics.json")
-    metrics = _metrics(params, case, designed, trials, shipped)
+    replayed = _replayed(case, source, folder / "replay.npz")
+    metrics = replace(_metrics(params, case, designed, trials, shipped), replay=replayed)
     metrics.write(folder / "metrics.json")
     took = step_us(Controller(source), next(iter(shipped.curves.values())), case.plant.dv_nominal)
     write_json(step_time_file(params.case, params.name), took)
@@ -71,7 +78,8 @@ def validate(name: str) -> None:
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)
     _keep_analysis(params, shipped.seed, folder / "analysis.npz")
-    evidence = _evidence(case, base, shipped)
+    models = read_json(model_folder(params.case, params.model) / "metrics.json") if case.on_models else {}
+    evidence = _evidence(case, base, shipped, grounds_of(case, models, [metrics.reached]))
     if (analysis := metrics.forms[BASE].analysis) is not None:
         evidence["analysis"] = analysis.figures
     if locked_up:
@@ -83,6 +91,16 @@ def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:
     """Test -> data seed -> closed loops that locked up, of those where any did."""
     tests = dict.fromkeys(test for t in base for test in t.locked_up)
     return {test: {str(t.seed): t.locked_up[test] for t in base if test in t.locked_up} for test in tests}
+
+
+def _replayed(case: Case, file: Path, path: Path) -> dict[str, dict[str, float]]:
+    """Figures of the file over the last rows of the plant's record, their curves kept; none without a record."""
+    if case.replayed is None:
+        return {}
+    record, ahead = case.replayed
+    found = replay(Controller(file), record, case.plant.signals, ahead)
+    np.savez_compressed(path, **cast(dict[str, Any], found.arrays()))
+    return found.figures(record)
 
 
 def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:
@@ -127,6 +145,7 @@ def _metrics(
             name: {seed: _over_seeds({t.seed: t.sequences[name][seed] for t in base}).median for seed in rows}
             for name, rows in base[0].sequences.items()
         },
+        reached=widest(t.reached for t in base),
     )
 
 
@@ -140,13 +159,13 @@ def _over_seeds(rows: Mapping[int, Metrics]) -> OverSeeds:
     return OverSeeds(median, low, high, {str(seed): row for seed, row in rows.items()})
 
 
-def _evidence(case: Case, base: list[Trial], shipped: Trial) -> dict[str, Any]:
+def _evidence(case: Case, base: list[Trial], shipped: Trial, grounds: Grounds | None) -> dict[str, Any]:
     """Evidence in the shipped file's manifest: its own figures, and the median over the data seeds."""
     figures = {
         name: {**row, f"{case.metric}_median": statistics.median(t.metrics[name][case.metric] for t in base)}
         for name, row in shipped.metrics.items()
     }
-    of = {"plant": "identified"} if case.on_models else {}
+    of = {} if grounds is None else {"plant": "identified", "on": grounds.to_dict()}
     return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "scenarios": figures}
 
 

@@ -29,6 +29,7 @@ def model_description(case: str, law: str, validation: Validation | None, champi
     take = case if name == champion else name
     return (
         f"<p>{escape(standing(name, law, validation, champion)[1])}</p>"
+        f"{_grounds(validation)}"
         f"<p><b>{escape(title)}</b> for {escape(place)}. "
         "Each version is one ONNX file that holds the whole control law: scaling, limits, anti-windup.</p>"
         f"<p>Take it: <code>loopwright registry fetch {escape(take)} FOLDER</code></p>"
@@ -56,13 +57,20 @@ def standing(name: str, law: str, validation: Validation | None, champion: str |
 
 def version_description(validation: Validation | None, gate: Gate, run_id: str, picture: str | None) -> str:
     """A version's description: verdict, closed-loop evidence per scenario, analysis, picture of the loop."""
-    parts = [_verdict(gate)]
+    parts = [_verdict(gate), _grounds(validation)]
     if validation is not None:
         parts += [_table(validation, gate), _analysis(validation, gate.law)]
     if picture:
         alt = "Closed loop on the test that weighs most, beside the baseline of the case"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
     return "\n".join(filter(None, parts))
+
+
+def _grounds(validation: Validation | None) -> str:
+    """What figures of tests on identified models rest on; nothing where tests ran on a plant's equations."""
+    if validation is None or validation.grounds is None:
+        return ""
+    return f"<p>Every figure was measured {escape(validation.grounds.words)}; none on the plant.</p>"
 
 
 def _verdict(gate: Gate) -> str:

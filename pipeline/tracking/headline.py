@@ -87,7 +87,13 @@ def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str,
         "step_us": own.step_us if own else None,
         "data_seeds": len(law.seeds),
     }
-    return shown | errors
+    return shown | _grounds(validation) | errors
+
+
+def _grounds(validation: Validation | None) -> dict[str, Any]:
+    """Of tests on identified models, how well these run free over rows that they never saw [%]."""
+    grounds = validation.grounds if validation else None
+    return {} if grounds is None else {f"models_free_run_fit/{name}": fit for name, fit in grounds.fit.items()}
 
 
 def _of_case(validation: Validation | None) -> dict[str, Any]:
@@ -98,6 +104,7 @@ def _of_case(validation: Validation | None) -> dict[str, Any]:
     shown: dict[str, Any] = {"laws": len(laws), "laws_that_locked_up": sum(bool(r.lock_ups) for r in laws.values())}
     if scores:
         shown |= {"best_ratio_to_bound": min(scores), "median_ratio_to_bound": statistics.median(scores)}
+    shown |= _grounds(validation)
     for name, words in (("requirements", "met"), ("claims", "confirmed"), ("paper", "reproduced")):
         known = [row.holds for row in getattr(validation, name) if row.holds is not None]
         if known:

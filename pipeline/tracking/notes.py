@@ -21,7 +21,8 @@ WHAT = {
 # What an error is divided by: of a case that is tested on its plant's equations, and on models of its record.
 BOUND = {
     False: "an NMPC that knows the plant exactly, and 1 is the bound",
-    True: "the baseline, which ran on the same models of the plant's record",
+    True: "an NMPC that knows the model of each test exactly, and 1 is the bound; every test ran on models identified"
+    " from the plant's record, none on the plant",
 }
 METRICS = {
     "excite": "`rows` counts the samples of all data seeds.",
@@ -46,6 +47,8 @@ def run_note(result: StageResult, case: str, validation: Validation | None, time
     # the page shows the first lines, the rest on a click
     parts = [_verdict(Gate.of(validation, item))] if result.kind == "validate" else []
     parts.append(WHAT.get(result.kind, "The stage {item} of the case *{case}*.").format(**words))
+    if validation is not None and validation.grounds is not None:
+        parts.append(f"Tested {validation.grounds.words}.")
     if result.kind == "report":
         parts.append("Open `report.html` under Artifacts.")
     parts.append(METRICS.get(result.kind, "").format(**words))
@@ -76,6 +79,8 @@ def experiment_note(case: str, validation: Validation | None, champion: str | No
         score = Gate.of(validation, law).score
         beside = "" if score is None else f", {score:.3f} times the bound"
         first += f" Champion: **[{laws.get(law, law)}](#/models/{champion})**{beside}."
+    if validation is not None and validation.grounds is not None:
+        first += f" Tested {validation.grounds.words}."
     lines = [first, "One run for each stage of the pipeline."]
     results = validation.gate.laws if validation else {}
     scores = {law: row.score for law, row in results.items() if row.score is not None}

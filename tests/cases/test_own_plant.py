@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from pipeline.cases import CASES, all_cases
-from pipeline.cases.own_plant import GAINS, LOAD, OwnCase, own_case
+from pipeline.cases.own_plant import GAINS, LOAD_AT, OwnCase, own_case
+from pipeline.cases.reach import LOAD
 from pipeline.errors import ParamsError, PlantError
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
@@ -104,9 +105,10 @@ def test_spoilt_plants_have_errors_and_carry_a_load(heater: OwnCase) -> None:
     for test in tests["load"]:
         assert test.plant is not None
         rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
-        moved = rest.pv[heater.hold, 0] - rest.pv[0, 0]
+        assert np.ptp(rest.pv[: LOAD_AT + 1]) < 1e-6
+        moved = rest.pv[heater.hold + LOAD_AT, 0] - rest.pv[0, 0]
         assert abs(moved) == pytest.approx(LOAD * heater.record.pv[:, 0].std(), rel=0.01)
-    assert len({np.sign(test.changes["load_TIC-101.PV"][0]) for test in tests["load"]}) == 2
+    assert len({np.sign(test.changes["load_TIC-101.PV"][-1]) for test in tests["load"]}) == 2
 
 
 def test_noise_is_that_of_the_model(heater: OwnCase) -> None:
@@ -132,6 +134,8 @@ def test_before_training_the_signals_are_known_and_the_rest_is_asked_for(heater:
         ({"mv": [{**VALVE, "high": 0.0}]}, "low must be below high"),
         ({"mv": [{"name": "u", "unit": "%"}]}, "missing"),
         ({"mv": [TEMPERATURE]}, "is there twice"),
+        ({"controlled": 2}, "allow 1 to 1"),
+        ({"controlled": 0}, "allow 1 to 1"),
         ({"perod_s": 1.0}, "unknown key 'perod_s'"),
     ],
 )

@@ -1,0 +1,151 @@
+"""What of a plant's range its record visited, and the set points, holds and loads of tests that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.evaluation.case import Array
+from pipeline.plants.identified import IdentifiedPlant
+from pipeline.plants.simulator import Simulator
+from pipeline.records.record import Record
+from pipeline.simulation.rests import RESTING, balanced, courses, inside, settled
+
+VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
+LEVELS = 6  # set points of a sequence
+SETTLED = 0.05  # of the largest answer
+LEAST_ANSWER = 0.2  # of a CV's largest answer to an MV: a smaller one says nothing about how long it takes
+MOVING = 0.05  # of the CV's visited range in the last quarter of RESTING: a CV that moves more does not settle
+TIMES, HOLD = 3, (30, 400)  # a set point lasts so many times as long as an answer; the fewest and most samples
+SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
+LOAD = 0.25  # standard deviations of the record's CV
+BALANCED = 1e-6  # largest residual of a balance
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Set points that can be held jointly, how long they are held, and loads, from a model of the plant and its record.
+
+    A CV that settles under constant MVs takes the set points of rests under MVs drawn over the visited range; MVs
+    whose rests leave the visited range of a CV are drawn nearer to their medians. A CV that never settles (an
+    integrator) takes set points drawn over its own visited range, under MVs that balance it.
+    """
+
+    model: IdentifiedPlant
+    record: Record
+
+    @cached_property
+    def mv(self) -> Array:
+        """Lowest, median and highest visited MVs, shape (3, n_mv)."""
+        low, high = VISITED_MV
+        return np.asarray(np.quantile(self.record.mv, (low, 0.5, high), axis=0))
+
+    @cached_property
+    def cv(self) -> Array:
+        """Lowest, median and highest visited CVs within the ranges of their set points, shape (3, n_cv)."""
+        signals, (low, high) = self.model.sp_signals, VISITED_CV
+        found = np.quantile(self.record.pv[:, : len(signals)], (low, 0.5, high), axis=0)
+        return np.clip(found, [s.low for s in signals], [s.high for s in signals])
+
+    @cached_property
+    def answers(self) -> Array:
+        """Differences (n_mv, RESTING + 1, n_cv) of the model's courses under the highest and the lowest of each MV."""
+        return self._courses[0] - self._courses[1]
+
+    @cached_property
+    def _courses(self) -> Array:
+        low, middle, high = self.mv
+        ends = [np.where(np.eye(len(middle), dtype=bool), end, middle) for end in (high, low)]
+        found = courses(self.model, self.model.start[0], np.vstack(ends), RESTING)[..., : len(self.model.sp_signals)]
+        return found.reshape(2, len(middle), *found.shape[1:])
+
+    @cached_property
+    def integrates(self) -> tuple[int, ...]:
+        """Places of the CVs that do not settle under constant MVs."""
+        late = np.abs(self._courses[:, :, -1] - self._courses[:, :, -RESTING // 4]).max(axis=(0, 1))
+        return tuple(int(i) for i in np.flatnonzero(late > MOVING * (self.cv[2] - self.cv[0])))
+
+    @cached_property
+    def hold(self) -> int:
+        """Samples of a set point: three times what the slowest CV needs, and within ``HOLD``.
+
+        A CV that settles needs the time to ``SETTLED`` of its largest answers. One that does not settle needs the
+        time in which the strongest MV carries it across its visited range: no loop could be faster.
+        """
+        size, needed = np.abs(self.answers), [1]
+        for i in range(size.shape[2]):
+            of = size[:, :, i]
+            if i in self.integrates:
+                crossed = of >= self.cv[2, i] - self.cv[0, i]
+                needed.append(int(np.where(crossed.any(axis=1), crossed.argmax(axis=1), RESTING).min()))
+                continue
+            strong = np.flatnonzero(of.max(axis=1) >= LEAST_ANSWER * of.max())
+            for j in strong:
+                away = np.abs(self.answers[j, :, i] - self.answers[j, -1, i]) > SETTLED * of[j].max()
+                needed.append(int(np.flatnonzero(away)[-1]) + 1 if away.any() else 1)
+        return int(np.clip(TIMES * max(needed), *HOLD))
+
+    @cached_property
+    def halfway(self) -> int:
+        """Samples in which the strongest MV has moved the slowest CV half as far as it will, or as was visited."""
+        size, width = np.abs(self.answers), self.cv[2] - self.cv[0]
+        way = 0.5 * np.minimum(size.max(axis=1), width)  # (n_mv, n_cv)
+        first = [int((size[j, :, i] >= way[j, i]).argmax()) for i, j in enumerate(way.argmax(axis=0))]
+        return max(1, *first)
+
+    def rest(self, plant: IdentifiedPlant) -> tuple[Array, Array]:
+        """(state (n_x,), mv (n_mv,)) where a plant rests: its own start, or balanced at the CVs' medians."""
+        x, mv = plant.start
+        if not self.integrates:
+            return x, mv
+        levels = self.cv[1, list(self.integrates)]
+        at, acting, away = balanced(plant, x, mv, levels, self.integrates)
+        return (at, acting) if away < BALANCED else (x, mv)
+
+    def set_points(self, plant: Simulator, seed: int, p: Array | None = None) -> Array:
+        """Set points (LEVELS * hold, n_cv) that a plant can hold under its parameters p (n_p,), each held."""
+        rng = np.random.default_rng(seed)
+        draws = rng.uniform(self.mv[0], self.mv[2], (LEVELS, self.mv.shape[1]))
+        levels = self._balances(plant, draws, rng, p) if self.integrates else self._rests(plant, draws, p)
+        return np.repeat(levels, self.hold, axis=0)
+
+    def _rests(self, plant: Simulator, draws: Array, p: Array | None) -> Array:
+        """CVs (LEVELS, n_cv) of rests within the visited range: of each draw the farthest from the medians."""
+        scaled = self.mv[1] + np.array(SCALES)[:, None, None] * (draws - self.mv[1])
+        x = settled(plant, plant.start[0], scaled.reshape(-1, draws.shape[1]), p)
+        cvs = plant.measured(x).reshape(*scaled.shape[:2], -1)[..., : self.cv.shape[1]]
+        good = inside(cvs, self.cv[0], self.cv[2])
+        first = np.where(good.any(axis=0), good.argmax(axis=0), len(SCALES) - 1)
+        return np.asarray(cvs[first, np.arange(len(draws))])
+
+    def _balances(self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None) -> Array:
+        """CVs (LEVELS, n_cv) of rests: those that integrate at levels drawn over their visited range."""
+        which, (start, mv0) = list(self.integrates), plant.start
+        low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
+        wanted = rng.uniform(self.cv[0, which], self.cv[2, which], (len(draws), len(which)))
+        found = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1))
+        for k, (draw, levels) in enumerate(zip(draws, wanted, strict=True)):
+            found[k, which] = levels
+            for scale in SCALES:
+                x, mv, away = balanced(plant, start, mv0 + scale * (draw - self.mv[1]), levels, which, p)
+                cvs = plant.measure(x)[: self.cv.shape[1]]
+                fits = inside(np.append(cvs, mv)[None], np.append(self.cv[0], low), np.append(self.cv[2], high))[0]
+                if away < BALANCED and fits:
+                    found[k] = cvs
+                    break
+        return found
+
+    def load(self, plant: IdentifiedPlant, cv: int) -> float:
+        """The load [CV a period] that moves a CV by ``LOAD`` within a hold, if no controller acts.
+
+        An integrating CV moves as far in a third of a hold: there a load is a rate, and three times that is no rest.
+        """
+        (x, mv), name = plant.start, f"load_{plant.pv_signals[cv].name}"
+        size = float(self.record.pv[:, cv].std())
+        samples, tried = self.hold // TIMES if cv in self.integrates else self.hold, 1e-3 * size
+        ends = [
+            courses(plant, x, mv[None], samples, plant.parameters({name: load}))[0, -1, cv] for load in (tried, 0.0)
+        ]
+        return tried * LOAD * size / abs(float(ends[0] - ends[1]))

@@ -1,0 +1,45 @@
+"""What figures of tests on identified models rest on: the models' free-run fit, and what lies beyond the data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+ON_MODELS = "on models identified from your data"
+
+
+@dataclass(frozen=True, slots=True)
+class Grounds:
+    """Free-run fit [%] of the models over rows that their fit never saw, by CV, and what lies beyond the data.
+
+    ``set_points``, ``loops``: how far set points, and PVs and MVs in closed loops, go beyond the range of the record,
+    in % of that range, by signal; signals that stay within are left out. A fit is None where the run exploded.
+    """
+
+    fit: Mapping[str, float | None]
+    set_points: Mapping[str, float]
+    loops: Mapping[str, float]
+
+    @property
+    def words(self) -> str:
+        """Where tests ran and what that is worth, to go on a sentence."""
+        return f"{ON_MODELS} ({self.figures})"
+
+    @property
+    def figures(self) -> str:
+        """The figures in words."""
+        fits = ", ".join(f"{name} {'none' if fit is None else f'{fit:.3g} %'}" for name, fit in self.fit.items())
+        inside = "set points stay within the data" if not self.set_points else f"set points go {_far(self.set_points)}"
+        left = "PVs and MVs do, too" if not self.set_points else "PVs and MVs stay within"
+        loops = left if not self.loops else f"in closed loop {_far(self.loops, 'goes')}"
+        return f"free-run fit over unseen rows: {fits}; {inside}; {loops}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """For the manifest: the figures, and the sentence."""
+        return {"words": self.words, **{key: dict(value) for key, value in asdict(self).items()}}
+
+
+def _far(of: Mapping[str, float], verb: str = "") -> str:
+    verb = f" {verb}" if verb else ""
+    return ", ".join(f"{name}{verb} {value:.3g} % of its recorded range beyond it" for name, value in of.items())

@@ -1,0 +1,73 @@
+"""How far tests on identified models, and their closed loops, left the record: the grounds of their figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.grounds import Grounds
+from pipeline.plants.simulator import Array
+from pipeline.simulation.simulate import Trajectory
+
+Ranges = Mapping[str, tuple[float, float]]
+"""Signal -> the lowest and the highest value."""
+
+LEAST = 0.5  # % of a recorded range: what goes less far beyond it stays within
+
+
+def grounds_of(case: Case, models: Mapping[str, Any], reached: Iterable[Ranges]) -> Grounds | None:
+    """Grounds of the tests of a case on models; None for a case that is tested on its plant's equations.
+
+    ``models`` is metrics.json of the law's model set, ``reached`` what each law's closed loops reached.
+    """
+    if not case.on_models:
+        return None
+    parts: Mapping[str, Any] = models.get("parts") or {}
+    outputs: Mapping[str, Any] = next(
+        (
+            row["outputs"]
+            for part in parts.values()
+            for row in (part.get("per_seed") or {}).values()
+            if "outputs" in row
+        ),
+        {},
+    )
+    fit = {s.name: (outputs.get(s.name) or {}).get("fit_percent") for s in case.plant.sp_signals}
+    asked = np.concatenate([test.sp for tests in case.tests().values() for test in tests])
+    names = [s.name for s in case.plant.sp_signals]
+    wanted = dict(zip(names, zip(asked.min(axis=0).tolist(), asked.max(axis=0).tolist(), strict=True), strict=True))
+    return Grounds(fit, beyond(wanted, case.recorded), beyond(widest(reached), case.recorded))
+
+
+def beyond(found: Ranges, recorded: Ranges) -> dict[str, float]:
+    """How far values go beyond the recorded ranges, in % of these; signals that stay within are left out."""
+    far = {}
+    for name, (low, high) in found.items():
+        if name in recorded:
+            least, most = recorded[name]
+            far[name] = 100 * max(least - low, high - most) / max(most - least, 1e-300)
+    return {name: float(f"{value:.3g}") for name, value in far.items() if value >= LEAST}
+
+
+def reached_by(loops: Sequence[Trajectory], case: Case) -> dict[str, tuple[float, float]]:
+    """The lowest and highest PV and MV of some closed loops, by signal."""
+    plant = case.plant
+    groups = ((plant.pv_signals, "pv"), (plant.mv_signals, "mv"))
+    found: dict[str, tuple[float, float]] = {}
+    for signals, name in groups:
+        values: Array = np.concatenate([getattr(loop, name) for loop in loops])
+        found |= {s.name: (float(v.min()), float(v.max())) for s, v in zip(signals, values.T, strict=True)}
+    return found
+
+
+def widest(several: Iterable[Ranges]) -> dict[str, tuple[float, float]]:
+    """Ranges that hold all of several."""
+    whole: dict[str, tuple[float, float]] = {}
+    for ranges in several:
+        for name, (low, high) in ranges.items():
+            least, most = whole.get(name, (low, high))
+            whole[name] = (min(least, low), max(most, high))
+    return whole

@@ -1,0 +1,97 @@
+"""Replay: what a controller would have asked over rows of the record, beside what was done; nothing is fed back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from pipeline.errors import RecordError
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
+from pipeline.records.record import Record
+from serving.errors import LoopwrightError
+
+UNSEEN = 0.2  # share of the rows, the last ones: the choice of the model's structure held them out
+MOST = 2_000  # rows
+AT_END = 1e-3  # of an MV's range
+
+
+class Steps(Protocol):
+    """What steps a control law: ``serving.Controller``."""
+
+    def cold_state(self) -> Array:
+        """The state of no past."""
+
+    def step(self, *, sp: Array, pv: Array, dv: Array, mv_applied: Array, state: Array) -> Any:
+        """(mv, state_next, info) from sp, pv, dv, mv_applied and state."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """Rows of a record with what a law asked for. The rows count on through the gaps of the record."""
+
+    time_s: Array  # (n,) rows times the period
+    sp: Array  # (n, n_sp) the set points that the law was given
+    pv: Array  # (n, n_sp) recorded controlled variables
+    asked: Array  # (n, n_mv); NaN where the controller refused the row
+    done: Array  # (n, n_mv) recorded
+
+    def figures(self, record: Record) -> dict[str, dict[str, float]]:
+        """Of each MV: distance of asked from done and its mean [% of range], correlation, share at an end [%].
+
+        The correlation is left out where either never moved.
+        """
+        found = {}
+        for i, signal in enumerate(record.mv_signals):
+            known = np.isfinite(self.asked[:, i])
+            asked, done, span = self.asked[known, i], self.done[known, i], signal.high - signal.low
+            if not asked.size:
+                found[signal.name] = {"refused": 100.0}
+                continue
+            ends = (asked <= signal.low + AT_END * span) | (asked >= signal.high - AT_END * span)
+            row = {
+                "distance": 100 * float(np.mean(np.abs(asked - done))) / span,
+                "more": 100 * float(np.mean(asked - done)) / span,
+                "at_end": 100 * float(np.mean(ends)),
+                "refused": 100 * float(np.mean(~known)),
+            }
+            if asked.std() > 1e-9 * span and done.std() > 1e-9 * span:
+                row["correlation"] = float(np.corrcoef(asked, done)[0, 1])
+            found[signal.name] = row
+        return found
+
+    def arrays(self) -> Mapping[str, Array]:
+        """By name, for a file."""
+        return {name: getattr(self, name) for name in ("time_s", "sp", "pv", "asked", "done")}
+
+
+def replay(law: Steps, record: Record, signals: Signals, ahead: int) -> Replay:
+    """A law over the last fifth of a record, at most ``MOST`` rows, with the recorded PVs, disturbances and MVs.
+
+    No set point stands in a record. The law is given where the operation went: the mean of each recorded CV over the
+    next ``ahead`` samples of its run. ``signals`` are the law's. Raises RecordError where there are no two rows.
+    """
+    n = len(record)
+    first = max(n - round(UNSEEN * n), n - MOST, 0)
+    if n - first < 2:
+        raise RecordError(f"the record has {n} rows, too few to replay its last fifth; record more")
+    rows, n_sp, n_pv = np.arange(first, n), len(signals.sp), len(signals.pv)
+    begins = np.flatnonzero(np.r_[True, record.run[1:] != record.run[:-1]])
+    ends = np.append(begins[1:], n)[np.searchsorted(begins, rows, side="right") - 1]
+    ends = np.minimum(rows + ahead, ends)
+    sp = np.array([record.pv[k:end, :n_sp].mean(axis=0) for k, end in zip(rows, ends, strict=True)])
+    asked, state = np.empty((len(rows), record.mv.shape[1])), law.cold_state()
+    for i, k in enumerate(rows):
+        fresh = i == 0 or k in begins
+        state = law.cold_state() if fresh else state
+        before = record.mv[k if fresh else k - 1]
+        try:
+            pv, dv = record.pv[k, :n_pv], record.dv[k]
+            asked[i], state, _ = law.step(sp=sp[i], pv=pv, dv=dv, mv_applied=before, state=state)
+        except LoopwrightError:
+            asked[i], state = np.nan, law.cold_state()
+    time_s = record.period_s * np.arange(len(rows), dtype=np.float64)
+    return Replay(time_s, sp, record.pv[rows, :n_sp], asked, record.mv[rows])

@@ -1,0 +1,86 @@
+"""Where a sampled plant can be held: its rests under given MVs, and the balance of outputs that never settle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.plants.simulator import Array, Simulator
+
+RESTING = 2_000  # periods that a plant is given to come to rest
+LOOK = 100  # periods between two looks whether it has
+STILL = 1e-7  # of the largest state: a change in one period that is none
+BROKEN = 1e9  # a state beyond it belongs to a plant that runs away
+CHANGE = 1e-6  # of a state or of an MV's range: for slopes
+NEWTON = 12  # iterations
+WEAK = 1e-7  # of the largest slope: a direction in which nothing is decided
+
+
+def courses(plant: Simulator, x0: Array, mvs: Array, n: int, p: Array | None = None) -> Array:
+    """PVs (runs, n + 1, n_pv) from one state x0 (n_x,) under constant mvs (runs, n_mv) and parameters p (n_p,).
+
+    A run that leaves all bounds stays at its last finite state: it never settles, which is what is asked.
+    """
+    advance = plant.many(len(mvs), p)
+    x = np.tile(x0, (len(mvs), 1))
+    found = [plant.measured(x)]
+    for _ in range(n):
+        x = _bounded(x, advance(x, mvs))
+        found.append(plant.measured(x))
+    return np.stack(found, axis=1)
+
+
+def settled(plant: Simulator, x0: Array, mvs: Array, p: Array | None = None) -> Array:
+    """States (runs, n_x) after at most ``RESTING`` periods from x0 (n_x,) under constant mvs (runs, n_mv)."""
+    advance = plant.many(len(mvs), p)
+    x = np.tile(x0, (len(mvs), 1))
+    for _ in range(RESTING // LOOK):
+        for _ in range(LOOK):
+            before, x = x, _bounded(x, advance(x, mvs))
+        if np.max(np.abs(x - before)) <= STILL * max(float(np.max(np.abs(x))), 1.0):
+            break
+    return x
+
+
+def _bounded(before: Array, after: Array) -> Array:
+    good = np.all(np.abs(after) < BROKEN, axis=-1, keepdims=True)
+    return after if good.all() else np.where(good, after, before)
+
+
+def balanced(
+    plant: Simulator, x: Array, mv: Array, levels: Array, which: Sequence[int], p: Array | None = None
+) -> tuple[Array, Array, float]:
+    """A rest at which the PVs ``which`` have ``levels`` (len(which),), near a state x (n_x,) and mv (n_mv,).
+
+        x = F(x, mv),   y[which] = levels
+
+    An output that never settles rests at any level, but only under MVs that balance it; these are moved as little as
+    Newton's method needs. Returns (x, mv, largest residual in units of the PVs and states). The residual is not small
+    where no MV balances the outputs; the MVs may leave their ranges.
+    """
+    low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
+    n_x, span, index = len(x), high - low, list(which)
+    x, mv = np.array(x, dtype=np.float64), np.array(mv, dtype=np.float64)
+    many = plant.many(n_x + len(mv) + 1, p)
+    away = np.inf
+    for _ in range(NEWTON):
+        size = np.concatenate([CHANGE * np.maximum(np.abs(x), 1.0), CHANGE * span])
+        z = np.concatenate([x, mv]) + np.vstack([np.zeros(n_x + len(mv)), np.diag(size)])
+        gap = np.column_stack([many(z[:, :n_x], z[:, n_x:]) - z[:, :n_x], plant.measured(z[:, :n_x])[:, index]])
+        gap[:, n_x:] -= levels
+        away = float(np.max(np.abs(gap[0])))
+        if not np.isfinite(away) or away < 1e-10:
+            break
+        slope = ((gap[1:] - gap[0]) / size[:, None]).T
+        # MVs count by their range, so that of all balances the nearest one is taken.
+        weight = np.concatenate([np.ones(n_x), span])
+        step = np.linalg.lstsq(slope * weight, -gap[0], rcond=WEAK)[0] * weight
+        x, mv = x + step[:n_x], mv + step[n_x:]
+    return x, mv, away
+
+
+def inside(values: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Which rows (n,) of values (n, m) lie within [low, high] (m,) in every column."""
+    return np.asarray(np.all((values >= low) & (values <= high), axis=-1))

@@ -1,0 +1,56 @@
+"""What tests on models rest on: how far values lie beyond the data, in figures and in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from own_cases import two_lags
+
+from pipeline.cases import CASES
+from pipeline.evaluation.grounds import Grounds
+from pipeline.evaluation.reached import beyond, grounds_of, reached_by, widest
+from pipeline.simulation.simulate import simulate_closed
+
+RECORDED = {"T": (20.0, 60.0), "V": (0.0, 10.0)}
+
+
+def test_what_stays_within_is_left_out() -> None:
+    assert beyond({"T": (25.0, 60.1), "V": (0.0, 10.0)}, RECORDED) == {}
+    assert beyond({"T": (16.0, 61.0), "V": (2.0, 12.5)}, RECORDED) == {"T": 10.0, "V": 25.0}
+    assert beyond({"unknown": (0.0, 1.0)}, RECORDED) == {}
+
+
+def test_the_widest_range_holds_all() -> None:
+    assert widest([{"T": (1.0, 2.0)}, {"T": (0.0, 1.5), "V": (3.0, 3.0)}]) == {"T": (0.0, 2.0), "V": (3.0, 3.0)}
+    assert widest([]) == {}
+
+
+@pytest.mark.parametrize(
+    ("grounds", "said"),
+    [
+        (Grounds({"T": 93.21}, {}, {}), "T 93.2 %; set points stay within the data; PVs and MVs do, too"),
+        (Grounds({"T": None}, {"T": 5.0}, {}), "T none; set points go T 5 % of its recorded range beyond it"),
+        (Grounds({"T": 90.0}, {}, {"V": 25.0}), "in closed loop V goes 25 % of its recorded range beyond it"),
+    ],
+)
+def test_the_sentence_says_the_fit_and_how_far_the_tests_leave_the_data(grounds: Grounds, said: str) -> None:
+    assert grounds.words.startswith("on models identified from your data (free-run fit over unseen rows: T ")
+    assert said in grounds.words
+
+
+def test_they_come_from_the_models_figures_and_from_the_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    case = two_lags()
+    models = {"parts": {"identified": {"per_seed": {"0": {"outputs": {"y0": {"fit_percent": 90.0}, "y1": {}}}}}}}
+    test = case.scenarios()["load"][0]
+    assert test.plant is not None
+    loop = simulate_closed(test.plant, lambda sp, pv, mv: (np.array([1.0, 0.0]), []), test)
+    found = grounds_of(case, models, [reached_by([loop], case)])
+    assert found is not None
+    assert found.fit == {"y0": 90.0, "y1": None}
+    assert found.set_points == {}
+    low, high = case.recorded["u0"]
+    assert found.loops["u0"] == pytest.approx(100 * (1 - high) / (high - low), rel=0.01)
+    assert grounds_of(CASES["batch_reactor"], {}, []) is None

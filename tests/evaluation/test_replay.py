@@ -1,0 +1,94 @@
+"""Replay of a law over a record: what it is given, where it starts afresh, and the figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import RecordError
+from pipeline.evaluation.replay import UNSEEN, replay
+from pipeline.plants.signals import Signals
+from pipeline.records.record import Record
+from serving.errors import LoopwrightError
+from serving.manifest import Signal
+
+Y, U = Signal("y", "m", 0.0, 10.0), Signal("u", "V", -1.0, 1.0)
+SIGNALS = Signals(2.0, (Y,), (Y,), (), (U,))
+N = 100
+
+
+@dataclass
+class Law:
+    """Asks for what was applied and more; refuses one row; counts its own steps in its state."""
+
+    refuses: float = np.nan
+    more: float = 0.1
+    given: list[dict[str, np.ndarray]] = field(default_factory=list)
+
+    def cold_state(self) -> np.ndarray:
+        return np.zeros(1)
+
+    def step(self, **inputs: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self.given.append(inputs)
+        if inputs["pv"][0] == self.refuses:
+            raise LoopwrightError("no")
+        return inputs["mv_applied"] + self.more, inputs["state"] + 1, np.zeros(0)
+
+
+def record(runs: tuple[int, ...] = (N,)) -> Record:
+    rng = np.random.default_rng(0)
+    run = np.repeat(np.arange(len(runs))[::-1], runs)  # numbers need not grow
+    return Record.of(SIGNALS, np.arange(N, dtype=float)[:, None] / 10, rng.uniform(-0.8, 0.8, (N, 1)), run=run)
+
+
+def test_a_law_meets_the_last_rows_with_what_was_applied_before() -> None:
+    law, data = Law(), record()
+    found = replay(law, data, SIGNALS, ahead=5)
+    assert len(found.time_s) == UNSEEN * N
+    np.testing.assert_allclose(np.diff(found.time_s), 2.0)
+    applied = np.array([given["mv_applied"] for given in law.given])
+    np.testing.assert_allclose(applied[1:], data.mv[N - 20 : N - 1])
+    np.testing.assert_allclose(found.asked, applied + 0.1)
+    np.testing.assert_allclose(found.done, data.mv[-20:])
+    assert [given["state"][0] for given in law.given] == list(range(20))
+
+
+def test_the_set_point_is_where_the_operation_went() -> None:
+    found = replay(Law(), record(), SIGNALS, ahead=5)
+    np.testing.assert_allclose(found.sp[:10], found.pv[:10] + 0.2)
+    assert found.sp[-1] == found.pv[-1]
+
+
+def test_a_gap_begins_afresh_and_no_set_point_looks_across_it() -> None:
+    law = Law()
+    found = replay(law, record((90, 10)), SIGNALS, ahead=5)
+    assert [given["state"][0] for given in law.given] == [*range(10), *range(10)]
+    assert found.sp[9] == found.pv[9]
+    np.testing.assert_allclose(law.given[10]["mv_applied"], found.done[10])
+
+
+def test_a_refused_row_is_a_gap_and_counts() -> None:
+    found = replay(Law(refuses=8.5), record(), SIGNALS, ahead=5)
+    assert np.flatnonzero(np.isnan(found.asked[:, 0])).tolist() == [5]
+    assert found.figures(record())["u"]["refused"] == pytest.approx(5.0)
+
+
+def test_the_figures_count_in_shares_of_the_range() -> None:
+    data = record()
+    found = replay(Law(), data, SIGNALS, ahead=5)
+    row = found.figures(data)["u"]
+    asked, done = found.asked[:, 0], found.done[:, 0]
+    assert row["distance"] == pytest.approx(50 * np.abs(asked - done).mean())
+    assert row["more"] == pytest.approx(50 * (asked - done).mean())
+    assert row["correlation"] == pytest.approx(np.corrcoef(asked, done)[0, 1])
+    assert row["at_end"] == row["refused"] == 0
+    assert replay(Law(more=5.0), data, SIGNALS, ahead=5).figures(data)["u"]["at_end"] == 100
+
+
+def test_a_record_that_is_too_short_says_so() -> None:
+    short = Record.of(SIGNALS, np.zeros((3, 1)), np.zeros((3, 1)))
+    with pytest.raises(RecordError, match="3 rows, too few to replay"):
+        replay(Law(), short, SIGNALS, ahead=5)
