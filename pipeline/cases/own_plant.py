@@ -223,8 +223,8 @@ class OwnCase(Case):
         )
 
 
-def own_case(name: str) -> Case:
-    """The case of ``plants.<name>`` of params.yaml."""
+def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
+    """The case of ``plants.<name>`` of params.yaml; ``base`` with ``further`` attributes is its class."""
     params = PlantParams.read(name)
     pv, mv, dv = (tuple(map(_signal, group)) for group in (params.pv, params.mv, params.dv))
     signals = Signals(params.period_s, pv[:1], pv, dv, mv)  # one variable is controlled so far, the first
@@ -238,8 +238,9 @@ def own_case(name: str) -> Case:
         "plant_class": type("OwnPlant", (Untrained,), described),
         "models": models,
         "data": params.data,
+        "__module__": base.__module__,
     }
-    return type("OwnPlantCase", (OwnCase,), own)((9001, 9002, 9003))
+    return type("OwnPlantCase", (base,), own | further)((9001, 9002, 9003))
 
 
 def _signal(params: SignalParams) -> Signal:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_plant import entries_of
+from pipeline.commands.new_simulated import SIMULATOR, Simulated, keep, simulated
 from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
@@ -24,6 +25,7 @@ from pipeline.records.record import Record
 from pipeline.report.screening import write_page
 
 DATA = Path("data")
+LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
          "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip
 
@@ -32,7 +34,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add = parser.add_argument
     add("name", metavar="NAME", help="of the plant: small letters, digits and _")
-    add("files", metavar="FILE", type=Path, nargs="+", help="exports: .csv, .txt, .gz, .parquet")
+    add("files", metavar="FILE", type=Path, nargs="*", help="exports: .csv, .txt, .gz, .parquet")
+    add("--simulator", metavar="FILE", type=Path, help="a class with start, step and measure, instead of exports")
+    add("--rows", metavar="N", type=_rows, default=8_000, help="of the experiment on a simulator (8000)")
     for role in ROLES:
         form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"
         add(f"--{role}", metavar=form, action="append", default=[], help=f"{WORDS[role]}; may be given again")
@@ -51,6 +55,10 @@ def run(options: argparse.Namespace) -> int:
     folder = DATA / name
     if folder.exists():
         raise RecordError(f"{folder} is there already; choose another name, or remove the folder")
+    if options.simulator:
+        return _simulated(name, folder, options)
+    if not options.files:
+        raise RecordError("no file is named; give one or more exports, or --simulator FILE")
     given = [parse_tag(text, role) for role in ROLES for text in getattr(options, role)]
     if given and options.tags:
         raise RecordError("--tags and options of roles are both given; give one of them")
@@ -65,6 +73,13 @@ def run(options: argparse.Namespace) -> int:
     export = read_export(options.files, values, modes, options.time, options.time_format)
     found = screened(name, export, tags, options.period, options.hold, options.without_mode)
     return _write(name, folder, found)
+
+
+def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
+    if options.files or options.tags or any(getattr(options, role) for role in ROLES):
+        raise RecordError("--simulator and an export or its tags are both given; give one of them")
+    made = simulated(name, options.simulator, options.rows, options.period)
+    return _write(name, folder, made.found, made)
 
 
 def _table(name: str, options: argparse.Namespace) -> int:
@@ -82,7 +97,7 @@ def _table(name: str, options: argparse.Namespace) -> int:
     return 0
 
 
-def _write(name: str, folder: Path, found: Screened) -> int:
+def _write(name: str, folder: Path, found: Screened, made: Simulated | None = None) -> int:
     """All files at once, then the section; neither without the other."""
     report, verdict = found.report, found.report.verdict
     usable = _usable(found.record)
@@ -91,12 +106,15 @@ def _write(name: str, folder: Path, found: Screened) -> int:
         if not usable:
             found.record.write(draft / "record.parquet")
         write_json(draft / "screening.json", report.to_dict())
+        if made:
+            keep(made, draft)
         if test:
             write_text(draft / "step_test.csv", test.table())
         write_page(draft / "screening.html", found, test)
     if not usable:
         try:
-            add_entries(entries_of(name, entry(found.record, report, folder)))
+            plant = entry(found.record, report, folder)
+            add_entries(entries_of(name, plant | ({"simulator": (folder / SIMULATOR).as_posix()} if made else {})))
         except PipelineError:
             shutil.rmtree(folder)
             raise
@@ -145,6 +163,12 @@ def _tell(name: str, folder: Path, report: Screening, test: StepTest | None) -> 
 
 def _with_unit(tag: Tag, units: dict[str, str]) -> Tag:
     return Tag(tag.tag, tag.role, units.get(tag.tag, ""), tag.low, tag.high, tag.name)
+
+
+def _rows(text: str) -> int:
+    if not text.isdigit() or not LEAST_ROWS <= int(text) <= MOST_ROWS:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of rows from {LEAST_ROWS} to {MOST_ROWS}")
+    return int(text)
 
 
 def _positive(text: str) -> float:

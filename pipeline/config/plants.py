@@ -38,7 +38,7 @@ class RawFileParams:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PlantParams:
-    """``plants.<name>``: period, signals, the clean record, and the raw files behind it."""
+    """``plants.<name>``: period, signals, the clean record, the raw files behind it, and a simulator if it has one."""
 
     period_s: float
     pv: tuple[SignalParams, ...]  # controlled variables first
@@ -46,6 +46,7 @@ class PlantParams:
     dv: tuple[SignalParams, ...]
     data: Path
     source: tuple[RawFileParams, ...]
+    simulator: Path | None = None  # the plant's own, on which its controllers are tested
 
     def __post_init__(self) -> None:
         if not self.period_s > 0:

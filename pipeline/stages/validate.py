@@ -146,7 +146,7 @@ def _evidence(case: Case, base: list[Trial], shipped: Trial) -> dict[str, Any]:
         name: {**row, f"{case.metric}_median": statistics.median(t.metrics[name][case.metric] for t in base)}
         for name, row in shipped.metrics.items()
     }
-    of = {"plant": "identified"} if case.on_models else {}
+    of = {"plant": case.stand_in} if case.on_models else {}
     return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "scenarios": figures}
 
 
