@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
-from _exports import HEADER, NOISE, PERIOD_S, ROWS, TAGS, Array, Columns, Export, cells, experiment, export_of
+from _exports import HEADER, NOISE, PERIOD_S, ROWS, TAGS, Array, Export, cells, experiment, export_of
 
 from pipeline.historian.tags import Tag
 
@@ -86,13 +86,37 @@ def swinging_door(values: Array, band: float) -> Array:
     while k < len(values) - 1:
         high, low, j = np.inf, -np.inf, k + 1
         while j < len(values):
-            high, low = min(high, (values[j] + band - values[k]) / (j - k)), max(low, (values[j] - band - values[k]) / (j - k))
+            high, low = (
+                min(high, (values[j] + band - values[k]) / (j - k)),
+                max(low, (values[j] - band - values[k]) / (j - k)),
+            )
             if low > high:
                 break
             j += 1
         k = max(j - 1, k + 1)
         kept.append(k)
     return np.interp(np.arange(len(values)), kept, values[kept])
+
+
+def compressed(band: float) -> Export:
+    """The PV through a swinging door."""
+    return export_of(CLEAN.with_(pv=np.round(swinging_door(CLEAN.pv, band), 3)))
+
+
+def ranged(unit: str, low: float, high: float) -> tuple[Tag, ...]:
+    """The usual tags, with a range of the PV."""
+    return (Tag("TIC-101.PV", "pv", unit, low, high), *TAGS[1:])
+
+
+def sent_twice() -> Export:
+    """1 % of the rows two times."""
+    return export_of([row for k, row in enumerate(cells(CLEAN)) for _ in range(2 if k in SPOT else 1)])
+
+
+def overlapping() -> Export:
+    """Two files that share 800 rows."""
+    rows = cells(CLEAN)
+    return Export({"a.csv": (HEADER, rows[:2400]), "b.csv": (HEADER, rows[1600:])})
 
 
 def regulation() -> Export:
@@ -122,9 +146,7 @@ def two_files(shift_s: float) -> Export:
     """PV in one file, the others in a second one whose clock differs."""
     rows = cells(CLEAN)
     second = [[f"{float(r[0]) + shift_s:.3f}", *r[2:]] for r in rows]
-    return Export(
-        {"a.csv": (HEADER[:2], [r[:2] for r in rows]), "b.csv": ((HEADER[0], *HEADER[2:]), second)}
-    )
+    return Export({"a.csv": (HEADER[:2], [r[:2] for r in rows]), "b.csv": ((HEADER[0], *HEADER[2:]), second)})
 
 
 def a_block_twice() -> Export:
@@ -153,6 +175,7 @@ def thinned() -> Export:
 
 def averaged() -> Export:
     """PV and flow as means over ten rows, repeated; the MV as it is."""
+
     def mean(v: Array) -> Array:
         return np.round(np.repeat(v.reshape(-1, 10).mean(axis=1), 10), 3)
 
@@ -180,7 +203,9 @@ def flow_around_zero(dead: bool) -> Export:
 
 def jitter(share: float) -> Export:
     """Times that stray."""
-    return export_of(CLEAN.with_(time_s=CLEAN.time_s + share * PERIOD_S * np.random.default_rng(9).uniform(-1, 1, ROWS)))
+    return export_of(
+        CLEAN.with_(time_s=CLEAN.time_s + share * PERIOD_S * np.random.default_rng(9).uniform(-1, 1, ROWS))
+    )
 
 
 def dst_back(t: float) -> float:
@@ -226,7 +251,10 @@ def loop_with_modes() -> Export:
     return Export({"export.csv": ((*HEADER, "TIC-101.MODE"), rows)}, tags=tags)
 
 
+SWAPPED = (Tag("TIC-101.OP", "pv", "%"), Tag("TIC-101.PV", "mv", "degC"), TAGS[2])
 t, c = np.arange(ROWS), CLEAN
+QUIET = np.random.default_rng(1).normal(0, NOISE, 400).round(3)
+HALVES = np.r_[500:1000, 2500:3000]
 WALK = np.cumsum(np.random.default_rng(12).normal(0, 0.1, ROWS))
 
 KINDS: tuple[Kind, ...] = (
@@ -244,13 +272,13 @@ KINDS: tuple[Kind, ...] = (
     Kind("spikes in the MV, 1 %", lambda: mv(SPOT, np.where(c.mv[SPOT] > 50, 5.0, 95.0))),
     Kind("stuck for 200 rows", lambda: pv(slice(1500, 1700), c.pv[1500])),
     Kind("stuck at rest, the MV moves later", lambda: pv(slice(1500, 1530), c.pv[1500])),
-    Kind("stuck with noise, 400 rows", lambda: pv(MIDDLE, c.pv[1500] + np.random.default_rng(1).normal(0, NOISE, 400).round(3))),
+    Kind("stuck with noise, 400 rows", lambda: pv(MIDDLE, c.pv[1500] + QUIET)),
     Kind("MV column frozen for 400 rows", lambda: mv(MIDDLE, c.mv[1500])),
     Kind("MV column frozen for 1,300 rows, mode says AUTO", loop_with_modes),
     Kind("disturbance stuck for 400 rows", lambda: export_of(c.with_(dv=at(c.dv, MIDDLE, c.dv[1500])))),
     Kind("saturated above 80 %", lambda: export_of(c.with_(pv=np.minimum(c.pv, np.quantile(c.pv, 0.8))))),
-    Kind("a range that half of the PV leaves", lambda: export_of(c, tags=(Tag("TIC-101.PV", "pv", "degC", 60, 90), *TAGS[1:]))),
-    Kind("a range in another unit", lambda: export_of(c, tags=(Tag("TIC-101.PV", "pv", "K", 300, 400), *TAGS[1:]))),
+    Kind("a range that half of the PV leaves", lambda: export_of(c, tags=ranged("degC", 60, 90))),
+    Kind("a range in another unit", lambda: export_of(c, tags=ranged("K", 300, 400))),
     Kind("quantized to 1 % of the span", lambda: export_of(c.with_(pv=np.round(c.pv / 0.5) * 0.5))),
     Kind("quantized to 10 % of the span", lambda: export_of(c.with_(pv=np.round(c.pv / 5) * 5))),
     Kind("MV one row late", lambda: moved(1)),
@@ -271,27 +299,27 @@ KINDS: tuple[Kind, ...] = (
     Kind("sensor's span changed by 20 % from the middle on", lambda: pv(LATE, 20 + 1.2 * (c.pv[LATE] - 20))),
     Kind("degF in 10 %", lambda: pv(MIDDLE, 1.8 * c.pv[MIDDLE] + 32)),
     Kind("degF in 40 %, to the end", lambda: pv(LATE, 1.8 * c.pv[LATE] + 32)),
-    Kind("degF over a quarter, two times", lambda: pv(np.r_[500:1000, 2500:3000], 1.8 * c.pv[np.r_[500:1000, 2500:3000]] + 32)),
+    Kind("degF over a quarter, two times", lambda: pv(HALVES, 1.8 * c.pv[HALVES] + 32)),
     Kind("MV as a fraction in 40 %, to the end", lambda: mv(LATE, c.mv[LATE] / 100)),
     Kind("MV as a fraction in 10 %", lambda: mv(MIDDLE, c.mv[MIDDLE] / 100)),
     Kind("disturbance in t/h in 10 %", lambda: export_of(c.with_(dv=at(c.dv, MIDDLE, c.dv[MIDDLE] / 1000)))),
     Kind("sign turned in 10 %", lambda: pv(MIDDLE, -c.pv[MIDDLE])),
-    Kind("PV and MV swapped", lambda: export_of(c, tags=(Tag("TIC-101.OP", "pv", "%"), Tag("TIC-101.PV", "mv", "degC"), TAGS[2]))),
+    Kind("PV and MV swapped", lambda: export_of(c, tags=SWAPPED)),
     Kind("a PV of another loop", lambda: export_of(c.with_(pv=experiment(5).pv))),
     Kind("jitter of 5 ms", lambda: jitter(0.0008)),
     Kind("jitter of 0.4 periods", lambda: jitter(0.4)),
-    Kind("duplicated stamps", lambda: export_of([r for k, r in enumerate(cells(c)) for _ in range(2 if k in SPOT else 1)])),
+    Kind("duplicated stamps", lambda: sent_twice()),
     Kind("shuffled rows", shuffled),
     Kind("a fifth of the rows lost", lambda: lost(0.2)),
     Kind("half of the rows lost", lambda: lost(0.5)),
     Kind("a block of 400 rows again, with later times", a_block_twice),
-    Kind("two files that overlap", lambda: Export({"a.csv": (HEADER, cells(c)[:2400]), "b.csv": (HEADER, cells(c)[1600:])})),
+    Kind("two files that overlap", overlapping),
     Kind("half the rate in the second half", thinned),
     Kind("stamps to the minute", lambda: stamps(local("%Y-%m-%d %H:%M"))),
     Kind("means over ten rows, repeated", averaged),
     Kind("stored beyond a dead band of 1 % of the span", lambda: by_exception(0.5)),
-    Kind("swinging door, 1 % of the span, drawn again", lambda: export_of(c.with_(pv=np.round(swinging_door(c.pv, 0.5), 3)))),
-    Kind("swinging door, 5 % of the span, drawn again", lambda: export_of(c.with_(pv=np.round(swinging_door(c.pv, 2.5), 3)))),
+    Kind("swinging door, 1 % of the span, drawn again", lambda: compressed(0.5)),
+    Kind("swinging door, 5 % of the span, drawn again", lambda: compressed(2.5)),
     Kind("ISO-8601 with a zone", lambda: stamps(local("%Y-%m-%dT%H:%M:%S+01:00", lambda _: 3600.0))),
     Kind("summer time ends (an hour twice)", lambda: stamps(local("%Y-%m-%d %H:%M:%S", dst_back))),
     Kind("summer time begins (an hour missing)", lambda: stamps(local("%Y-%m-%d %H:%M:%S", dst_forward))),

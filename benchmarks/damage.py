@@ -1,9 +1,10 @@
-"""What happens to each kind of dirt in an export, and what it costs: ``python benchmarks/damage.py [--write] [KIND ...]``.
+"""What happens to each kind of dirt in an export, and its cost: ``python benchmarks/damage.py [--write] [KIND ...]``.
 
 One plant without dirt is exported; each kind spoils the export in its own way. `loopwright new` refuses it, masks it,
 names it, or takes it. Of what it takes, a linear model is identified (regularized ARX, Hankel, output error) and run
 free over rows of another, clean experiment. ``factor``: its error there over that of the model from the clean export.
-Silent: nothing is masked, named or doubted. About two minutes; ``--write`` puts the table into docs/damage.md.
+Told: the only trace is what the data say of the plant (gain, first answer, settling), which a person is asked to
+compare with it. Silent: nothing at all. About two minutes; ``--write`` puts the table into docs/damage.md.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +38,9 @@ HEAD = """# What dirt in an export costs
 Written by `python benchmarks/damage.py --write`. A plant with one manipulated variable and one measured disturbance
 (second order, dead time of two samples, {rows} rows) is exported without dirt, and each kind spoils the export.
 **Factor**: error of a linear model's free run over clean rows of another experiment (its standard deviation: feedback
-removes a constant offset), over that of the model from the clean export. A dash: no record was made, or no model came out of it.
+removes a constant offset), over that of the model from the clean export. **Told**: `new` prints when each variable
+first answers, and asks whether it is so on the plant; here that figure differs from the clean export's ({usual}).
+A dash: no record was made, or no model came out of it.
 
 | Kind | What happens | Factor |
 |---|---|---:|
@@ -49,7 +52,7 @@ class Outcome:
     """What became of one export."""
 
     kind: str
-    what: str  # refused, masked, named, doubted, silent
+    what: str  # refused, not added, doubted, masked, named, told, accepted in silence
     words: str
     factor: float | None
 
@@ -62,13 +65,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     chosen = [k for k in KINDS if not options.kinds or any(word in k.name for word in options.kinds)]
     with tempfile.TemporaryDirectory() as folder:
-        yardstick = error_of(taken(CLEAN, Path(folder)).record)
+        clean = taken(CLEAN, Path(folder))
+        yardstick, usual = error_of(clean.record), answers_of(clean)
         rows = []
         for kind in chosen:
-            rows.append(outcome(kind, Path(folder), yardstick))
+            rows.append(outcome(kind, Path(folder), yardstick, usual))
             print(line(rows[-1]), flush=True)
     if options.write:
-        page = HEAD.format(rows=len(experiment(0).pv)) + "".join(line(row) + "\n" for row in rows)
+        page = HEAD.format(
+            rows=len(experiment(0).pv), usual=", ".join(f"{pv} {s:g} s after {u}" for (u, pv), s in usual.items())
+        ) + "".join(line(row) + "\n" for row in rows)
         PAGE.write_text(page, encoding="utf-8")
     costly = [r.kind for r in rows if r.what == "accepted in silence" and (r.factor or 9.9) > SILENT_FACTOR]
     for name in costly:
@@ -90,7 +96,7 @@ def taken(export: Export, folder: Path) -> Screened:
     return screened("plant", read_export(paths, values, modes), tags, **export.options)
 
 
-def outcome(kind: Kind, folder: Path, yardstick: float) -> Outcome:
+def outcome(kind: Kind, folder: Path, yardstick: float, usual: Mapping[tuple[str, str], float]) -> Outcome:
     """What becomes of one kind."""
     export = kind.spoil()
     try:
@@ -114,10 +120,13 @@ def outcome(kind: Kind, folder: Path, yardstick: float) -> Outcome:
     verdict = report.verdict
     if verdict.carries != "yes":
         words.append("; ".join(verdict.reasons))
+    told = {pair: s for pair, s in answers_of(found).items() if s != usual.get(pair)}
+    words += [f"{pv} is said to answer {s:g} s after {u}" for (u, pv), s in told.items()] if not words else []
     what = (
         "not added" if verdict.carries == "no"
         else "doubted" if verdict.carries == "doubtful"
         else "masked" if masked or readings or report.unreadable_rows or report.timeless_rows or report.gaps
+        else "told" if told and not report.findings
         else "named" if words
         else "accepted in silence"
     )  # fmt: skip
@@ -126,6 +135,11 @@ def outcome(kind: Kind, folder: Path, yardstick: float) -> Outcome:
     except (ModelError, PipelineError, np.linalg.LinAlgError):
         factor = None
     return Outcome(kind.name, what, "; ".join(words), factor)
+
+
+def answers_of(found: Screened) -> dict[tuple[str, str], float]:
+    """(input, PV) -> seconds from a move to the first answer, as `loopwright new` tells them."""
+    return {(i.name, pv): s for i in found.report.verdict.inputs for pv, s in i.first_answer_s.items()}
 
 
 def error_of(record: Record, lower: float = 0.0) -> float:
@@ -139,9 +153,7 @@ def error_of(record: Record, lower: float = 0.0) -> float:
         n = int(0.8 * len(data))
         train, held = data.rows(slice(0, n)).stretches(), data.rows(slice(n, None)).stretches()
     realizations = Realizations.of(high_order_arx(data).impulse_response(100), data.v.std(axis=0))
-    fits: list[Fitted] = []
-    for order in ORDERS:
-        fits.append(OutputError(iterations=25).fit(realizations.order(order), train, held))
+    fits: list[Fitted] = [OutputError(iterations=25).fit(realizations.order(n), train, held) for n in ORDERS]
     best = min(fits, key=lambda f: f.held_out)
     clean = experiment(1)
     signals = Signals(record.period_s, record.pv_signals, record.pv_signals, record.dv_signals, record.mv_signals)

@@ -63,7 +63,9 @@ def _every(plant: FileSimulator, test: FirstTest, period_s: float | None) -> int
 
 def _findings(plant: FileSimulator, test: FirstTest, plan: Plan) -> list[Finding]:
     h, k = plant.period_s, test.settling_periods
-    words = f"settles within {k} periods of {h:g} s" if test.settles else f"does not settle; {k} periods to move a tenth"
+    words = (
+        f"settles within {k} periods of {h:g} s" if test.settles else f"does not settle; {k} periods to move a tenth"
+    )
     if plant.every > 1:
         words += f"; the period is {plant.every} steps of the simulator, so that an answer takes {WANTED} or so"
     found = [Finding("first_test", plant.name, words)]

@@ -40,7 +40,7 @@ def first_test(plant: Simulator) -> FirstTest:
 
     Raises PlantError where no MV moves any PV.
     """
-    x0, mv0 = plant.start
+    _x0, mv0 = plant.start
     room = np.array([s.high - s.low for s in plant.pv_signals])
     base = _course(plant, mv0, LONGEST)
     times, gains, settles = [], np.zeros((len(room), len(mv0))), True
@@ -49,11 +49,11 @@ def first_test(plant: Simulator) -> FirstTest:
         step = step if mv0[j] + step <= signal.high else -step
         moved = mv0.copy()
         moved[j] += step
-        change, ends = _settled(plant, base, moved)
+        change, rests = _settled(plant, base, moved)
         if not np.any(np.abs(change) > 1e-9 * room):
             continue
-        settles &= ends
-        if ends:
+        settles &= rests
+        if rests:
             gains[:, j] = change[-1] / step
             times.append(_settling(change, room))
         else:
@@ -69,8 +69,8 @@ def first_test(plant: Simulator) -> FirstTest:
     slowest = int(np.clip(max(times), 2, LONGEST))
     look = int(min(LONGEST, 3 * slowest)) if settles else slowest
     ends = [[_reach(plant, mv0, j, end, look) for j, end in enumerate(side)] for side in _sides(plant)]
-    rests = bool(np.all(np.abs(base - base[0]) <= RESTS * room)) if len(base) else False
-    return FirstTest(slowest, settles, rests, tuple(map(tuple, gains.tolist())), tuple(ends[0]), tuple(ends[1]))
+    stays = bool(np.all(np.abs(base - base[0]) <= RESTS * room)) if len(base) else False
+    return FirstTest(slowest, settles, stays, tuple(map(tuple, gains.tolist())), tuple(ends[0]), tuple(ends[1]))
 
 
 def _sides(plant: Simulator) -> tuple[list[float], list[float]]:

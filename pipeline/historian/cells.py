@@ -124,7 +124,9 @@ def unit_slips(values: Array, kinds: Sequence[str] = ()) -> tuple[Where, Counter
     noise = max(noise_sd(values), 1e-12)
     jumps = np.flatnonzero(np.abs(step) > max(JUMP_SD * noise, JUMP_SPAN * (high - low) * 0.5))
     slack = MATCH_SD * noise + float(np.quantile(np.abs(step[:: max(1, n // SAMPLE)]), 0.99))
-    matched = [(int(k), _conversion(values[k], values[k + 1], slack, kinds or tuple(CONVERSIONS))) for k in jumps[:2000]]
+    matched = [
+        (int(k), _conversion(values[k], values[k + 1], slack, kinds or tuple(CONVERSIONS))) for k in jumps[:2000]
+    ]
     stretches = _stretches([(k, kind) for k, kind in matched if kind], n)
     others = np.ones(n, dtype=bool)
     for a, b, _ in stretches:

@@ -21,7 +21,8 @@ WHOLE = 0.7  # of a window's rows must have both values
 TRUSTED = 0.8  # median share of the variance that the inputs explain in a window: else nothing is judged
 ELSEWHERE, OTHERS = 0.6, 3  # explained share of at least this, in at least so many windows of the same region
 COVERED = 0.6  # of a window's expected range, that a window of the same region must cover
-SMALL = 0.3  # one motion against another, and their correlation
+SMALL, HIGH = 0.3, 0.5  # one motion against another, and correlations
+EDGE = 6.0  # medians of the residual
 MOST = 0.4  # of the rows: more are no exception
 WORDS = {
     "no answer": "does not answer to its inputs as it does elsewhere: a dead sensor or a closed loop around another",
@@ -76,6 +77,8 @@ def contradict(
         for kind, rows in _judged(windows, len(y)).items():
             if kind == "no cause":
                 rows = _with_its_rest(rows, [grid.value[t.tag] for t in signals if t.role == "mv"])
+            elif rows.any():
+                rows = _to_its_edges(rows, np.abs(y - expected[tag.tag]), length // 2)
             new = rows & (grid.code[tag.tag] == 0) & np.isfinite(grid.value[tag.tag])
             if new.any():
                 grid.code[tag.tag][new] = Reason.UNLIKE
@@ -98,6 +101,22 @@ def _with_its_rest(rows: NDArray[np.bool_], inputs: Sequence[Array]) -> NDArray[
     return out
 
 
+def _to_its_edges(rows: NDArray[np.bool_], residual: Array, most: int) -> NDArray[np.bool_]:
+    """The rows, and up to ``most`` on each side as long as half of the residuals (n,) stay beyond what is usual."""
+    far = residual > EDGE * float(np.nanmedian(residual[~rows]))
+    out = rows.copy()
+    for a, b in zip(*runs_of(rows), strict=True):
+        out[a - _reach(far[max(a - most, 0) : a][::-1]) : b + _reach(far[b : b + most])] = True
+    return out
+
+
+def _reach(far: NDArray[np.bool_]) -> int:
+    """Rows up to the last one that is far, with half of all before it."""
+    share = np.cumsum(far) / np.arange(1, len(far) + 1)
+    last = np.flatnonzero(far & (share >= 0.5))
+    return int(last[-1]) + 1 if last.size else 0
+
+
 def _judged(w: Windows, n: int) -> dict[str, NDArray[np.bool_]]:
     """Rows (n,) by kind; none where the inputs explain the PV badly, or too many rows are struck."""
     if len(w.start) < 2 * OTHERS:
@@ -106,11 +125,11 @@ def _judged(w: Windows, n: int) -> dict[str, NDArray[np.bool_]]:
     if not moving.any() or float(np.median(w.share[moving])) < TRUSTED:
         return {}
     usual = float(np.median(w.expected[moving]))
-    alone = moving & (np.abs(w.correlation) < SMALL)
+    silent, alone = w.actual < SMALL * w.expected, w.expected < SMALL * w.actual
     kinds = {
-        "no answer": alone & (w.actual < SMALL * w.expected) & (w.expected > SMALL * usual),
-        "no cause": alone & (w.expected < SMALL * w.actual) & (w.actual > SMALL * usual),
-        "other sign": moving & (w.correlation < -SMALL) & (np.minimum(w.actual, w.expected) > SMALL * usual),
+        "no answer": moving & silent & (np.abs(w.correlation) < SMALL) & (w.expected > SMALL * usual),
+        "no cause": moving & alone & (w.correlation < HIGH) & (w.actual > SMALL * usual),
+        "other sign": moving & ~silent & ~alone & (w.correlation < -HIGH) & (w.actual > SMALL * usual),
     }
     found = {}
     struck = np.zeros(n, dtype=bool)

@@ -14,6 +14,7 @@ Y_LAGS = 3
 BLOCKS = ((0, 1), (1, 2), (2, 3), (3, 6), (6, 11), (11, 21), (21, 41))  # lags of an input that share a coefficient
 AHEAD = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
 MOST_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly over the record
+SETTLED = 0.8  # of the rows that an answer is followed: later it has not settled
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
 LEAST_ROWS = 60
 
@@ -63,12 +64,13 @@ class Linear:
         return y[Y_LAGS - 1 : -1]
 
     def settling(self, i: int, length: int = 600) -> int:
-        """Rows after which the answer to input ``i`` stays within 10 % of its end; 0 where it has none."""
+        """Rows after which the answer to input ``i`` stays within 10 % of its end; 0 if not in ``length``."""
         answer = self.step_response(i, length)
         if not np.isfinite(answer).all() or abs(answer[-1]) <= 1e-12:
             return 0
         outside = np.flatnonzero(np.abs(answer - answer[-1]) > 0.1 * abs(answer[-1]))
-        return int(outside[-1]) + 1 if outside.size else 1
+        rows = int(outside[-1]) + 1 if outside.size else 1
+        return rows if rows < SETTLED * length else 0
 
 
 def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:

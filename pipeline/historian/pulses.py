@@ -37,7 +37,7 @@ def pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag]) -> lis
         plain[rows] = u[rows - 1]
         table = {name: grid.value[name] for name in inputs}
         gain = 0.0
-        for y in (grid.value[t.tag] for t in signals if t.role == "pv"):
+        for y in (_as_read(grid, own[t.tag]) for t in signals if t.role == "pv"):
             with_them = fitted(y, np.column_stack(list(table.values())), grid.piece)
             without = fitted(y, np.column_stack(list((table | {tag.tag: plain}).values())), grid.piece)
             if with_them is not None and without is not None:
@@ -50,6 +50,15 @@ def pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag]) -> lis
             words = f"{len(rows)} moves for a single row that nothing answers to; the value before holds instead"
             found.append(Finding("outlier", tag.tag, words, True))
     return found
+
+
+def _as_read(grid: Grid, series: Series) -> Array:
+    """The PV (n,) with its outliers: a sharp answer to a pulse looks like one."""
+    y = grid.value[series.tag].copy()
+    bad = np.flatnonzero(series.code == Reason.OUTLIER)
+    row = np.searchsorted(grid.time_s, series.time_s[bad] - 0.5 * grid.period_s)
+    y[row[row < len(y)]] = series.value[bad[row < len(y)]]
+    return y
 
 
 def _pulses(u: Array, piece: NDArray[np.int64]) -> NDArray[np.int64]:

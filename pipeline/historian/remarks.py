@@ -11,9 +11,9 @@ from pipeline.historian.character import quantum, staircase, straight_share
 from pipeline.historian.excitation import HELD
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
+from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.grid import Grid, Sampling
 from pipeline.historian.linear import Linear
-from pipeline.metrics import Array
 from pipeline.records.record import Record
 
 COARSE = 0.002  # of the usual span: a converter's step that a model feels
@@ -44,7 +44,7 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
         found.append(Finding("compression", series.tag, words))
     if (length := staircase(values)) > 1 and role == "pv":
         words = (
-            f"every value stands {length} times: made once in {length * rate.step_s:.4g} s (a mean, or held) and written "
+            f"every value stands {length} times: made once in {length * rate.step_s:.4g} s (a mean, or held), written "
             f"more often; give --period {length * rate.step_s:.6g}"
         )
         found.append(Finding("repeated", series.tag, words))
@@ -79,7 +79,8 @@ def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Findi
         early = {name: m.ahead[i] for name, m in models.items() if m is not None and m.ahead[i][0] > AHEAD}
         # In a loop the MV follows the PV at every row; an MV that holds does not know what comes.
         if early and held >= HELD:
-            lead = max(early.values())[1]
+            first = {n: first_answer(y, record.mv[:, i], record.run) for n, y in zip(models, record.pv.T, strict=True)}
+            lead = max(max(early.values())[1], *(1 - k for k in first.values() if k != NONE))
             words = (
                 f"{', '.join(early)} answers about {lead} row{'s' if lead > 1 else ''} before {signal.name} moves: the "
                 f"export stores {signal.name} late, or an operator moves it at once when the other changes"

@@ -26,7 +26,6 @@ from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.static import explained
 from pipeline.historian.tags import Tag
 from pipeline.historian.wandering import of_levels
-from pipeline.metrics import Array
 from pipeline.records.record import Record
 
 LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures

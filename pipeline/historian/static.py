@@ -10,6 +10,7 @@ from pipeline.metrics import Array
 
 SLOW = ((41, 81), (81, 161), (161, 321))  # lags beyond BLOCKS that share a coefficient; the last are left out first
 SETTLED = 0.15
+MOST_SHARE = 0.05  # of the rows: longer lags explain by chance what the inputs did not cause
 CHUNK = 200_000  # rows
 
 
@@ -22,9 +23,11 @@ def explained(y: Array, u: Array, piece: NDArray[np.int64]) -> tuple[Array, int]
     """
     out = np.full(len(y), np.nan)
     blocks: tuple[tuple[int, int], ...] = (*BLOCKS, *SLOW)
+    while len(blocks) > len(BLOCKS) and blocks[-1][1] > MOST_SHARE * len(y):
+        blocks = blocks[:-1]
     while True:
         rows = rows_of(y, u, piece, blocks[-1][1] - 1)
-        if len(rows) >= max(LEAST_ROWS, 6 * u.shape[1] * len(blocks)) and len(rows) > 0.5 * len(y) * (len(blocks) > 7):
+        if len(rows) >= max(LEAST_ROWS, 6 * u.shape[1] * len(blocks)):
             break
         if len(blocks) <= 4:
             return out, 0

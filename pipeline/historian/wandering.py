@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.historian.findings import Finding
 from pipeline.metrics import Array
@@ -22,7 +23,7 @@ def of_levels(name: str, y: Array, expected: Array, span: float, settling: int) 
     What a static nonlinearity (a cubic of ``expected``) explains of the levels is none of it.
     """
     ok = np.flatnonzero(np.isfinite(y) & np.isfinite(expected))
-    length = max(BLOCK, settling, len(ok) // MOST_LEVELS)
+    length = max(BLOCK, min(settling, len(ok) // (2 * LEVELS)), len(ok) // MOST_LEVELS)
     m = len(ok) // length
     if m < LEVELS or span <= 0:
         return []
@@ -39,7 +40,7 @@ def of_levels(name: str, y: Array, expected: Array, span: float, settling: int) 
     return [Finding("drift", name, _words(level, curve, z, e, rows[:, 0], span))]
 
 
-def _words(level: Array, curve: Array, z: Array, e: Array, first: Array, span: float) -> str:
+def _words(level: Array, curve: Array, z: Array, e: Array, first: NDArray[np.int64], span: float) -> str:
     m = len(level)
     time = np.linspace(-0.5, 0.5, m)
     none = _left(curve, level)[0]
@@ -52,13 +53,21 @@ def _words(level: Array, curve: Array, z: Array, e: Array, first: Array, span: f
     left, s, jump, more = min(jumps)
     if min(ramp, left) > (1 - EXPLAINED) * none:
         size = 100 * float(np.ptp(level)) / span
-        return f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; loads that nobody measures"
+        return (
+            f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; loads that nobody measures"
+        )
     if ramp < left + 0.05 * none:
         change = float(slope[-1])
-        return f"drifts by {change:.4g} over the record, {100 * abs(change) / span:.0f} % of its span, without its inputs"
-    words = f"jumps by {jump:.4g} at row {int(first[s])}, {100 * abs(jump) / span:.0f} % of its span, without its inputs"
+        return (
+            f"drifts by {change:.4g} over the record, {100 * abs(change) / span:.0f} % of its span, without its inputs"
+        )
+    words = (
+        f"jumps by {jump:.4g} at row {int(first[s])}, {100 * abs(jump) / span:.0f} % of its span, without its inputs"
+    )
     if abs(more) > RATIO:
-        words += f", and answers {1 + more:.2f} times as strongly from there on: a sensor's new span, or another product"
+        words += (
+            f", and answers {1 + more:.2f} times as strongly from there on: a sensor's new span, or another product"
+        )
     else:
         words += ": a calibration, or another product"
     return words
@@ -67,4 +76,4 @@ def _words(level: Array, curve: Array, z: Array, e: Array, first: Array, span: f
 def _left(x: Array, target: Array) -> tuple[float, Array]:
     """Sum of squares that least squares leaves, and the coefficients."""
     theta = np.linalg.lstsq(x, target, rcond=None)[0]
-    return float(np.sum((target - x @ theta) ** 2)), theta
+    return float(np.sum((target - x @ theta) ** 2)), np.asarray(theta, dtype=np.float64)

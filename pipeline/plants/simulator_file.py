@@ -1,4 +1,4 @@
-"""A plant from a person's own file: one class with ``start``, ``step``, ``measure`` and its signals, in plain Python."""
+"""A plant from a person's own file: one class with ``start``, ``step``, ``measure`` and its signals."""
 
 from __future__ import annotations
 
