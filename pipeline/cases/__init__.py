@@ -14,11 +14,13 @@ from pipeline.cases.batch_reactor.case import BatchReactorCase
 from pipeline.cases.henson_seborg_cstr.case import HensonSeborgCstrCase
 from pipeline.cases.jacketed_batch_reactor.case import JacketedBatchReactorCase
 from pipeline.cases.own_plant import own_case
+from pipeline.cases.own_simulator import simulated_case
 from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
 from pipeline.cases.ph_neutralization.case_15s import PhNeutralization15sCase
 from pipeline.cases.reversible_cstr.case import ReversibleCstrCase
 from pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
 from pipeline.config.params import PARAMS_FILE, sections
+from pipeline.config.plants import PlantParams
 from pipeline.evaluation.case import Case
 from pipeline.plants.simulator import Simulator
 
@@ -40,7 +42,11 @@ PLANTS: dict[str, type[Simulator]] = {
 def all_cases() -> dict[str, Case]:
     """CASES, and after them the own plants of params.yaml, where there is one here."""
     own = sections("plants") if PARAMS_FILE.exists() else ()
-    return {**CASES, **{name: own_case(name) for name in own}}
+    return {**CASES, **{name: _own(name) for name in own}}
+
+
+def _own(name: str) -> Case:
+    return simulated_case(name) if PlantParams.read(name).simulator else own_case(name)
 
 
 def beside(case: Case, module: str, name: str, default: Any) -> Any:

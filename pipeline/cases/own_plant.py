@@ -265,8 +265,8 @@ class OwnCase(Case):
         )
 
 
-def own_case(name: str) -> Case:
-    """The case of ``plants.<name>`` of params.yaml."""
+def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
+    """The case of ``plants.<name>`` of params.yaml; ``base`` with ``further`` attributes is its class."""
     params = PlantParams.read(name)
     pv, mv, dv = (tuple(map(_signal, group)) for group in (params.pv, params.mv, params.dv))
     signals = Signals(params.period_s, pv[: params.n_controlled], pv, dv, mv)
@@ -281,8 +281,9 @@ def own_case(name: str) -> Case:
         "models": models,
         "data": params.data,
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
+        "__module__": base.__module__,
     }
-    return type("OwnPlantCase", (OwnCase,), own)((9001, 9002, 9003))
+    return type("OwnPlantCase", (base,), own | further)((9001, 9002, 9003))
 
 
 def mae_of(cv: Signal) -> str:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_plant import entries_of
+from pipeline.commands.new_simulated import SIMULATOR, Simulated, keep, simulated
 from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
 from pipeline.files import draft_folder_of, write_json, write_text
-from pipeline.historian.findings import Screening
+from pipeline.historian.findings import Screening, Verdict
 from pipeline.historian.guessing import guesses
 from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
@@ -24,6 +25,8 @@ from pipeline.records.record import Record
 from pipeline.report.screening import write_page
 
 DATA = Path("data")
+REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added
+LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
          "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip
 
@@ -32,7 +35,10 @@ def options(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add = parser.add_argument
     add("name", metavar="NAME", help="of the plant: small letters, digits and _")
-    add("files", metavar="FILE", type=Path, nargs="+", help="exports: .csv, .txt, .gz, .parquet")
+    add("files", metavar="FILE", type=Path, nargs="*", help="exports: .csv, .txt, .gz, .parquet")
+    add("--anyway", action="store_true", help="add the plant even where the data cannot carry a model")
+    add("--simulator", metavar="FILE", type=Path, help="a class with start, step and measure, instead of exports")
+    add("--rows", metavar="N", type=_rows, default=8_000, help="of the experiment on a simulator (8000)")
     for role in ROLES:
         form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"
         add(f"--{role}", metavar=form, action="append", default=[], help=f"{WORDS[role]}; may be given again")
@@ -49,8 +55,12 @@ def run(options: argparse.Namespace) -> int:
     name: str = options.name
     check_name(name)
     folder = DATA / name
-    if folder.exists():
+    if folder.exists() and not _refused(folder):
         raise RecordError(f"{folder} is there already; choose another name, or remove the folder")
+    if options.simulator:
+        return _simulated(name, folder, options)
+    if not options.files:
+        raise RecordError("no file is named; give one or more exports, or --simulator FILE")
     given = [parse_tag(text, role) for role in ROLES for text in getattr(options, role)]
     if given and options.tags:
         raise RecordError("--tags and options of roles are both given; give one of them")
@@ -64,7 +74,14 @@ def run(options: argparse.Namespace) -> int:
     values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
     export = read_export(options.files, values, modes, options.time, options.time_format)
     found = screened(name, export, tags, options.period, options.hold, options.without_mode)
-    return _write(name, folder, found)
+    return _write(name, folder, found, options.anyway)
+
+
+def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
+    if options.files or options.tags or any(getattr(options, role) for role in ROLES):
+        raise RecordError("--simulator and an export or its tags are both given; give one of them")
+    made = simulated(name, options.simulator, options.rows, options.period)
+    return _write(name, folder, made.found, options.anyway, made)
 
 
 def _table(name: str, options: argparse.Namespace) -> int:
@@ -82,36 +99,49 @@ def _table(name: str, options: argparse.Namespace) -> int:
     return 0
 
 
-def _write(name: str, folder: Path, found: Screened) -> int:
+def _write(name: str, folder: Path, found: Screened, anyway: bool, made: Simulated | None = None) -> int:
     """All files at once, then the section; neither without the other."""
     report, verdict = found.report, found.report.verdict
-    usable = _usable(found.record)
+    usable = _usable(found, anyway)
     test = planned(verdict.inputs, found.record.mv[-1], report.period_s) if verdict.carries != "yes" else None
+    if folder.exists():
+        shutil.rmtree(folder)  # of a refusal
     with draft_folder_of(folder) as draft:
         if not usable:
             found.record.write(draft / "record.parquet")
         write_json(draft / "screening.json", report.to_dict())
+        if made:
+            keep(made, draft)
         if test:
             write_text(draft / "step_test.csv", test.table())
         write_page(draft / "screening.html", found, test)
     if not usable:
         try:
-            add_entries(entries_of(name, entry(found.record, report, folder)))
+            plant = entry(found.record, report, folder)
+            add_entries(entries_of(name, plant | ({"simulator": (folder / SIMULATOR).as_posix()} if made else {})))
         except PipelineError:
             shutil.rmtree(folder)
             raise
-    _tell(name, folder, report, test)
+    _tell(name, folder, report, test, not usable)
     if usable:
         print(f"loopwright new: {name} was not added to params.yaml: {usable}", file=sys.stderr)
     return 2 if usable else 0
 
 
-def _usable(record: Record) -> str:
-    """Why no model can be trained on the record at all; empty where one can."""
+def _usable(found: Screened, anyway: bool) -> str:
+    """Why the plant is not added; empty where it is."""
+    record, verdict = found.record, found.report.verdict
     for signal, values in zip(record.mv_signals, record.mv.T, strict=True):
         if float(values.max() - values.min()) <= 1e-9 * (signal.high - signal.low):
             return f"{signal.name} is {values[0]:g} {signal.unit} in every row; run the step test in step_test.csv"
+    if verdict.carries == "no" and not anyway:
+        return f"{verdict.reasons[0]}; run the step test in step_test.csv, or give --anyway"
     return ""
+
+
+def _refused(folder: Path) -> bool:
+    """Whether the folder holds nothing but the report of an export that was not added."""
+    return {p.name for p in folder.iterdir()} <= REFUSED and (folder / "screening.json").exists()
 
 
 def entry(record: Record, report: Screening, folder: Path) -> dict[str, Any]:
@@ -125,7 +155,7 @@ def entry(record: Record, report: Screening, folder: Path) -> dict[str, Any]:
     }
 
 
-def _tell(name: str, folder: Path, report: Screening, test: StepTest | None) -> None:
+def _tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:
     kept = 100 * report.kept_rows / report.grid_rows
     print(f"{name}: {report.file_rows} rows of {len(report.files)} file(s) -> {report.grid_rows} rows of "
           f"{report.period_s:g} s, {report.kept_rows} kept ({kept:.1f} %) in {report.runs} run(s)")  # fmt: skip
@@ -133,18 +163,41 @@ def _tell(name: str, folder: Path, report: Screening, test: StepTest | None) -> 
         print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
     for finding in report.findings:
         print(f"  {finding.tag}: {finding.words}")
+    for line in sayings(report.verdict):
+        print(f"  {line}")
     print(f"can these data carry a model: {report.verdict.carries}")
     for reason in report.verdict.reasons:
         print(f"  {reason}")
     print(f"look at {folder}/screening.html: trends with every mask")
-    if report.verdict.carries != "no":
+    if added:
         print(f"then: loopwright run {name}")
     if test:
         print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h")
 
 
+def sayings(verdict: Verdict) -> list[str]:
+    """What the data say of the plant, a line a pair, for a person to compare with what is known of it."""
+    lines = []
+    for i in verdict.inputs:
+        for pv, gain in i.gain.items():
+            first = i.first_answer_s.get(pv)
+            if not gain and first is None:
+                continue
+            words = [f"gain {gain:.3g}"] if gain else ["gain not clear"]
+            words += [f"first answer after {first:g} s"] if first is not None else []
+            words += [f"settled after {i.settling_s:g} s"] if i.settling_s and gain else []
+            lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
+    return lines
+
+
 def _with_unit(tag: Tag, units: dict[str, str]) -> Tag:
     return Tag(tag.tag, tag.role, units.get(tag.tag, ""), tag.low, tag.high, tag.name)
+
+
+def _rows(text: str) -> int:
+    if not text.isdigit() or not LEAST_ROWS <= int(text) <= MOST_ROWS:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of rows from {LEAST_ROWS} to {MOST_ROWS}")
+    return int(text)
 
 
 def _positive(text: str) -> float:

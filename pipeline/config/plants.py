@@ -38,10 +38,11 @@ class RawFileParams:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PlantParams:
-    """``plants.<name>``: period, signals, the clean record, and the raw files behind it.
+    """``plants.<name>``: period, signals, the clean record, the raw files behind it, and a simulator if it has one.
 
     ``controlled`` is the number of PVs that have a set point, the first ones of ``pv``. None: all of them, and where
-    there are more PVs than MVs, as many as there are MVs.
+    there are more PVs than MVs, as many as there are MVs. The controllers are tested on ``simulator``, the file of the
+    plant's own simulator; None: on models of the record.
     """
 
     period_s: float
@@ -50,6 +51,7 @@ class PlantParams:
     dv: tuple[SignalParams, ...]
     data: Path
     source: tuple[RawFileParams, ...]
+    simulator: Path | None = None
     controlled: int | None = None
 
     @property

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar, Self
 
 import numpy as np
@@ -117,6 +118,8 @@ class Case(ABC):
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
     on_models: ClassVar[bool] = False  # the tests run on models of the plant's record
+    stand_in: ClassVar[str] = "identified"  # what they run on in the plant's place: such models, or a simulator
+    reads: ClassVar[tuple[Path, ...]] = ()  # files, beside the code, that the tests run
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
 
     def __post_init__(self) -> None:

@@ -6,6 +6,7 @@ Each function takes the series of one tag and returns where they are; the values
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ WINDOW = 9  # readings of the running median
 SPIKE_SD, SPIKE_SPAN = 8.0, 0.03  # of the residual's robust sd, and of the usual span
 LONGEST_SPIKE = 4  # readings
 CONVERSIONS: dict[str, tuple[float, float]] = {
+    "turned sign": (-1.0, 0.0),
     "degC to degF": (1.8, 32.0),
     "degF to degC": (1 / 1.8, -32 / 1.8),
     "degC to K": (1.0, 273.15),
@@ -43,6 +45,7 @@ CONVERSIONS: dict[str, tuple[float, float]] = {
     "x 3.6": (3.6, 0.0),
     "/ 3.6": (1 / 3.6, 0.0),
 }
+MV_CONVERSIONS = ("x 100", "/ 100", "x 1000", "/ 1000")  # of a value that jumps whenever it is moved
 JUMP_SD, JUMP_SPAN = 15.0, 0.5  # a change of unit moves the value by more than these
 MATCH_SD, MATCH_SHARE = 6.0, 0.05  # how near the conversion must come: noise, and share of the jump
 
@@ -105,11 +108,12 @@ def noise_sd(values: Array) -> float:
     return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0)) if second.size else 0.0
 
 
-def unit_slips(values: Array) -> tuple[Where, Counter[str]]:
+def unit_slips(values: Array, kinds: Sequence[str] = ()) -> tuple[Where, Counter[str]]:
     """Where (n,) the values are in another unit for a while: a jump by a known conversion, and the jump back.
 
-    values (n,) must be finite. A jump counts where the conversion of the value before it meets the value after it
-    within the noise; the shorter of the two stretches is the one in the other unit.
+    values (n,) must be finite; ``kinds`` names the conversions that count, all of them where it is empty. A jump counts
+    where the conversion of the value before it meets the value after it within the noise; the shorter of the two
+    stretches is the one in the other unit.
     """
     n = len(values)
     where, found = np.zeros(n, dtype=bool), Counter[str]()
@@ -120,47 +124,61 @@ def unit_slips(values: Array) -> tuple[Where, Counter[str]]:
     noise = max(noise_sd(values), 1e-12)
     jumps = np.flatnonzero(np.abs(step) > max(JUMP_SD * noise, JUMP_SPAN * (high - low) * 0.5))
     slack = MATCH_SD * noise + float(np.quantile(np.abs(step[:: max(1, n // SAMPLE)]), 0.99))
-    kinds = [(int(k), _conversion(values[k], values[k + 1], slack)) for k in jumps[:2000]]
-    taken = -1
-    for i, (k, kind) in enumerate(kinds):
-        if not kind or k < taken:
-            continue
-        back = next((j for j, other in kinds[i + 1 :] if _returns(kind, other)), None)
-        if back is not None:
-            stretch = slice(k + 1, back + 1)
-        elif taken < 0:  # it never comes back: the shorter side is the other unit
-            stretch = slice(k + 1, n) if n - k - 1 <= k + 1 else slice(0, k + 1)
-            kind = kind if stretch.start else _inverse(kind)
-        else:
-            continue
-        length = stretch.stop - stretch.start
-        if LONGEST_SPIKE < length <= n // 2 and _plausible(values, stretch, kind):
-            where[stretch] = True
-            found[kind] += length
-            taken = stretch.stop
+    matched = [
+        (int(k), _conversion(values[k], values[k + 1], slack, kinds or tuple(CONVERSIONS))) for k in jumps[:2000]
+    ]
+    stretches = _stretches([(k, kind) for k, kind in matched if kind], n)
+    others = np.ones(n, dtype=bool)
+    for a, b, _ in stretches:
+        others[a:b] = False
+    usual_range = np.quantile(values[others][:: max(1, n // SAMPLE)], [0.05, 0.95]) if others.any() else (0.0, 0.0)
+    for a, b, kind in stretches:
+        if LONGEST_SPIKE < b - a <= n // 2 and others.sum() >= n // 3 and _plausible(values[a:b], usual_range, kind):
+            where[a:b] = True
+            found[kind] += b - a
     return where, found
 
 
-def _plausible(values: Array, stretch: slice, kind: str) -> bool:
-    """Whether the stretch, converted back, lies where the other values are, and does not as it stands."""
+def _stretches(jumps: Sequence[tuple[int, str]], n: int) -> list[tuple[int, int, str]]:
+    """(first row, row after the last, conversion) between each jump and the next one that takes it back."""
+    found: list[tuple[int, int, str]] = []
+    taken = -1
+    for i, (k, kind) in enumerate(jumps):
+        if k < taken:
+            continue
+        back = next((j for j, other in jumps[i + 1 :] if _returns(kind, other)), None)
+        if back is not None:
+            found.append((k + 1, back + 1, kind))
+            taken = back + 1
+        elif n - k - 1 <= k + 1:  # it never comes back: the shorter side is the other unit
+            found.append((k + 1, n, kind))
+            taken = n
+        elif not found:
+            found.append((0, k + 1, _inverse(kind)))
+    return found
+
+
+def _plausible(stretch: Array, usual_range: tuple[float, float] | Array, kind: str) -> bool:
+    """Whether a stretch, converted back, lies where the other values are, and does not as it stands."""
     factor, offset = CONVERSIONS[kind]
-    others = np.r_[values[: stretch.start], values[stretch.stop :]]
-    low, high = np.quantile(others[:: max(1, len(others) // SAMPLE)], [0.05, 0.95])
-    pad = 0.5 * (high - low)
+    low, high = usual_range
+    span = high - low
 
-    def inside(v: Array) -> float:
-        return float(np.mean((v >= low - pad) & (v <= high + pad)))
+    def inside(v: Array, pad: float) -> float:
+        return float(np.mean((v >= low - pad * span) & (v <= high + pad * span)))
 
-    return inside((values[stretch] - offset) / factor) > 0.9 > 0.5 > inside(values[stretch])
+    # Values around a small fraction of the others' lie just outside their range.
+    return inside((stretch - offset) / factor, 0.5) > 0.9 > 0.5 > inside(stretch, 0.0)
 
 
 def _inverse(kind: str) -> str:
     return next(k for k in CONVERSIONS if _returns(kind, k))
 
 
-def _conversion(before: float, after: float, slack: float) -> str:
+def _conversion(before: float, after: float, slack: float, kinds: Sequence[str]) -> str:
     best, best_error = "", np.inf
-    for name, (factor, offset) in CONVERSIONS.items():
+    for name in kinds:
+        factor, offset = CONVERSIONS[name]
         error = abs(after - factor * before - offset)
         allowed = min(slack * (1 + abs(factor)), MATCH_SHARE * abs(after - before)) + 1e-9 * abs(after)
         if error <= allowed and error < best_error:

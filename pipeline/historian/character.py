@@ -12,6 +12,7 @@ from pipeline.metrics import Array
 SAMPLE = 50_000
 STUCK_CHANCE = 1e-4  # of a stretch as long by chance anywhere in the record
 SHORTEST_STUCK, LONGEST_STUCK = 8, 400  # rows
+NOISY = 0.2  # share of equal neighbours, up to which a value that repeats is a fault whatever the others do
 CLIPPED_ROWS = 5
 LINEAR_ROWS = 5  # of a stretch that a compressed signal's interpolation makes straight
 
@@ -51,7 +52,7 @@ def stuck(values: Array, others: Sequence[tuple[Array, float]], same_piece: Wher
     values (n,); others: all other signals, (n,) each, with their usual spans; same_piece (n-1,): no gap between rows.
     With p the share of equal neighbours outside the longest stretches, a stretch of L rows comes by chance
     n p^L times; L is where this is STUCK_CHANCE. Others move where one leaves its mean over the stretch's first
-    quarter by more than 5 % of its span.
+    quarter by more than 5 % of its span. Where p is below NOISY, noise alone moves the value, and the others need not.
     """
     scale = max(float(np.nanmax(np.abs(values), initial=0.0)), 1e-300)
     same = (np.abs(np.diff(values)) <= 1e-12 * scale) & same_piece
@@ -66,7 +67,7 @@ def stuck(values: Array, others: Sequence[tuple[Array, float]], same_piece: Wher
     least = np.clip(np.log(STUCK_CHANCE / len(values)) / np.log(p), SHORTEST_STUCK, LONGEST_STUCK)
     for a, b in zip(start[length >= least], end[length >= least], strict=True):
         quarter = max((b - a) // 4, 1)
-        if any(_moved(other[a : b + 1], quarter) > 0.05 * span for other, span in others if span > 0):
+        if p < NOISY or any(_moved(other[a : b + 1], quarter) > 0.05 * span for other, span in others if span > 0):
             where[a + 1 : b + 1] = True
     return where
 
@@ -107,13 +108,36 @@ def straight_share(values: Array) -> float:
     v = values[np.isfinite(values)][:SAMPLE]
     if len(v) < 50:
         return 0.0
-    q = quantum(v)
+    digits = _digits(v)
     first = np.diff(v)
     moving = np.abs(first) > max(1e-9 * float(np.ptp(v)), 0.0)
     tolerance = max(1e-6 * float(np.quantile(np.abs(first), 0.9)), 1e-12 * float(np.abs(v).max()))
-    if q > 0.2 * float(np.quantile(np.abs(first[moving]), 0.5) if moving.any() else 1.0):
+    if digits > 0.2 * float(np.quantile(np.abs(first[moving]), 0.5) if moving.any() else 1.0):
         return 0.0  # the converter's steps hide it
-    straight = (np.abs(np.diff(v, 2)) <= max(tolerance, 1.01 * q)) & moving[1:]
+    # Each of three rounded values strays by half a digit: their second difference by two.
+    straight = (np.abs(np.diff(v, 2)) <= max(tolerance, 2.01 * digits)) & moving[1:]
     start, end = runs_of(straight)
     long = (end - start) >= LINEAR_ROWS - 2
     return float((end - start)[long].sum() / len(v))
+
+
+def _digits(values: Array) -> float:
+    """The unit of the last decimal that is written, of at most six; 0 where there are more."""
+    for places in range(-3, 7):
+        if np.all(np.abs(values - np.round(values, places)) <= 1e-9 * np.maximum(np.abs(values), 1.0)):
+            return float(10.0**-places)
+    return 0.0
+
+
+def staircase(values: Array) -> int:
+    """Rows for which every value is repeated: of means or held values written more often than they are made; 1 if none.
+
+    At least 95 % of the distances between two changes are multiples of it.
+    """
+    v = values[np.isfinite(values)][:SAMPLE]
+    change = np.flatnonzero(np.diff(v) != 0) + 1
+    if len(change) < 30:
+        return 1
+    apart = np.diff(change)
+    length = int(np.median(apart))
+    return length if length > 1 and np.mean(apart % length == 0) >= 0.95 else 1

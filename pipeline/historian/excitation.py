@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.findings import InputReport, Verdict
+from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.linear import Linear
+from pipeline.historian.spectra import Spectrum, spectra
 from pipeline.metrics import Array
 from pipeline.records.record import Record
+from serving.manifest import Signal
 
 Runs = NDArray[np.int64]
 
@@ -22,6 +25,10 @@ FOLLOWS, FOLLOWS_CLOSELY = 0.15, 0.9  # share of the moves that the PVs' past ex
 ALIKE, THE_SAME = 0.9, 0.98  # correlation of two inputs
 NARROW = 0.05  # of an MV's range
 ROWS_A_PARAMETER, LEAST_ROWS_A_PARAMETER = 20, 4
+IN_BAND = 0.1  # share of an input's power in the plant's band
+COHERENT = 0.3  # coherence in the band
+LONG_DELAY, LEAST_DELAY = 1.0, 20  # dead time over what follows it, and rows
+UNKNOWN_SETTLING = 30  # rows, where no answer is seen
 HELD = 0.6  # share of rows without a move, from which an input is moved in steps
 
 
@@ -74,28 +81,77 @@ def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int) -
     """The verdict over a record; ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points."""
     signals = [(s, "mv") for s in record.mv_signals] + [(s, "dv") for s in record.dv_signals]
     u = np.hstack([record.mv, record.dv])
-    inputs = []
-    for i, (signal, role) in enumerate(signals):
-        moves = moves_of(u[:, i], record.run)
-        span = float(np.ptp(u[:, i])) if len(u) else 0.0
-        still = np.abs(np.diff(u[:, i])) <= 1e-9 * span if span > 0 else np.ones(max(len(u) - 1, 1))
-        answers = {n: m.strength[i] if m else 0.0 for n, m in models.items()}
-        settling = max((m.settling(i) for n, m in models.items() if m and answers[n] > SEEN), default=0)
-        names = [s.name for s in record.pv_signals]
-        loops = {n: follows(u[:, i], record.pv[:, j], record.run) for j, n in enumerate(names)} if role == "mv" else {}
-        median, largest = (float(np.median(moves)), float(moves.max())) if moves.size else (0.0, 0.0)
-        inputs.append(
-            InputReport(
-                signal.name, role, signal.unit, signal.low, signal.high, len(moves), median, largest,
-                float(np.mean(still)), answers, loops, settling * record.period_s,
-            )
-        )  # fmt: skip
+    found = spectra_of(record, models)
+    inputs = [
+        _input(record, models, i, signal, role, u[:, i], {n: s[i] for n, s in found.items()})
+        for i, (signal, role) in enumerate(signals)
+    ]
     correlation = _correlation(u, [s.name for s, _ in signals])
     parameters = 3 * len(record.pv_signals) + 7 * len(signals) + 1
     used = max((len(m.rows) for m in models.values() if m), default=0)
     reasons, level = _reasons(record, inputs, correlation, parameters, moved_sp)
     carries = ("yes", "doubtful", "no")[level]
     return Verdict(carries, tuple(reasons), tuple(inputs), correlation, len(record), parameters, used)
+
+
+def spectra_of(record: Record, models: Mapping[str, Linear | None]) -> dict[str, list[Spectrum]]:
+    """The spectra of all inputs, MVs first, by PV; a PV of which the record is too short for them is left out."""
+    u = np.hstack([record.mv, record.dv])
+    found = {}
+    for (name, model), y in zip(models.items(), record.pv.T, strict=True):
+        settling = [
+            (model.settling(i) if model and model.strength[i] > SEEN else 0) or UNKNOWN_SETTLING
+            for i in range(u.shape[1])
+        ]
+        own = spectra(u, y, record.run, settling)
+        if own is not None:
+            found[name] = own
+    return found
+
+
+def _input(
+    record: Record,
+    models: Mapping[str, Linear | None],
+    i: int,
+    signal: Signal,
+    role: str,
+    u: Array,
+    known: Mapping[str, Spectrum],
+) -> InputReport:
+    """What input ``i`` with the values u (n,) did, and what answered."""
+    moves = moves_of(u, record.run)
+    span = float(np.ptp(u)) if len(u) else 0.0
+    still = np.abs(np.diff(u)) <= 1e-9 * span if span > 0 else np.ones(max(len(u) - 1, 1))
+    held = float(np.mean(still))
+    pvs = dict(zip((s.name for s in record.pv_signals), record.pv.T, strict=True))
+    answers = {n: m.strength[i] if m else 0.0 for n, m in models.items()}
+    seen = {n: m for n, m in models.items() if m and answers[n] > SEEN}
+    settling = max((m.settling(i) for m in seen.values()), default=0)
+    first = {n: first_answer(y, u, record.run) for n, y in pvs.items()} if held >= HELD else {}
+    median, largest = (float(np.median(moves)), float(moves.max())) if moves.size else (0.0, 0.0)
+    return InputReport(
+        name=signal.name,
+        role=role,
+        unit=signal.unit,
+        low=signal.low,
+        high=signal.high,
+        moves=len(moves),
+        median_move=median,
+        largest_move=largest,
+        held_share=held,
+        answers=answers,
+        follows={n: follows(u, y, record.run) for n, y in pvs.items()} if role == "mv" else {},
+        settling_s=settling * record.period_s,
+        first_answer_s={n: k * record.period_s for n, k in first.items() if k != NONE},
+        gain={n: _gain(seen[n], i) if n in seen else 0.0 for n in pvs},
+        band_share=max((s.band_share for s in known.values()), default=-1.0),
+        coherence={n: s.band_coherence for n, s in known.items()},
+    )
+
+
+def _gain(model: Linear, i: int) -> float:
+    """The answer's last value; 0 where it does not settle."""
+    return float(model.step_response(i)[-1]) if model.settling(i) else 0.0
 
 
 def _reasons(
@@ -113,8 +169,12 @@ def _reasons(
             found.append((2, f"{i.name} made {i.moves} moves of {100 * MOVE_SHARE:g} % of its span or more: too few"))
         elif i.moves < ENOUGH_MOVES:
             found.append((1, f"{i.name} made {i.moves} informative moves; {ENOUGH_MOVES} are wanted"))
-        if i.moves >= FEW_MOVES and not any(a > SEEN for a in i.answers.values()):
-            found.append((2, f"no process variable answers to {i.name}: check the tag, its times, and the PVs"))
+        if i.moves >= FEW_MOVES and not _answered(i):
+            words = f"no process variable answers to {i.name}: check the tag, its times, and the PVs"
+            if any(s > FOLLOWS for s in i.follows.values()):
+                words += f"; {i.name} answers to a PV instead: are the two swapped, or is it a controller's output"
+            found.append((2, words))
+        found += _band_and_delay(i, record.period_s)
         if 0 < span < NARROW * (i.high - i.low):
             found.append((1, f"{i.name} moved over {100 * span / (i.high - i.low):.1f} % of its range"))
         followed = {pv: s for pv, s in i.follows.items() if s > FOLLOWS}
@@ -130,6 +190,29 @@ def _reasons(
             end = ": their effects cannot be told apart" if abs(r) > THE_SAME else ""
             found.append((2 if abs(r) > THE_SAME else 1, f"{pair} move together (correlation {r:.2f}){end}"))
     return [words for _, words in sorted(found, key=lambda f: -f[0])], max((level for level, _ in found), default=0)
+
+
+def _answered(i: InputReport) -> bool:
+    return any(a > SEEN for a in i.answers.values()) or bool(i.first_answer_s)
+
+
+def _band_and_delay(i: InputReport, period_s: float) -> list[tuple[int, str]]:
+    found = []
+    if 0 <= i.band_share < IN_BAND:
+        found.append((1, f"{i.name} moves slower or faster than the plant answers: {100 * i.band_share:.0f} % of its "
+                         "motion lies in the plant's band"))  # fmt: skip
+    if i.coherence and _answered(i) and max(i.coherence.values()) < COHERENT:
+        pv, share = max(i.coherence.items(), key=lambda item: item[1])
+        found.append((1, f"{pv} owes {100 * share:.0f} % of its motion to {i.name} (coherence in the plant's band): "
+                         "noise, other causes, or a strong nonlinearity"))  # fmt: skip
+    for pv, after in i.first_answer_s.items():
+        if after < 0.5 * period_s:
+            found.append((1, f"{pv} answers before {i.name} moves, by {-after:g} s or more: its column is late"))
+        if after >= LEAST_DELAY * period_s and after > LONG_DELAY * (i.settling_s - after):
+            found.append(
+                (1, f"{pv} answers to {i.name} only after {after:g} s: a long dead time, or clocks that differ")
+            )
+    return found
 
 
 def _correlation(u: Array, names: list[str]) -> dict[str, float]:

@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import combinations, pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.historian.character import runs_of
 from pipeline.historian.numbers import Codes
 from pipeline.historian.reason import Reason
 from pipeline.metrics import Array
 
-CLOCK_S = 3600.0  # a clock set back at the end of summer time
-CLOCK_SLACK_S = 300.0
+MOST_PASSES = 20  # over the same time; more is disorder
+LEAST_OVERLAP = 5  # readings
+SENT_AGAIN = 0.9  # of the values of two passes that are equal: sent twice, and no ambiguous clock
+SHARED = 0.4  # of the readings have the stamp of the one before: stamps are rounded
 
 
 @dataclass(slots=True, eq=False)
@@ -27,6 +31,7 @@ class Series:
     code: Codes  # (n,) Reason
     texts: Counter[str] = field(default_factory=Counter)  # cells that hold no number; of a mode, its names
     categories: tuple[str, ...] = ()  # of a mode: value i is categories[i]
+    rounded_s: float = 0.0  # to which the stamps were rounded, where several readings shared each
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -74,20 +79,22 @@ class Export:
 def in_order(series: Series) -> Series:
     """The readings sorted by time; of equal times the last good one stays, the others are DUPLICATE.
 
-    Times that come twice because a clock was set back by an hour are CLOCK, in both passes.
+    Two passes over the same time with other values are CLOCK, both of them: a clock was set back, or zones are mixed.
+    Readings that share rounded stamps in equal numbers are spread evenly over them.
     """
     t = series.time_s
     back = np.flatnonzero(np.diff(t) < 0)
-    ambiguous = np.zeros(len(t), dtype=bool)
-    for k in back if len(back) <= 20 else ():  # more is disorder
-        if abs(t[k] - t[k + 1] - CLOCK_S) < CLOCK_SLACK_S and k + 2 < len(t):
-            ambiguous |= (t >= t[k + 1]) & (t <= t[k])
-    series.code[ambiguous & series.good] = Reason.CLOCK
+    if 0 < len(back) <= MOST_PASSES:  # more is disorder
+        series.code[_ambiguous(t, series.value, back + 1) & series.good] = Reason.CLOCK
     if back.size:
         order = np.argsort(t, kind="stable")
         series.time_s, series.value, series.code = t[order], series.value[order], series.code[order]
         t = series.time_s
     same = np.flatnonzero(np.diff(t) == 0)
+    if same.size > SHARED * len(t):
+        _spread(series)
+        t = series.time_s
+        same = np.flatnonzero(np.diff(t) == 0)
     if same.size:
         # The last good reading of a time stays; groups are short, so one pass from the end is enough.
         group = np.cumsum(np.r_[True, np.diff(t) > 0]) - 1
@@ -97,6 +104,41 @@ def in_order(series: Series) -> Series:
         twice = np.bincount(group)[group] > 1
         series.code[twice & series.good & (best[group] != np.arange(len(t)))] = Reason.DUPLICATE
     return series
+
+
+def _ambiguous(t: Array, values: Array, cuts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Readings (n,) of passes over the same time, each ascending, that disagree with another pass."""
+    where = np.zeros(len(t), dtype=bool)
+    edges = [0, *cuts.tolist(), len(t)]
+    passes = [slice(a, b) for a, b in pairwise(edges)]
+    for one, other in combinations(passes, 2):
+        start, end = max(t[one][0], t[other][0]), min(t[one][-1], t[other][-1])
+        first, second = ((t[p] >= start) & (t[p] <= end) for p in (one, other))
+        if min(first.sum(), second.sum()) < LEAST_OVERLAP:
+            continue
+        _, i, j = np.intersect1d(t[one][first], t[other][second], return_indices=True)
+        if len(i) >= 0.5 * min(first.sum(), second.sum()):
+            same = values[one][first][i] == values[other][second][j]
+            if np.mean(same) > SENT_AGAIN:
+                continue  # the same readings, sent again
+        for part, inside in ((one, first), (other, second)):
+            where[part] |= inside
+    return where
+
+
+def _spread(series: Series) -> None:
+    """Readings in the order of the file, in groups of one stamp, over the time to the next stamp; equal groups only."""
+    t = series.time_s
+    stamps, counts = np.unique(t, return_counts=True)
+    usual = int(np.median(counts))
+    if usual < 2 or len(stamps) < 3 or np.mean(np.abs(counts[1:-1] - usual) <= 1) < 0.8:
+        return
+    step = float(np.median(np.diff(stamps)))
+    rank = np.arange(len(t)) - np.repeat(np.cumsum(counts) - counts, counts)
+    # The first group may begin anywhere within its step; it ends with it.
+    rank[: counts[0]] += max(usual - counts[0], 0)
+    series.time_s = t + rank * (step / np.maximum(np.repeat(counts, counts), usual))
+    series.rounded_s = step
 
 
 def joined(parts: list[Series]) -> Series:

@@ -52,6 +52,10 @@ class InputReport:
     answers: dict[str, float]  # PV -> strength of its answer; above 4 it is seen
     follows: dict[str, float]  # PV -> share of the moves that its past explains
     settling_s: float  # [s] of the slowest PV that answers; 0 where none does
+    first_answer_s: dict[str, float]  # PV -> [s] after a move, of an input that is held and where one is seen
+    gain: dict[str, float]  # PV -> change at rest over the input's, by the quick model; 0 where none is seen
+    band_share: float  # of its power in the band of the plant; -1 where the record is too short to tell
+    coherence: dict[str, float]  # PV -> median in that band; empty where it is too short
 
 
 @dataclass(frozen=True, slots=True)

@@ -183,7 +183,8 @@ def _line(at: Array, t: Array, v: Array, h: float, hold_s: float) -> tuple[Array
     right = np.clip(right, 0, len(t) - 1)
     gap = t[right] - t[left]
     share = np.where(gap > slack, (at - t[left]) / np.where(gap > slack, gap, 1.0), 0.0)
-    inside = (gap >= -slack) & (gap <= hold_s) & (share >= 0) & (share <= 1)
+    between = (at >= t[left] - slack) & (at <= t[right] + slack)  # not beyond the last reading
+    inside = between & (gap >= -slack) & (gap <= hold_s) & (share >= 0) & (share <= 1)
     exact = np.abs(at - t[left]) <= slack
     out[inside] = (v[left] + share * (v[right] - v[left]))[inside]
     out[exact] = v[left][exact]

@@ -12,9 +12,9 @@ from pipeline.metrics import Array
 
 Y_LAGS = 3
 BLOCKS = ((0, 1), (1, 2), (2, 3), (3, 6), (6, 11), (11, 21), (21, 41))  # lags of an input that share a coefficient
-SLOW = ((41, 81), (81, 161), (161, 321))  # cut where the record begins
 AHEAD = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
 MOST_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly over the record
+SETTLED = 0.8  # of the rows that an answer is followed: later it has not settled
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
 LEAST_ROWS = 60
 
@@ -37,7 +37,6 @@ class Linear:
     explained: float  # share of the variance of y(k+1) - y(k)
     rows: NDArray[np.int64]  # (n,) rows k of the fit
     residual: Array  # (n,)
-    unexplained: Array  # (n,) what is left of y when only the inputs explain it, their slow parts too
 
     def predicted(self, y: Array, u: Array, k: NDArray[np.int64]) -> Array:
         """y(k+1) (m,) from the rows up to k (m,) of y (n,) and u (n, n_inputs); NaN where one is missing.
@@ -49,7 +48,7 @@ class Linear:
         first = int(k[0]) - back
         for i, row in enumerate(self.b):
             part = u[first : int(k[-1]) + 1, i] - self.centre[i]
-            out = out + _blocks(part, k - first, self.blocks) @ row
+            out = out + blocks_of(part, k - first, self.blocks) @ row
         return np.asarray(out)
 
     def step_response(self, i: int, length: int = 600) -> Array:
@@ -65,12 +64,13 @@ class Linear:
         return y[Y_LAGS - 1 : -1]
 
     def settling(self, i: int, length: int = 600) -> int:
-        """Rows after which the answer to input ``i`` stays within 10 % of its end; 0 where it has none."""
+        """Rows after which the answer to input ``i`` stays within 10 % of its end; 0 if not in ``length``."""
         answer = self.step_response(i, length)
         if not np.isfinite(answer).all() or abs(answer[-1]) <= 1e-12:
             return 0
         outside = np.flatnonzero(np.abs(answer - answer[-1]) > 0.1 * abs(answer[-1]))
-        return int(outside[-1]) + 1 if outside.size else 1
+        rows = int(outside[-1]) + 1 if outside.size else 1
+        return rows if rows < SETTLED * length else 0
 
 
 def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
@@ -80,7 +80,7 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
     """
     blocks: tuple[tuple[int, int], ...] = BLOCKS
     while True:
-        rows = _rows(y, u, run, blocks[-1][1] - 1)
+        rows = rows_of(y, u, run, blocks[-1][1] - 1)
         parameters = Y_LAGS + 1 + u.shape[1] * (len(blocks) + len(AHEAD))
         if len(rows) >= max(LEAST_ROWS, 3 * parameters):
             break
@@ -92,10 +92,10 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
     if np.ptp(target) <= 0:
         return None
     centre = np.array([np.nanmean(u[:, i]) for i in range(u.shape[1])])
-    inputs = [_blocks(u[:, i] - centre[i], rows, blocks) for i in range(u.shape[1])]
-    ahead = [_blocks(u[:, i] - centre[i], rows, AHEAD) for i in range(u.shape[1])]
+    inputs = [blocks_of(u[:, i] - centre[i], rows, blocks) for i in range(u.shape[1])]
+    ahead = [blocks_of(u[:, i] - centre[i], rows, AHEAD) for i in range(u.shape[1])]
     x = np.column_stack([past, *inputs, np.ones(len(rows))])
-    theta, cov, keep = _least_squares(x, target)
+    theta, cov, keep = least_squares(x, target)
     residual = target - x @ theta
     sd = _robust_sd(residual[keep])
     m = len(blocks)
@@ -104,9 +104,6 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
     growth = np.var((target - past[:, 0])[keep])
     explained = 1.0 - np.var(residual[keep]) / growth if growth > 0 else 0.0
     b = np.array([theta[p] for p in places.values()]).reshape(u.shape[1], m)
-    slow = [_blocks(u[:, i] - centre[i], rows, SLOW) for i in range(u.shape[1])]
-    static = np.column_stack([*inputs, *slow, np.ones(len(rows))])
-    unexplained = target - static @ _least_squares(static, target)[0]
     early = {i: _early(x, ahead[i], target) for i in range(u.shape[1])}
     return Linear(
         theta[:Y_LAGS],
@@ -120,11 +117,10 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
         float(explained),
         rows,
         residual,
-        unexplained,
     )
 
 
-def _rows(y: Array, u: Array, run: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
+def rows_of(y: Array, u: Array, run: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
     """Rows k with lag rows before and five after in their run, without NaN, in windows spread evenly."""
     after = -AHEAD[-1][0]
     lag = max(lag, Y_LAGS - 1)
@@ -138,7 +134,7 @@ def _rows(y: Array, u: Array, run: NDArray[np.int64], lag: int) -> NDArray[np.in
     return k
 
 
-def _blocks(u: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
+def blocks_of(u: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
     """Means of u over lags first .. last-1 of each row, (n, blocks)."""
     total = np.r_[0.0, np.cumsum(np.nan_to_num(u))]
     return np.column_stack(
@@ -146,7 +142,7 @@ def _blocks(u: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ..
     )
 
 
-def _least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+def least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Coefficients and their covariance, from the rows whose residual is within OUTSIDE_SD of a first fit."""
     scale = np.abs(x).max(axis=0)
     scale[scale == 0] = 1.0  # an input that never moves
@@ -171,7 +167,7 @@ def _wald(theta: Array, cov: Array) -> float:
 
 def _early(x: Array, ahead: Array, target: Array) -> tuple[float, int]:
     """Whether moves still to come improve the fit: their Wald statistic, and the lead [rows] of the strongest."""
-    theta, cov, _ = _least_squares(np.column_stack([x, ahead]), target)
+    theta, cov, _ = least_squares(np.column_stack([x, ahead]), target)
     m = x.shape[1]
     t = np.abs(theta[m:]) / np.sqrt(np.maximum(np.diag(cov)[m:], 1e-300))
     best = int(np.argmax(t)) if np.isfinite(t).all() else 0

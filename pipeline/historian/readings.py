@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
-from pipeline.historian.cells import outliers, sentinels, unit_slips, usual
+from pipeline.historian.cells import MV_CONVERSIONS, outliers, sentinels, unit_slips, usual
+from pipeline.historian.copies import copied
+from pipeline.historian.dialect import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.reason import Reason
@@ -22,15 +27,25 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
     counts = series.counts()
     if series.texts:
         words = ", ".join(f"{t!r} {n} times" for t, n in series.texts.most_common(3))
-        found.append(Finding("text", tag.tag, f"text where a number belongs: {words}", True))
+        mixed = any(COMMA_DECIMAL.match(t) or POINT_DECIMAL.match(t) for t in series.texts)
+        hint = "; decimal points and commas are mixed, write one of them" if mixed else ""
+        found.append(Finding("text", tag.tag, f"text where a number belongs: {words}{hint}", True))
     if counts.get("quality"):
         found.append(Finding("quality", tag.tag, f"quality is not good in {counts['quality']} readings", True))
     if counts.get("duplicate"):
         words = f"{counts['duplicate']} readings came a second time; the last good one of each stays"
         found.append(Finding("duplicate", tag.tag, words, True))
     if counts.get("clock"):
-        words = f"the clock was set back: {counts['clock']} readings have an ambiguous time; export UTC"
+        words = (
+            f"{counts['clock']} readings have an ambiguous time: the clock was set back, or zones are mixed; export UTC"
+        )
         found.append(Finding("clock", tag.tag, words, True))
+    if tag.role == "pv" and (n := series.flag(_copies(series), Reason.COPY)):
+        words = f"{n} readings repeat a block of earlier ones to the last digit; the first of each stays"
+        found.append(Finding("copy", tag.tag, words, True))
+    if series.rounded_s:
+        words = f"stamps are rounded to {series.rounded_s:g} s: readings that share one were spread evenly over it"
+        found.append(Finding("rounded", tag.tag, words))
     where, codes = sentinels(np.where(series.good, series.value, np.nan))
     if series.flag(where, Reason.SENTINEL):
         words = ", ".join(f"{c} {n} times" for c, n in codes.most_common(3))
@@ -38,7 +53,17 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
     found += _out_of_range(series, tag)
     if tag.role in {"pv", "dv"}:
         found += _unlike_the_rest(series, tag)
+    elif tag.role == "mv":
+        place = np.flatnonzero(series.good)
+        found += _slipped(series, tag, place, *unit_slips(series.value[place], MV_CONVERSIONS))
     return found
+
+
+def _copies(series: Series) -> NDArray[np.bool_]:
+    where = np.zeros(len(series), dtype=bool)
+    place = np.flatnonzero(series.good)
+    where[place] = copied(series.value[place])
+    return where
 
 
 def _out_of_range(series: Series, tag: Tag) -> list[Finding]:
@@ -68,17 +93,25 @@ def _unlike_the_rest(series: Series, tag: Tag) -> list[Finding]:
     calm = ~outliers(values)
     slipped = np.zeros(len(values), dtype=bool)
     slipped[calm], kinds = unit_slips(values[calm])
-    if slipped.any():
-        series.code[place[slipped]] = Reason.UNIT_SLIP
-        words = ", ".join(f"{k} in {n} readings" for k, n in kinds.most_common())
-        found.append(Finding("unit_slip", tag.tag, f"the level jumps as if the unit had changed: {words}", True))
-        place, values = place[~slipped], values[~slipped]
+    found += _slipped(series, tag, place, slipped, kinds)
+    place, values = place[~slipped], values[~slipped]
     alone = outliers(values)
     if alone.any():
         series.code[place[alone]] = Reason.OUTLIER
         words = f"{int(alone.sum())} readings stand alone, {_example(values[alone])}; usual are {_usual(values)}"
         found.append(Finding("outlier", tag.tag, words, True))
     return found
+
+
+def _slipped(
+    series: Series, tag: Tag, place: NDArray[np.int64], where: NDArray[np.bool_], kinds: Counter[str]
+) -> list[Finding]:
+    """Readings of ``place`` (m,) that are in another unit ``where`` (m,) get their reason."""
+    if not where.any():
+        return []
+    series.code[place[where]] = Reason.UNIT_SLIP
+    words = ", ".join(f"{k} in {n} readings" for k, n in kinds.most_common())
+    return [Finding("unit_slip", tag.tag, f"the level jumps as if the unit had changed: {words}", True)]
 
 
 def _example(values: Array) -> str:

@@ -26,6 +26,8 @@ class Reason(IntEnum):
     SATURATED = 12
     MODE = 13
     SHORT_RUN = 14
+    COPY = 15
+    UNLIKE = 16
 
     @property
     def words(self) -> str:
@@ -49,4 +51,6 @@ WORDS = {
     Reason.SATURATED: "sensor is at the end of its range",
     Reason.MODE: "mode that was asked to be left out",
     Reason.SHORT_RUN: "too short a piece between two gaps",
+    Reason.COPY: "a block of earlier readings again",
+    Reason.UNLIKE: "sensor and inputs contradict each other",
 }

@@ -12,16 +12,20 @@ from pipeline.errors import RecordError
 from pipeline.historian.cells import usual
 from pipeline.historian.character import quantum
 from pipeline.historian.confirming import confirm
+from pipeline.historian.contradictions import contradict
 from pipeline.historian.excitation import judged, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.grid import Grid, Sampling, proposed_period, resampled, sampling
 from pipeline.historian.linear import Linear, fitted
+from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
 from pipeline.historian.reason import Reason
-from pipeline.historian.remarks import of_models, of_series
+from pipeline.historian.remarks import of_grid, of_models, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
+from pipeline.historian.static import explained
 from pipeline.historian.tags import Tag
+from pipeline.historian.wandering import of_levels
 from pipeline.records.record import Record
 
 LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
@@ -61,10 +65,13 @@ def screened(
     held = [own[t.tag] for t in tags if t.role in {"mv", "sp", "mode"}]
     pvs = [own[t.tag] for t in tags if t.role == "pv"]
     period = period_s or proposed_period(pvs)
-    findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s))]
+    role_of = {t.tag: t.role for t in tags}
+    findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag])]
     grid, rates = resampled(drawn, held, period, hold_s)
     by_tag = {r.tag: r for r in rates}
     signals = [t for t in tags if t.role in {"pv", "mv", "dv"}]
+    findings += of_grid(grid)
+    findings += pulses(grid, own, signals)
     findings += confirm(grid, own, signals, by_tag)
     counts_of = {t.tag: own[t.tag].counts() for t in tags}
     steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
@@ -72,6 +79,7 @@ def screened(
         if len(s) > LARGE:
             s.lighten()
     findings += stretches(grid, signals, by_tag)
+    findings += inputs_and_answers(grid, signals)
     code = row_codes(grid, signals, tags, own, without_modes)
     record = record_of(grid, code, signals)
     models = models_of(record)
@@ -103,6 +111,21 @@ def screened(
         verdict=judged(record, models, moved),
     )
     return Screened(record, grid, code, own, report)
+
+
+def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
+    """Stretches in which PVs and inputs contradict each other are masked, slow motion without the inputs is named."""
+    inputs = [t.tag for t in signals if t.role != "pv"]
+    u = np.column_stack([np.where(grid.code[t] == 0, grid.value[t], np.nan) for t in inputs])
+    pvs = {t.tag: np.where(grid.code[t.tag] == 0, grid.value[t.tag], np.nan) for t in signals if t.role == "pv"}
+    answers = {tag: explained(y, u, grid.piece) for tag, y in pvs.items()}
+    expected = {tag: values for tag, (values, _) in answers.items()}
+    settling = {tag: rows for tag, (_, rows) in answers.items()}
+    found = contradict(grid, signals, expected, settling)
+    for tag, y in pvs.items():
+        y = np.where(grid.code[tag] == 0, y, np.nan)
+        found += of_levels(tag, y, expected[tag], float(np.ptp(usual(y))), settling[tag])
+    return found
 
 
 def models_of(record: Record) -> dict[str, Linear | None]:

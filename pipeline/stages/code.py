@@ -59,6 +59,8 @@ def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:
     files = {path_of(root, module) for module in modules(stage, case)}
     if stage in {"report", "overview"}:
         files |= set(root.glob(TEMPLATES))
+    if stage == "validate":
+        files |= {root / path for path in all_cases()[case].reads}
     bounds = path_of(root, beside(case, "bounds")).with_suffix(".json") if stage == "report" else root
     if bounds.is_file():
         files.add(bounds)

@@ -165,7 +165,7 @@ def _evidence(case: Case, base: list[Trial], shipped: Trial, grounds: Grounds | 
         name: {**row, f"{case.metric}_median": statistics.median(t.metrics[name][case.metric] for t in base)}
         for name, row in shipped.metrics.items()
     }
-    of = {} if grounds is None else {"plant": "identified", "on": grounds.to_dict()}
+    of = {} if grounds is None else {"plant": case.stand_in, "on": grounds.to_dict()}
     return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "scenarios": figures}
 
 

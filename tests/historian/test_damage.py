@@ -10,6 +10,7 @@ import pytest
 from dirty_plant import PERIOD_S, TAGS, Clean, cells, clean, screen, screen_of, write
 
 from pipeline.errors import RecordError
+from pipeline.historian.reason import Reason
 from pipeline.historian.screening import Screened
 from pipeline.historian.tags import Tag
 
@@ -68,6 +69,19 @@ DROPPED: dict[str, tuple[Callable[[Clean], Clean], str, str]] = {
     "the other unit to the end": (
         lambda d: d.with_(pv=at(d.pv, slice(1200, None), d.pv[1200:] + 273.15)), "unit_slip", "pv",
     ),
+    "degF for two whiles": (
+        lambda d: d.with_(pv=at(d.pv, np.r_[200:500, 900:1200], 1.8 * d.pv[np.r_[200:500, 900:1200]] + 32)),
+        "unit_slip", "pv",
+    ),
+    "the sign turned": (lambda d: d.with_(pv=at(d.pv, slice(400, 520), -d.pv[400:520])), "unit_slip", "pv"),
+    "the MV as a fraction": (
+        lambda d: d.with_(mv=at(d.mv, slice(400, 700), d.mv[400:700] / 100)), "unit_slip", "mv",
+    ),
+    "a block again": (
+        lambda d: d.with_(pv=at(d.pv, slice(1100, 1250), d.pv[300:450]), mv=at(d.mv, slice(1100, 1250), d.mv[300:450])),
+        "copy", "pv",
+    ),
+    "pulses of the MV": (lambda d: d.with_(mv=at(d.mv, SPOT, np.where(d.mv[SPOT] > 50, 21.0, 79.0))), "outlier", "mv"),
     "saturated": (lambda d: d.with_(pv=np.minimum(d.pv, np.quantile(d.pv, 0.8))), "saturated", "pv"),
 }  # fmt: skip
 
@@ -130,6 +144,8 @@ def test_all_faults_at_once(tmp_path: Path) -> None:
         ("quantized", lambda d: d.with_(pv=np.round(d.pv / 0.5) * 0.5), "quantization", "TIC-101.PV"),
         ("MV late by three rows", lambda d: d.with_(mv=np.r_[np.full(5, d.mv[0]), d.mv[:-5]]), "shifted", "TIC-101.OP"),
         ("drift", lambda d: d.with_(pv=d.pv + np.linspace(0, 25, len(d.pv))), "drift", "TIC-101.PV"),
+        ("a jump", lambda d: d.with_(pv=d.pv + 5 * (np.arange(len(d.pv)) > 1400)), "drift", "TIC-101.PV"),
+        ("values repeated", lambda d: d.with_(pv=np.repeat(d.pv[::5], 5)), "repeated", "TIC-101.PV"),
         (
             "swinging door", lambda d: d.with_(pv=np.interp(d.time_s, d.time_s[::25], d.pv[::25])),
             "compression", "TIC-101.PV",
@@ -277,3 +293,83 @@ def test_exception_reports_with_a_dead_band_are_held(tmp_path: Path) -> None:
     assert found.report.kept_rows > 2900
     assert worst_error(found, data) < 0.4
     assert found.report.verdict.carries == "yes"
+
+
+def test_a_dead_sensor_with_noise_is_masked_but_for_its_edges(tmp_path: Path) -> None:
+    data = clean()
+    flat = 50 + np.random.default_rng(2).normal(0, 0.1, 250).round(3)
+    found = screen_of(data.with_(pv=at(data.pv, slice(500, 750), flat)), tmp_path)
+    accounted(found)
+    lost = found.code == Reason.UNLIKE
+    assert lost[500:750].mean() > 0.9
+    assert lost[:480].sum() + lost[770:].sum() == 0
+
+
+def test_a_frozen_mv_is_masked_over_its_whole_rest(tmp_path: Path) -> None:
+    """The PV goes on answering to the true valve: rows 500 to 750, of which nothing shows the moves."""
+    data = clean()
+    found = screen_of(data.with_(mv=at(data.mv, slice(500, 750), data.mv[500])), tmp_path)
+    accounted(found)
+    assert "unlike" in kinds(found)
+    lost = np.flatnonzero(found.code == Reason.UNLIKE)
+    assert 500 - 60 <= lost[0] <= 510
+    assert 740 <= lost[-1] <= 755
+
+
+def test_a_gain_that_changes_over_the_range_is_no_contradiction(tmp_path: Path) -> None:
+    """A third of the gain above 60 %, and none above 72 %: it is the plant, and every row stays."""
+    data, random = clean(), np.random.default_rng(0)
+    u = np.minimum(data.mv, 72.0)
+    target, y = 20 + 0.8 * np.minimum(u, 60) + 0.27 * np.maximum(u - 60, 0), np.full(len(u), 50.0)
+    for k in range(len(u) - 1):
+        y[k + 1] = y[k] + 0.1 * (target[max(k - 2, 0)] - y[k])
+    found = screen_of(data.with_(pv=np.round(y + random.normal(0, 0.1, len(u)), 3)), tmp_path)
+    accounted(found)
+    assert not {"unlike", "stuck"} & kinds(found), found.report.findings
+    assert found.report.kept_rows == found.report.grid_rows
+
+
+def test_stamps_to_the_minute_are_spread(tmp_path: Path) -> None:
+    data = clean()
+    found = screen_of(data.with_(time_s=np.floor(data.time_s / 60) * 60), tmp_path)
+    accounted(found)
+    assert "rounded" in kinds(found)
+    assert found.report.period_s == PERIOD_S
+    assert len(found.record) == len(data.pv)
+    np.testing.assert_allclose(found.record.pv[:, 0], data.pv)
+
+
+def test_two_zones_in_one_file_are_ambiguous(tmp_path: Path) -> None:
+    data = clean(3000)
+    shifted = data.time_s - np.where(np.arange(3000) < 1500, 0.0, 7200.0)
+    found = screen_of(data.with_(time_s=shifted), tmp_path)
+    accounted(found)
+    assert found.report.tags[0].readings["clock"] == 2 * 1200
+    again = screen(write(tmp_path / "x.csv", [*cells(data)[:2000], *cells(data)[1400:]]))  # sent again, and no fault
+    assert again.report.tags[0].readings == {"good": 3000, "duplicate": 600}
+    assert len(again.record) == 3000
+
+
+@pytest.mark.parametrize(("late", "first"), [(0, 4), (2, 2), (-3, 7)])
+def test_the_first_answer_is_told(late: int, first: int, tmp_path: Path) -> None:
+    """u(k-2) acts on y(k+1), and the move at row k is u(k): the answer is at row k + 3; the noise hides none of it."""
+    data = clean(2500)
+    (valve, _) = screen_of(data.with_(mv=np.roll(data.mv, late)), tmp_path).report.verdict.inputs
+    assert valve.first_answer_s["TIC-101.PV"] == pytest.approx((first - 1) * PERIOD_S)
+    assert valve.gain["TIC-101.PV"] == pytest.approx(0.8, rel=0.1)
+    assert valve.band_share > 0.5
+    assert valve.coherence["TIC-101.PV"] > 0.7
+
+
+def test_a_late_mv_is_doubted(tmp_path: Path) -> None:
+    data = clean(2500)
+    verdict = screen_of(data.with_(mv=np.roll(data.mv, 8)), tmp_path).report.verdict
+    assert verdict.carries == "doubtful"
+    assert "its column is late" in " ".join(verdict.reasons)
+
+
+def test_swapped_tags_are_told(tmp_path: Path) -> None:
+    tags = (Tag("TIC-101.OP", "pv", "%"), Tag("TIC-101.PV", "mv", "degC"), TAGS[2])
+    verdict = screen_of(clean(2500), tmp_path, tags).report.verdict
+    assert verdict.carries == "no"
+    assert "are the two swapped" in " ".join(verdict.reasons)

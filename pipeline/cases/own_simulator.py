@@ -1,0 +1,92 @@
+"""An own plant with a simulator: the same tests, on the simulator itself instead of models of its record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from pipeline.cases.own_plant import OwnCase, own_case
+from pipeline.cases.reach import LOAD
+from pipeline.config.plants import PlantParams
+from pipeline.errors import ParamsError
+from pipeline.evaluation.case import Array, Case
+from pipeline.plants.simulator import Simulator
+from pipeline.plants.simulator_file import FileSimulator
+from pipeline.simulation.scenario import Scenario
+
+LOADS = "load_"  # at the start of a parameter that is a load
+APART = "spoilt"  # a test that needs errors of gain and dead time, which a simulator does not offer: on models
+TRIED = 1e-2  # of an MV's range: a load that the simulator's answer is measured with
+
+
+class SimulatedCase(OwnCase):
+    """Tests of an own plant on its simulator; laws are designed and tuned on models of its record alone.
+
+    Set points and loads are those of ``OwnCase``. A load acts on the MV that moves the CV most, and would move it as
+    far as on the models.
+    """
+
+    stand_in: ClassVar[str] = "simulator"
+    simulator_file: ClassVar[Path]
+
+    @cached_property
+    def simulator(self) -> FileSimulator:
+        """The simulator, with the period of the record."""
+        first = FileSimulator(self.simulator_file, self.name)
+        return FileSimulator(self.simulator_file, self.name, max(1, round(self.signals.period_s / first.period_s)))
+
+    def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
+        """The tests of ``OwnCase`` on the simulator, but for ``spoilt``."""
+        return {
+            name: tuple(map(_on_models if name == APART else self._on_simulator, tests))
+            for name, tests in super().scenarios().items()
+        }
+
+    def _on_simulator(self, test: Scenario) -> Scenario:
+        x0, mv0 = self.simulator.start
+        changes: dict[str, Array] = {}
+        for key, values in test.changes.items():
+            cv = [s.name for s in self.simulator.pv_signals].index(key.removeprefix(LOADS))
+            name, size = self._load_on_mv(cv)
+            changes[name] = size * np.sign(values)
+        sp = test.sp
+        if changes:  # a load is tested at rest
+            sp = np.tile(self.simulator.measure(x0)[: sp.shape[1]], (len(sp), 1))
+        title = test.title.replace("models identified from the record", "the simulator")
+        return replace(test, title=title, sp=sp, plant=self.simulator, x0=x0, mv0=mv0, changes=changes)
+
+    def _load_on_mv(self, cv: int) -> tuple[str, float]:
+        """The load [MV's unit] that moves a CV by LOAD standard deviations within a hold, if no controller acts."""
+        wanted = LOAD * float(self.record.pv[:, cv].std())
+        answers = {}
+        for name, s in zip(self.simulator.parameter_names(), self.simulator.mv_signals, strict=True):
+            tried = TRIED * (s.high - s.low)
+            answers[name] = abs(self._moved(self.simulator, name, tried, cv)) / tried
+        name = max(answers, key=lambda key: answers[key])
+        return name, wanted / max(answers[name], 1e-12)
+
+    def _moved(self, plant: Simulator, name: str, size: float, cv: int) -> float:
+        """What a load changes of a CV over a hold, against the same hold without it."""
+        ends = []
+        for load in (size, 0.0):
+            (x, mv), p = plant.start, plant.parameters({name: load})
+            for _ in range(self.hold):
+                x = plant.step(x, mv, plant.dv_nominal, p)
+            ends.append(float(plant.measure(x)[cv]))
+        return ends[0] - ends[1]
+
+
+def _on_models(test: Scenario) -> Scenario:
+    return replace(test, title=test.title.replace("such models", "models identified from the record"))
+
+
+def simulated_case(name: str) -> Case:
+    """The case of ``plants.<name>`` of params.yaml, which has a simulator."""
+    file = PlantParams.read(name).simulator
+    if file is None:
+        raise ParamsError(f"plants.{name} has no simulator; `loopwright new NAME --simulator FILE` gives it one")
+    return own_case(name, SimulatedCase, simulator_file=file, reads=(file,))

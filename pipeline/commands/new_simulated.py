@@ -1,0 +1,80 @@
+"""``loopwright new NAME --simulator FILE``: a first step test, an experiment that it plans, and the record of it."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import RecordError
+from pipeline.excitation.first_test import FirstTest, first_test
+from pipeline.excitation.planned import Plan, excited, planned
+from pipeline.files import sha256, write_json
+from pipeline.historian.findings import Finding
+from pipeline.historian.made import judged_record
+from pipeline.historian.screening import Screened
+from pipeline.plants.simulator_file import FileSimulator
+
+SLOW, WANTED = 120, 60  # periods of the settling time: above the first, the period becomes long enough for the second
+SEED = 0
+SIMULATOR = "simulator.py"  # its copy beside the record
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """The experiment on a simulator: what the first test showed, what was planned, and the record as if screened."""
+
+    plant: FileSimulator
+    test: FirstTest
+    plan: Plan
+    found: Screened
+
+
+def simulated(name: str, path: Path, rows: int, period_s: float | None) -> Simulated:
+    """The whole experiment; PlantError where the simulator fails, RecordError for a period that it cannot have."""
+    plant = FileSimulator(path, name)
+    test = first_test(plant)
+    every = _every(plant, test, period_s)
+    if every > 1:
+        plant = FileSimulator(path, name, every)
+        test = first_test(plant)
+    plan = planned(plant, test, rows)
+    record = excited(plant, plan, SEED)
+    files = [{"file": str(path), "sha256": sha256(path)}]
+    found = judged_record(name, record, files, _findings(plant, test, plan), "simulated")
+    return Simulated(plant, test, plan, found)
+
+
+def keep(made: Simulated, folder: Path) -> None:
+    """Copy the simulator beside its record, for the validation, and write what the first test showed."""
+    shutil.copyfile(made.plant.path, folder / SIMULATOR)
+    write_json(folder / "first_test.json", made.test.to_dict())
+
+
+def _every(plant: FileSimulator, test: FirstTest, period_s: float | None) -> int:
+    if period_s is None:
+        slow = test.settles and test.settling_periods > SLOW
+        return round(test.settling_periods / WANTED) if slow else 1
+    every = round(period_s / plant.period_s)
+    if every < 1 or abs(every * plant.period_s - period_s) > 1e-6 * period_s:
+        raise RecordError(f"--period {period_s:g}: give a multiple of the simulator's period, {plant.period_s:g} s")
+    return every
+
+
+def _findings(plant: FileSimulator, test: FirstTest, plan: Plan) -> list[Finding]:
+    h, k = plant.period_s, test.settling_periods
+    words = (
+        f"settles within {k} periods of {h:g} s" if test.settles else f"does not settle; {k} periods to move a tenth"
+    )
+    if plant.every > 1:
+        words += f"; the period is {plant.every} steps of the simulator, so that an answer takes {WANTED} or so"
+    found = [Finding("first_test", plant.name, words)]
+    if not test.at_rest:
+        words = "start() is no rest: the process variables move without a step, so settling and gains are rough"
+        found.append(Finding("first_test", plant.name, words))
+    for j, s in enumerate(plant.mv_signals):
+        kind = "gain" if test.settles else "slope a period"
+        gains = ", ".join(f"{pv.name} {g[j]:.3g}" for pv, g in zip(plant.pv_signals, test.gain, strict=True))
+        words = f"{kind}: {gains}; moved from {plan.low[j]:.4g} to {plan.high[j]:.4g} {s.unit}, held for "
+        found.append(Finding("first_test", s.name, f"{words}{plan.mv_hold[0]} to {plan.mv_hold[1]} periods"))
+    return found

@@ -1,0 +1,79 @@
+"""Slow motion of a PV that its inputs do not explain: a drift, a jump, another span of the sensor, or loads."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.historian.findings import Finding
+from pipeline.metrics import Array
+
+BLOCK = 20  # rows at least that one level is the mean of; more where the plant is slow
+LEVELS, MOST_LEVELS = 12, 2_000
+WANDERS = 0.015  # of the PV's span: standard deviation of the levels
+OF_NOISE = 3.0  # of what noise alone leaves in a mean
+EXPLAINED = 0.7  # of the levels' variance, by a ramp or a jump
+SPLITS = 40  # places tried for a jump
+RATIO = 0.08  # by which the answer must change with the jump, to be another span
+
+
+def of_levels(name: str, y: Array, expected: Array, span: float, settling: int) -> list[Finding]:
+    """One finding where the levels of y (n,) wander about what the inputs explain, ``expected`` (n,); [] otherwise.
+
+    What a static nonlinearity (a cubic of ``expected``) explains of the levels is none of it.
+    """
+    ok = np.flatnonzero(np.isfinite(y) & np.isfinite(expected))
+    length = max(BLOCK, min(settling, len(ok) // (2 * LEVELS)), len(ok) // MOST_LEVELS)
+    m = len(ok) // length
+    if m < LEVELS or span <= 0:
+        return []
+    rows = ok[: m * length].reshape(m, length)
+    e = expected[rows].mean(axis=1)
+    level = y[rows].mean(axis=1) - e
+    z = (e - e.mean()) / max(float(e.std()), 1e-300)
+    curve = np.column_stack([np.ones(m), z, z**2, z**3])
+    rest = level - curve @ np.linalg.lstsq(curve, level, rcond=None)[0]
+    noise = float(np.median(np.std(y[rows] - expected[rows], axis=1))) / np.sqrt(length)
+    sd = float(rest.std())
+    if sd < max(WANDERS * span, OF_NOISE * noise):
+        return []
+    return [Finding("drift", name, _words(level, curve, z, e, rows[:, 0], span))]
+
+
+def _words(level: Array, curve: Array, z: Array, e: Array, first: NDArray[np.int64], span: float) -> str:
+    m = len(level)
+    time = np.linspace(-0.5, 0.5, m)
+    none = _left(curve, level)[0]
+    ramp, slope = _left(np.column_stack([curve, time]), level)
+    jumps = []
+    for s in np.unique(np.linspace(2, m - 2, SPLITS).astype(np.int64)):
+        after = (np.arange(m) >= s).astype(np.float64)
+        left, theta = _left(np.column_stack([curve, after, after * z]), level)
+        jumps.append((left, int(s), float(theta[-2]), float(theta[-1] / max(float(e.std()), 1e-300))))
+    left, s, jump, more = min(jumps)
+    if min(ramp, left) > (1 - EXPLAINED) * none:
+        size = 100 * float(np.ptp(level)) / span
+        return (
+            f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; loads that nobody measures"
+        )
+    if ramp < left + 0.05 * none:
+        change = float(slope[-1])
+        return (
+            f"drifts by {change:.4g} over the record, {100 * abs(change) / span:.0f} % of its span, without its inputs"
+        )
+    words = (
+        f"jumps by {jump:.4g} at row {int(first[s])}, {100 * abs(jump) / span:.0f} % of its span, without its inputs"
+    )
+    if abs(more) > RATIO:
+        words += (
+            f", and answers {1 + more:.2f} times as strongly from there on: a sensor's new span, or another product"
+        )
+    else:
+        words += ": a calibration, or another product"
+    return words
+
+
+def _left(x: Array, target: Array) -> tuple[float, Array]:
+    """Sum of squares that least squares leaves, and the coefficients."""
+    theta = np.linalg.lstsq(x, target, rcond=None)[0]
+    return float(np.sum((target - x @ theta) ** 2)), np.asarray(theta, dtype=np.float64)
