@@ -16,6 +16,7 @@ from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from pipeline.models.identified.selection import Selection
+from pipeline.models.identified.stability import stability_figures
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.models.identified.structure_search import StructureSearch
 from pipeline.models.identified.verdict import (
@@ -28,6 +29,9 @@ from pipeline.models.identified.verdict import (
 )
 from pipeline.models.part import Learnt, Part, Source
 from pipeline.plants.simulator import Array
+
+OUTSIDE = 0.02
+"""Share of held-out rows outside the range of the training rows above which a warning says so."""
 
 NEAR = 1.05
 """Held-out error, relative to the chosen one's, up to which a finalist's fits count for the bands."""
@@ -90,6 +94,13 @@ class IdentifiedPart(Part):
         responses, dead = response_figures(bands, structure.delays, problem.data, scales, pvs, inputs)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
+        visited = _visited(fitted.model, whole, structure.correction)
+        warnings = [
+            f"{name}: {runs[name]['outside_training']:.0%} of the held-out rows leave the range of the training rows; "
+            "their error says little of the model elsewhere"
+            for name in (s.name for s in pvs)
+            if runs[name]["outside_training"] > OUTSIDE
+        ]
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
             "n_train": sum(len(s) for s in whole),
@@ -100,6 +111,8 @@ class IdentifiedPart(Part):
             "gains": gain_figures(bands, problem.data, scales, pvs, inputs),
             "dead_times": dead,
             "spectral_radius": gains(fitted.model, problem.data)[1],
+            "stability": stability_figures(fitted.model, visited, [s.v for s in whole]),
+            "warnings": warnings,
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
             "step_responses": responses,
             "candidates_tried": _table(selection),
@@ -129,6 +142,17 @@ def _residuals(problem: Problem, structure: Structure, model: Dynamics) -> tuple
         starts = fit_starts(model, whole, 1.0)
         found = residuals(model, starts, whole, 1.0) or [s.y for s in whole]
     return noise_of(found), found, whole
+
+
+def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> list[Array]:
+    """States of the run over each stretch; of one that explodes, the outputs alone with hidden states at zero."""
+    runs = [
+        model.free_run(x, part, correction) for x, part in zip(fit_starts(model, data, correction), data, strict=True)
+    ]
+    return [
+        np.pad(part.y, ((0, 0), (0, model.n_x - part.y.shape[1]))) if run is None else run[1]
+        for run, part in zip(runs, data, strict=True)
+    ]
 
 
 def _bands(selection: Selection) -> Sequence[Dynamics]:

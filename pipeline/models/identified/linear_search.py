@@ -80,6 +80,20 @@ class LinearSearch:
         finished = self.rounds.trials(tasks, "linear models, both folds")[0] or kept
         return smallest_first(finished)
 
+    def in_the_same_row(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The best balanced and the best lagged candidate again, the MVs acting in their own row."""
+        kept = [next((t for t in trials if t.structure.start == start), None) for start in ("balanced", "lagged")]
+        structures = [replace(t.structure, same_row=True) for t in kept if t is not None]
+        self.starts.update(
+            self.rounds.starts([replace(s, order=0, correction=0.0) for s in structures if s.start == "balanced"])
+        )
+        tasks = [
+            Task(s, k, SHORT + LONG, start=self._start(s, k))
+            for s in structures
+            for k in range(len(self.rounds.problem.folds))
+        ]
+        return smallest_first(self.rounds.trials(tasks, "linear models, MVs in their own row")[0])
+
     def corrected(self, trials: Sequence[Trial], correction: float) -> list[Trial]:
         """The same candidates, trained with another correction of their runs."""
         folds = range(len(self.rounds.problem.folds))
@@ -91,7 +105,8 @@ class LinearSearch:
         return smallest_first(self.rounds.trials(tasks, "linear models, corrected")[0])
 
     def _start(self, structure: Structure, fold: int) -> Start | None:
-        found = (start for (s, k), start in self.starts.items() if s.delays == structure.delays and k == fold)
+        shift = (structure.delays, structure.same_row, fold)
+        found = (start for (s, k), start in self.starts.items() if (s.delays, s.same_row, k) == shift)
         return next((start for start in found if isinstance(start, Start)), None)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.models.identified.candidates import Task
+from pipeline.models.identified.candidates import BEGINNING, Task
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Structure
 from pipeline.models.identified.trial import Trial, best_of
@@ -39,7 +39,7 @@ class NetworkSearch:
         """The candidates of the last round; none where the budget is spent or no number of units is given."""
         if not units or self.rounds.budget.left() <= 0:
             return []
-        offers = self.rounds.affordable(_offers([t.structure for t in self.linear], units), SHORT, 0.4)
+        offers = self.rounds.affordable(_offers([t.structure for t in self.linear], units), BEGINNING + SHORT, 0.4)
         quick, _ = self.rounds.trials([self._task(s, 0, 0, SHORT) for s in offers], "networks")
         ranked = sorted((t for t in quick if np.isfinite(t.error)), key=lambda t: t.error)[:SECOND]
         if len(ranked) > LAST and self.rounds.budget.left(0.6) > 0:
@@ -58,7 +58,7 @@ class NetworkSearch:
         left = self.rounds.budget.left()
         for seed in range(SEEDS):
             for s in structures:
-                left -= len(self._folds) * self.rounds.budget.of(s, LONG)
+                left -= len(self._folds) * self.rounds.budget.of(s, BEGINNING + LONG)
                 if left >= 0 or not tasks:
                     tasks += [self._task(s, k, seed, LONG) for k in self._folds]
         return self.rounds.trials(tasks, "networks, all seeds")[0]
@@ -78,10 +78,13 @@ class NetworkSearch:
 
 
 def _offers(linear: Sequence[Structure], units: Sequence[int]) -> list[Structure]:
-    """Networks to try: units on the best two balanced and the best two lagged candidates."""
-    balanced = [s for s in linear if s.start == "balanced"]
-    lagged = [s for s in linear if s.start == "lagged"]
-    bases = [*balanced[:1], *lagged[:1], *balanced[1:2], *lagged[1:2]]
+    """Networks to try: units on the best two balanced and the best two lagged candidates of each row convention."""
+    groups = [
+        [s for s in linear if s.start == start and s.same_row is same_row][:2]
+        for same_row in (False, True)
+        for start in ("balanced", "lagged")
+    ]
+    bases = [g[place] for place in (0, 1) for g in groups if len(g) > place]
     middle = units[len(units) // 2]
     first = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]
     rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:3]]

@@ -38,7 +38,7 @@ class Rounds:
         outcomes: list[Fitted | str] = ["not fitted"] * len(tasks)
         for i, outcome in zip(order, found, strict=True):
             outcomes[i] = outcome
-            done = 2 if isinstance(outcome, str) else outcome.iterations + 2
+            done = 2 if isinstance(outcome, str) else outcome.work
             self.budget.spent += self.budget.of(tasks[i].structure, done)
         return outcomes
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.models.identified.candidates import misses
-from pipeline.models.identified.linear_search import LinearSearch
+from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
 from pipeline.models.identified.rounds import Rounds
+from pipeline.models.identified.row_convention import may_act_in_its_row
 from pipeline.models.identified.structure import Problem
 from pipeline.models.identified.trial import Trial, best_of
 
@@ -64,10 +65,11 @@ def select(
     """The search over one record.
 
     Linear candidates first: balanced starts of each order with and without the dead times that the impulse
-    response shows, and lagged starts. Then networks on the best of them, in rounds that keep fewer and train them
-    longer. When the budget is spent, what there is decides. ``correction`` None: 0, or ``SLOW`` where the linear
-    model integrates or the best network misses much more than the noise, and the models so trained err less in plain
-    free runs over held-out rows. Raises ModelError where no candidate can be fitted.
+    response shows, and lagged starts; where the record leaves it open, with the MVs acting in their own row too.
+    Then networks on the best of them, in rounds that keep fewer and train them longer. When the budget is spent, what
+    there is decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
+    much more than the noise, and the models so trained err less in plain free runs over held-out rows. Raises
+    ModelError where no candidate can be fitted.
     """
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
@@ -75,6 +77,9 @@ def select(
     if correction is None and _integrates(linear[0]):
         corrected = search.corrected(linear, SLOW)
         linear = corrected if corrected and corrected[0].error < linear[0].error else linear
+    if may_act_in_its_row(rounds.problem.part(linear[0].structure, rounds.problem.folds[0].train), rounds.problem.n_mv):
+        # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
+        linear = smallest_first([*linear, *search.in_the_same_row(linear)])
     offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
     settles = not _integrates(linear[0])
     networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
