@@ -19,6 +19,7 @@ from pipeline.models.identified.selection import Selection
 from pipeline.models.identified.stability import stability_figures
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.models.identified.structure_search import StructureSearch
+from pipeline.models.identified.uncertainty import drawn
 from pipeline.models.identified.verdict import (
     free_run_figures,
     gain_figures,
@@ -32,6 +33,9 @@ from pipeline.plants.simulator import Array
 
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
+
+DRAWS = 12
+"""Models drawn from the covariance of the parameters, for the bands."""
 
 NEAR = 1.05
 """Held-out error, relative to the chosen one's, up to which a finalist's fits count for the bands."""
@@ -47,8 +51,9 @@ class IdentifiedPart(Part):
     numbers of tanh units tried, none for linear models only. ``correction`` is the share of the output's error that
     each sample of a training run takes back, None: 0, or .05 where that does better in plain free runs; a number
     given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
-    one core, counted in nominal work so that results are reproducible; the best so far is kept. ``rows`` is the most
-    rows that are fitted; of longer records the stretches in which the inputs move most.
+    one core (None: 3, and 3 more for each further output), counted in nominal work so that results are reproducible;
+    the best so far is kept. ``rows`` is the most rows that are fitted; of longer records the stretches in which the
+    inputs move most.
     """
 
     model: ClassVar[type[Model]] = Identified
@@ -56,7 +61,7 @@ class IdentifiedPart(Part):
     orders: tuple[int, int] | None = None
     units: tuple[int, ...] = UNITS
     correction: float | None = None
-    minutes: float = 3.0
+    minutes: float | None = None
     rows: int = 8000
 
     def __post_init__(self) -> None:
@@ -68,7 +73,7 @@ class IdentifiedPart(Part):
             raise ValueError(f"units are {list(self.units)}; each must be at least 1, and [] tries linear models only")
         if self.correction is not None and not 0 <= self.correction <= 1:
             raise ValueError(f"correction is {self.correction:g}; it must lie between 0 and 1")
-        if not self.minutes > 0:
+        if self.minutes is not None and not self.minutes > 0:
             raise ValueError(f"minutes is {self.minutes:g}; it must be positive")
         if self.rows < 100:
             raise ValueError(f"rows is {self.rows}; it must be at least 100")
@@ -89,7 +94,7 @@ class IdentifiedPart(Part):
         noise, found, whole = _residuals(problem, structure, fitted.model)
         model = assembled(fitted.model, structure.delays, scales, problem.data, noise, n_mv, source.seed)
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
-        bands = _bands(selection)
+        bands = [*_bands(selection), *_as_likely(problem, structure, fitted.model, source.seed)]
         runs, curves = free_run_figures(problem, selection.chosen, scales, [s.name for s in pvs])
         responses, dead = response_figures(bands, structure.delays, problem.data, scales, pvs, inputs)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
@@ -168,6 +173,13 @@ def _bands(selection: Selection) -> Sequence[Dynamics]:
     fits = [f for t in (chosen, *(t for t in same if t is not chosen)) for f in t.fits.values()]
     finite = [f.model for f in fits if np.isfinite(f.held_out)]
     return finite or [chosen.of_fold(0)[0].model]
+
+
+def _as_likely(problem: Problem, structure: Structure, model: Dynamics, seed: int) -> list[Dynamics]:
+    """Models that the record's noise could have given instead of this one."""
+    whole = problem.whole(structure)
+    starts = fit_starts(model, whole, structure.correction)
+    return drawn(model, starts, whole, DRAWS, structure.correction, seed)
 
 
 def _table(selection: Selection) -> list[dict[str, Any]]:

@@ -10,21 +10,24 @@ import numpy as np
 from pipeline.models.identified.candidates import BEGINNING, Task
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Structure
-from pipeline.models.identified.trial import Trial, best_of
+from pipeline.models.identified.trial import Trial
 
 SEEDS = 3
 """Seeds of each network that reaches the last round."""
+
+QUICK_SEEDS = 2
+"""Seeds of each network in the first round, of which the better one counts: a free run has poor minima."""
 
 UNITS = (4, 8, 12)
 """Tanh units on offer."""
 
 RIDGES = (1.0, 30.0)
-"""Weights of the ridge on offer: the first in all rounds, the others for the winner."""
+"""Weights of the ridge on offer: the first in the first round, all after it."""
 
-SHORT, MIDDLE, LONG = 20, 60, 120
+SHORT, MIDDLE, LONG = 20, 50, 120
 """Iterations of the first, the second and the last round."""
 
-SECOND, LAST = 4, 2
+SECOND, LAST = 4, 3
 """Candidates of the second and of the last round."""
 
 
@@ -39,29 +42,38 @@ class NetworkSearch:
         """The candidates of the last round; none where the budget is spent or no number of units is given."""
         if not units or self.rounds.budget.left() <= 0:
             return []
-        offers = self.rounds.affordable(_offers([t.structure for t in self.linear], units), BEGINNING + SHORT, 0.4)
-        quick, _ = self.rounds.trials([self._task(s, 0, 0, SHORT) for s in offers], "networks")
-        ranked = sorted((t for t in quick if np.isfinite(t.error)), key=lambda t: t.error)[:SECOND]
-        if len(ranked) > LAST and self.rounds.budget.left(0.6) > 0:
-            tasks = [self._task(t.structure, k, 0, MIDDLE, t) for t in ranked for k in self._folds]
-            longer, _ = self.rounds.trials(tasks, "networks, both folds")
-            ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.error) or ranked
-        found = self.last_round([t.structure for t in ranked[:LAST]])
-        best = best_of(found)
-        if best is not None and self.rounds.budget.left() > 0:
-            found += self.last_round([replace(best.structure, ridge=ridge) for ridge in RIDGES[1:]])
-        return found
+        offers = _offers([t.structure for t in self.linear], units)
+        offers = self.rounds.affordable(offers, QUICK_SEEDS * (BEGINNING + SHORT), 0.4)
+        tasks = [self._task(s, 0, seed, SHORT) for s in offers for seed in range(QUICK_SEEDS)]
+        quick = _ranked(self.rounds.trials(tasks, "networks")[0])
+        second = [
+            self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE, t)
+            for t in quick[:SECOND]
+            for ridge in RIDGES
+            for k in self._folds
+        ]
+        longer = self.rounds.trials(second, "networks, both folds")[0] if self.rounds.budget.left(0.5) > 0 else []
+        ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.error) or quick
+        return self.last_round(ranked[:LAST])
 
-    def last_round(self, structures: Sequence[Structure]) -> list[Trial]:
-        """Candidates over all folds and as many seeds as the budget carries, one structure at least."""
+    def last_round(self, trials: Sequence[Trial]) -> list[Trial]:
+        """Candidates over all folds and as many seeds as the budget carries, one seed of one candidate at least.
+
+        Fits that ``trials`` hold are gone on with.
+        """
         tasks: list[Task] = []
         left = self.rounds.budget.left()
-        for seed in range(SEEDS):
-            for s in structures:
-                left -= len(self._folds) * self.rounds.budget.of(s, BEGINNING + LONG)
+        for place in range(SEEDS):
+            for t in trials:
+                seed = [_seed(t), *(k for k in range(SEEDS) if k != _seed(t))][place]
+                left -= len(self._folds) * self.rounds.budget.of(t.structure, LONG + (0 if place == 0 else BEGINNING))
                 if left >= 0 or not tasks:
-                    tasks += [self._task(s, k, seed, LONG) for k in self._folds]
+                    tasks += [self._task(t.structure, k, seed, LONG, t) for k in self._folds]
         return self.rounds.trials(tasks, "networks, all seeds")[0]
+
+    def corrected(self, trial: Trial, correction: float) -> list[Trial]:
+        """The candidate with another correction of its training runs, trained anew."""
+        return self.last_round([Trial(replace(trial.structure, correction=correction))])
 
     @property
     def _folds(self) -> range:
@@ -69,12 +81,23 @@ class NetworkSearch:
 
     def _task(self, structure: Structure, fold: int, seed: int, iterations: int, trial: Trial | None = None) -> Task:
         """A fit, gone on from the one of ``trial`` where there is one."""
-        bases = (
-            t for t in self.linear if replace(t.structure, correction=0.0) == replace(structure.base, correction=0.0)
-        )
+        uncorrected = replace(structure.base, correction=0.0)
+        bases = (t for t in self.linear if replace(t.structure, correction=0.0) == uncorrected)
         base = next((t.fits[fold, 0] for t in bases if (fold, 0) in t.fits), None)
         begun = None if trial is None else trial.fits.get((fold, seed))
         return Task(structure, fold, iterations, seed, base=base, begun=begun)
+
+
+def _ranked(trials: Sequence[Trial]) -> list[Trial]:
+    """Trials of the first fold by their better seed, exploded ones left out."""
+    finite = [t for t in trials if np.isfinite(t.of_fold(0)[0].held_out)]
+    return sorted(finite, key=lambda t: t.of_fold(0)[0].held_out)
+
+
+def _seed(trial: Trial) -> int:
+    """The seed of a trial's best fit on its first fold; 0 without one."""
+    first = [(f.held_out, seed) for (fold, seed), f in trial.fits.items() if fold == 0]
+    return min(first)[1] if first else 0
 
 
 def _offers(linear: Sequence[Structure], units: Sequence[int]) -> list[Structure]:

@@ -86,7 +86,7 @@ def select(
     finalists = networks.finalists(units) if _misses(rounds.problem, linear[0], WHITE) else []
     best = best_of(finalists)
     if correction is None and best is not None and _misses(rounds.problem, best, DRIFTS):
-        finalists += networks.last_round([replace(best.structure, correction=SLOW)])
+        finalists += networks.corrected(best, SLOW)
     return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles)
 
 
