@@ -199,7 +199,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("folder", type=Path, metavar="DIR")
     parser.add_argument("records", nargs="*", choices=[[], *RECORDS], help="(default: all whose files are there)")
     parser.add_argument("--rows", type=int, default=8_000, help="that are fitted at most (8000)")
-    parser.add_argument("--minutes", type=float, help="of the search on one core (3)")
+    parser.add_argument("--minutes", type=float, help="of the search on one core (2)")
     options = parser.parse_args(argv)
     part = IdentifiedPart(rows=options.rows, minutes=options.minutes)
     print("RMSE of the free run over test rows, beside what is published")

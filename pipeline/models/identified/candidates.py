@@ -11,7 +11,14 @@ from pipeline.errors import ModelError
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
 from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
-from pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
+from pipeline.models.identified.output_error import (
+    Fitted,
+    OutputError,
+    fit_starts,
+    free_run_error,
+    overall,
+    residuals,
+)
 from pipeline.models.identified.rests import settle
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.plants.simulator import Array
@@ -20,7 +27,7 @@ RESPONSE = 120
 """Samples of the high-order ARX's impulse response that are realized."""
 
 WILD = 20.0
-"""Scaled state that no rest of a usable network exceeds."""
+"""Scaled output that no rest of a usable network exceeds."""
 
 
 BEGIN, EASED = 15, 0.05
@@ -32,7 +39,7 @@ BEGINNING = 4 * BEGIN
 PATIENCE = 30
 """Iterations without a better held-out error that end a network's fit."""
 
-AROUND = 2.5
+AROUND = 1.5
 """Distance of the states from their middle, over that of the visited ones, from which a usable network returns."""
 
 RESTS = 0.9
@@ -87,7 +94,7 @@ def fit(problem: Problem, task: Task) -> Fitted | str:
         fitted = (_network if task.structure.n_hidden else _linear)(problem, task)
     except ModelError as error:
         return str(error)
-    if task.structure.n_hidden and problem.settles and wild(fitted.model, problem.data.v):
+    if task.structure.n_hidden and problem.settles and wild(fitted.model, problem.data.v, problem.data.y.shape[1]):
         return replace(fitted, held_out=np.inf)
     return fitted
 
@@ -146,13 +153,24 @@ def _network(problem: Problem, task: Task) -> Fitted:
     return replace(found, work=work + by_way.work + at_once.work + after.work + found.work)
 
 
+def judged_again(problem: Problem, task: tuple[Structure, int, Fitted]) -> Fitted:
+    """A fit with its held-out error under the problem's way to judge; one that exploded stays so."""
+    structure, fold, fitted = task
+    if not np.isfinite(fitted.held_out):
+        return fitted
+    errors, _ = free_run_error(fitted.model, problem.held(structure, fold), problem.judged)
+    return replace(fitted, held_out=overall(errors))
+
+
 def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
     """The fit gone on over all rows, by fewer iterations where more end in a network that does not settle."""
     whole = problem.whole(structure)
     for iterations in (30, 8, 2):
         fitter = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
         found = fitter.fit(fitted.model, whole)
-        if not (problem.settles and found.model.n_hidden and wild(found.model, problem.data.v)):
+        if not (
+            problem.settles and found.model.n_hidden and wild(found.model, problem.data.v, problem.data.y.shape[1])
+        ):
             return found
     return fitted
 
@@ -182,24 +200,24 @@ def visited(model: Dynamics, train: list[Stretch], correction: float) -> Array:
     return np.concatenate(found)
 
 
-def wild(model: Dynamics, v: Array) -> bool:
+def wild(model: Dynamics, v: Array, n_y: int) -> bool:
     """Whether the model does not settle over the inputs v (N, n_v) of the data.
 
-    That is: it goes beyond all bounds under one of them held constant, or swings under a tenth of them, or does not
-    come back from states far outside the visited ones while the inputs change.
+    That is: an output goes beyond all bounds under one of them held constant, or swings under a tenth of them, or does
+    not come back from states far outside the visited ones while the inputs change.
     """
     rows = np.linspace(0, len(v) - 1, 60).astype(np.int64)
     x, still = settle(model, v[rows])
-    if not np.abs(x).max() < WILD or still.mean() < RESTS:
+    if not np.abs(x[:, :n_y]).max() < WILD or still.mean() < RESTS:
         return True
-    middle = x.mean(axis=0)
+    middle = np.median(x, axis=0)
     x = middle + AROUND * (x - middle)
     for shift in range(0, 60, 7):
         inputs = v[np.roll(rows, shift)]
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(100):
                 x = model.advance(x, inputs)
-    return not np.abs(x).max() < WILD
+    return not np.abs(x[:, :n_y]).max() < WILD
 
 
 def misses(model: Dynamics, starts: list[Array], train: list[Stretch], ratio: float, correction: float) -> bool:

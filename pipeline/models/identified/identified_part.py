@@ -51,7 +51,7 @@ class IdentifiedPart(Part):
     numbers of tanh units tried, none for linear models only. ``correction`` is the share of the output's error that
     each sample of a training run takes back, None: 0, or .05 where that does better in plain free runs; a number
     given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
-    one core (None: 3, and 3 more for each further output), counted in nominal work so that results are reproducible;
+    one core (None: 2, and 2 more for each further output), counted in nominal work so that results are reproducible;
     the best so far is kept. ``rows`` is the most rows that are fitted; of longer records the stretches in which the
     inputs move most.
     """

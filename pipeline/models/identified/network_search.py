@@ -12,11 +12,11 @@ from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Structure
 from pipeline.models.identified.trial import Trial
 
-SEEDS = 3
-"""Seeds of each network that reaches the last round."""
+SEEDS = (3, 6)
+"""Fewest and most seeds of each network that reaches the last round; short records carry more of them."""
 
-QUICK_SEEDS = 2
-"""Seeds of each network in the first round, of which the better one counts: a free run has poor minima."""
+QUICK_SEEDS = (2, 6)
+"""The same of the first round, in which the best one counts: a free run has poor minima."""
 
 UNITS = (4, 8, 12)
 """Tanh units on offer."""
@@ -43,8 +43,10 @@ class NetworkSearch:
         if not units or self.rounds.budget.left() <= 0:
             return []
         offers = _offers([t.structure for t in self.linear], units)
-        offers = self.rounds.affordable(offers, QUICK_SEEDS * (BEGINNING + SHORT), 0.4)
-        tasks = [self._task(s, 0, seed, SHORT) for s in offers for seed in range(QUICK_SEEDS)]
+        offers = self.rounds.affordable(offers, QUICK_SEEDS[0] * (BEGINNING + SHORT), 0.4)
+        cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT) for s in offers)
+        seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *QUICK_SEEDS))
+        tasks = [self._task(s, 0, seed, SHORT) for s in offers for seed in range(seeds)]
         quick = _ranked(self.rounds.trials(tasks, "networks")[0])
         second = [
             self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE, t)
@@ -63,11 +65,13 @@ class NetworkSearch:
         """
         tasks: list[Task] = []
         left = self.rounds.budget.left()
-        for place in range(SEEDS):
+        least, most = SEEDS
+        for place in range(most):
             for t in trials:
-                seed = [_seed(t), *(k for k in range(SEEDS) if k != _seed(t))][place]
+                seed = [_seed(t), *(k for k in range(most) if k != _seed(t))][place]
                 left -= len(self._folds) * self.rounds.budget.of(t.structure, LONG + (0 if place == 0 else BEGINNING))
-                if left >= 0 or not tasks:
+                # The seeds beyond the fewest leave half of the budget to later rounds.
+                if left >= (0 if place < least else 0.5 * self.rounds.budget.left()) or not tasks:
                     tasks += [self._task(t.structure, k, seed, LONG, t) for k in self._folds]
         return self.rounds.trials(tasks, "networks, all seeds")[0]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.models.identified.candidates import misses
+from pipeline.models.identified.drift import drifts
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
 from pipeline.models.identified.rounds import Rounds
@@ -40,6 +41,8 @@ class Selection:
     finalists: list[Trial]
     spent: float  # nominal seconds
     settles: bool  # whether the linear model comes to rest by itself
+    drifts: bool  # whether gain or level move inside the record
+    judged: float  # correction of the free runs over held-out rows by which candidates were compared
 
     @property
     def nonlinear(self) -> bool:
@@ -68,8 +71,8 @@ def select(
     response shows, and lagged starts; where the record leaves it open, with the MVs acting in their own row too.
     Then networks on the best of them, in rounds that keep fewer and train them longer. When the budget is spent, what
     there is decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
-    much more than the noise, and the models so trained err less in plain free runs over held-out rows. Raises
-    ModelError where no candidate can be fitted.
+    much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or, where the
+    plant drifts inside the record, in slowly corrected ones. Raises ModelError where no candidate can be fitted.
     """
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
@@ -85,9 +88,26 @@ def select(
     networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
     finalists = networks.finalists(units) if _misses(rounds.problem, linear[0], WHITE) else []
     best = best_of(finalists)
-    if correction is None and best is not None and _misses(rounds.problem, best, DRIFTS):
+    drifting = correction is None and best is not None and _drifts(rounds.problem, min(best, linear[0], key=_trained))
+    if correction is None and best is not None and (drifting or _misses(rounds.problem, best, DRIFTS)):
         finalists += networks.corrected(best, SLOW)
-    return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles)
+    judged = rounds.problem.judged
+    if drifting:
+        # Plain free runs would rank candidates by how they follow what no model can.
+        linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
+        judged, again = SLOW, replace(rounds, problem=replace(rounds.problem, judged=SLOW))
+        linear, finalists = smallest_first(again.judged_again(linear)), again.judged_again(finalists)
+    return Selection(
+        linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles, drifting, judged
+    )
+
+
+def _trained(trial: Trial) -> float:
+    return trial.of_fold(trial.folds[0])[0].trained
+
+
+def _drifts(problem: Problem, trial: Trial) -> bool:
+    return drifts(trial.of_fold(trial.folds[0])[0].model, problem.whole(trial.structure))
 
 
 def _with_correction(trial: Trial, correction: float) -> Trial:

@@ -10,7 +10,7 @@ from pipeline.models.identified.selection import Selection, select
 from pipeline.models.identified.structure import Budget, Problem
 from pipeline.models.part import Groundwork, Source
 
-MINUTES = 3.0
+MINUTES = 2.0
 """Budget for each output, in minutes of one core."""
 
 
@@ -46,4 +46,4 @@ class StructureSearch(Groundwork[Searched]):
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction)
-        return Searched(replace(problem, settles=selection.settles), selection, scales)
+        return Searched(replace(problem, settles=selection.settles, judged=selection.judged), selection, scales)

@@ -52,6 +52,8 @@ def structure_figures(selection: Selection) -> dict[str, Any]:
         "ridge": s.ridge,
         "correction": s.correction,
         "same_row": s.same_row,
+        "drifts": selection.drifts,
+        "judged_with_correction": selection.judged,
         "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
         "held_out_spread": chosen.spread,
