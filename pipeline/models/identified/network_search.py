@@ -27,8 +27,11 @@ RIDGES = (1.0, 30.0)
 SHORT, MIDDLE, LONG = 20, 50, 120
 """Iterations of the first, the second and the last round."""
 
-SECOND, LAST = 4, 3
+SECOND, LAST = 6, 3
 """Candidates of the second and of the last round."""
+
+SMALL, VARIED = 3, 4
+"""Smallest balanced candidates that carry networks, and candidates that carry every number of units."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,14 +108,19 @@ def _seed(trial: Trial) -> int:
 
 
 def _offers(linear: Sequence[Structure], units: Sequence[int]) -> list[Structure]:
-    """Networks to try: units on the best two balanced and the best two lagged candidates of each row convention."""
-    groups = [
-        [s for s in linear if s.start == start and s.same_row is same_row][:2]
-        for same_row in (False, True)
-        for start in ("balanced", "lagged")
-    ]
-    bases = [g[place] for place in (0, 1) for g in groups if len(g) > place]
+    """Networks to try: units on the best balanced and lagged candidates, and on the smallest balanced ones.
+
+    Order and units are chosen together: the best linear order is that of the curve that it has to imitate.
+    """
+    first, second = list[Structure](), list[Structure]()
+    for same_row in (False, True):
+        balanced, lagged = (
+            [s for s in linear if s.start == start and s.same_row is same_row] for start in ("balanced", "lagged")
+        )
+        first += [*balanced[:1], *lagged[:1]]
+        second += [*sorted(balanced[1:], key=lambda s: s.order)[:SMALL], *lagged[1:2]]
+    bases = [*first, *second]
     middle = units[len(units) // 2]
-    first = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]
-    rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:3]]
-    return [*first, *rest]
+    widest = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]
+    rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:VARIED]]
+    return [*widest, *rest]

@@ -19,6 +19,9 @@ from pipeline.models.identified.trial import Trial, best_of
 INTEGRATES = 0.999
 """Pole of the linear model beyond which a slow correction of the training run is tried, as for drift."""
 
+NEARLY = 1.02
+"""Relative error up to which a linear model that settles stands in for one that integrates."""
+
 SLOW = 0.05
 """That correction."""
 
@@ -77,6 +80,9 @@ def select(
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
     linear = search.finish(search.first_round(orders, given))
+    if _integrates(linear[0]):
+        settling = [t for t in search.settling(linear) if not _integrates(t) and t.error <= NEARLY * linear[0].error]
+        linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear
     if correction is None and _integrates(linear[0]):
         corrected = search.corrected(linear, SLOW)
         linear = corrected if corrected and corrected[0].error < linear[0].error else linear
