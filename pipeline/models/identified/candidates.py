@@ -11,7 +11,14 @@ from pipeline.errors import ModelError
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
 from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
-from pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
+from pipeline.models.identified.output_error import (
+    Fitted,
+    OutputError,
+    fit_starts,
+    free_run_error,
+    overall,
+    residuals,
+)
 from pipeline.models.identified.rests import settle
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.plants.simulator import Array
@@ -20,8 +27,20 @@ RESPONSE = 120
 """Samples of the high-order ARX's impulse response that are realized."""
 
 WILD = 20.0
-"""Scaled state that no rest of a usable network exceeds."""
+"""Scaled output that no rest of a usable network exceeds."""
 
+
+BEGIN, EASED = 15, 0.05
+"""Iterations of each step in which a network's fit begins, and the correction of the runs of one of them."""
+
+BEGINNING = 4 * BEGIN
+"""Iterations before a network's fit at most."""
+
+PATIENCE = 30
+"""Iterations without a better held-out error that end a network's fit."""
+
+AROUND = 1.5
+"""Distance of the states from their middle, over that of the visited ones, from which a usable network returns."""
 
 RESTS = 0.9
 """Least share of constant inputs under which a usable network comes to rest."""
@@ -75,7 +94,7 @@ def fit(problem: Problem, task: Task) -> Fitted | str:
         fitted = (_network if task.structure.n_hidden else _linear)(problem, task)
     except ModelError as error:
         return str(error)
-    if task.structure.n_hidden and problem.settles and wild(fitted.model, problem.data.v):
+    if task.structure.n_hidden and problem.settles and wild(fitted.model, problem.data.v, problem.data.y.shape[1]):
         return replace(fitted, held_out=np.inf)
     return fitted
 
@@ -100,12 +119,13 @@ def _linear(problem: Problem, task: Task) -> Fitted:
 def _network(problem: Problem, task: Task) -> Fitted:
     """A network, begun as its linear model with units that do nothing.
 
-    A lagged start first trains one step ahead (correction 1, output rows only), then frees all rows.
+    A lagged start first trains one step ahead (correction 1, output rows only), then frees all rows. The free run of
+    slow plants has poor minima: the fit begins twice, at once and by way of corrected runs, and the better one goes on.
     """
     s = task.structure
     train, held = problem.train(s, task.fold), problem.held(s, task.fold)
     fitter = OutputError(
-        iterations=task.iterations, correction=s.correction, judged=problem.judged, ridge=s.ridge, patience=15
+        iterations=task.iterations, correction=s.correction, judged=problem.judged, ridge=s.ridge, patience=PATIENCE
     )
     if task.begun is not None:
         return fitter.fit(task.begun.model, train, held, starts=task.begun.starts)
@@ -119,10 +139,27 @@ def _network(problem: Problem, task: Task) -> Fitted:
     states = visited(linear, train, 1.0 if starts is None else s.correction)
     inputs = np.concatenate([part.v for part in train])
     model = with_units(linear, states, inputs, s.n_hidden, 1000 * problem.seed + task.seed)
+    work = 0
     if starts is None:
-        one_step = OutputError(iterations=15, correction=1.0, judged=problem.judged, ridge=s.ridge, patience=5)
-        model = one_step.fit(model, train, held, free=output_rows(model, problem.data.y.shape[1])).model
-    return fitter.fit(model, train, held, starts=starts)
+        one_step = OutputError(iterations=BEGIN, correction=1.0, ridge=s.ridge)
+        first = one_step.fit(model, train, free=output_rows(model, problem.data.y.shape[1]))
+        model, work = first.model, first.work
+    eased = OutputError(iterations=BEGIN, correction=max(EASED, s.correction), ridge=s.ridge)
+    plain = OutputError(iterations=BEGIN, correction=s.correction, ridge=s.ridge)
+    by_way, at_once = eased.fit(model, train, starts=starts), plain.fit(model, train, starts=starts)
+    after = plain.fit(by_way.model, train, starts=by_way.starts)
+    begun = min((after, at_once), key=lambda fitted: fitted.trained)
+    found = fitter.fit(begun.model, train, held, starts=begun.starts)
+    return replace(found, work=work + by_way.work + at_once.work + after.work + found.work)
+
+
+def judged_again(problem: Problem, task: tuple[Structure, int, Fitted]) -> Fitted:
+    """A fit with its held-out error under the problem's way to judge; one that exploded stays so."""
+    structure, fold, fitted = task
+    if not np.isfinite(fitted.held_out):
+        return fitted
+    errors, _ = free_run_error(fitted.model, problem.held(structure, fold), problem.judged)
+    return replace(fitted, held_out=overall(errors))
 
 
 def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
@@ -131,7 +168,9 @@ def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitte
     for iterations in (30, 8, 2):
         fitter = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
         found = fitter.fit(fitted.model, whole)
-        if not (problem.settles and found.model.n_hidden and wild(found.model, problem.data.v)):
+        if not (
+            problem.settles and found.model.n_hidden and wild(found.model, problem.data.v, problem.data.y.shape[1])
+        ):
             return found
     return fitted
 
@@ -161,11 +200,24 @@ def visited(model: Dynamics, train: list[Stretch], correction: float) -> Array:
     return np.concatenate(found)
 
 
-def wild(model: Dynamics, v: Array) -> bool:
-    """Whether the model goes beyond all bounds under constant inputs of the data, or swings under a tenth of them."""
+def wild(model: Dynamics, v: Array, n_y: int) -> bool:
+    """Whether the model does not settle over the inputs v (N, n_v) of the data.
+
+    That is: an output goes beyond all bounds under one of them held constant, or swings under a tenth of them, or does
+    not come back from states far outside the visited ones while the inputs change.
+    """
     rows = np.linspace(0, len(v) - 1, 60).astype(np.int64)
     x, still = settle(model, v[rows])
-    return not np.abs(x).max() < WILD or bool(still.mean() < RESTS)
+    if not np.abs(x[:, :n_y]).max() < WILD or still.mean() < RESTS:
+        return True
+    middle = np.median(x, axis=0)
+    x = middle + AROUND * (x - middle)
+    for shift in range(0, 60, 7):
+        inputs = v[np.roll(rows, shift)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(100):
+                x = model.advance(x, inputs)
+    return not np.abs(x[:, :n_y]).max() < WILD
 
 
 def misses(model: Dynamics, starts: list[Array], train: list[Stretch], ratio: float, correction: float) -> bool:

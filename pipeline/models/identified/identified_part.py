@@ -16,8 +16,10 @@ from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from pipeline.models.identified.selection import Selection
+from pipeline.models.identified.stability import stability_figures
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.models.identified.structure_search import StructureSearch
+from pipeline.models.identified.uncertainty import drawn
 from pipeline.models.identified.verdict import (
     free_run_figures,
     gain_figures,
@@ -28,6 +30,12 @@ from pipeline.models.identified.verdict import (
 )
 from pipeline.models.part import Learnt, Part, Source
 from pipeline.plants.simulator import Array
+
+OUTSIDE = 0.02
+"""Share of held-out rows outside the range of the training rows above which a warning says so."""
+
+DRAWS = 12
+"""Models drawn from the covariance of the parameters, for the bands."""
 
 NEAR = 1.05
 """Held-out error, relative to the chosen one's, up to which a finalist's fits count for the bands."""
@@ -43,8 +51,9 @@ class IdentifiedPart(Part):
     numbers of tanh units tried, none for linear models only. ``correction`` is the share of the output's error that
     each sample of a training run takes back, None: 0, or .05 where that does better in plain free runs; a number
     given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
-    one core, counted in nominal work so that results are reproducible; the best so far is kept. ``rows`` is the most
-    rows that are fitted; of longer records the stretches in which the inputs move most.
+    one core (None: 2, and 2 more for each further output), counted in nominal work so that results are reproducible;
+    the best so far is kept. ``rows`` is the most rows that are fitted; of longer records the stretches in which the
+    inputs move most.
     """
 
     model: ClassVar[type[Model]] = Identified
@@ -52,7 +61,7 @@ class IdentifiedPart(Part):
     orders: tuple[int, int] | None = None
     units: tuple[int, ...] = UNITS
     correction: float | None = None
-    minutes: float = 3.0
+    minutes: float | None = None
     rows: int = 8000
 
     def __post_init__(self) -> None:
@@ -64,7 +73,7 @@ class IdentifiedPart(Part):
             raise ValueError(f"units are {list(self.units)}; each must be at least 1, and [] tries linear models only")
         if self.correction is not None and not 0 <= self.correction <= 1:
             raise ValueError(f"correction is {self.correction:g}; it must lie between 0 and 1")
-        if not self.minutes > 0:
+        if self.minutes is not None and not self.minutes > 0:
             raise ValueError(f"minutes is {self.minutes:g}; it must be positive")
         if self.rows < 100:
             raise ValueError(f"rows is {self.rows}; it must be at least 100")
@@ -85,11 +94,18 @@ class IdentifiedPart(Part):
         noise, found, whole = _residuals(problem, structure, fitted.model)
         model = assembled(fitted.model, structure.delays, scales, problem.data, noise, n_mv, source.seed)
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
-        bands = _bands(selection)
+        bands = [*_bands(selection), *_as_likely(problem, structure, fitted.model, source.seed)]
         runs, curves = free_run_figures(problem, selection.chosen, scales, [s.name for s in pvs])
         responses, dead = response_figures(bands, structure.delays, problem.data, scales, pvs, inputs)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
+        visited = _visited(fitted.model, whole, structure.correction)
+        warnings = [
+            f"{name}: {runs[name]['outside_training']:.0%} of the held-out rows leave the range of the training rows; "
+            "their error says little of the model elsewhere"
+            for name in (s.name for s in pvs)
+            if runs[name]["outside_training"] > OUTSIDE
+        ]
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
             "n_train": sum(len(s) for s in whole),
@@ -100,6 +116,8 @@ class IdentifiedPart(Part):
             "gains": gain_figures(bands, problem.data, scales, pvs, inputs),
             "dead_times": dead,
             "spectral_radius": gains(fitted.model, problem.data)[1],
+            "stability": stability_figures(fitted.model, visited, [s.v for s in whole]),
+            "warnings": warnings,
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
             "step_responses": responses,
             "candidates_tried": _table(selection),
@@ -131,6 +149,17 @@ def _residuals(problem: Problem, structure: Structure, model: Dynamics) -> tuple
     return noise_of(found), found, whole
 
 
+def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> list[Array]:
+    """States of the run over each stretch; of one that explodes, the outputs alone with hidden states at zero."""
+    runs = [
+        model.free_run(x, part, correction) for x, part in zip(fit_starts(model, data, correction), data, strict=True)
+    ]
+    return [
+        np.pad(part.y, ((0, 0), (0, model.n_x - part.y.shape[1]))) if run is None else run[1]
+        for run, part in zip(runs, data, strict=True)
+    ]
+
+
 def _bands(selection: Selection) -> Sequence[Dynamics]:
     """The fits that show how sure the figures are: those of the chosen structure, and of finalists as good as it."""
     chosen = selection.chosen
@@ -144,6 +173,13 @@ def _bands(selection: Selection) -> Sequence[Dynamics]:
     fits = [f for t in (chosen, *(t for t in same if t is not chosen)) for f in t.fits.values()]
     finite = [f.model for f in fits if np.isfinite(f.held_out)]
     return finite or [chosen.of_fold(0)[0].model]
+
+
+def _as_likely(problem: Problem, structure: Structure, model: Dynamics, seed: int) -> list[Dynamics]:
+    """Models that the record's noise could have given instead of this one."""
+    whole = problem.whole(structure)
+    starts = fit_starts(model, whole, structure.correction)
+    return drawn(model, starts, whole, DRAWS, structure.correction, seed)
 
 
 def _table(selection: Selection) -> list[dict[str, Any]]:

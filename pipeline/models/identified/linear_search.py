@@ -9,6 +9,8 @@ import numpy as np
 
 from pipeline.errors import ModelError
 from pipeline.models.identified.candidates import Start, Task
+from pipeline.models.identified.dynamics import Dynamics
+from pipeline.models.identified.linear_start import within_unit_circle
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Structure
 from pipeline.models.identified.trial import Trial
@@ -25,8 +27,11 @@ SHORT, LONG = 10, 30
 NEARLY = 1.02
 """Relative error up to which candidates of the first round count as equal, the smaller ones first."""
 
-FINISHED = 3
-"""Candidates of any start that are trained to the end."""
+SETTLING = 0.98
+"""Largest pole of a candidate that begins again inside the unit circle."""
+
+FINISHED, SMALLEST = 3, 3
+"""Candidates that are trained to the end: the best of any start, and the best of each of the smallest orders."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +71,14 @@ class LinearSearch:
         return sorted(finite, key=lambda t: (t.error, 0) if t.error > limit else (0.0, t.structure.order))
 
     def finish(self, shortlist: Sequence[Trial]) -> list[Trial]:
-        """The best of a short list, both starts among them where both succeeded, trained to the end on all folds."""
+        """The best of a short list and its smallest models, both starts among them, trained to the end on all folds.
+
+        The smallest balanced ones are there for networks: units do with few states what a linear model does with many.
+        """
         kept = list(shortlist[:FINISHED])
-        for start in ("balanced", "lagged"):
-            of_start = [t for t in shortlist if t.structure.start == start]
-            kept.extend(t for t in of_start[:2] if t not in kept)
+        balanced, lagged = ([t for t in shortlist if t.structure.start == s] for s in ("balanced", "lagged"))
+        small = [min(of, key=lambda t: t.error) for of in _by_order(balanced)[:SMALLEST]]
+        kept.extend(t for t in (*balanced[:2], *lagged[:2], *small) if t not in kept)
         folds = range(len(self.rounds.problem.folds))
         tasks = [
             Task(t.structure, k, LONG, start=self._start(t.structure, k), begun=t.fits.get((k, 0)))
@@ -79,6 +87,33 @@ class LinearSearch:
         ]
         finished = self.rounds.trials(tasks, "linear models, both folds")[0] or kept
         return smallest_first(finished)
+
+    def in_the_same_row(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The best balanced and the best lagged candidate again, the MVs acting in their own row."""
+        kept = [next((t for t in trials if t.structure.start == start), None) for start in ("balanced", "lagged")]
+        structures = [replace(t.structure, same_row=True) for t in kept if t is not None]
+        self.starts.update(
+            self.rounds.starts([replace(s, order=0, correction=0.0) for s in structures if s.start == "balanced"])
+        )
+        tasks = [
+            Task(s, k, SHORT + LONG, start=self._start(s, k))
+            for s in structures
+            for k in range(len(self.rounds.problem.folds))
+        ]
+        return smallest_first(self.rounds.trials(tasks, "linear models, MVs in their own row")[0])
+
+    def settling(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The best candidates again, begun with all poles within ``SETTLING``.
+
+        A nonlinear plant can leave the impulse response, and the fit that starts from it, with a pole at 1 that the
+        plant does not have; an integrator's pole finds its way back.
+        """
+        tasks = [
+            Task(t.structure, k, LONG, begun=replace(f, model=inside(f.model)))
+            for t in trials[:2]
+            for (k, _), f in t.fits.items()
+        ]
+        return smallest_first(self.rounds.trials(tasks, "linear models, poles inside")[0])
 
     def corrected(self, trials: Sequence[Trial], correction: float) -> list[Trial]:
         """The same candidates, trained with another correction of their runs."""
@@ -91,8 +126,20 @@ class LinearSearch:
         return smallest_first(self.rounds.trials(tasks, "linear models, corrected")[0])
 
     def _start(self, structure: Structure, fold: int) -> Start | None:
-        found = (start for (s, k), start in self.starts.items() if s.delays == structure.delays and k == fold)
+        shift = (structure.delays, structure.same_row, fold)
+        found = (start for (s, k), start in self.starts.items() if (s.delays, s.same_row, k) == shift)
         return next((start for start in found if isinstance(start, Start)), None)
+
+
+def _by_order(trials: Sequence[Trial]) -> list[list[Trial]]:
+    """The trials of each order, the smallest order first."""
+    orders = sorted({t.structure.order for t in trials})
+    return [[t for t in trials if t.structure.order == n] for n in orders]
+
+
+def inside(model: Dynamics) -> Dynamics:
+    """The model with all its poles within ``SETTLING``."""
+    return replace(model, a=within_unit_circle(model.a, SETTLING))
 
 
 def smallest_first(trials: Sequence[Trial]) -> list[Trial]:

@@ -19,6 +19,9 @@ SCALES = 10.0 ** np.arange(-2.0, 6.5, 1.0)
 DECAYS = np.array([0.4, 0.6, 0.75, 0.85, 0.92, 0.96, 0.98])
 """Grids of the prior: variance of the first coefficient over that of the residual, and its decay a lag."""
 
+DEFECTIVE = 1e10
+"""Condition of the eigenvectors beyond which they do not carry a matrix."""
+
 LARGEST = 1e3
 """Impulse response, scaled, beyond which the ARX counts as unstable."""
 
@@ -161,12 +164,17 @@ class Realizations:
 
 
 def within_unit_circle(a: Array, largest: float = 1.0) -> Array:
-    """A with the poles beyond ``largest`` moved in to it, along their rays; A itself where there is none."""
+    """A with the poles beyond ``largest`` moved in to it, along their rays; A itself where there is none.
+
+    Without a full set of eigenvectors all poles are moved in proportion.
+    """
     poles, vectors = np.linalg.eig(a)
     size = np.abs(poles)
     if np.all(size <= largest):
         return a
     inside = poles * np.where(size > largest, largest / np.maximum(size, 1e-300), 1.0)
+    if np.linalg.cond(vectors) > DEFECTIVE:
+        return a * (largest / size.max())
     return np.real(vectors @ np.diag(inside) @ np.linalg.inv(vectors))
 
 

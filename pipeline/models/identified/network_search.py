@@ -7,25 +7,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.models.identified.candidates import Task
+from pipeline.models.identified.candidates import BEGINNING, Task
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Structure
-from pipeline.models.identified.trial import Trial, best_of
+from pipeline.models.identified.trial import Trial
 
-SEEDS = 3
-"""Seeds of each network that reaches the last round."""
+SEEDS = (3, 6)
+"""Fewest and most seeds of each network that reaches the last round; short records carry more of them."""
+
+QUICK_SEEDS = (2, 6)
+"""The same of the first round, in which the best one counts: a free run has poor minima."""
 
 UNITS = (4, 8, 12)
 """Tanh units on offer."""
 
 RIDGES = (1.0, 30.0)
-"""Weights of the ridge on offer: the first in all rounds, the others for the winner."""
+"""Weights of the ridge on offer: the first in the first round, all after it."""
 
-SHORT, MIDDLE, LONG = 20, 60, 120
+SHORT, MIDDLE, LONG = 20, 50, 120
 """Iterations of the first, the second and the last round."""
 
-SECOND, LAST = 4, 2
+SECOND, LAST = 6, 3
 """Candidates of the second and of the last round."""
+
+SMALL, VARIED = 3, 4
+"""Smallest balanced candidates that carry networks, and candidates that carry every number of units."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,29 +45,42 @@ class NetworkSearch:
         """The candidates of the last round; none where the budget is spent or no number of units is given."""
         if not units or self.rounds.budget.left() <= 0:
             return []
-        offers = self.rounds.affordable(_offers([t.structure for t in self.linear], units), SHORT, 0.4)
-        quick, _ = self.rounds.trials([self._task(s, 0, 0, SHORT) for s in offers], "networks")
-        ranked = sorted((t for t in quick if np.isfinite(t.error)), key=lambda t: t.error)[:SECOND]
-        if len(ranked) > LAST and self.rounds.budget.left(0.6) > 0:
-            tasks = [self._task(t.structure, k, 0, MIDDLE, t) for t in ranked for k in self._folds]
-            longer, _ = self.rounds.trials(tasks, "networks, both folds")
-            ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.error) or ranked
-        found = self.last_round([t.structure for t in ranked[:LAST]])
-        best = best_of(found)
-        if best is not None and self.rounds.budget.left() > 0:
-            found += self.last_round([replace(best.structure, ridge=ridge) for ridge in RIDGES[1:]])
-        return found
+        offers = _offers([t.structure for t in self.linear], units)
+        offers = self.rounds.affordable(offers, QUICK_SEEDS[0] * (BEGINNING + SHORT), 0.4)
+        cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT) for s in offers)
+        seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *QUICK_SEEDS))
+        tasks = [self._task(s, 0, seed, SHORT) for s in offers for seed in range(seeds)]
+        quick = _ranked(self.rounds.trials(tasks, "networks")[0])
+        second = [
+            self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE, t)
+            for t in quick[:SECOND]
+            for ridge in RIDGES
+            for k in self._folds
+        ]
+        longer = self.rounds.trials(second, "networks, both folds")[0] if self.rounds.budget.left(0.5) > 0 else []
+        ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.error) or quick
+        return self.last_round(ranked[:LAST])
 
-    def last_round(self, structures: Sequence[Structure]) -> list[Trial]:
-        """Candidates over all folds and as many seeds as the budget carries, one structure at least."""
+    def last_round(self, trials: Sequence[Trial]) -> list[Trial]:
+        """Candidates over all folds and as many seeds as the budget carries, one seed of one candidate at least.
+
+        Fits that ``trials`` hold are gone on with.
+        """
         tasks: list[Task] = []
         left = self.rounds.budget.left()
-        for seed in range(SEEDS):
-            for s in structures:
-                left -= len(self._folds) * self.rounds.budget.of(s, LONG)
-                if left >= 0 or not tasks:
-                    tasks += [self._task(s, k, seed, LONG) for k in self._folds]
+        least, most = SEEDS
+        for place in range(most):
+            for t in trials:
+                seed = [_seed(t), *(k for k in range(most) if k != _seed(t))][place]
+                left -= len(self._folds) * self.rounds.budget.of(t.structure, LONG + (0 if place == 0 else BEGINNING))
+                # The seeds beyond the fewest leave half of the budget to later rounds.
+                if left >= (0 if place < least else 0.5 * self.rounds.budget.left()) or not tasks:
+                    tasks += [self._task(t.structure, k, seed, LONG, t) for k in self._folds]
         return self.rounds.trials(tasks, "networks, all seeds")[0]
+
+    def corrected(self, trial: Trial, correction: float) -> list[Trial]:
+        """The candidate with another correction of its training runs, trained anew."""
+        return self.last_round([Trial(replace(trial.structure, correction=correction))])
 
     @property
     def _folds(self) -> range:
@@ -69,20 +88,39 @@ class NetworkSearch:
 
     def _task(self, structure: Structure, fold: int, seed: int, iterations: int, trial: Trial | None = None) -> Task:
         """A fit, gone on from the one of ``trial`` where there is one."""
-        bases = (
-            t for t in self.linear if replace(t.structure, correction=0.0) == replace(structure.base, correction=0.0)
-        )
+        uncorrected = replace(structure.base, correction=0.0)
+        bases = (t for t in self.linear if replace(t.structure, correction=0.0) == uncorrected)
         base = next((t.fits[fold, 0] for t in bases if (fold, 0) in t.fits), None)
         begun = None if trial is None else trial.fits.get((fold, seed))
         return Task(structure, fold, iterations, seed, base=base, begun=begun)
 
 
+def _ranked(trials: Sequence[Trial]) -> list[Trial]:
+    """Trials of the first fold by their better seed, exploded ones left out."""
+    finite = [t for t in trials if np.isfinite(t.of_fold(0)[0].held_out)]
+    return sorted(finite, key=lambda t: t.of_fold(0)[0].held_out)
+
+
+def _seed(trial: Trial) -> int:
+    """The seed of a trial's best fit on its first fold; 0 without one."""
+    first = [(f.held_out, seed) for (fold, seed), f in trial.fits.items() if fold == 0]
+    return min(first)[1] if first else 0
+
+
 def _offers(linear: Sequence[Structure], units: Sequence[int]) -> list[Structure]:
-    """Networks to try: units on the best two balanced and the best two lagged candidates."""
-    balanced = [s for s in linear if s.start == "balanced"]
-    lagged = [s for s in linear if s.start == "lagged"]
-    bases = [*balanced[:1], *lagged[:1], *balanced[1:2], *lagged[1:2]]
+    """Networks to try: units on the best balanced and lagged candidates, and on the smallest balanced ones.
+
+    Order and units are chosen together: the best linear order is that of the curve that it has to imitate.
+    """
+    first, second = list[Structure](), list[Structure]()
+    for same_row in (False, True):
+        balanced, lagged = (
+            [s for s in linear if s.start == start and s.same_row is same_row] for start in ("balanced", "lagged")
+        )
+        first += [*balanced[:1], *lagged[:1]]
+        second += [*sorted(balanced[1:], key=lambda s: s.order)[:SMALL], *lagged[1:2]]
+    bases = [*first, *second]
     middle = units[len(units) // 2]
-    first = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]
-    rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:3]]
-    return [*first, *rest]
+    widest = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]
+    rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:VARIED]]
+    return [*widest, *rest]

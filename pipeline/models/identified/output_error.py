@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,6 @@ from pipeline.models.identified.sensitivities import Equations, sensitivity_sums
 from pipeline.plants.simulator import Array
 
 GROWTH = 1e10  # of the damping, after which no step is looked for
-
-STABLE = 0.9999
-"""Largest pole of A that a step of a network's fit may reach, where it started below."""
 
 
 # ---------------------------------------------------------------------- errors of free runs
@@ -116,7 +113,7 @@ class Fitted:
     starts: list[Array]
     trained: float
     held_out: float
-    iterations: int
+    work: int  # iterations that led here
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,10 +121,8 @@ class OutputError:
     """Levenberg-Marquardt for min over theta, x0 of mean (y - y_hat)^2 + ridge |theta_ridged|^2.
 
     The ridge weight is ``ridge`` times the variance of the present residual over the number of residuals, and acts on
-    W1 and W2 alone. Damping follows Nielsen's rule. A network keeps the poles of A inside the circle of radius
-    ``STABLE``, or of those that it started with: as its units are bounded, every run then is. Held-out rows are judged
-    by free runs with the correction ``judged``. ``patience`` iterations without a better held-out error end the fit;
-    the best model is kept.
+    W1 and W2 alone. Damping follows Nielsen's rule. Held-out rows are judged by free runs with the correction
+    ``judged``. ``patience`` iterations without a better held-out error end the fit; the best model is kept.
 
     Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, 2nd ed.,
     DTU 2004, algorithm 3.16; L. Ljung, System identification, 2nd ed., 1999, section 10.3 (output error).
@@ -156,16 +151,16 @@ class OutputError:
         n = sum(s.y.size for s in data)
         loss = squares(model, starts, data, self.correction)
         best = Fitted(model, starts, float(np.sqrt(loss / n)), judge(model), 0)
-        mu, grow, since, flat = -1.0, 2.0, 0, 0
-        circle = max(STABLE, largest_pole(model)) if model.n_hidden else np.inf
+        mu, grow, since, flat, work = -1.0, 2.0, 0, 0, 0
         for iteration in range(1, self.iterations + 1):
+            work = iteration
             sums = sensitivity_sums(model, starts, data, free, self.correction)
             if sums is None:
                 break
             weights = self._ridge(model, free, loss, n)
             if mu < 0:
                 mu = 1e-3 * _scale(sums)
-            moved = self._step(model, starts, data, free, sums, weights, loss, mu, grow, circle)
+            moved = self._step(model, starts, data, free, sums, weights, loss, mu, grow)
             if moved is None:
                 break
             after, mu, grow, model, starts = moved
@@ -174,10 +169,10 @@ class OutputError:
             error = judge(model)
             since = 0 if error < best.held_out else since + 1
             if error < best.held_out or not held:
-                best = Fitted(model, starts, float(np.sqrt(loss / n)), error, iteration)
+                best = Fitted(model, starts, float(np.sqrt(loss / n)), error, work)
             if flat >= 3 or (held and since >= self.patience):
                 break
-        return best
+        return replace(best, work=work)
 
     def _judge(self, held: Sequence[Stretch]) -> Callable[[Dynamics], float]:
         memory: list[list[Array] | None] = [None]
@@ -207,7 +202,6 @@ class OutputError:
         loss: float,
         mu: float,
         grow: float,
-        circle: float,
     ) -> tuple[float, float, float, Dynamics, list[Array]] | None:
         """One step that lowers the objective: (loss, mu, growth, model, initial states); None where there is none."""
         theta = model.vector()
@@ -225,8 +219,7 @@ class OutputError:
             trial[free] += step
             candidate = model.with_vector(trial)
             begun = [x + move for x, move in zip(starts, moves, strict=True)]
-            outside = np.isfinite(circle) and largest_pole(candidate) > circle
-            after = np.inf if outside else squares(candidate, begun, data, self.correction)
+            after = squares(candidate, begun, data, self.correction)
             gain = total - after - float(weights @ trial[free] ** 2)
             right = sum(float(move @ s[2]) for move, s in zip(moves, sums.of_starts, strict=True))
             promised = float(step @ (mu * step + gradient)) + right
@@ -235,11 +228,6 @@ class OutputError:
                 return after, mu * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0, candidate, begun
             mu, grow = mu * grow, grow * 2
         return None
-
-
-def largest_pole(model: Dynamics) -> float:
-    """Spectral radius of A."""
-    return float(np.abs(np.linalg.eigvals(model.a)).max())
 
 
 def _scale(sums: Equations) -> float:

@@ -11,6 +11,9 @@ RESTS = 200
 SETTLE = 3000
 """Rests that the map is fitted to, and the most periods in which one is reached."""
 
+FARTHEST = 1e3
+"""Scaled state, hidden ones included, beyond which a model has not come to rest."""
+
 FAR = 0.25
 """Deviation of the outputs, scaled, that loads add to the rests."""
 
@@ -25,7 +28,7 @@ def settle(model: Dynamics, v: Array, start: Array | None = None, periods: int =
             moved = np.abs(x - before).max(axis=1)
             if not np.any(moved > 1e-7):
                 break
-    still = (moved < 1e-5) & (np.abs(x).max(axis=1) < 50)
+    still = (moved < 1e-5) & (np.abs(x).max(axis=1) < FARTHEST)
     return x, still
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from pipeline.engine.parallel import parallel_map
-from pipeline.models.identified.candidates import Start, Task, find_start, fit
+from pipeline.models.identified.candidates import Start, Task, find_start, fit, judged_again
 from pipeline.models.identified.output_error import Fitted
 from pipeline.models.identified.structure import Budget, Problem, Structure
 from pipeline.models.identified.trial import Trial
@@ -38,7 +38,7 @@ class Rounds:
         outcomes: list[Fitted | str] = ["not fitted"] * len(tasks)
         for i, outcome in zip(order, found, strict=True):
             outcomes[i] = outcome
-            done = 2 if isinstance(outcome, str) else outcome.iterations + 2
+            done = 2 if isinstance(outcome, str) else outcome.work
             self.budget.spent += self.budget.of(tasks[i].structure, done)
         return outcomes
 
@@ -53,6 +53,12 @@ class Rounds:
                 trial = trials.setdefault(task.structure, Trial(task.structure))
                 trial.fits[task.fold, task.seed] = outcome
         return list(trials.values()), reasons
+
+    def judged_again(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The trials with held-out errors under this problem's way to judge."""
+        tasks = [(t.structure, fold, fitted) for t in trials for (fold, _), fitted in t.fits.items()]
+        found = iter(parallel_map(partial(judged_again, self.problem), tasks, f"{self.label}: judged again"))
+        return [Trial(t.structure, {key: next(found) for key in t.fits}) for t in trials]
 
     def affordable(self, structures: Sequence[Structure], iterations: int, share: float) -> list[Structure]:
         """The first of some structures that ``iterations`` of each fit into ``share`` of the budget, one at least."""

@@ -8,14 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.models.identified.candidates import misses
-from pipeline.models.identified.linear_search import LinearSearch
+from pipeline.models.identified.drift import drifts
+from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
 from pipeline.models.identified.rounds import Rounds
+from pipeline.models.identified.row_convention import may_act_in_its_row
 from pipeline.models.identified.structure import Problem
 from pipeline.models.identified.trial import Trial, best_of
 
 INTEGRATES = 0.999
 """Pole of the linear model beyond which a slow correction of the training run is tried, as for drift."""
+
+NEARLY = 1.02
+"""Relative error up to which a linear model that settles stands in for one that integrates."""
 
 SLOW = 0.05
 """That correction."""
@@ -39,6 +44,8 @@ class Selection:
     finalists: list[Trial]
     spent: float  # nominal seconds
     settles: bool  # whether the linear model comes to rest by itself
+    drifts: bool  # whether gain or level move inside the record
+    judged: float  # correction of the free runs over held-out rows by which candidates were compared
 
     @property
     def nonlinear(self) -> bool:
@@ -64,25 +71,49 @@ def select(
     """The search over one record.
 
     Linear candidates first: balanced starts of each order with and without the dead times that the impulse
-    response shows, and lagged starts. Then networks on the best of them, in rounds that keep fewer and train them
-    longer. When the budget is spent, what there is decides. ``correction`` None: 0, or ``SLOW`` where the linear
-    model integrates or the best network misses much more than the noise, and the models so trained err less in plain
-    free runs over held-out rows. Raises ModelError where no candidate can be fitted.
+    response shows, and lagged starts; where the record leaves it open, with the MVs acting in their own row too.
+    Then networks on the best of them, in rounds that keep fewer and train them longer. When the budget is spent, what
+    there is decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
+    much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or, where the
+    plant drifts inside the record, in slowly corrected ones. Raises ModelError where no candidate can be fitted.
     """
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
     linear = search.finish(search.first_round(orders, given))
+    if _integrates(linear[0]):
+        settling = [t for t in search.settling(linear) if not _integrates(t) and t.error <= NEARLY * linear[0].error]
+        linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear
     if correction is None and _integrates(linear[0]):
         corrected = search.corrected(linear, SLOW)
         linear = corrected if corrected and corrected[0].error < linear[0].error else linear
+    if may_act_in_its_row(rounds.problem.part(linear[0].structure, rounds.problem.folds[0].train), rounds.problem.n_mv):
+        # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
+        linear = smallest_first([*linear, *search.in_the_same_row(linear)])
     offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
     settles = not _integrates(linear[0])
     networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
     finalists = networks.finalists(units) if _misses(rounds.problem, linear[0], WHITE) else []
     best = best_of(finalists)
-    if correction is None and best is not None and _misses(rounds.problem, best, DRIFTS):
-        finalists += networks.last_round([replace(best.structure, correction=SLOW)])
-    return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles)
+    drifting = correction is None and best is not None and _drifts(rounds.problem, min(best, linear[0], key=_trained))
+    if correction is None and best is not None and (drifting or _misses(rounds.problem, best, DRIFTS)):
+        finalists += networks.corrected(best, SLOW)
+    judged = rounds.problem.judged
+    if drifting:
+        # Plain free runs would rank candidates by how they follow what no model can.
+        linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
+        judged, again = SLOW, replace(rounds, problem=replace(rounds.problem, judged=SLOW))
+        linear, finalists = smallest_first(again.judged_again(linear)), again.judged_again(finalists)
+    return Selection(
+        linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles, drifting, judged
+    )
+
+
+def _trained(trial: Trial) -> float:
+    return trial.of_fold(trial.folds[0])[0].trained
+
+
+def _drifts(problem: Problem, trial: Trial) -> bool:
+    return drifts(trial.of_fold(trial.folds[0])[0].model, problem.whole(trial.structure))
 
 
 def _with_correction(trial: Trial, correction: float) -> Trial:

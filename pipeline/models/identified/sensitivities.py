@@ -13,7 +13,7 @@ from pipeline.models.identified.compiled import propagate
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.plants.simulator import Array
 
-CHUNK = 512  # rows whose sensitivities are held at a time
+CHUNK = 256  # rows whose sensitivities are held at a time
 
 
 @dataclass(slots=True, eq=False)
@@ -26,6 +26,7 @@ class Equations:
     h: Array  # (P, P)
     g: Array  # (P,)
     of_starts: list[tuple[Array, Array, Array]] = field(default_factory=list)
+    of_blocks: list[Array] = field(default_factory=list)  # (J'r, X'r) of each CHUNK rows
 
     def solve(self, damping: float, start_damping: float) -> tuple[Array, list[Array]]:
         """The step of the parameters (P,) and of each initial state (n_x,).
@@ -65,7 +66,7 @@ def sensitivity_sums(
         predicted, from_states = run
         n_y = stretch.y.shape[1]
         own = np.zeros((n_free + n_x, n_free + n_x))
-        right = np.zeros(n_free + n_x)
+        blocks: list[Array] = []
         width = (len(free) if n_free else 0) + n_x
         s = np.zeros((n_x, width))
         s[:, -n_x:] = np.eye(n_x)
@@ -80,10 +81,12 @@ def sensitivity_sums(
                 jac = jac[:, columns]
             with np.errstate(over="ignore", invalid="ignore"):
                 own += jac.T @ jac
-                right += jac.T @ (stretch.y[rows] - predicted[rows, :n_y]).ravel()
+                blocks.append(jac.T @ (stretch.y[rows] - predicted[rows, :n_y]).ravel())
         if not np.all(np.isfinite(own)):
             return None
+        right = np.sum(blocks, axis=0)
         sums.h += own[:n_free, :n_free]
         sums.g += right[:n_free]
+        sums.of_blocks.extend(blocks)
         sums.of_starts.append((own[:n_free, n_free:], own[n_free:, n_free:], right[n_free:]))
     return sums

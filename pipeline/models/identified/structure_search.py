@@ -10,6 +10,9 @@ from pipeline.models.identified.selection import Selection, select
 from pipeline.models.identified.structure import Budget, Problem
 from pipeline.models.part import Groundwork, Source
 
+MINUTES = 2.0
+"""Budget for each output, in minutes of one core."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Searched:
@@ -28,7 +31,7 @@ class StructureSearch(Groundwork[Searched]):
     orders: tuple[int, int] | None
     units: tuple[int, ...]
     correction: float | None
-    minutes: float
+    minutes: float | None
     rows: int
 
     def done(self, source: Source, label: str) -> Searched:
@@ -38,9 +41,9 @@ class StructureSearch(Groundwork[Searched]):
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
         problem = Problem(data, folds(record), len(source.signals.mv), source.seed, self.correction or 0.0)
-        budget = Budget(60 * self.minutes, len(data), n_y)
+        budget = Budget(60 * (MINUTES * n_y if self.minutes is None else self.minutes), len(data), n_y)
         least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction)
-        return Searched(replace(problem, settles=selection.settles), selection, scales)
+        return Searched(replace(problem, settles=selection.settles, judged=selection.judged), selection, scales)

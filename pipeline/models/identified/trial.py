@@ -28,9 +28,14 @@ class Trial:
 
     @property
     def error(self) -> float:
-        """The rms over the folds of the median over the seeds of the held-out free-run error, scaled."""
-        medians = [statistics.median(f.held_out for f in self.of_fold(k)) for k in self.folds]
-        return float(np.sqrt(np.mean(np.square(medians))))
+        """The rms over the folds of the median over the seeds of the held-out free-run error, scaled.
+
+        Seeds that exploded are left out; infinite where all of a fold's did.
+        """
+        finite = [[f.held_out for f in self.of_fold(k) if np.isfinite(f.held_out)] for k in self.folds]
+        if not all(finite):
+            return np.inf
+        return float(np.sqrt(np.mean([statistics.median(errors) ** 2 for errors in finite])))
 
     @property
     def spread(self) -> float:

@@ -51,6 +51,10 @@ def structure_figures(selection: Selection) -> dict[str, Any]:
         "hidden": s.n_hidden,
         "ridge": s.ridge,
         "correction": s.correction,
+        "same_row": s.same_row,
+        "drifts": selection.drifts,
+        "judged_with_correction": selection.judged,
+        "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
         "held_out_spread": chosen.spread,
         "linear_error": selection.linear.error,
@@ -67,7 +71,9 @@ def free_run_figures(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """(figures of each PV, {measured, free run} of the first) of a fold's best fit over the rows that it never saw.
 
-    ``rmse`` in the PV's unit, ``fit_percent``, and ``rmse_by_third``: where the PV was low, in the middle and high.
+    ``rmse`` in the PV's unit, ``fit_percent``, ``rmse_by_third``: where the PV was low, in the middle and high, and
+    ``outside_training``: the share of these rows in which it left the range of the training rows, where the error
+    says nothing of the other rows.
     """
     best = trial.of_fold(fold)[0]
     held = problem.held(trial.structure, fold)
@@ -79,6 +85,10 @@ def free_run_figures(
         [np.full(s.y.shape, np.nan) if r is None else r[0][:, :n_y] for r, s in zip(runs, held, strict=True)]
     )
     actual, predicted = (z * scales.y_scale + scales.y_center for z in (actual, predicted))
+    trained = (
+        np.concatenate([part.y for part in problem.train(trial.structure, fold)]) * scales.y_scale + scales.y_center
+    )
+    low, high = trained.min(axis=0), trained.max(axis=0)
     figures = {}
     for i, name in enumerate(names):
         y, error = actual[:, i], actual[:, i] - predicted[:, i]
@@ -87,6 +97,7 @@ def free_run_figures(
         figures[name] = {
             "free_run_rmse": float(np.sqrt(np.mean(error**2))),
             "fit_percent": fit_percent(y, predicted[:, i]) if np.all(np.isfinite(error)) else None,
+            "outside_training": float(np.mean((y < low[i]) | (y > high[i]))),
             "rmse_by_third": [float(np.sqrt(np.mean(e**2))) if len(e) else None for e in thirds],
         }
     return figures, {"measured": actual[:, 0], "free run": predicted[:, 0]}

@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 
 from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.identified.linear_search import LinearSearch
+from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Budget, Structure
 from pipeline.models.identified.structure_search import Searched
+from pipeline.models.identified.trial import Trial
 from pipeline.models.part import Source
+from pipeline.records.record import Record
 
 PART = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.01)
 
@@ -54,6 +58,25 @@ def test_a_budget_bounds_the_work_and_keeps_the_best_so_far() -> None:
     assert small.spent < 0.3 * large.spent
     assert np.isfinite(small.chosen.error)
     assert large.chosen.error < small.chosen.error
+
+
+@pytest.mark.parametrize(
+    ("record", "integrates"), [(made_plants.second_order(600), False), (made_plants.integrator(600), True)]
+)
+def test_a_pole_at_one_stays_only_where_the_plant_integrates(record: Record, integrates: bool) -> None:
+    source = Source(record, made_plants.signals_of(1, 1))
+    problem = replace(PART, units=()).groundwork().done(source, "search").problem
+    search = LinearSearch.of(Rounds(problem, Budget(60.0, len(record), 1), "search"))
+    trial = search.finish(search.first_round([2], 0.0))[0]
+    at_one = {k: replace(f, model=replace(f.model, a=pole_at_one(f.model.a))) for k, f in trial.fits.items()}
+    again = search.settling([Trial(trial.structure, at_one)])[0]
+    poles = [np.abs(np.linalg.eigvals(f.model.a)).max() for f in again.fits.values()]
+    assert (min(poles) > 0.995) is integrates
+    assert again.error == pytest.approx(trial.error, rel=0.05)
+
+
+def pole_at_one(a: np.ndarray) -> np.ndarray:
+    return a / np.abs(np.linalg.eigvals(a)).max()
 
 
 def test_a_larger_candidate_costs_more() -> None:
