@@ -64,7 +64,7 @@ def structure_figures(selection: Selection) -> dict[str, Any]:
 def free_run_figures(
     training: Training, trial: Trial, scales: Scales, names: Sequence[str], fold: int = 0
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
-    """(figures of each PV, {measured, free run} of the first) of a fold's best fit over the rows that it never saw.
+    """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 
     ``rmse`` in the PV's unit, ``fit_percent``, and ``rmse_by_third``: where the PV was low, in the middle and high.
     """
@@ -88,7 +88,7 @@ def free_run_figures(
             "fit_percent": fit_percent(y, predicted[:, i]) if np.all(np.isfinite(error)) else None,
             "rmse_by_third": [float(np.sqrt(np.mean(e**2))) if len(e) else None for e in thirds],
         }
-    return figures, {"measured": actual[:, 0], "free run": predicted[:, 0]}
+    return figures, {"measured": actual, "free run": predicted}
 
 
 # ---------------------------------------------------------------------- what the plant does
