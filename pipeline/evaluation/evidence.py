@@ -217,6 +217,21 @@ class Evidence:
         scores = {n: e for n, e in errors.items() if e is not None}
         return min(scores, key=lambda n: scores[n], default=None)
 
+    @property
+    def why_best(self) -> str:
+        """Why the best law is the best, in words; empty without one."""
+        errors = {n: law.development for n, law in self.laws.items() if law.development is not None}
+        if self.best is None:
+            return ""
+        if not errors:
+            return "it has the lowest gate score of the laws that did not lock up"
+        others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)
+        beside = f" (others: {others})" if others else ""
+        short = self.case.criterion.short
+        return f"its {short} over the development sequences, which are not scored, is the lowest: " + (
+            f"{errors[self.best]:.3g}{beside}"
+        )
+
     def loop(self, curve: Curve, scenario: str) -> Loop | None:
         """The trajectory behind a curve of a figure; None where none was stored."""
         law = self.laws.get(curve.law)
