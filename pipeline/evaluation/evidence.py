@@ -209,13 +209,17 @@ class Evidence:
     def best(self) -> str | None:
         """The law with the lowest error on the development sequences; no scored test is used.
 
-        A law that locked up on one of them is left out. Without development figures the gate score decides.
+        A law that locked up on one of them, or that is not shipped, is left out. Without development figures the gate
+        score decides.
         """
-        errors = {n: law.development for n, law in self.laws.items()}
+        errors = {n: law.development for n, law in self.laws.items() if not self._withheld(n)}
         if all(error is None for error in errors.values()):
             errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
         scores = {n: e for n, e in errors.items() if e is not None}
         return min(scores, key=lambda n: scores[n], default=None)
+
+    def _withheld(self, law: str) -> bool:
+        return self.case.on_models and self.laws[law].withheld
 
     @property
     def why_best(self) -> str:
