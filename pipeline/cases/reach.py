@@ -72,13 +72,15 @@ class Reach:
         """Samples of a set point: three times what the slowest CV needs, and within ``HOLD``.
 
         A CV that settles needs the time to ``SETTLED`` of its largest answers. One that does not settle needs the
-        time in which the strongest MV carries it across its visited range: no loop could be faster.
+        time in which the strongest MV, over all of its range, carries it across its visited range: no loop could be
+        faster.
         """
         size, needed = np.abs(self.answers), [1]
+        whole = np.array([s.high - s.low for s in self.model.mv_signals]) / (self.mv[2] - self.mv[0])
         for i in range(size.shape[2]):
             of = size[:, :, i]
             if i in self.integrates:
-                crossed = of >= self.cv[2, i] - self.cv[0, i]
+                crossed = of * whole[:, None] >= self.cv[2, i] - self.cv[0, i]
                 needed.append(int(np.where(crossed.any(axis=1), crossed.argmax(axis=1), RESTING).min()))
                 continue
             strong = np.flatnonzero(of.max(axis=1) >= LEAST_ANSWER * of.max())

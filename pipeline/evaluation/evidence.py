@@ -209,13 +209,32 @@ class Evidence:
     def best(self) -> str | None:
         """The law with the lowest error on the development sequences; no scored test is used.
 
-        A law that locked up on one of them is left out. Without development figures the gate score decides.
+        A law that locked up on one of them, or that is not shipped, is left out. Without development figures the gate
+        score decides.
         """
-        errors = {n: law.development for n, law in self.laws.items()}
+        errors = {n: law.development for n, law in self.laws.items() if not self._withheld(n)}
         if all(error is None for error in errors.values()):
             errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
         scores = {n: e for n, e in errors.items() if e is not None}
         return min(scores, key=lambda n: scores[n], default=None)
+
+    def _withheld(self, law: str) -> bool:
+        return self.case.on_models and self.laws[law].withheld
+
+    @property
+    def why_best(self) -> str:
+        """Why the best law is the best, in words; empty without one."""
+        errors = {n: law.development for n, law in self.laws.items() if law.development is not None}
+        if self.best is None:
+            return ""
+        if not errors:
+            return "it has the lowest gate score of the laws that did not lock up"
+        others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)
+        beside = f" (others: {others})" if others else ""
+        short = self.case.criterion.short
+        return f"its {short} over the development sequences, which are not scored, is the lowest: " + (
+            f"{errors[self.best]:.3g}{beside}"
+        )
 
     def loop(self, curve: Curve, scenario: str) -> Loop | None:
         """The trajectory behind a curve of a figure; None where none was stored."""

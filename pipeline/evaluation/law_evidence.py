@@ -129,6 +129,11 @@ class LawEvidence:
         return self.metrics.lock_ups
 
     @property
+    def withheld(self) -> bool:
+        """Whether it is not shipped: it locked up, and reproduces no paper."""
+        return self.lock_ups > 0 and not self.metrics.as_printed
+
+    @property
     def development(self) -> float | None:
         """Median of the data seeds' errors over the development sequences, in the case's metric.
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 Metrics = Mapping[str, Any]
+IDENTIFIED = "identified"
+"""The kind of part that has a section of its own in the report."""
 HOW: dict[str, Callable[[Iterable[float]], float]] = {"median": statistics.median, "min": min, "max": max}
 
 
@@ -40,6 +42,15 @@ def _values(leaf: Any, how: str) -> list[float]:
         leaf = leaf.get(how)
     rows = leaf if isinstance(leaf, Sequence) and not isinstance(leaf, str) else [leaf]
     return [float(v) for v in rows if isinstance(v, int | float)]
+
+
+def identified_part(models: Mapping[str, Metrics]) -> Metrics:
+    """The figures of the identified model that laws are designed on, of its first data seed; empty without one."""
+    for model in models.values():
+        parts = [part for part in (model.get("parts") or {}).values() if part.get("kind") == IDENTIFIED]
+        for part in parts:
+            return next(iter((part.get("per_seed") or {}).values()), {})
+    return {}
 
 
 def model_rows(name: str, model: Metrics) -> list[dict[str, Any]]:

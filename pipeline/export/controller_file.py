@@ -36,6 +36,13 @@ def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any])
     return manifest
 
 
+def withhold(dst: str | Path, why: str) -> None:
+    """Leave no controller at ``dst``, and say why in the JSON file beside it."""
+    dst = Path(dst)
+    dst.unlink(missing_ok=True)
+    write_text(dst.with_suffix(".json"), json.dumps({"withheld": why}, indent=2) + "\n")
+
+
 def assembled(model: bytes, manifest: Manifest) -> bytes:
     """Model bytes + manifest + digest; appended, because a protobuf may be continued so."""
     entry = onnx.StringStringEntryProto(key=MANIFEST_KEY, value=manifest.to_json())

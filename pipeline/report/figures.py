@@ -13,13 +13,21 @@ from matplotlib.figure import Figure as Canvas
 from pipeline.errors import ReportError
 from pipeline.evaluation.case import Figure
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.model_evidence import candidates
-from pipeline.pictures.drawing import STYLE, CasePicture, save
+from pipeline.evaluation.model_evidence import candidates, identified_part
+from pipeline.pictures.drawing import STYLE, CasePicture, Draw, save
+from pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
 from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
 from pipeline.pictures.replay_pictures import replay_picture
 from pipeline.pictures.words import scenario_name
 from pipeline.simulation.scenario import NOISE_SUFFIX
+
+MODEL_PICTURES: tuple[tuple[str, Draw, str], ...] = (
+    ("free_run", free_run_picture, "The free run over rows that the fit never saw, and its residual"),
+    ("step_responses", step_responses_picture, "Step responses, with the band of all fits that are as good"),
+    ("gains", gains_picture, "Local gains over the visited range of each MV"),
+)
+"""Of identified models."""
 
 
 def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) -> dict[str, str]:
@@ -40,6 +48,9 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
         drawn[f"{name}.png"] = caption
 
     with mpl.rc_context(STYLE):
+        for name, draw, words in MODEL_PICTURES if identified_part(evidence.models) else ():
+            with suppress(NotMeasuredError):
+                keep(f"model_{name}", draw(evidence), words)
         for figure in evidence.case.figures:
             with suppress(NotMeasuredError):
                 title = f"Figure {figure.number}. {figure.title}"

@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import BASE, lock_up_text
 from pipeline.evaluation.metric import NO_UNIT
-from pipeline.evaluation.model_evidence import candidates, model_rows
+from pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
 from pipeline.evaluation.validation import FILE
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
@@ -19,6 +19,7 @@ from pipeline.pictures.numbers import number, ratio
 from pipeline.pictures.words import law_name, scenario_name
 from pipeline.report.figures import draw_all, main_words
 from pipeline.report.for_programs import validation
+from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
 from pipeline.simulation.scenario import NOISE_SUFFIX
@@ -44,6 +45,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
     """Everything that the templates show."""
     case, best = evidence.case, evidence.laws.get(evidence.best or "")
     models = [row for name, model in evidence.models.items() for row in model_rows(name, model)]
+    # An identified model has a section of its own, with what these rows have no columns for.
+    models = [row for row in models if row["kind"] != IDENTIFIED]
 
     def of_kind(start: str) -> dict[str, str]:
         return {k: v for k, v in pictures.items() if k.startswith(start) and k not in own}
@@ -65,6 +68,9 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "replays": of_kind("replay_"),
         "replayed": [(name, mv, row) for name, law in evidence.laws.items() for mv, row in law.metrics.replay.items()],
         "overview": pictures.get("closed_loop.png"),
+        "identified": model_section(evidence),
+        "identified_heads": (VARIABLES, ANSWERS, TRIED),
+        "identified_pictures": of_kind("model_"),
         "main_test": main_words(evidence)[0],
         "tables": judged.tables,
         "rule": RULE,
@@ -153,7 +159,7 @@ def _locked(evidence: Evidence, law: str) -> dict[str, str]:
         "law": law,
         "loops": "one closed loop" if own.lock_ups == 1 else f"{own.lock_ups} closed loops",
         "tests": lock_up_text(own.locked_up),
-        "why": ". It is shipped as printed, to reproduce the paper" if own.as_printed else "",
+        "why": ". It is shipped as printed, to reproduce the paper" if own.as_printed else ". It is not shipped",
     }
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pipeline.evaluation.case import Curve, PaperFigure, PaperTable, Requirement
 from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.validation import Statement
 from pipeline.evaluation.verdicts import ABSOLUTE, RELATIVE, Claims, Reason, close, plain_reason
 from pipeline.pictures.numbers import number
@@ -90,8 +91,20 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[Statement]:
             f"lock-ups of all laws: {locked}",
         ),
     ]
+    if evidence.case.on_models:
+        common = [row for name in evidence.laws for row in _of_law(name, evidence, seeds)]
     rows = [requirement(need, evidence) for need in evidence.case.requirements]
     return [*rows, *common, *(check.statement(evidence) for check in claims.acceptance)]
+
+
+def _of_law(name: str, evidence: Evidence, seeds: int) -> list[Statement]:
+    """What is asked of every shipped law, whichever is the best."""
+    law = evidence.laws[name]
+    where = lock_up_text(law.metrics.locked_up)
+    return [
+        Statement(f"{name}, data seeds", f"≥ {seeds}", str(law.seeds), law.seeds >= seeds),
+        Statement(f"{name}, lock-ups over all seeds and scenarios", "0", str(law.lock_ups), law.lock_ups == 0, where),
+    ]
 
 
 def requirement(need: Requirement, evidence: Evidence) -> Statement:

@@ -15,6 +15,8 @@ STILL = 1e-7  # of the largest state: a change in one period that is none
 BROKEN = 1e9  # a state beyond it belongs to a plant that runs away
 CHANGE = 1e-6  # of a state or of an MV's range: for slopes
 NEWTON = 12  # iterations
+STEP = 0.02  # of an MV's range: for local gains
+MOVING = 0.2  # of a difference, over RESTING periods at its late rate: a CV that moves more does not settle
 WEAK = 1e-7  # of the largest slope: a direction in which nothing is decided
 
 
@@ -47,6 +49,22 @@ def settled(plant: Simulator, x0: Array, mvs: Array, p: Array | None = None) -> 
 def _bounded(before: Array, after: Array) -> Array:
     good = np.all(np.abs(after) < BROKEN, axis=-1, keepdims=True)
     return after if good.all() else np.where(good, after, before)
+
+
+def local_gains(plant: Simulator, mv: int, places: Array, middle: Array, n_cv: int) -> tuple[Array, NDArray[np.bool_]]:
+    """(gains dCV/dMV (n, n_cv), whether each is a rate) of one MV at its ``places`` (n,), the others at ``middle``.
+
+    Central differences of rests. Where a CV does not settle under the two MVs of a difference, its gain is the rate at
+    which they part, in CV a period.
+    """
+    size = STEP * (plant.mv_signals[mv].high - plant.mv_signals[mv].low)
+    pairs = np.tile(middle, (2, len(places), 1))
+    pairs[0, :, mv], pairs[1, :, mv] = places + size, places - size
+    y = courses(plant, plant.start[0], pairs.reshape(-1, len(middle)), RESTING)[..., :n_cv]
+    apart = (y[: len(places)] - y[len(places) :]) / (2 * size)  # (places, samples, n_cv)
+    late = (apart[:, -1] - apart[:, -RESTING // 4]) / (RESTING // 4 - 1)
+    moving = np.abs(late) * RESTING > MOVING * np.abs(apart[:, -1])
+    return np.where(moving, late, apart[:, -1]), moving
 
 
 def balanced(

@@ -1,7 +1,8 @@
 """Stage code: ``python -m pipeline.stages.code`` lists the files that every other stage runs.
 
 work/code/<stage>-<case>.json (<stage>.json of a stage over all cases) holds the sha256 of each file
-of ``pipeline`` and ``serving`` that the stage imports, at whatever depth. The stage depends on that
+of ``pipeline`` and ``serving`` that the stage imports, at whatever depth, and of a report the digest of
+what it reads of params.yaml. The stage depends on that
 one file, so an edit runs again what it has a part in and nothing else. One file for each stage keeps
 dvc.lock short, which DVC reads and writes after every stage.
 """
@@ -12,12 +13,14 @@ import sys
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import grimp
 
 from pipeline.cases import all_cases
+from pipeline.config.params import entries, read_section, sections
 from pipeline.engine.command import run_stage
-from pipeline.files import sha256, write_json
+from pipeline.files import digest, sha256, write_json
 from pipeline.stages.paths import WORK
 
 PACKAGES = ("pipeline", "serving")
@@ -44,6 +47,8 @@ APART = {
 }
 # Stage -> the modules beside case.py that it loads.
 BESIDE = {"excite": ("excitations",), "fit": ("models",), "report": ("paper", "pictures")}
+# Entries of params.yaml that a report goes by: section and field.
+LISTED = (("controllers", "name"), ("models", "model"), ("models", "data"))
 # Files that are read and not imported.
 TEMPLATES = "pipeline/report/templates/*"
 
@@ -64,7 +69,14 @@ def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:
     bounds = path_of(root, beside(case, "bounds")).with_suffix(".json") if stage == "report" else root
     if bounds.is_file():
         files.add(bounds)
-    return {p.relative_to(root).as_posix(): sha256(p) for p in sorted(files)}
+    found = {p.relative_to(root).as_posix(): sha256(p) for p in sorted(files)}
+    return {**found, "params.yaml": digest(_read_of(case))} if stage == "report" else found
+
+
+def _read_of(case: str) -> list[Any]:
+    """What a report reads of params.yaml: the case, its plant, and which controllers and models it lists."""
+    own = [read_section(kind, case) for kind in ("cases", "plants") if case in sections(kind)]
+    return [*own, *(list(entries(kind, case, field)) for kind, field in LISTED)]
 
 
 def modules(stage: str, case: str = "") -> set[str]:

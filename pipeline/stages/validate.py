@@ -24,7 +24,7 @@ from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, O
 from pipeline.evaluation.reached import grounds_of, widest
 from pipeline.evaluation.replay import replay
 from pipeline.evaluation.trial import Metrics, Trial, step_us, try_file
-from pipeline.export.controller_file import with_evidence
+from pipeline.export.controller_file import with_evidence, withhold
 from pipeline.files import read_json, write_json
 from pipeline.stages.paths import (
     ARTIFACTS,
@@ -41,7 +41,11 @@ FIELDS = ("time_s", "sp", "pv", "mv", "info")  # of the trajectories that are ke
 
 
 def validate(name: str) -> None:
-    """Run every file of ``controllers.<name>`` over its plant; ship the best by the development sequences."""
+    """Run every file of ``controllers.<name>`` over its plant; ship the best by the development sequences.
+
+    A law that locks up anywhere is not shipped. On a plant's equations that is an error; where tests run on models of
+    a record, the case goes on without it, and its report says why.
+    """
     params = ControllerParams.read(name)
     choices = parse(CaseParams, read_section("cases", params.case), f"cases.{params.case}")
     case = choose(all_cases(), params.case, "case", f"controllers.{name}").with_held_out(choices.held_out_seeds)
@@ -59,11 +63,11 @@ def validate(name: str) -> None:
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))
     source = controller_file(params.case, params.name, BASE, shipped.seed)
     locked_up = _locked_up(base)
-    if locked_up and not params.as_printed:
-        raise LawError(
-            f"controllers.{name} locked up on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
-            "numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
-        )
+    withheld = f"controllers.{name} locked up on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
+    withheld += "numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
+    refused = bool(locked_up) and not params.as_printed
+    if refused and not case.on_models:
+        raise LawError(withheld)
     folder = validation_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -84,7 +88,12 @@ def validate(name: str) -> None:
         evidence["analysis"] = analysis.figures
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
-    with_evidence(source, ARTIFACTS / params.case / f"{params.name}.onnx", evidence)
+    target = ARTIFACTS / params.case / f"{params.name}.onnx"
+    if refused:
+        print(f"validate {name}: {withheld}", file=sys.stderr)
+        withhold(target, withheld)
+    else:
+        with_evidence(source, target, evidence)
 
 
 def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:

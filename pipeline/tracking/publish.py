@@ -64,7 +64,7 @@ def _publish_case(
             _say(f"[{number}/{len(own)}] {case}: run {result.name}")
     digests, made = {}, 0
     for result in own:
-        for path in sorted(root / out for out in result.outs if result.kind == "validate" and out.endswith(".onnx")):
+        for path in result.controllers(root):
             run_id, law = runs[result.key], path.stem
             if result.key in known:
                 refresh(client, known[result.key], law, validation)

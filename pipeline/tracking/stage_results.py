@@ -66,10 +66,19 @@ class StageResult:
 
     def files(self, root: Path) -> Iterator[tuple[Path, str | None]]:
         """Every file of the outputs, and the folder that it lies in, relative to the output; None for none."""
-        for top in (root / out for out in self.outs):
+        for top in self._tops(root):
             for path in [top] if top.is_file() else sorted(p for p in top.rglob("*") if p.is_file()):
                 folder = path.parent.relative_to(top if top.is_dir() else top.parent).as_posix()
                 yield path, None if folder == "." else folder
+
+    def controllers(self, root: Path) -> list[Path]:
+        """The controller files of a validation: each beside its JSON file, whose digest stands for it in dvc.lock."""
+        beside = {root / out for out in self.outs if self.kind == "validate" and out.startswith("artifacts/")}
+        return sorted({path.with_suffix(".onnx") for path in beside if path.with_suffix(".onnx").is_file()})
+
+    def _tops(self, root: Path) -> list[Path]:
+        """Files and folders of the outputs, and the controllers beside them."""
+        return list(dict.fromkeys([*(root / out for out in self.outs), *self.controllers(root)]))
 
     def is_current(self, root: Path) -> bool:
         """Whether the outputs on disk are those that dvc.lock records.

@@ -105,11 +105,10 @@ def test_a_level_begins_at_rest_and_its_set_points_are_what_the_record_visited(l
 
 
 def test_a_level_has_time_to_cross_its_range(level: OwnCase) -> None:
-    # At the median MV and without a load it stays; at full speed it needs width / (rate x MV's way) samples.
+    # At full speed it needs width / (rate x the MV's whole range) samples, and a few for the lag.
     low, high = np.quantile(level.record.pv, (0.01, 0.99))
-    bottom, top = np.quantile(level.record.mv, (0.1, 0.9))
-    needed = (high - low) / (RATE * (top - bottom))
-    assert level.hold == pytest.approx(3 * needed, abs=9)
+    needed = (high - low) / (RATE * 2.0)
+    assert 3 * needed <= level.hold <= 3 * needed + 9
 
 
 def test_a_law_holds_a_level_against_a_load(level: OwnCase) -> None:

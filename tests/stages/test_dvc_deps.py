@@ -24,7 +24,7 @@ def test_every_stage_of_a_case_depends_on_its_files(stage: str) -> None:
 
 
 def test_the_list_of_files_is_made_of_all_of_them_and_before_the_rest() -> None:
-    assert DVC["code"]["deps"] == ["pipeline", "serving"]
+    assert DVC["code"]["deps"] == ["pipeline", "serving", "params.yaml"]
     assert DVC["code"]["outs"] == ["work/code"]
     assert set(DVC) == {"code", *STAGES, *LAST}
     assert "work/code/overview.json" in DVC["overview"]["deps"]

@@ -71,10 +71,18 @@ def test_the_report_says_models_and_no_paper(folder: Path) -> None:
     assert "paper" not in text.lower()
     assert "no bounds" not in text
     assert "free-run fit over unseen rows: TIC-101.PV" in text
+    html = (folder / "artifacts/tank/report.html").read_text()
+    for heading in ("The model of the plant", "Replay over the record"):
+        assert f"## {heading}" in text
+        assert f">{heading}</h2>" in html
+    for picture in ("model_free_run", "model_step_responses", "model_gains", "replay_predictive", "replay_pid"):
+        assert (folder / f"artifacts/tank/figures/{picture}.png").stat().st_size > 10_000
+        assert f"figures/{picture}.png" in html
     validation = json.loads((folder / "artifacts/tank/validation.json").read_text())
     assert validation["on_models"] is True
     assert set(validation["grounds"]) == {"fit", "set_points", "loops"}
     assert 1 <= validation["gate"]["laws"]["predictive"]["score"] < validation["gate"]["laws"]["pid"]["score"]
+    assert validation["bounds"]["held_out"]["nmpc"]["failures"] == 0
     tests = validation["scenarios"]
     assert {"held_out", "held_out_noise", "spoilt", "load"} <= set(tests)
     assert all(np.isfinite(row["mae"]) for laws in tests.values() for row in laws.values())

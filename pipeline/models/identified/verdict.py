@@ -69,7 +69,7 @@ def structure_figures(selection: Selection) -> dict[str, Any]:
 def free_run_figures(
     problem: Problem, trial: Trial, scales: Scales, names: Sequence[str], fold: int = 0
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
-    """(figures of each PV, {measured, free run} of the first) of a fold's best fit over the rows that it never saw.
+    """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 
     ``rmse`` in the PV's unit, ``fit_percent``, ``rmse_by_third``: where the PV was low, in the middle and high, and
     ``outside_training``: the share of these rows in which it left the range of the training rows, where the error
@@ -100,7 +100,7 @@ def free_run_figures(
             "outside_training": float(np.mean((y < low[i]) | (y > high[i]))),
             "rmse_by_third": [float(np.sqrt(np.mean(e**2))) if len(e) else None for e in thirds],
         }
-    return figures, {"measured": actual[:, 0], "free run": predicted[:, 0]}
+    return figures, {"measured": actual, "free run": predicted}
 
 
 # ---------------------------------------------------------------------- what the plant does

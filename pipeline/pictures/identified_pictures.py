@@ -1,0 +1,160 @@
+"""Identified models drawn: step responses with bands, local gains over the range, free run and its residual."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+
+from pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from pipeline.evaluation.law_evidence import Array
+from pipeline.evaluation.model_evidence import identified_part
+from pipeline.pictures.drawing import (
+    PALETTE,
+    SIZE,
+    axis_label,
+    legend_below,
+    ratio_unit,
+    signal_label,
+    symbol,
+    time_axis,
+)
+from pipeline.plants.identified import IdentifiedPlant
+from pipeline.simulation.rests import local_gains
+from serving.manifest import Signal
+
+LAW, OTHER = PALETTE[1], "#8fb8d6"
+PANEL, WIDEST, LOWEST = (2.9, 1.9), 11.0, 3.2  # inches
+QUANTILES = (0.05, 0.95)  # of a record's MV: over them the gains are taken
+PLACES = 7
+LAGS = 40
+SURE = 2.58  # standard deviations of a white residual's correlation that 99 % stay within
+SHOWN = 800  # samples of a free run
+SIGNS = {"+": "rises with", "-": "falls with", "uncertain": "may rise or fall with"}
+
+
+def _grid(rows: int, columns: int, **shared: Any) -> tuple[Canvas, list[list[Axes]]]:
+    width = float(np.clip(columns * PANEL[0], SIZE[0], WIDEST))
+    canvas = Canvas(figsize=(width, max(rows * PANEL[1] + 1.0, LOWEST)), layout="constrained")
+    return canvas, [list(row) for row in canvas.subplots(rows, columns, squeeze=False, **shared)]
+
+
+def step_responses_picture(evidence: Evidence) -> Canvas:
+    """Answer of each controlled variable to a step of one unit of each input, with the band of all good fits."""
+    responses = identified_part(evidence.models).get("step_responses")
+    dead: Mapping[str, float] = identified_part(evidence.models).get("dead_times") or {}
+    if not responses:
+        raise NotMeasuredError
+    plant = evidence.case.plant_class
+    inputs, cvs = (*plant.mv_signals, *plant.dv_signals), [s for s in plant.sp_signals if s.name in responses]
+    canvas, panels = _grid(len(cvs), len(inputs), sharex=True)
+    for row, cv in zip(panels, cvs, strict=True):
+        for axes, signal in zip(row, inputs, strict=True):
+            found = responses[cv.name][signal.name]
+            # A response begins at 0 where the input moves.
+            time, words = time_axis(plant.period_s * np.array([0, *found["periods"]], dtype=np.float64))
+            middle, low, high = (np.array([0.0, *found[key]]) for key in ("middle", "low", "high"))
+            axes.fill_between(time, low, high, color=LAW, alpha=0.25, linewidth=0, label="band of all good fits")
+            axes.plot(time, middle, color=LAW, linewidth=1.4, label="their middle")
+            axes.axhline(0.0, color="#888888", linewidth=0.7)
+            waits = dead.get(signal.name, 0.0) * plant.period_s
+            if waits:
+                axes.axvline(time[-1] * waits / (plant.period_s * found["periods"][-1]), color=PALETTE[0],
+                             linewidth=0.9, linestyle=":", label="dead time")  # fmt: skip
+            if row is panels[0]:
+                axes.set_title(f"step of {_of(signal)}", fontsize=9.5)
+            if row is panels[-1]:
+                axes.set_xlabel(words)
+            axes.margins(x=0.01)
+        row[0].set_ylabel(signal_label(cv))
+    _legend(canvas, panels)
+    return canvas
+
+
+def gains_picture(evidence: Evidence) -> Canvas:
+    """Local gain of each controlled variable over the visited range of each MV: the law's model and the others."""
+    if evidence.case.replayed is None or not isinstance(evidence.case.plant, IdentifiedPlant):
+        raise NotMeasuredError
+    plant, record = evidence.case.plant, evidence.case.replayed[0]
+    signs: Mapping[str, Any] = identified_part(evidence.models).get("gains") or {}
+    others = list({id(t.plant): t.plant for tests in evidence.tests.values() for t in tests if t.plant}.values())
+    middle, (low, high) = np.median(record.mv, axis=0), np.quantile(record.mv, QUANTILES, axis=0)
+    canvas, panels = _grid(len(plant.sp_signals), len(plant.mv_signals))
+    for j, mv in enumerate(plant.mv_signals):
+        places = np.linspace(low[j], high[j], PLACES)
+        found = [local_gains(p, j, places, middle, len(plant.sp_signals)) for p in (*others, plant)]
+        for i, cv in enumerate(plant.sp_signals):
+            axes, rate = panels[i][j], bool(found[-1][1][:, i].any())
+            for k, (gain, _) in enumerate(found):
+                own = k == len(found) - 1
+                look: dict[str, Any] = {"color": LAW if own else OTHER, "linewidth": 1.7 if own else 1.0}
+                axes.plot(places, gain[:, i], label="law's model" if own else "models of the tests", **look)
+            axes.axhline(0.0, color="#888888", linewidth=0.7)
+            axes.set_xlabel(signal_label(mv))
+            unit = ratio_unit(cv.unit, mv.unit) + (" a period" if rate else "")
+            axes.set_ylabel(axis_label(f"d {symbol(cv.name)} / d {symbol(mv.name)}", unit), fontsize=8.5)
+            sign = (signs.get(cv.name) or {}).get(mv.name, {}).get("sign")
+            axes.set_title(f"{symbol(cv.name)} {SIGNS.get(sign, 'answers to')} {symbol(mv.name)}", fontsize=9.5)
+    _legend(canvas, panels)
+    return canvas
+
+
+def free_run_picture(evidence: Evidence) -> Canvas:
+    """Measurement and free run over rows that the fit never saw, the residual, and its correlation with itself."""
+    sets = (evidence.predictions(name) for name in evidence.models)
+    arrays = next((found for found in sets if "free run" in found), {})
+    if not {"measured", "free run", "time_s"} <= set(arrays):
+        raise NotMeasuredError
+    measured, run = (np.reshape(arrays[k], (len(arrays["time_s"]), -1)) for k in ("measured", "free run"))
+    cvs = evidence.case.plant_class.sp_signals[: measured.shape[1]]
+    canvas = Canvas(figsize=(SIZE[0] * 1.15, 0.9 + 3.0 * len(cvs)), layout="constrained")
+    panels = canvas.subplots(2 * len(cvs), 2, squeeze=False, width_ratios=(3, 1), height_ratios=(2, 1) * len(cvs))
+    for i, cv in enumerate(cvs):
+        _free_run_of(panels[2 * i : 2 * i + 2], arrays["time_s"], measured[:, i], run[:, i], cv)
+    legend_below(canvas, *panels[0][0].get_legend_handles_labels())
+    return canvas
+
+
+def _free_run_of(panels: Any, time_s: Array, measured: Array, run: Array, cv: Signal) -> None:
+    (above, beside), (below, spread) = panels
+    time, words = time_axis(time_s[:SHOWN])
+    residual = measured - run
+    above.plot(time, measured[:SHOWN], color="black", linewidth=0.9, label="measured")
+    above.plot(time, run[:SHOWN], color=PALETTE[0], linewidth=1.2, label="free run of the model")
+    above.set_ylabel(signal_label(cv))
+    below.plot(time, residual[:SHOWN], color=LAW, linewidth=0.8)
+    below.set_ylabel(axis_label("residual", cv.unit), fontsize=8.5)
+    below.set_xlabel(words)
+    for axes in (above, below):
+        axes.margins(x=0.01)
+    known = residual[np.isfinite(residual)]
+    if len(known) > 2 * LAGS:
+        centred = known - known.mean()
+        lags = np.arange(1, LAGS + 1)
+        power = max(float(centred @ centred), 1e-300)
+        own = [float(centred[lag:] @ centred[:-lag]) / power for lag in lags]
+        beside.axhspan(-SURE / np.sqrt(len(known)), SURE / np.sqrt(len(known)), color="#dddddd", linewidth=0)
+        beside.vlines(lags, 0, own, color=LAW, linewidth=1.2)
+        beside.set_title("residual with itself", fontsize=9)
+        beside.set_xlabel("lag [samples]", fontsize=8.5)
+        spread.hist(known, bins=30, color=LAW, alpha=0.6)
+        spread.set_xlabel(axis_label("residual", cv.unit), fontsize=8.5)
+        spread.set_yticks([])
+
+
+def _of(signal: Signal) -> str:
+    return f"{symbol(signal.name)} by 1 {signal.unit.replace('deg', '°')}".strip()
+
+
+def _legend(canvas: Canvas, panels: Sequence[Sequence[Axes]]) -> None:
+    """One entry a label, whichever panel has it."""
+    found = {
+        text: handle
+        for row in panels
+        for axes in row
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    legend_below(canvas, list(found.values()), list(found))

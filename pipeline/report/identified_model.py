@@ -1,0 +1,126 @@
+"""What the report of an own plant says of its identified model: verdicts, figures by variable and by answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.model_evidence import identified_part
+from pipeline.pictures.drawing import axis_label, ratio_unit
+from pipeline.pictures.numbers import figure, number
+
+MOST_TRIED = 12  # candidates in the table, the best first
+SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
+
+
+@dataclass(frozen=True, slots=True)
+class ModelSection:
+    """Sentences, and the rows of three tables as texts."""
+
+    verdicts: tuple[str, ...]
+    variables: tuple[tuple[str, ...], ...]  # of each controlled variable, see VARIABLES
+    answers: tuple[tuple[str, ...], ...]  # of each variable to each input, see ANSWERS
+    tried: tuple[tuple[str, ...], ...]  # candidates, see TRIED
+
+
+VARIABLES = (
+    "Variable",
+    "Free-run fit",
+    "RMSE",
+    "RMSE low, middle, high",
+    "Noise",
+    "Residual with itself",
+    "with inputs",
+)
+ANSWERS = ("Variable", "Input", "Gain", "Sign", "Over the range", "Dead time [s]")
+TRIED = ("Start", "States", "Dead times", "Hidden units", "Held-out error", "Spread", "Chosen")
+
+
+def model_section(evidence: Evidence) -> ModelSection | None:
+    """What was found of the model that laws are designed on; None for a case without an identified one."""
+    part = identified_part(evidence.models)
+    if not part:
+        return None
+    return ModelSection(_verdicts(part), _variables(evidence, part), _answers(evidence, part), _tried(part))
+
+
+def _verdicts(part: Mapping[str, Any]) -> tuple[str, ...]:
+    """Linear or not, stable or not, and what the fit itself warns of."""
+    structure, stability = part.get("structure") or {}, part.get("stability") or {}
+    radius = part.get("spectral_radius")
+    words = [structure.get("verdict"), stability.get("verdict"), structure.get("row_convention")]
+    if not stability and radius is not None:
+        words.append(f"the largest pole at rests of the visited range is {radius:.4g}; at most 1 is stable")
+    warnings = tuple(f"Warning: {text}." for text in part.get("warnings") or ())
+    return (*(f"{text[:1].upper()}{text[1:]}." for text in words if text), *warnings)
+
+
+def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
+    rows = []
+    for signal in evidence.case.plant_class.sp_signals:
+        found = (part.get("outputs") or {}).get(signal.name)
+        if found is None:
+            continue
+        residual = (part.get("residual") or {}).get(signal.name) or {}
+        fit, thirds = found.get("fit_percent"), found.get("rmse_by_third") or ()
+        rows.append(
+            (
+                axis_label(signal.name, signal.unit),
+                "the run explodes" if fit is None else f"{fit:.3g} %",
+                figure(found.get("free_run_rmse")),
+                ", ".join(figure(third) for third in thirds),
+                figure(found.get("noise_sd")),
+                _share(residual.get("autocorrelated")),
+                _share(residual.get("input_correlated")),
+            )
+        )
+    return tuple(rows)
+
+
+def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
+    plant, gains = evidence.case.plant_class, part.get("gains") or {}
+    rows = []
+    for signal in plant.sp_signals:
+        for given in (*plant.mv_signals, *plant.dv_signals):
+            found = (gains.get(signal.name) or {}).get(given.name)
+            if found is None:
+                continue
+            dead = (part.get("dead_times") or {}).get(given.name)
+            varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
+            rows.append(
+                (
+                    signal.name,
+                    given.name,
+                    axis_label(
+                        f"{number(found['gain'])} ± {number(found['spread'], 2)}", ratio_unit(signal.unit, given.unit)
+                    ),
+                    SIGNS.get(found["sign"], found["sign"]),
+                    f"{number(found['low'])} … {number(found['high'])}, {varies}",
+                    "–" if dead is None else number(dead * plant.period_s),
+                )
+            )
+    return tuple(rows)
+
+
+def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
+    tried = [row for row in part.get("candidates_tried") or () if row.get("error") is not None]
+    best = sorted(tried, key=lambda row: float(row["error"]))[:MOST_TRIED]
+    chosen = [row for row in tried if row.get("chosen") and row not in best]
+    return tuple(
+        (
+            str(row.get("start", "")),
+            str(row.get("order", "")),
+            ", ".join(map(str, row.get("delays") or ())),
+            str(row.get("hidden", "")),
+            figure(row["error"]),
+            figure(row.get("spread")),
+            "yes" if row.get("chosen") else "",
+        )
+        for row in (*best, *chosen)
+    )
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{100 * value:.0f} %"

@@ -1,0 +1,84 @@
+"""The section of a report on an identified model: signs, dead times, verdicts and the structures tried."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from own_cases import two_lags
+
+from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, ModelSection, model_section
+
+
+def gain(sign: str, varies: float | None) -> dict[str, Any]:
+    return {"gain": 0.5, "spread": 0.3, "sign": sign, "low": -0.1, "high": 0.9, "varies": varies}
+
+
+def tried(error: float | None, chosen: bool) -> dict[str, Any]:
+    fixed = {"start": "lagged", "order": 2, "delays": [0, 1], "hidden": 4, "spread": 0.1}
+    return {**fixed, "error": error, "chosen": chosen}
+
+
+PART: dict[str, Any] = {
+    "structure": {"verdict": "linear is enough: it is as good"},
+    "stability": {"verdict": "stable: it settles"},
+    "spectral_radius": 0.9,
+    "warnings": ["y0: half of the rows are elsewhere"],
+    "outputs": {
+        "y0": {"fit_percent": 91.27, "free_run_rmse": 0.1, "rmse_by_third": [0.2, 0.1, None], "noise_sd": 0.05},
+        "y1": {"fit_percent": None, "free_run_rmse": 9.0, "rmse_by_third": [9.0, 9.0, 9.0], "noise_sd": 0.05},
+    },
+    "residual": {"y0": {"autocorrelated": 0.5, "input_correlated": 0.02}},
+    "gains": {"y0": {"u0": gain("+", 1.4), "u1": gain("uncertain", None)}, "y1": {"u0": gain("-", 1.0)}},
+    "dead_times": {"u0": 3.0, "u1": 0.0},
+    "candidates_tried": [*(tried(0.1 * k, False) for k in range(1, 20)), tried(5.0, True), tried(None, False)],
+}
+
+
+@pytest.fixture
+def section(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelSection:
+    monkeypatch.chdir(tmp_path)
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": PART}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    return found
+
+
+def test_verdicts_are_sentences(section: ModelSection) -> None:
+    assert section.verdicts == (
+        "Linear is enough: it is as good.",
+        "Stable: it settles.",
+        "Warning: y0: half of the rows are elsewhere.",
+    )
+
+
+def test_every_variable_has_its_fit_and_its_residual(section: ModelSection) -> None:
+    assert section.variables[0] == ("y0 [m]", "91.3 %", "0.1", "0.2, 0.1, –", "0.05", "50 %", "2 %")
+    assert section.variables[1][1] == "the run explodes"
+    assert section.variables[1][-2:] == ("–", "–")
+
+
+def test_an_answer_says_its_sign_and_how_sure_that_is(section: ModelSection) -> None:
+    signs = {row[:2]: row[3] for row in section.answers}
+    assert signs == {("y0", "u0"): "+", ("y0", "u1"): "uncertain", ("y1", "u0"): "−"}
+    assert "turns its sign" in section.answers[1][4]
+    assert [row[5] for row in section.answers] == ["3", "0", "3"]
+
+
+def test_the_best_structures_are_listed_and_the_chosen_one_whatever_its_error(section: ModelSection) -> None:
+    errors = [float(row[4]) for row in section.tried]
+    assert errors[:-1] == sorted(errors[:-1])
+    assert section.tried[-1][-1] == "yes"
+    assert len(section.tried) == 13
+
+
+def test_rows_have_a_cell_a_column(section: ModelSection) -> None:
+    for head, rows in ((VARIABLES, section.variables), (ANSWERS, section.answers), (TRIED, section.tried)):
+        assert {len(row) for row in rows} == {len(head)}
+
+
+def test_a_case_without_an_identified_model_has_no_such_section() -> None:
+    models = {"nnarx": {"parts": {"a": {"kind": "nnarx"}}}}
+    assert model_section(SimpleNamespace(models=models)) is None  # type: ignore[arg-type]

@@ -1,0 +1,51 @@
+"""A law of an own plant that locks up: nothing is shipped, the reason stays, and the case goes on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from identified_models import scaled_model
+from own_cases import case_of, section
+
+from pipeline.evaluation.law_evidence import LawEvidence, LawMetrics
+from pipeline.stages.design import design
+from pipeline.stages.validate import validate
+
+POLES = (0.6, 0.55, 0.65)
+
+
+@pytest.fixture
+def metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LawMetrics:
+    """Of a PID whose sign is wrong, designed and validated on a lag."""
+    monkeypatch.chdir(tmp_path)
+    mv = np.repeat(np.random.default_rng(0).uniform(-0.6, 0.6, (40, 1)), 10, axis=0)
+    y = np.zeros((400, 1))
+    for k in range(399):
+        y[k + 1] = POLES[0] * y[k] + (1 - POLES[0]) * 2 * mv[k]
+    lags = [scaled_model(1, 1, 0, 1, a=np.array([[p]]), b=np.array([[2 * (1 - p)]]), rest=np.eye(1, 3)) for p in POLES]
+    case = case_of(section(1, 1), lags, y, mv)
+    (case.models.parent / "metrics.json").write_text(json.dumps({"data": {"0": "x"}, "parts": {}}))
+    tree = yaml.safe_load(Path("params.yaml").read_text())
+    tree["cases"] = {"it": {"held_out_seeds": [9001, 9002]}}
+    wrong = {"law": "pid", "tuning": "manual", "kc": -2.0, "ti_s": 3.0}
+    tree["controllers"] = {"it-pid": {"case": "it", "name": "pid", "model": "identified", **wrong}}
+    Path("params.yaml").write_text(yaml.safe_dump(tree))
+    stale = Path("artifacts/it/pid.onnx")
+    stale.parent.mkdir(parents=True)
+    stale.write_bytes(b"of an earlier run")
+    design("it-pid")
+    validate("it-pid")
+    return LawMetrics.read(Path("work/it/validation/pid/metrics.json"))
+
+
+def test_no_file_is_shipped_and_the_reason_stays(metrics: LawMetrics) -> None:
+    assert metrics.lock_ups > 0
+    assert not Path("artifacts/it/pid.onnx").exists()
+    why = json.loads(Path("artifacts/it/pid.json").read_text())["withheld"]
+    assert why.startswith("controllers.it-pid locked up on ")
+    assert set(metrics.locked_up) >= {"held_out", "spoilt"}
+    assert LawEvidence(metrics, Path("trajectories.npz")).withheld
