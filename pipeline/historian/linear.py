@@ -17,6 +17,7 @@ MOST_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly o
 SETTLED = 0.8  # of the rows that an answer is followed: later it has not settled
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
 LEAST_ROWS = 60
+NO_EFFECT = 2.0  # strength of an input that a prediction leaves out
 LONG = 1_000_000  # rows, of which a part is looked at
 
 
@@ -48,6 +49,8 @@ class Linear:
         back = self.blocks[-1][1]
         first = int(k[0]) - back
         for i, row in enumerate(self.b):
+            if self.strength[i] < NO_EFFECT:
+                continue
             part = u[i][first : int(k[-1]) + 1] - self.centre[i]
             out = out + blocks_of(part, k - first, self.blocks) @ row
         return np.asarray(out)

@@ -33,9 +33,12 @@ from pipeline.records.record import Record
 LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Screened:
-    """The clean record, the rows it was taken from, and the report."""
+    """The clean record, the rows it was taken from, and the report.
+
+    ``record`` may give way to an excerpt once it is written: pages and pictures need no more.
+    """
 
     record: Record
     grid: Grid

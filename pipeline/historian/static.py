@@ -12,6 +12,7 @@ from pipeline.metrics import Array
 
 SLOW = ((41, 81), (81, 161), (161, 321))  # lags beyond BLOCKS that share a coefficient; the last are left out first
 SETTLED = 0.15
+WEAK = 0.01  # part in the answer, over the strongest input's
 MOST_SHARE = 0.05  # of the rows: longer lags explain by chance what the inputs did not cause
 CHUNK = 200_000  # rows
 
@@ -35,15 +36,22 @@ def explained(y: Array, u: Sequence[Array], piece: NDArray[np.int64]) -> tuple[A
             return out, 0
         blocks = blocks[:-1]
     centre = np.array([float(np.mean(c[rows])) for c in u])
-    theta = least_squares(_inputs(u, centre, rows, blocks), y[rows + 1])[0]
+    table = _inputs(u, centre, rows, blocks)
+    theta = least_squares(table, y[rows + 1])[0]
+    parts = (table[:, :-1] * theta[:-1]).reshape(len(rows), len(u), len(blocks)).sum(axis=2).std(axis=0)
+    # An input without a part costs as much time as one with it.
+    strong = [i for i, part in enumerate(parts) if part >= WEAK * parts.max()]
+    full, m = theta, len(blocks)
+    theta = np.r_[full[:-1].reshape(len(u), m)[strong].ravel(), full[-1]]
+    used, middle = [u[i] for i in strong], centre[strong]
     back = blocks[-1][1] - 1
     bad = np.r_[0, np.cumsum(~whole(*u), dtype=np.int32)]
     for start in range(back, len(y) - 1, CHUNK):
         k = np.arange(start, min(start + CHUNK, len(y) - 1))
-        value = _inputs(u, centre, k, blocks) @ theta
+        value = _inputs(used, middle, k, blocks) @ theta
         seen = (piece[k - back] == piece[k + 1]) & (bad[k + 1] == bad[k - back])
         out[k + 1] = np.where(seen, value, np.nan)
-    return out, _settling(theta, np.array([float(np.std(c[rows])) for c in u]), blocks)
+    return out, _settling(full, np.array([float(np.std(c[rows])) for c in u]), blocks)
 
 
 def _inputs(
