@@ -15,6 +15,7 @@ from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
 from pipeline.files import draft_folder_of, write_json, write_text
+from pipeline.historian.excerpt import evenly
 from pipeline.historian.findings import Screening, Verdict
 from pipeline.historian.guessing import guesses
 from pipeline.historian.reading import read_export, units_of
@@ -109,6 +110,8 @@ def _write(name: str, folder: Path, found: Screened, anyway: bool, made: Simulat
     with draft_folder_of(folder) as draft:
         if not usable:
             found.record.write(draft / "record.parquet")
+        plant = entry(found.record, report, folder)
+        found.record = evenly(found.record)  # pages need no more, and a long record is large
         write_json(draft / "screening.json", report.to_dict())
         if made:
             keep(made, draft)
@@ -117,7 +120,6 @@ def _write(name: str, folder: Path, found: Screened, anyway: bool, made: Simulat
         write_page(draft / "screening.html", found, test)
     if not usable:
         try:
-            plant = entry(found.record, report, folder)
             add_entries(entries_of(name, plant | ({"simulator": (folder / SIMULATOR).as_posix()} if made else {})))
         except PipelineError:
             shutil.rmtree(folder)

@@ -32,7 +32,7 @@ def confirm(
     """
     found = []
     inputs = [t for t in signals if t.role != "pv"]
-    u = np.column_stack([np.empty((len(grid), 0)), *(grid.value[t.tag] for t in inputs)])
+    u = [grid.value[t.tag] for t in inputs]
     for tag in (t for t in signals if t.role == "pv"):
         series, rate = own[tag.tag], rates[tag.tag]
         y = grid.value[tag.tag]
@@ -52,7 +52,7 @@ def confirm(
     return found
 
 
-def _answers(grid: Grid, series: Series, model: Linear, y: Array, u: Array) -> int:
+def _answers(grid: Grid, series: Series, model: Linear, y: Array, u: Sequence[Array]) -> int:
     """Put outliers back that the model explains; how many."""
     bad = np.flatnonzero(series.code == Reason.OUTLIER)
     row = np.searchsorted(grid.time_s, series.time_s[bad] - 0.5 * grid.period_s)
@@ -68,7 +68,7 @@ def _answers(grid: Grid, series: Series, model: Linear, y: Array, u: Array) -> i
     return len(bad)
 
 
-def _errors(model: Linear, y: Array, u: Array, piece: NDArray[np.int64]) -> NDArray[np.int64]:
+def _errors(model: Linear, y: Array, u: Sequence[Array], piece: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows with an error d of one measurement, (m,).
 
         e(k+j) = p_j d,   p = (1, -a_0, -a_1, -a_2),   d = sum p_j e(k+j) / sum p_j^2

@@ -47,18 +47,32 @@ class Windows:
     @classmethod
     def of(cls, y: Array, expected: Array, length: int) -> Windows:
         """Of a PV y (n,) and its expected values (n,); windows with too many gaps are left out."""
-        rows = []
-        for a in range(0, len(y) - length + 1, max(length // STEPS, 1)):
-            v, e = y[a : a + length], expected[a : a + length]
-            ok = np.isfinite(v) & np.isfinite(e)
-            if ok.sum() >= WHOLE * length:
-                v, e = v[ok], e[ok]
-                sd, motion = float(v.std()), float(e.std())
-                both = float(np.mean((v - v.mean()) * (e - e.mean()))) / max(sd * motion, 1e-300)
-                share = 1.0 - float(np.var(v - e)) / max(sd**2, 1e-300)
-                rows.append((a, sd, motion, both, share, float(e.min()), float(e.max())))
-        table = np.array(rows, dtype=np.float64).reshape(-1, 7)
-        return cls(length, table[:, 0].astype(np.int64), *table[:, 1:].T)
+        part = max(length // STEPS, 1)
+        m = len(y) // part
+        ok = np.isfinite(y[: m * part]) & np.isfinite(expected[: m * part])
+        y0, e0 = (float(np.mean(v[: m * part][ok])) if ok.any() else 0.0 for v in (y, expected))
+        v = np.where(ok, y[: m * part] - y0, 0.0)
+        e = np.where(ok, expected[: m * part] - e0, 0.0)
+
+        def sums(values: Array) -> Array:
+            """Over each window of STEPS parts, (m - STEPS + 1,)."""
+            return np.convolve(values.reshape(m, part).sum(axis=1), np.ones(STEPS), "valid")
+
+        if m < STEPS:
+            ok, v, e, m = np.zeros(STEPS * part, bool), np.zeros(STEPS * part), np.zeros(STEPS * part), STEPS
+        count = sums(ok.astype(np.float64))
+        n = np.maximum(count, 1.0)
+        my, me = sums(v) / n, sums(e) / n
+        vv, ee, ve = sums(v * v) / n - my**2, sums(e * e) / n - me**2, sums(v * e) / n - my * me
+        floor, ceiling = np.where(ok, e, np.inf).reshape(m, part), np.where(ok, e, -np.inf).reshape(m, part)
+        low = np.min([floor.min(axis=1)[i : m - STEPS + 1 + i] for i in range(STEPS)], axis=0) + e0
+        high = np.max([ceiling.max(axis=1)[i : m - STEPS + 1 + i] for i in range(STEPS)], axis=0) + e0
+        sd, motion = np.sqrt(np.maximum(vv, 0.0)), np.sqrt(np.maximum(ee, 0.0))
+        both = ve / np.maximum(sd * motion, 1e-300)
+        share = 1.0 - (vv + ee - 2 * ve) / np.maximum(vv, 1e-300)
+        keep = count >= WHOLE * STEPS * part
+        start = np.arange(m - STEPS + 1, dtype=np.int64) * part
+        return cls(STEPS * part, start[keep], *(a[keep] for a in (sd, motion, both, share, low, high)))
 
 
 def contradict(

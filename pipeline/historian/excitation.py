@@ -77,8 +77,11 @@ def follows(u: Array, y: Array, run: Runs) -> float:
     return float(share) if share * (len(k) - 7) / max(1 - share, 1e-9) / 3 > 10 else 0.0
 
 
-def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int) -> Verdict:
-    """The verdict over a record; ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points."""
+def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int, rows: int) -> Verdict:
+    """The verdict over a record of ``rows`` rows, or an excerpt of it.
+
+    ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points.
+    """
     signals = [(s, "mv") for s in record.mv_signals] + [(s, "dv") for s in record.dv_signals]
     u = np.hstack([record.mv, record.dv])
     found = spectra_of(record, models)
@@ -89,9 +92,9 @@ def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int) -
     correlation = _correlation(u, [s.name for s, _ in signals])
     parameters = 3 * len(record.pv_signals) + 7 * len(signals) + 1
     used = max((len(m.rows) for m in models.values() if m), default=0)
-    reasons, level = _reasons(record, inputs, correlation, parameters, moved_sp)
+    reasons, level = _reasons(record, inputs, correlation, parameters, moved_sp, rows)
     carries = ("yes", "doubtful", "no")[level]
-    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, len(record), parameters, used)
+    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used)
 
 
 def spectra_of(record: Record, models: Mapping[str, Linear | None]) -> dict[str, list[Spectrum]]:
@@ -155,10 +158,9 @@ def _gain(model: Linear, i: int) -> float:
 
 
 def _reasons(
-    record: Record, inputs: list[InputReport], correlation: Mapping[str, float], parameters: int, moved_sp: int
+    record: Record, inputs: list[InputReport], correlation: Mapping[str, float], parameters: int, moved_sp: int, n: int
 ) -> tuple[list[str], int]:
     found: list[tuple[int, str]] = []
-    n = len(record)
     if n < LEAST_ROWS_A_PARAMETER * parameters:
         found.append((2, f"{n} rows for {parameters} parameters of a linear model: too few; record longer"))
     elif n < ROWS_A_PARAMETER * parameters:

@@ -25,6 +25,7 @@ SMALLEST_MOVE = 0.05  # over the median move, of a tag with a dead band
 MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
 THINNED = 1.9  # readings a period from which PVs are averaged
 LEAST_PIECE = 2  # rows
+LONG = 1_000_000  # rows
 CHUNK = 500_000  # rows
 
 
@@ -46,12 +47,17 @@ class Grid:
     period_s: float
     time_s: Array  # (n,) [s] as the export counts
     piece: NDArray[np.int64]  # (n,) number of the piece between two gaps in time
-    value: Mapping[str, Array]  # (n,) NaN where there is no value
+    value: dict[str, Array]  # (n,) NaN where there is no value
     code: Mapping[str, Codes]  # (n,) why there is none; GOOD where there is one
     bridged: Mapping[str, int]  # rows whose value was drawn or held over a bad or missing reading
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def lighten(self, tag: str) -> None:
+        """Keep single precision of a long tag: enough for what is only drawn from here on."""
+        if len(self) > LONG:
+            self.value[tag] = self.value[tag].astype(np.float32)
 
 
 def sampling(series: Series, period_s: float | None = None, hold_s: float | None = None) -> Sampling:
@@ -93,6 +99,7 @@ def resampled(
     held: Sequence[Series],
     period_s: float,
     hold_s: float | None = None,
+    done: Callable[[str], None] = lambda _: None,
 ) -> tuple[Grid, tuple[Sampling, ...]]:
     """All series on one grid: PVs and measured disturbances (``pv``) drawn or averaged, the others held.
 
@@ -100,7 +107,7 @@ def resampled(
     PVs: held where they are stored beyond a dead band, else on a straight line between two good readings no farther
     apart than the hold; where two or more readings fall into a period, the mean over (t - h, t], against aliasing.
     Held ones: the reading that holds at the middle of [t, t + h), so that jitter of less than half a period does not
-    matter; the mean over it where they are thinned out.
+    matter; the mean over it where they are thinned out. ``done`` is told each tag that needs its readings no more.
     """
     if not period_s > 0:
         raise RecordError(f"the period is {period_s:g} s; it must be positive")
@@ -122,6 +129,7 @@ def resampled(
             )
         value[s.tag], code[s.tag] = out, _reasons(time_s, s, out, period_s)
         bridged[s.tag] = 0 if rate.irregular else int(np.count_nonzero(over))
+        done(s.tag)
     return Grid(period_s, time_s, piece, value, code, bridged), tuple(rates.values())
 
 

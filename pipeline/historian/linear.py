@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,8 @@ MOST_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly o
 SETTLED = 0.8  # of the rows that an answer is followed: later it has not settled
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
 LEAST_ROWS = 60
+NO_EFFECT = 2.0  # strength of an input that a prediction leaves out
+LONG = 1_000_000  # rows, of which a part is looked at
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +40,8 @@ class Linear:
     rows: NDArray[np.int64]  # (n,) rows k of the fit
     residual: Array  # (n,)
 
-    def predicted(self, y: Array, u: Array, k: NDArray[np.int64]) -> Array:
-        """y(k+1) (m,) from the rows up to k (m,) of y (n,) and u (n, n_inputs); NaN where one is missing.
+    def predicted(self, y: Array, u: Sequence[Array], k: NDArray[np.int64]) -> Array:
+        """y(k+1) (m,) from the rows up to k (m,) of y (n,) and of each input u (n,); NaN where one is missing.
 
         k must increase and leave as many rows before it as the blocks reach back.
         """
@@ -47,7 +49,9 @@ class Linear:
         back = self.blocks[-1][1]
         first = int(k[0]) - back
         for i, row in enumerate(self.b):
-            part = u[first : int(k[-1]) + 1, i] - self.centre[i]
+            if self.strength[i] < NO_EFFECT:
+                continue
+            part = u[i][first : int(k[-1]) + 1] - self.centre[i]
             out = out + blocks_of(part, k - first, self.blocks) @ row
         return np.asarray(out)
 
@@ -73,15 +77,15 @@ class Linear:
         return rows if rows < SETTLED * length else 0
 
 
-def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
-    """The model of y (n,) from inputs u (n, m) within runs (n,); None where too few rows or no motion are there.
+def fitted(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | None:
+    """The model of y (n,) from inputs u, (n,) each, within runs (n,); None where too few rows or no motion are there.
 
     Rows with NaN take no part. At most MOST_ROWS rows are used, in windows spread evenly.
     """
     blocks: tuple[tuple[int, int], ...] = BLOCKS
     while True:
         rows = rows_of(y, u, run, blocks[-1][1] - 1)
-        parameters = Y_LAGS + 1 + u.shape[1] * (len(blocks) + len(AHEAD))
+        parameters = Y_LAGS + 1 + len(u) * (len(blocks) + len(AHEAD))
         if len(rows) >= max(LEAST_ROWS, 3 * parameters):
             break
         if len(blocks) <= 3:
@@ -91,20 +95,20 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
     past = np.column_stack([y[rows - i] for i in range(Y_LAGS)])
     if np.ptp(target) <= 0:
         return None
-    centre = np.array([np.nanmean(u[:, i]) for i in range(u.shape[1])])
-    inputs = [blocks_of(u[:, i] - centre[i], rows, blocks) for i in range(u.shape[1])]
-    ahead = [blocks_of(u[:, i] - centre[i], rows, AHEAD) for i in range(u.shape[1])]
+    centre = np.array([float(np.mean(c[rows])) for c in u])
+    inputs = [blocks_of(c - m, rows, blocks) for c, m in zip(u, centre, strict=True)]
+    ahead = [blocks_of(c - m, rows, AHEAD) for c, m in zip(u, centre, strict=True)]
     x = np.column_stack([past, *inputs, np.ones(len(rows))])
     theta, cov, keep = least_squares(x, target)
     residual = target - x @ theta
     sd = _robust_sd(residual[keep])
     m = len(blocks)
-    places = {i: slice(Y_LAGS + i * m, Y_LAGS + (i + 1) * m) for i in range(u.shape[1])}
+    places = {i: slice(Y_LAGS + i * m, Y_LAGS + (i + 1) * m) for i in range(len(u))}
     strength = {i: _wald(theta[p], cov[p, p]) for i, p in places.items()}
     growth = np.var((target - past[:, 0])[keep])
     explained = 1.0 - np.var(residual[keep]) / growth if growth > 0 else 0.0
-    b = np.array([theta[p] for p in places.values()]).reshape(u.shape[1], m)
-    early = {i: _early(x, ahead[i], target) for i in range(u.shape[1])}
+    b = np.array([theta[p] for p in places.values()]).reshape(len(u), m)
+    early = {i: _early(x, ahead[i], target) for i in range(len(u))}
     return Linear(
         theta[:Y_LAGS],
         b,
@@ -120,18 +124,33 @@ def fitted(y: Array, u: Array, run: NDArray[np.int64]) -> Linear | None:
     )
 
 
-def rows_of(y: Array, u: Array, run: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
+def rows_of(y: Array, u: Sequence[Array], run: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
     """Rows k with lag rows before and five after in their run, without NaN, in windows spread evenly."""
     after = -AHEAD[-1][0]
     lag = max(lag, Y_LAGS - 1)
-    ok = np.isfinite(y) & np.isfinite(u).all(axis=1)
-    bad = np.r_[0, np.cumsum(~ok)]
-    k = np.arange(lag, len(y) - after)
-    k = k[(run[k - lag] == run[k + after]) & (bad[k + after + 1] == bad[k - lag])]
+    bad = np.r_[0, np.cumsum(~whole(y, *u), dtype=np.int32)]
+
+    def good(k: NDArray[np.int64]) -> NDArray[np.int64]:
+        return k[(run[k - lag] == run[k + after]) & (bad[k + after + 1] == bad[k - lag])]
+
+    last = len(y) - after
+    if last - lag > LONG:  # a part first, so that a long record needs no long list of rows
+        starts = np.linspace(lag, last - WINDOW_ROWS, 4 * MOST_ROWS // WINDOW_ROWS).astype(np.int64)
+        k = good((starts[:, None] + np.arange(WINDOW_ROWS)).ravel())
+    else:
+        k = good(np.arange(lag, last))
     if len(k) > MOST_ROWS:
         starts = np.linspace(0, len(k) - WINDOW_ROWS, MOST_ROWS // WINDOW_ROWS).astype(np.int64)
         k = k[np.unique((starts[:, None] + np.arange(WINDOW_ROWS)).ravel())]
     return k
+
+
+def whole(*columns: Array) -> NDArray[np.bool_]:
+    """Rows (n,) in which no column (n,) is NaN."""
+    ok = np.ones(len(columns[0]), dtype=bool)
+    for column in columns:
+        ok &= np.isfinite(column)
+    return ok
 
 
 def blocks_of(u: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:

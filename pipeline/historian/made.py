@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from pipeline.historian.excerpt import evenly
 from pipeline.historian.excitation import judged
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding, Screening, TagReport
@@ -23,6 +24,7 @@ def judged_record(
     groups = {"pv": record.pv_signals, "mv": record.mv_signals, "dv": record.dv_signals}
     columns = {s.name: getattr(record, r)[:, i] for r, group in groups.items() for i, s in enumerate(group)}
     good = np.zeros(n, np.uint8)
+    excerpt = evenly(record)
     grid = Grid(h, record.time_s, record.run, columns, dict.fromkeys(columns, good), dict.fromkeys(columns, 0))
     tags = tuple(
         TagReport(
@@ -49,7 +51,7 @@ def judged_record(
         tags=tags,
         modes={},
         findings=tuple(findings),
-        verdict=judged(record, models_of(record), 0),
+        verdict=judged(excerpt, models_of(excerpt), 0, n),
     )
     series = {name: Series(name, record.time_s, values, good, Counter()) for name, values in columns.items()}
     return Screened(record, grid, good, series, report)

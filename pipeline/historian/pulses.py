@@ -38,8 +38,8 @@ def pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag]) -> lis
         table = {name: grid.value[name] for name in inputs}
         gain = 0.0
         for y in (_as_read(grid, own[t.tag]) for t in signals if t.role == "pv"):
-            with_them = fitted(y, np.column_stack(list(table.values())), grid.piece)
-            without = fitted(y, np.column_stack(list((table | {tag.tag: plain}).values())), grid.piece)
+            with_them = fitted(y, list(table.values()), grid.piece)
+            without = fitted(y, list((table | {tag.tag: plain}).values()), grid.piece)
             if with_them is not None and without is not None:
                 gain += len(with_them.rows) * np.log(_left(with_them, without.sd) / _left(without, without.sd))
         if gain > CLEARER:

@@ -95,7 +95,7 @@ def _unlike_the_rest(series: Series, tag: Tag) -> list[Finding]:
     slipped[calm], kinds = unit_slips(values[calm])
     found += _slipped(series, tag, place, slipped, kinds)
     place, values = place[~slipped], values[~slipped]
-    alone = outliers(values)
+    alone = outliers(values) if slipped.any() else ~calm
     if alone.any():
         series.code[place[alone]] = Reason.OUTLIER
         words = f"{int(alone.sum())} readings stand alone, {_example(values[alone])}; usual are {_usual(values)}"

@@ -77,7 +77,10 @@ def row_codes(
 
 
 def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Record:
-    """The rows without a reason as a record: a run ends at a gap and at every row that was left out."""
+    """The rows without a reason as a record: a run ends at a gap and at every row that was left out.
+
+    A long grid keeps its values in single precision only.
+    """
     kept = np.flatnonzero(code == 0)
     if not kept.size:
         counts = np.bincount(code, minlength=len(Reason))
@@ -90,6 +93,7 @@ def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Re
     for role, group in groups.items():
         for i, tag in enumerate(group):
             columns[role][:, i] = grid.value[tag.tag][kept]
+            grid.lighten(tag.tag)
     own = {r: tuple(_signal(t, v) for t, v in zip(g, columns[r].T, strict=True)) for r, g in groups.items()}
     position = np.arange(len(run)) - np.maximum.accumulate(np.where(fresh, np.arange(len(run)), 0))
     time_s = position.astype(np.float64) * grid.period_s

@@ -13,6 +13,7 @@ from pipeline.historian.cells import usual
 from pipeline.historian.character import quantum
 from pipeline.historian.confirming import confirm
 from pipeline.historian.contradictions import contradict
+from pipeline.historian.excerpt import SEEN, evenly
 from pipeline.historian.excitation import judged, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding, Screening, TagReport
@@ -26,14 +27,18 @@ from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.static import explained
 from pipeline.historian.tags import Tag
 from pipeline.historian.wandering import of_levels
+from pipeline.metrics import Array
 from pipeline.records.record import Record
 
 LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Screened:
-    """The clean record, the rows it was taken from, and the report."""
+    """The clean record, the rows it was taken from, and the report.
+
+    ``record`` may give way to an excerpt once it is written: pages and pictures need no more.
+    """
 
     record: Record
     grid: Grid
@@ -67,24 +72,32 @@ def screened(
     period = period_s or proposed_period(pvs)
     role_of = {t.tag: t.role for t in tags}
     findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag])]
-    grid, rates = resampled(drawn, held, period, hold_s)
+    counts_of = {t.tag: own[t.tag].counts() for t in tags}
+    steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
+
+    def resampled_one(tag: str) -> None:
+        if len(own[tag]) > LARGE and role_of[tag] in {"dv", "sp"}:
+            own[tag].lighten()  # nothing but pictures needs them from here on
+
+    grid, rates = resampled(drawn, held, period, hold_s, resampled_one)
     by_tag = {r.tag: r for r in rates}
     signals = [t for t in tags if t.role in {"pv", "mv", "dv"}]
     findings += of_grid(grid)
     findings += pulses(grid, own, signals)
     findings += confirm(grid, own, signals, by_tag)
-    counts_of = {t.tag: own[t.tag].counts() for t in tags}
-    steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
-    for s in own.values():
-        if len(s) > LARGE:
-            s.lighten()
+    for t in tags:
+        if role_of[t.tag] in {"pv", "mv"}:
+            counts_of[t.tag] = own[t.tag].counts()
+        if len(own[t.tag]) > LARGE and role_of[t.tag] not in {"dv", "sp"}:
+            own[t.tag].lighten()
     findings += stretches(grid, signals, by_tag)
     findings += inputs_and_answers(grid, signals)
     code = row_codes(grid, signals, tags, own, without_modes)
     record = record_of(grid, code, signals)
-    models = models_of(record)
-    moved = max((len(moves_of(grid.value[t.tag][code == 0], record.run)) for t in tags if t.role == "sp"), default=0)
-    findings += of_models(record, models)
+    excerpt = evenly(record)
+    models = models_of(excerpt)
+    moved = max((len(moves_of(grid.value[t.tag][code == 0][:SEEN], record.run[:SEEN])) for t in tags if t.role == "sp"), default=0)
+    findings += of_models(excerpt, models)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
     )
@@ -108,7 +121,7 @@ def screened(
         tags=reports,
         modes={t.tag: _mode_rows(grid, own[t.tag]) for t in tags if t.role == "mode"},
         findings=merged(findings),
-        verdict=judged(record, models, moved),
+        verdict=judged(excerpt, models, moved, len(record)),
     )
     return Screened(record, grid, code, own, report)
 
@@ -116,8 +129,8 @@ def screened(
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
     """Stretches in which PVs and inputs contradict each other are masked, slow motion without the inputs is named."""
     inputs = [t.tag for t in signals if t.role != "pv"]
-    u = np.column_stack([np.where(grid.code[t] == 0, grid.value[t], np.nan) for t in inputs])
-    pvs = {t.tag: np.where(grid.code[t.tag] == 0, grid.value[t.tag], np.nan) for t in signals if t.role == "pv"}
+    u = [_kept(grid, t) for t in inputs]
+    pvs = {t.tag: _kept(grid, t.tag) for t in signals if t.role == "pv"}
     answers = {tag: explained(y, u, grid.piece) for tag, y in pvs.items()}
     expected = {tag: values for tag, (values, _) in answers.items()}
     settling = {tag: rows for tag, (_, rows) in answers.items()}
@@ -128,9 +141,15 @@ def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
     return found
 
 
+def _kept(grid: Grid, tag: str) -> Array:
+    """The tag's values (n,), NaN where it has a reason; the grid's own array where there is none."""
+    code = grid.code[tag]
+    return np.where(code == 0, grid.value[tag], np.nan) if code.any() else grid.value[tag]
+
+
 def models_of(record: Record) -> dict[str, Linear | None]:
     """The quick linear model of each PV from all inputs."""
-    u = np.hstack([record.mv, record.dv])
+    u = [*record.mv.T, *record.dv.T]
     return {s.name: fitted(y, u, record.run) for s, y in zip(record.pv_signals, record.pv.T, strict=True)}
 
 

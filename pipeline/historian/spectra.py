@@ -15,7 +15,7 @@ from pipeline.metrics import Array
 SETTLINGS = 4  # of a segment
 SHORTEST, LONGEST = 64, 4096  # rows of a segment
 SEGMENTS = 4  # at least, for a coherence
-MOST = 400_000  # rows
+MOST = 60_000  # rows
 BAND = (0.1, 3.0)  # of the plant's corner frequency
 
 

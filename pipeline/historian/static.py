@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.linear import BLOCKS, LEAST_ROWS, blocks_of, least_squares, rows_of
+from pipeline.historian.linear import BLOCKS, LEAST_ROWS, blocks_of, least_squares, rows_of, whole
 from pipeline.metrics import Array
 
 SLOW = ((41, 81), (81, 161), (161, 321))  # lags beyond BLOCKS that share a coefficient; the last are left out first
 SETTLED = 0.15
+WEAK = 0.01  # part in the answer, over the strongest input's
 MOST_SHARE = 0.05  # of the rows: longer lags explain by chance what the inputs did not cause
 CHUNK = 200_000  # rows
 
 
-def explained(y: Array, u: Array, piece: NDArray[np.int64]) -> tuple[Array, int]:
+def explained(y: Array, u: Sequence[Array], piece: NDArray[np.int64]) -> tuple[Array, int]:
     """The answer (n,) to the inputs' past, NaN where a part of it is missing, and its settling time [rows].
 
         y_hat(k+1) = c + sum_j sum_blocks b_jl mean(u_j over block l),     by robust least squares
 
-    y (n,), u (n, m), piece (n,). All NaN, and 0, where the rows are too few for four blocks.
+    y (n,), each input (n,), piece (n,). All NaN, and 0, where the rows are too few for four blocks.
     """
     out = np.full(len(y), np.nan)
     blocks: tuple[tuple[int, int], ...] = (*BLOCKS, *SLOW)
@@ -27,33 +30,41 @@ def explained(y: Array, u: Array, piece: NDArray[np.int64]) -> tuple[Array, int]
         blocks = blocks[:-1]
     while True:
         rows = rows_of(y, u, piece, blocks[-1][1] - 1)
-        if len(rows) >= max(LEAST_ROWS, 6 * u.shape[1] * len(blocks)):
+        if len(rows) >= max(LEAST_ROWS, 6 * len(u) * len(blocks)):
             break
         if len(blocks) <= 4:
             return out, 0
         blocks = blocks[:-1]
-    centre = np.nanmean(u, axis=0)
-    theta = least_squares(_inputs(u, centre, rows, blocks), y[rows + 1])[0]
+    centre = np.array([float(np.mean(c[rows])) for c in u])
+    table = _inputs(u, centre, rows, blocks)
+    theta = least_squares(table, y[rows + 1])[0]
+    parts = (table[:, :-1] * theta[:-1]).reshape(len(rows), len(u), len(blocks)).sum(axis=2).std(axis=0)
+    # An input without a part costs as much time as one with it.
+    strong = [i for i, part in enumerate(parts) if part >= WEAK * parts.max()]
+    full, m = theta, len(blocks)
+    theta = np.r_[full[:-1].reshape(len(u), m)[strong].ravel(), full[-1]]
+    used, middle = [u[i] for i in strong], centre[strong]
     back = blocks[-1][1] - 1
-    bad = np.r_[0, np.cumsum(~np.isfinite(u).all(axis=1))]
+    bad = np.r_[0, np.cumsum(~whole(*u), dtype=np.int32)]
     for start in range(back, len(y) - 1, CHUNK):
         k = np.arange(start, min(start + CHUNK, len(y) - 1))
-        value = _inputs(u, centre, k, blocks) @ theta
-        whole = (piece[k - back] == piece[k + 1]) & (bad[k + 1] == bad[k - back])
-        out[k + 1] = np.where(whole, value, np.nan)
-    return out, _settling(theta, u, blocks)
+        value = _inputs(used, middle, k, blocks) @ theta
+        seen = (piece[k - back] == piece[k + 1]) & (bad[k + 1] == bad[k - back])
+        out[k + 1] = np.where(seen, value, np.nan)
+    return out, _settling(full, np.array([float(np.std(c[rows])) for c in u]), blocks)
 
 
-def _inputs(u: Array, centre: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
+def _inputs(
+    u: Sequence[Array], centre: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
     first, last = int(rows[0]) - blocks[-1][1], int(rows[-1]) + 1
     first = max(first, 0)
-    columns = [blocks_of(u[first:last, i] - centre[i], rows - first, blocks) for i in range(u.shape[1])]
+    columns = [blocks_of(c[first:last] - m, rows - first, blocks) for c, m in zip(u, centre, strict=True)]
     return np.column_stack([*columns, np.ones(len(rows))])
 
 
-def _settling(theta: Array, u: Array, blocks: tuple[tuple[int, int], ...]) -> int:
+def _settling(theta: Array, motion: Array, blocks: tuple[tuple[int, int], ...]) -> int:
     """Rows after which the answer to a step of the strongest input stays within SETTLED of its largest value."""
-    answers = np.cumsum(theta[:-1].reshape(u.shape[1], len(blocks)), axis=1)
-    strongest = answers[int(np.argmax(np.abs(answers).max(axis=1) * np.nanstd(u, axis=0)))]
+    answers = np.cumsum(theta[:-1].reshape(len(motion), len(blocks)), axis=1)
+    strongest = answers[int(np.argmax(np.abs(answers).max(axis=1) * motion))]
     outside = np.flatnonzero(np.abs(strongest - strongest[-1]) > SETTLED * np.abs(strongest).max())
     return blocks[min(int(outside[-1]) + 1, len(blocks) - 1)][1] - 1 if outside.size else 1

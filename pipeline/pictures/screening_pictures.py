@@ -111,9 +111,13 @@ def _detail(axes: Axes, found: Screened, tag: TagReport, reason: Reason) -> None
     around = max(AROUND, int(AROUND_SHARE * (b - a)))
     first, last = times[max(a - around, 0)], times[min(b + around, len(times) - 1)]
     near = (series.time_s >= first) & (series.time_s <= last)
-    t = series.time_s[near] - grid.time_s[0]
+    source, values, codes = series.time_s, series.value, series.code
+    if near.sum() < 2:  # of a long export only the remarkable readings are kept
+        source, values, codes = grid.time_s, grid.value[tag.tag], np.zeros(len(grid), np.uint8)
+        near = (source >= first) & (source <= last)
+    t = source[near] - grid.time_s[0]
     x, label = time_axis(t)
-    v, code = series.value[near], series.code[near]
+    v, code = values[near], codes[near]
     good = code == Reason.GOOD
     axes.plot(x[good], v[good], ".-", color=LINE, linewidth=0.8, markersize=3)
     # A code for a missing value has no place on the axis of the others.
