@@ -14,12 +14,27 @@ from torch import Tensor
 from pipeline.errors import LawError
 from pipeline.export.gate import export
 from pipeline.laws.predictive.horizon import horizon_of
+from pipeline.laws.predictive.loads import Where, loads_of
 from pipeline.laws.predictive.moves import Moves
-from pipeline.laws.predictive.observer import BOOST, FIRST_LOAD, FORGETTING, FULL, RISE, Estimate, Noises, Observer
+from pipeline.laws.predictive.observer import (
+    BOOST,
+    CALMING,
+    FIRST_LOAD,
+    FORGETTING,
+    FULL,
+    OUTLIER,
+    RISE,
+    Estimate,
+    Noises,
+    Observer,
+    load_variance,
+)
 from pipeline.laws.predictive.plan import Cost, Planner
 from pipeline.laws.predictive.predictive import Predictive
 from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
-from pipeline.laws.predictive.tuning import Trials, searched
+from pipeline.laws.predictive.side_by_side import side_by_side
+from pipeline.laws.predictive.trials import LOOPS, Outcome, Trials
+from pipeline.laws.predictive.tuning import TRAVEL, costs, searched
 from pipeline.models.identified.identified import Identified
 from pipeline.models.static.mlp import MLP
 from serving import Controller
@@ -74,19 +89,20 @@ def test_a_shifted_plan_is_the_plan_one_sample_later(seed: int, ramps: bool) -> 
 
 # ---------------------------------------------------------------------- free run
 @pytest.mark.parametrize("n_hidden", [0, 5])
-@pytest.mark.parametrize("ramps", [False, True])
+@pytest.mark.parametrize(("ramps", "where"), [(False, "mvs"), (True, "outputs")])
 @given(seed=seeds)
 @settings(max_examples=8, deadline=None)
-def test_the_run_and_its_slopes_are_those_of_the_model(seed: int, n_hidden: int, ramps: bool) -> None:
+def test_the_run_and_its_slopes_are_those_of_the_model(seed: int, n_hidden: int, ramps: bool, where: Where) -> None:
     model = random_model(seed, n_y=2, n_mv=2, n_dv=1, n_hidden=n_hidden)
     moves = Moves.over(14, 5, 2, ramps=ramps)
-    horizon, rng = horizon_of(model, moves, lambda z: 0.5 * z + 0.1, n_cv=2), np.random.default_rng(seed)
+    loads, rng = loads_of(model, where, 14), np.random.default_rng(seed)
+    horizon = horizon_of(model, loads, moves, lambda z: 0.5 * z + 0.1, n_cv=2)
     x, d, dv, plan = (torch.from_numpy(rng.normal(size=n)) for n in (4, 2, 1, moves.count))
 
     def run(plan: Tensor) -> Tensor:
         at, found = x, []
         for mv in 0.5 * moves.courses(plan) + 0.1:
-            at = model(torch.cat([at, mv, dv])) + torch.cat([d, torch.zeros(2, dtype=torch.float64)])
+            at = model(torch.cat([at, torch.cat([mv, dv]) + loads.into_v @ d])) + loads.into_x @ d
             found.append(at[:2])
         return torch.cat(found)
 
@@ -104,7 +120,7 @@ def test_the_plan_is_the_minimum_of_its_cost(sp: float, rate: float | None) -> N
     """A linear model makes the cost convex: many passes end where a convex solver does, also at the bounds."""
     model = random_model(3, n_y=2, n_mv=2, n_hidden=0)
     moves = Moves.over(15, 4, 2, ramps=rate is not None)
-    horizon = horizon_of(model, moves, same, n_cv=2)
+    horizon = horizon_of(model, loads_of(model, "outputs", 15), moves, same, n_cv=2)
     rates = None if rate is None else torch.full((2,), rate, dtype=torch.float64)
     planner = Planner(horizon, moves, Cost((1.0, 0.5), 0.2, 0.1, 0.3), passes=60, sweeps=30, rate=rates)
     start, applied, wanted = torch.zeros(1, 6, dtype=torch.float64), row(0.2, -0.1)[None], row(sp, -0.2)[None]
@@ -147,54 +163,108 @@ def test_the_first_move_is_that_of_a_dense_quadratic_program() -> None:
 
 
 # ---------------------------------------------------------------------- observer
+@pytest.mark.parametrize("where", ["mvs", "outputs"])
 @given(seed=seeds)
-@few
-def test_the_filter_is_the_textbook_s_on_a_linear_model(seed: int) -> None:
-    """Corrections one output after another equal the joint one; the load's variance grows as the formula says."""
-    model = random_model(seed, n_y=2, n_mv=1, n_hidden=0)
+@settings(max_examples=8, deadline=None)
+def test_the_filter_is_the_textbook_s_on_a_linear_model(seed: int, where: Where) -> None:
+    """Corrections one output after another equal the joint one; the covariance grows as the formulas say."""
+    model = random_model(seed, n_y=2, n_mv=2, n_hidden=0)
     q_x, q_d, rng = 0.02, 1e-3, np.random.default_rng(seed)
-    observer, n_a = Observer(model, Noises(q_x, q_d)), 6
+    loads = loads_of(model, where, 20)
+    observer, n_a = Observer(model, loads, Noises(q_x, q_d)), 6
     r = np.diag(model.noise.numpy() ** 2)
-    f = np.block([[model.a.numpy(), np.eye(4, 2)], [np.zeros((2, 4)), np.eye(2)]])
-    b, c, h = np.vstack([model.b, np.zeros((2, 1))]), np.r_[model.c, 0, 0], np.eye(2, n_a)
-    mean, p, drift = np.zeros(n_a), observer.first.numpy(), np.zeros(2)
+    into = (loads.into_x + model.b @ loads.into_v).numpy()
+    f = np.block([[model.a.numpy(), into], [np.zeros((2, 4)), np.eye(2)]])
+    b, c, h = np.vstack([model.b, np.zeros((2, 2))]), np.r_[model.c, 0, 0], np.eye(2, n_a)
+    share, begun = loads.share.numpy(), loads.begun.numpy()
+    q = np.diag([*(q_x * np.diag(r)), 0, 0, *(q_d * np.diag(r) @ share)])
+    mean, p, drift, square, signed = np.zeros(n_a), observer.first.numpy(), np.zeros(2), np.zeros(2), np.zeros(2)
     assert p[4, 4] == FIRST_LOAD**2
-    found = Estimate(torch.zeros(1, n_a, dtype=torch.float64), observer.first, torch.zeros(1, 2, dtype=torch.float64))
+    none = torch.zeros(1, 2, dtype=torch.float64)
+    found = Estimate(torch.zeros(1, n_a, dtype=torch.float64), observer.first, none, torch.cat([none, none], dim=-1))
     for k in range(30):
-        y, v = 0.02 * rng.normal(size=2) + (k > 15), rng.normal(size=1)
-        mean, p = f @ mean + b @ v + c, f @ p @ f.T + np.diag([*(q_x * np.diag(r)), 0, 0, *(q_d * np.diag(r))])
+        y, v = 0.02 * rng.normal(size=2) + (k > 15), rng.normal(size=2)
+        mean, p = f @ mean + b @ v + c, f @ p @ f.T + q
         error = y - h @ mean
-        drift = drift + FORGETTING * (error / np.sqrt(np.diag(h @ p @ h.T + r)) - drift)
-        boost = np.clip(drift**2 * (2 - FORGETTING) / (RISE * FORGETTING) - 1, 0, FULL) / FULL
-        p = p + np.diag([0, 0, 0, 0, *(BOOST * q_d * np.diag(r) * boost)])
+        scaled = error / np.sqrt(np.diag(h @ p @ h.T + r))
+        drift = drift + FORGETTING * (scaled - drift)
+        bounded = np.clip(scaled * np.abs(scaled), -OUTLIER, OUTLIER)
+        square, signed = square + CALMING * (np.abs(bounded) - square), signed + CALMING * (bounded - signed)
+        calm = np.maximum(square - np.abs(signed), 1)
+        boost = np.clip(drift**2 * (2 - FORGETTING) / (RISE * FORGETTING) / calm - 1, 0, FULL) / FULL
+        for i in range(2):
+            for x in begun[..., i]:
+                g = np.r_[x, np.eye(2)[i]]
+                p = p + BOOST * q_d * (boost * np.diag(r)) @ share[:, i] * np.outer(g, g) / len(begun)
         gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
         mean, p = mean + gain @ error, p - gain @ h @ p
         found, shown = observer(torch.from_numpy(y)[None], torch.from_numpy(v)[None], found)
-        np.testing.assert_allclose(found.mean[0], mean, rtol=1e-7, atol=1e-9)
-        np.testing.assert_allclose(found.covariance, p, rtol=1e-6, atol=1e-12)
-        np.testing.assert_allclose(shown[0], boost, atol=1e-7)
+        np.testing.assert_allclose(found.mean[0], mean, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(found.covariance, p, rtol=1e-6, atol=1e-11)
+        np.testing.assert_allclose(shown[0], boost, atol=1e-6)
 
 
-def test_the_covariance_goes_by_the_jacobian_of_the_network() -> None:
+@pytest.mark.parametrize("where", ["mvs", "outputs"])
+def test_the_covariance_goes_by_the_jacobian_of_the_network(where: Where) -> None:
     model = random_model(1, n_y=1, n_hidden=5)
-    observer, x, v = Observer(model, Noises(0.01, 2e-4)), torch.linspace(-1, 1, 4).double(), row(0.3)
-    f = np.eye(5)
-    f[:4, :4] = torch.autograd.functional.jacobian(lambda x: model(torch.cat([x, v])), x)
-    f[0, 4] = 1.0
-    past = Estimate(torch.cat([x, row(0.0)])[None], observer.first, row(0.0)[None])
+    loads = loads_of(model, where, 20)
+    observer, z, v = Observer(model, loads, Noises(0.01, 2e-4)), torch.linspace(-1, 1, 5).double(), row(0.3)
+
+    def run(z: Tensor) -> Tensor:
+        x, d = z[:4], z[4:]
+        return torch.cat([model(torch.cat([x, v + loads.into_v @ d])) + loads.into_x @ d, d])
+
+    f = torch.autograd.functional.jacobian(run, z).numpy()
+    past = Estimate(z[None], observer.first, row(0.0)[None], row(0.0, 0.0)[None])
     mean, covariance = observer.predicted(v[None], past)
-    torch.testing.assert_close(mean[0, :4], model(torch.cat([x, v])))
+    torch.testing.assert_close(mean[0], run(z))
     np.testing.assert_allclose(covariance, f @ observer.first.numpy() @ f.T + observer.q.numpy(), rtol=1e-9, atol=1e-12)
+
+
+def test_a_load_at_the_mv_has_begun_when_it_shows() -> None:
+    """A lag of pole a behind d samples: growth 1/3 at once after the dead time; 5 % of the effect after its first."""
+    model = first_order(pole=0.9, gain=2.0, dead=3)
+    loads = loads_of(model, "mvs", 60)
+    assert loads.into_v.item() == pytest.approx(1 / 3 / 0.2)
+    np.testing.assert_allclose(loads.begun[:, 0, 0], [(1 - 0.9**k) * 10 / 3 for k in (1, 3)])
+    assert not loads.into_x.any()
+    for alone in (loads_of(model, "outputs", 60), loads_of(random_model(0, n_y=1, n_mv=2), "mvs", 60)):
+        assert not alone.at_mvs
+        assert torch.equal(alone.into_x, torch.eye(*alone.into_x.shape, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("alternating", [False, True])
+def test_innovations_of_both_signs_are_no_load(alternating: bool) -> None:
+    model = first_order(pole=0.5)
+    observer = Observer(model, loads_of(model, "outputs", 12), Noises(0.01, 1e-5))
+    past = Estimate(row(0.0, 0.0)[None], observer.first, row(0.0)[None], row(0.0, 0.0)[None])
+    boosts = []
+    for k in range(40):
+        size = 0.2 * (-1.0 if alternating and k // 4 % 2 else 1.0)
+        predicted = observer.predicted(row(0.0)[None], past)[0][0, 0].item()
+        past, boost = observer(row(predicted + size)[None], row(0.0)[None], past)
+        boosts.append(boost.item())
+    assert boosts[3] == 1.0
+    assert (max(boosts[-8:]) < 0.6) is alternating
+
+
+def test_a_load_s_variance_goes_with_the_noise() -> None:
+    model = first_order()
+    model.noise[:] = 0.03
+    assert load_variance(model).item() == pytest.approx(1e-3)
 
 
 # ---------------------------------------------------------------------- settling
 def test_the_horizon_is_the_settling_time() -> None:
-    """A lag of pole a settles to 10 % in ln .1/ln a samples, and later by its dead time; a level takes the longest."""
-    for pole, dead, samples in ((0.9, 0, 22), (0.9, 4, 26), (0.5, 0, 12), (0.995, 0, 50), (1.0, 0, 50)):
+    """A lag of pole a settles to 10 % in ln .1/ln a samples, and later by its dead time; a level none at all."""
+    for pole, dead, samples in ((0.9, 0, 22), (0.9, 4, 26), (0.5, 0, 12), (0.995, 0, 50), (1.0, 0, 12)):
         model = first_order(pole=min(pole, 0.999), dead=dead)
         if pole == 1.0:
             model.a[0, 0], model.b[0, 0] = 1.0, 0.05
         assert horizon_for(model, same) == samples
+    late_level = first_order(dead=9)
+    late_level.a[0, 0], late_level.a[0, -1] = 1.0, 0.05
+    assert horizon_for(late_level, same) == 2 * 9 + 2
     answers = step_responses(first_order(pole=0.8), same)
     np.testing.assert_allclose(settling_times(answers), np.ceil(np.log(0.1) / np.log(0.8)))
 
@@ -268,7 +338,7 @@ def test_noise_and_a_gain_error_lead_to_no_lock_up() -> None:
 
 
 def test_a_load_that_steps_is_followed_at_once_and_noise_is_not() -> None:
-    law, plant = law_of(first_order()), first_order()
+    law, plant = law_of(first_order(), loads="outputs"), first_order()
     load = np.where(np.arange(160) >= 80, 0.1, 0.0)
     _, _, info = closed(law, plant, np.zeros((160, 1)), load=load, noise=0.01)
     found, boost = info[:, law.info.index("load_y0")], info[:, law.info.index("boost_y0")]
@@ -322,37 +392,82 @@ def test_more_mvs_disturbances_and_a_rate_export(tmp_path) -> None:
     model = random_model(2, n_y=2, n_mv=2, n_dv=1, n_x=5, n_hidden=4)
     law = law_of(model, horizon=10, moves=3, passes=1, sweeps=2, mv_rate=0.1)
     manifest = export(law, tmp_path / "law.onnx", case="made", provenance={})
-    assert manifest.info == ("load_y0", "load_y1", "next_y0", "next_y1", "boost_y0", "boost_y1")
+    assert manifest.info == ("load_u0", "load_u1", "next_y0", "next_y1", "boost_y0", "boost_y1")
     assert Controller(tmp_path / "law.onnx").cold_state().shape == (law.n_state,)
 
 
 # ---------------------------------------------------------------------- tuning
+class Numbered(torch.nn.Module):
+    """Stands for a law: only its numbers' logarithms."""
+
+    def __init__(self, numbers: dict[str, float]) -> None:
+        super().__init__()
+        self.register_buffer("logs", torch.tensor(list(numbers.values()), dtype=torch.float64).log())
+
+
 class Bowl:
-    """Trials whose cost is known: the numbers' logarithms from their best values."""
+    """Trials whose errors are known: the squares of the numbers' logarithms from their best values."""
 
-    def cost(self, law: dict[str, float]) -> float:
-        best = {"move_weight": 0.03, "q_d": 0.002, "q_x": 0.01, "horizon": 20.0}
-        return float(sum(np.log(law[n] / best[n]) ** 2 for n in law))
+    best = row(2.0, 0.4, 26.0)
+
+    def run(self, laws: Numbered, count: int) -> Outcome:
+        error = 1 + (laws.logs.reshape(count, 3) - self.best.log()).square().sum(dim=-1, keepdim=True).numpy()
+        return Outcome(error.repeat(LOOPS, axis=1), error.repeat(LOOPS, axis=1), np.zeros((count, 2)))
 
 
-def test_the_search_takes_the_best_factor_of_each_number() -> None:
-    start = {"move_weight": 0.1, "q_d": 5e-4, "q_x": 0.01, "horizon": 20.0}
-    best, tried = searched(Bowl(), dict, start)  # type: ignore[arg-type]
-    assert best.numbers == pytest.approx({"move_weight": 0.03, "q_d": 0.002, "q_x": 0.01, "horizon": 20.0})
+def test_the_search_takes_what_costs_least() -> None:
+    start = {"speed": 1.0, "caution": 1.0, "horizon": 20.0}
+    best, tried = searched(Bowl(), Numbered, start)  # type: ignore[arg-type]
+    assert list(best.numbers.values()) == pytest.approx(Bowl.best.tolist())
     assert tried[0].numbers == start
+    assert tried[0].cost == pytest.approx(1.0)
     assert len({tuple(c.numbers.values()) for c in tried}) == len(tried)
+
+
+def test_the_cost_weighs_relative_errors_and_travel() -> None:
+    even = np.full((2, LOOPS), 2.0)
+    uneven = np.array([[2.0] * LOOPS, [2.0] * (LOOPS - 1) + [8.0]])
+    given = Outcome(even[:1], even[:1], np.zeros((1, 2)))
+    found = costs(Outcome(even, uneven, np.array([[0.0, 0.0], [2.0, 4.0]])), given)
+    assert found[0] == 1.0
+    assert found[1] == pytest.approx(0.5 + 0.5 * 3.0 / 2.0 + 3 * TRAVEL)
+
+
+def test_laws_side_by_side_are_the_laws() -> None:
+    model = random_model(4, n_y=2, n_mv=2)
+    laws = [law_of(model, horizon=10, moves=3, speed=s, caution=c) for s, c in ((1.0, 1.0), (2.0, 0.5), (0.5, 4.0))]
+    trials = Trials.draw(model, laws[0].signals, 10, seed=1)
+    together = trials.run(side_by_side(laws), 3)
+    for i, law in enumerate(laws):
+        alone = trials.run(law, 1)
+        np.testing.assert_allclose(together.set_points[i], alone.set_points[0], rtol=1e-9)
+        np.testing.assert_allclose(together.loads[i], alone.loads[0], rtol=1e-9)
+        np.testing.assert_allclose(together.travel[i], alone.travel[0], rtol=1e-9)
 
 
 def test_trials_tell_a_good_law_from_a_sluggish_one_and_are_the_same_again() -> None:
     model = first_order(pole=0.9)
     signals, law = made_signals(), law_of(model, horizon=12)
-    trials, again = (Trials.draw([model], signals, 12, seed=1) for _ in range(2))
-    cost = trials.cost(law)
-    assert cost == again.cost(law)
-    assert trials.cost(law_of(model, horizon=12, move_weight=300.0)) > 1.2 * cost
-    assert trials.cost(law_of(model, horizon=12, caution=1e4)) > cost
-    assert torch.equal(trials.gain[0, [0, 4]], torch.ones(2, 1, dtype=torch.float64))
-    assert not torch.equal(trials.load, torch.zeros_like(trials.load))
+    trials, again = (Trials.draw(model, signals, 12, seed=1) for _ in range(2))
+    good = trials.run(law, 1)
+    np.testing.assert_array_equal(good.set_points, again.run(law, 1).set_points)
+    slow, cautious = (law_of(model, horizon=12, **n) for n in ({"speed": 0.02}, {"caution": 1e4}))
+    assert trials.run(slow, 1).set_points.mean() > 1.2 * good.set_points.mean()
+    assert trials.run(cautious, 1).loads.mean() > 1.2 * good.loads.mean()
+
+
+def test_set_points_of_trials_are_within_reach_of_their_own_plants() -> None:
+    """Also under a gain that is too low; those of a level, which has no rest, lie within its record."""
+    model = first_order(pole=0.9, gain=2.0)
+    trials = Trials.draw(model, made_signals(), 30, seed=0)
+    error = trials.run(law_of(model, horizon=30), 1)
+    assert error.set_points.max() < 4.0
+    assert trials.sp.abs().max() < 2.0
+    level = first_order(pole=0.9)
+    level.a[0, 0], level.b[0, 0] = 1.0, 0.05
+    drawn = Trials.draw(level, made_signals(), 20, seed=0).sp[:, :LOOPS]
+    assert drawn.std() > 0.5
+    assert drawn.abs().max() <= 1.5
 
 
 def test_a_searched_law_costs_no_more_than_the_given_one() -> None:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from pipeline.laws.base import hold_numbers
+from pipeline.laws.predictive.loads import Loads
 from pipeline.laws.predictive.moves import Moves
 from pipeline.laws.predictive.one_step import one_step
 from pipeline.laws.predictive.product import product
@@ -40,32 +41,32 @@ class LinearHorizon(nn.Module):
     slopes_t: Tensor  # (N n_cv, m)
 
     @torch.no_grad()
-    def __init__(self, model: Identified, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
+    def __init__(self, model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
         super().__init__()
 
         def run(p: Named) -> dict[str, Tensor]:
             v, x, y = inputs(moves, mv_of, p), p["x"], []
             for i in range(moves.horizon):
-                x = one_step(model, {"x": x, "d": p["d"], "v": v[..., i, :]})["next"]
+                x = one_step(model, loads, {"x": x, "d": p["d"], "v": v[..., i, :]})["next"]
                 y.append(x[..., :n_cv])
             return {"y": torch.cat(y, dim=-1)}
 
-        self.run = Stage(layout_of(model, moves), run)
+        self.run = Stage(layout_of(model, loads, moves), run)
         slopes = self.run.matrix[-moves.count :].clone()
         self.register_buffer("slopes", slopes)
         self.register_buffer("slopes_t", slopes.T.contiguous())
 
     def forward(self, start: Tensor, plan: Tensor) -> Prediction:
-        """The run from ``start`` (..., 1, n_x + n_y + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
+        """The run from ``start`` (..., 1, n_x + n_d + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
         return Prediction(self.run(torch.cat([start, plan], dim=-1))["y"], self.slopes, self.slopes_t)
 
 
 class NetworkHorizon(nn.Module):
     """Free run x(1) .. x(N) from [x, d, dv] under a plan z, loads and measured disturbances held; and its slopes.
 
-    The run is x(i+1) = A x(i) + B v(i) + c + [d; 0] + W2 tanh(h(i)), h(i) = W1 [x(i), v(i)] + b1, with v(i) from
-    the moves that act at sample i. Everything but the tanh is affine, so the units [h, e x] with a small e all pass
-    the tanh, which hardly bends e x, and a step is one tanh and one product with a constant:
+    The run is x(i+1) = A x(i) + B v(i) + c + X d + W2 tanh(h(i)), h(i) = W1 [x(i), v(i)] + b1, with v(i) from
+    the moves that act at sample i, and V d. Everything but the tanh is affine, so the units [h, e x] with a small e
+    all pass the tanh, which hardly bends e x, and a step is one tanh and one product with a constant:
 
         p(i+1) = tanh(p(i)) M + P(i+1),   p = [h, e x]
 
@@ -86,12 +87,13 @@ class NetworkHorizon(nn.Module):
     by_small: Tensor  # (1,)
 
     @torch.no_grad()
-    def __init__(self, model: Identified, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
+    def __init__(self, model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
         super().__init__()
         n, m, n_x, n_mv = moves.horizon, moves.count, model.n_x, model.n_mv
         self.n, self.m, self.n_h, self.n_cv, self.n_s = n, m, model.n_hidden, n_cv, n_x + n_mv
         self.run = Stage(
-            layout_of(model, moves), lambda p: {f"p{i}": u for i, u in enumerate(_forced(model, moves, mv_of, p))}
+            layout_of(model, loads, moves),
+            lambda p: {f"p{i}": u for i, u in enumerate(_forced(model, loads, moves, mv_of, p))},
         )
         w1_x, to_x = model.w1[:, :n_x], torch.cat([model.w2, model.a / SMALL], dim=1)  # from tanh(p) to the unforced x
         gain = mv_of(torch.eye(n_mv, dtype=torch.float64)) - mv_of(torch.zeros(n_mv, dtype=torch.float64))
@@ -114,7 +116,7 @@ class NetworkHorizon(nn.Module):
         hold_numbers(self, by_small=1 / SMALL)
 
     def forward(self, start: Tensor, plan: Tensor) -> Prediction:
-        """The run from ``start`` (..., 1, n_x + n_y + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
+        """The run from ``start`` (..., 1, n_x + n_d + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
         given = torch.cat([start, plan], dim=-1)
         batch, n_h = given.shape[:-2], self.n_h
         forced = list(self.run(given).values())
@@ -142,14 +144,16 @@ class NetworkHorizon(nn.Module):
         return torch.cat(slopes, dim=-1)
 
 
-def horizon_of(model: Identified, moves: Moves, mv_of: Scaling, n_cv: int) -> LinearHorizon | NetworkHorizon:
+def horizon_of(
+    model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int
+) -> LinearHorizon | NetworkHorizon:
     """The free run of a model over the first ``n_cv`` of its outputs."""
-    return (NetworkHorizon if model.n_hidden else LinearHorizon)(model, moves, mv_of, n_cv)
+    return (NetworkHorizon if model.n_hidden else LinearHorizon)(model, loads, moves, mv_of, n_cv)
 
 
-def layout_of(model: Identified, moves: Moves) -> dict[str, int]:
+def layout_of(model: Identified, loads: Loads, moves: Moves) -> dict[str, int]:
     """Names and sizes of what a free run depends on."""
-    return {"x": model.n_x, "d": model.n_y, "dv": model.n_dv, "z": moves.count}
+    return {"x": model.n_x, "d": loads.count, "dv": model.n_dv, "z": moves.count}
 
 
 def inputs(moves: Moves, mv_of: Scaling, p: Named) -> Tensor:
@@ -158,12 +162,12 @@ def inputs(moves: Moves, mv_of: Scaling, p: Named) -> Tensor:
     return torch.cat([mv, p["dv"].unsqueeze(-2).expand(*mv.shape[:-1], p["dv"].shape[-1])], dim=-1)
 
 
-def _forced(model: Identified, moves: Moves, mv_of: Scaling, p: Named) -> list[Tensor]:
+def _forced(model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, p: Named) -> list[Tensor]:
     """P(0) .. P(N), each (..., n_h + n_x): what does not come through the tanh of the sample before."""
     v, found, x = inputs(moves, mv_of, p), [], p["x"]
     for i in range(moves.horizon + 1):
         here = v[..., min(i, moves.horizon - 1), :]
-        hidden = one_step(model, {"x": x, "d": p["d"], "v": here})["hidden"]
+        hidden = one_step(model, loads, {"x": x, "d": p["d"], "v": here})["hidden"]
         found.append(torch.cat([hidden, SMALL * x], dim=-1))
-        x = one_step(model, {"x": torch.zeros_like(x), "d": p["d"], "v": here})["next"]
+        x = one_step(model, loads, {"x": torch.zeros_like(x), "d": p["d"], "v": here})["next"]
     return found

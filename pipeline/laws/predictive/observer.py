@@ -1,4 +1,4 @@
-"""Extended Kalman filter over an identified model, with a load at every output."""
+"""Extended Kalman filter over an identified model, with as many loads as outputs."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.laws.base import hold_numbers
+from pipeline.laws.predictive.loads import Loads
 from pipeline.laws.predictive.one_step import one_step
 from pipeline.laws.predictive.product import product
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Stage
 
 NOISE_FLOOR = 1e-3  # scaled; a model that claims less noise would believe rounding
+LOAD_CHANGE = 3e-5  # scaled
 FIRST_LOAD = 0.05  # scaled, a period: standard deviation of a load before anything was seen of it
 FORGETTING = 0.5  # of the mean innovation
+CALMING = 0.1  # share of the last innovation in the mean squares
+OUTLIER = 100.0  # largest square that counts
 RISE = 7.0  # times its variance in pure noise: the square of the mean innovation at which the boost begins
 FULL = 4.0  # further such rises until it is full
 BOOST = 1_000.0  # times its normal variance a load may move in a period then
@@ -27,37 +31,54 @@ class Noises:
     """Variances of the filter, in units of the measurement's: of the outputs' model errors, and of the loads."""
 
     outputs: float
-    loads: float
+    loads: Tensor | float  # (n_y,), as each output sees it, or one for all
+
+
+def load_variance(model: Identified) -> Tensor:
+    """Variance (n_y,) of a load's change a period, in units of the noise's, where nothing is known of the loads.
+
+    It is 3e-5 over the noise: a load as quick for every plant is 1/noise^2 of it, and one whose estimate moves the MV
+    as calmly for every noise is the same share of it; this is their geometric mean.
+    """
+    return LOAD_CHANGE / torch.clamp(model.noise, min=NOISE_FLOOR)
 
 
 class Estimate(NamedTuple):
     """The state and the loads, their covariance, and the mean innovation."""
 
-    mean: Tensor  # (..., 1, n_x + n_y) [x, d]
-    covariance: Tensor  # (..., n_x + n_y, n_x + n_y)
+    mean: Tensor  # (..., 1, n_x + n_d) [x, d]
+    covariance: Tensor  # (..., n_x + n_d, n_x + n_d)
     drift: Tensor  # (..., 1, n_y) innovations in units of their standard deviation, averaged
+    squares: Tensor  # (..., 1, 2 n_y) their squares, averaged for longer, without and with their signs
 
 
 class Observer(nn.Module):
     """State x and loads d of an identified model f, scaled.
 
-        x+ = f(x, v) + [d; 0] + w,   d+ = d + n,   y = x[:n_y] + e
+        x+ = f(x, v + V d) + X d + w,   d+ = d + n,   y = x[:n_y] + e
 
-    w has the variance q_x R in the rows of the outputs, n has q_d R, e has R, the square of the model's noise. A load
-    passes the plant's poles, unlike an error that is added to the output. The filter is the extended Kalman filter,
-    whose correction takes the outputs one after another.
+    w has the variance q_x R in the rows of the outputs, e has R, the square of the model's noise, and n has q_d
+    R, R of the outputs that a load moves. A load passes the plant's poles, unlike an error that is added to the output,
+    and a load at an MV all its lags and dead times. The filter is the extended Kalman filter, whose correction takes
+    the outputs one after another.
 
-    A load that steps would be followed slowly. So the innovations e, by their standard deviation s, have a mean
+    A load that steps would be followed slowly. So the innovations e, by their standard deviation s, have a mean, and
+    their squares two, without and with their signs:
 
-        m <- m + a (e/s - m),   b = clip(m^2 (2 - a)/(7 a) - 1, 0, 4)/4
+        m <- m + a (e/s - m),   p <- p + c (e^2/s^2 - p),   q <- q + c (sign(e) e^2/s^2 - q)
+        b = clip(m^2 (2 - a)/(7 a max(p - |q|, 1)) - 1, 0, 4)/4
 
-    and n has the variance q_d R (1 + 1000 b): m^2 (2 - a)/a is 1 on average in pure noise, and the filter stays quiet.
+    m^2 (2 - a)/a is 1 on average in pure noise, and the filter stays quiet. After a step of a load, the covariance of
+    [x, d] grows by 1000 b q_d R g g', where g is what a unit of the load has made of them by the time that the outputs
+    show it (``Loads.begun``): state and load then follow together. Innovations of both signs, p - |q|, are no load
+    but an error of the model: a loop that swings would be kept swinging by a filter that follows it.
 
     Source: the extended Kalman filter of Jazwinski, Stochastic Processes and Filtering Theory, section 8.3; loads
-    as integrated noise after Pannocchia and Rawlings, AIChE Journal 49 (2003) 426.
+    as integrated noise after Pannocchia and Rawlings, AIChE Journal 49 (2003) 426; a jump of the state and the load
+    together after Willsky and Jones, IEEE Transactions on Automatic Control 21 (1976) 108.
     """
 
-    place: Tensor  # (n_y, n_a n_a) from a boost to its entry of the covariance
+    place: Tensor  # (n_y, n_a n_a) from a boost to what it adds to the covariance
     first: Tensor  # (n_a, n_a) covariance without a past
     q: Tensor  # (n_a, n_a)
     r: Tensor  # (n_y,)
@@ -70,40 +91,47 @@ class Observer(nn.Module):
     forgetting: Tensor  # (1,) a
     rise: Tensor  # (1,) (2 - a)/(7 a)
     fall: Tensor  # (1,) 1/4
+    calming: Tensor  # (1,) c
     diagonal: Tensor  # (n_y,) where the outputs' variances stand in the flat covariance
 
     @torch.no_grad()
-    def __init__(self, model: Identified, noises: Noises) -> None:
+    def __init__(self, model: Identified, loads: Loads, noises: Noises) -> None:
         super().__init__()
-        self.n_y, self.n_x = model.n_y, model.n_x
-        self.n_a = n_a = model.n_x + model.n_y
-        self.layout = {"x": model.n_x, "d": model.n_y, "v": model.n_mv + model.n_dv}
-        self.step = Stage(self.layout, lambda p: _with_loads(one_step(model, p), p["d"]))
+        self.n_y, self.n_x, n_x = model.n_y, model.n_x, model.n_x
+        self.n_a = n_a = n_x + loads.count
+        self.layout = {"x": n_x, "d": loads.count, "v": model.n_mv + model.n_dv}
+        self.step = Stage(self.layout, lambda p: _with_loads(one_step(model, loads, p), p["d"]))
         self.nonlinear = model.n_hidden > 0
         f = torch.eye(n_a, dtype=torch.float64)
-        f[: self.n_x, : self.n_x] = model.a
-        f[: self.n_y, self.n_x :] = torch.eye(self.n_y, dtype=torch.float64)
+        f[:n_x, :n_x], f[:n_x, n_x:] = model.a, loads.into_x + model.b @ loads.into_v
         w1, w2 = torch.zeros(model.n_hidden, n_a).double(), torch.zeros(n_a, model.n_hidden).double()
-        w1[:, : self.n_x], w2[: self.n_x] = model.w1[:, : self.n_x], model.w2
+        w1[:, :n_x], w1[:, n_x:], w2[:n_x] = model.w1[:, :n_x], model.w1[:, n_x:] @ loads.into_v, model.w2
         # Both orders of each matrix: a product with a transposed one is not exported.
         for name, matrix in {"f": f, "w1": w1, "w2": w2}.items():
             self.register_buffer(name, matrix)
             self.register_buffer(f"{name}_t", matrix.T.contiguous())
         r = torch.clamp(model.noise, min=NOISE_FLOOR) ** 2
         q = torch.zeros(n_a, dtype=torch.float64)
-        q[: self.n_y], q[self.n_x :] = noises.outputs * r, noises.loads * r
+        q[: self.n_y], q[n_x:] = noises.outputs * r, (noises.loads * r) @ loads.share
         place = torch.zeros(self.n_y, n_a, n_a, dtype=torch.float64)
-        for o in range(self.n_y):
-            place[o, self.n_x + o, self.n_x + o] = BOOST / FULL * noises.loads * r[o]
+        for i in range(loads.count):
+            since = torch.cat(
+                [loads.begun[..., i], torch.eye(loads.count, dtype=torch.float64)[i].expand(len(loads.begun), -1)],
+                dim=-1,
+            )
+            grown = since.T @ since / len(since)  # (n_a, n_a)
+            place += BOOST / FULL * (noises.loads * r * loads.share[:, i])[:, None, None] * grown
         by_y = torch.cat([torch.eye(self.n_y, dtype=torch.float64), model.rest[self.n_y :, : self.n_y]])
         first = torch.zeros(n_a, n_a, dtype=torch.float64)
-        first[self.n_y : self.n_x, self.n_y : self.n_x] = model.rest_cov[self.n_y :, self.n_y :]
-        first[: self.n_x, : self.n_x] += (by_y * r) @ by_y.T
-        first[self.n_x :, self.n_x :] = FIRST_LOAD**2 * torch.eye(self.n_y, dtype=torch.float64)
+        first[self.n_y : n_x, self.n_y : n_x] = model.rest_cov[self.n_y :, self.n_y :]
+        first[:n_x, :n_x] += (by_y * r) @ by_y.T
+        first[n_x:, n_x:] = FIRST_LOAD**2 * torch.eye(loads.count, dtype=torch.float64)
         for name, values in {"q": torch.diag(q), "r": r, "place": place.flatten(1), "first": first}.items():
             self.register_buffer(name, values.contiguous())
         self.register_buffer("diagonal", torch.arange(self.n_y) * (n_a + 1))
-        hold_numbers(self, forgetting=FORGETTING, rise=(2 - FORGETTING) / (RISE * FORGETTING), fall=1 / FULL)
+        hold_numbers(
+            self, forgetting=FORGETTING, rise=(2 - FORGETTING) / (RISE * FORGETTING), fall=1 / FULL, calming=CALMING
+        )
 
     def forward(self, y: Tensor, v: Tensor, past: Estimate) -> tuple[Estimate, Tensor]:
         """The estimate after the measurement, and the boost b (..., 1, n_y), 0 to 1.
@@ -113,15 +141,19 @@ class Observer(nn.Module):
         mean, covariance = self.predicted(v, past)
         variance = covariance.flatten(-2).index_select(-1, self.diagonal).unsqueeze(-2)
         sd = torch.sqrt(variance + self.r)
-        drift = past.drift + self.forgetting * ((y - mean[..., : self.n_y]) / sd - past.drift)
-        boost = torch.clamp(self.rise * drift * drift - 1.0, 0.0, FULL)
+        innovation = (y - mean[..., : self.n_y]) / sd
+        drift = past.drift + self.forgetting * (innovation - past.drift)
+        signed = torch.clamp(innovation * innovation.abs(), -OUTLIER, OUTLIER)
+        squares = past.squares + self.calming * (torch.cat([signed.abs(), signed], dim=-1) - past.squares)
+        both = squares[..., : self.n_y] - squares[..., self.n_y :].abs()
+        boost = torch.clamp(self.rise * drift * drift / torch.clamp(both, min=1.0) - 1.0, 0.0, FULL)
         covariance = covariance + (boost @ self.place).reshape(covariance.shape)
         for o in range(self.n_y):
             row = covariance[..., o : o + 1, :]
             gain = row / (row[..., o : o + 1] + self.r[o : o + 1])
             mean = mean + gain * (y[..., o : o + 1] - mean[..., o : o + 1])
             covariance = covariance - gain.reshape(*gain.shape[:-2], self.n_a, 1) * row
-        return Estimate(mean, covariance, drift), self.fall * boost
+        return Estimate(mean, covariance, drift, squares), self.fall * boost
 
     def predicted(self, v: Tensor, past: Estimate) -> tuple[Tensor, Tensor]:
         """Mean and covariance one period on, before the measurement."""

@@ -13,11 +13,13 @@ from torch import Tensor
 from pipeline.errors import LawError
 from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
 from pipeline.laws.predictive.horizon import horizon_of
+from pipeline.laws.predictive.loads import Where, loads_of
 from pipeline.laws.predictive.moves import Moves
-from pipeline.laws.predictive.observer import Estimate, Noises, Observer
+from pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_variance
 from pipeline.laws.predictive.plan import Cost, Planner
 from pipeline.laws.predictive.settling import horizon_for, refuse_unstable
-from pipeline.laws.predictive.tuning import Candidate, Trials, searched
+from pipeline.laws.predictive.trials import Trials
+from pipeline.laws.predictive.tuning import Candidate, searched
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Named, Stage
@@ -57,10 +59,12 @@ class Predictive(ControlLaw):
         ``move_weight`` lambda > 0 of squared moves, mu = lambda (N - dead time)/10, MVs in units of half their range.
         ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
         by their size. ``weights`` > 0 of the CVs in units of their standard deviation; None: all 1. ``q_x`` and
-        ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's.
-        ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more.
-        ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses move_weight, q_d, horizon
-        and q_x in closed loops over the model with wrong gains and loads, drawn by ``seed``. ``mv_rate`` [mv]:
+        ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's; q_d
+        None: 3e-5 over the noise. ``loads`` act on the ``mvs`` or the ``outputs``.
+        ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or
+        more; None: .5 of one MV, .25 of several.
+        ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses speed, caution
+        and horizon in closed loops over the model with wrong gains and loads, drawn by ``seed``. ``mv_rate`` [mv]:
         largest MV change a sample, which the plan knows; None: unlimited.
         """
 
@@ -72,8 +76,9 @@ class Predictive(ControlLaw):
         eps: float = 0.1
         weights: tuple[float, ...] | None = None
         q_x: float = 0.01
-        q_d: float = 5e-4
-        damping: float = 0.5
+        q_d: float | None = None
+        loads: Where = "mvs"
+        damping: float | None = None
         passes: int = 2
         sweeps: int = 4
         tuning: Literal["given", "search"] = "given"
@@ -82,11 +87,14 @@ class Predictive(ControlLaw):
 
         def __post_init__(self) -> None:
             for name in ("speed", "caution", "move_weight", "eps", "q_x", "q_d"):
-                if not 0 < getattr(self, name) < np.inf:
-                    raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0, and finite")
+                given = getattr(self, name)
+                if given is not None and not 0 < given < np.inf:
+                    raise ValueError(f"{name} is {given}; it must be above 0, and finite")
+            if self.loads not in ("mvs", "outputs"):
+                raise ValueError(f"loads is {self.loads!r}; allowed are mvs, outputs")
             if self.tuning not in ("given", "search"):
                 raise ValueError(f"tuning is {self.tuning!r}; allowed are given, search")
-            if not 0 <= self.damping < np.inf:
+            if self.damping is not None and not 0 <= self.damping < np.inf:
                 raise ValueError(f"damping is {self.damping}; it must be 0 or above, and finite")
             for name, least in (("horizon", 8), ("moves", 1), ("passes", 1), ("sweeps", 1)):
                 value = getattr(self, name)
@@ -103,6 +111,7 @@ class Predictive(ControlLaw):
     mv_half: Tensor  # (n_mv,)
     y_center: Tensor  # (n_cv,)
     y_scale: Tensor  # (n_cv,)
+    load_scale: Tensor  # [mv] of loads at MVs, [pv a period] of loads at outputs; of a scaled load
 
     def __init__(self, signals: Signals, model: Identified, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
@@ -120,14 +129,21 @@ class Predictive(ControlLaw):
         count = (8 if n_mv == 1 else 5) if params.moves is None else params.moves
         self.moves = Moves.over(horizon, count, n_mv, ramps=self.rate is not None)
         dead = min(float(model.dead.min()), horizon - 1.0)
-        cost = Cost(weights, params.move_weight / params.speed**2 * (horizon - dead) / 10, params.eps, params.damping)
-        self.observer = Observer(model, Noises(params.q_x, params.q_d / params.caution**2))
+        move = params.move_weight / params.speed**2 * (horizon - dead) / 10
+        damping = (0.5 if n_mv == 1 else 0.25) if params.damping is None else params.damping
+        cost = Cost(weights, move, params.eps, damping)
+        loads = loads_of(model, params.loads, horizon)
+        self.n_d = loads.count
+        self.q_d = load_variance(model) if params.q_d is None else torch.full((model.n_y,), params.q_d).double()
+        self.observer = Observer(model, loads, Noises(params.q_x, self.q_d / params.caution**2))
         rate = None if self.rate is None else self.rate / half
-        run = horizon_of(model, self.moves, mv_of, n_cv)
+        run = horizon_of(model, loads, self.moves, mv_of, n_cv)
         self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate)
+        at_mvs = loads.into_v[:n_mv].diagonal() * model.v_scale[:n_mv] if loads.at_mvs else model.y_scale[:n_cv]
+        self.register_buffer("load_scale", at_mvs.clone())
         self._build_ends(model, n_cv, middle, half)
         self.info = (
-            *(f"load_{s.name}" for s in signals.sp),
+            *(f"load_{s.name}" for s in (signals.mv if loads.at_mvs else signals.sp)),
             *(f"next_{s.name}" for s in signals.sp),
             *(f"boost_{s.name}" for s in signals.sp),
         )
@@ -141,7 +157,7 @@ class Predictive(ControlLaw):
         whole = torch.zeros(n_a, n_a, dtype=torch.long)
         whole[upper[0], upper[1]] = whole[upper[1], upper[0]] = torch.arange(upper.shape[1])
         first = self.observer.first[upper[0], upper[1]]
-        self.kept = {"mean": n_a, "covariance": len(first), "drift": n_y, "plan": count}
+        self.kept = {"mean": n_a, "covariance": len(first), "drift": n_y, "squares": 2 * n_y, "plan": count}
         self.n_state = 1 + sum(self.kept.values()) + n_dv
 
         def inputs(p: Named) -> Named:
@@ -150,7 +166,16 @@ class Predictive(ControlLaw):
             z = (p["mv"] - middle) / half
             one = torch.ones_like(z[..., :1])
             rest = torch.cat([y, v, one], dim=-1) @ model.rest[n_y:].T
-            past = [y, rest, 0 * y, one * first, 0 * y, z.repeat(*(1 for _ in z.shape[:-1]), count // z.shape[-1])]
+            past = [
+                y,
+                rest,
+                one * torch.zeros(self.n_d, dtype=torch.float64),
+                one * first,
+                0 * y,
+                0 * y,
+                0 * y,
+                z.repeat(*(1 for _ in z.shape[:-1]), count // z.shape[-1]),
+            ]
             sp = (p["sp"] - y_center[:n_cv]) / y_scale[:n_cv]
             return {"y": y, "sp": sp, "z": z, "v": v, "past": torch.cat(past, dim=-1), "one": one}
 
@@ -181,12 +206,11 @@ class Predictive(ControlLaw):
         horizon = self.moves.horizon
 
         def law_of(n: Mapping[str, float]) -> Any:
-            given = {"move_weight": n["move_weight"], "q_d": n["q_d"], "q_x": n["q_x"], "horizon": int(n["horizon"])}
-            changed: Any = replace(params, **given)  # type: ignore[arg-type]  # of mixed numbers
+            changed: Any = replace(params, speed=n["speed"], caution=n["caution"], horizon=int(n["horizon"]))
             return type(self)(self.signals, model, changed).eval()
 
-        start = {n: float(getattr(params, n)) for n in ("move_weight", "q_d", "q_x")} | {"horizon": float(horizon)}
-        best, tried = searched(Trials.draw([model], self.signals, horizon, params.seed), law_of, start)
+        start = {n: float(getattr(params, n)) for n in ("speed", "caution")} | {"horizon": float(horizon)}
+        best, tried = searched(Trials.draw(model, self.signals, horizon, params.seed), law_of, start)
         law: Self = law_of(best.numbers)
         law.tried = tuple(tried)
         return law
@@ -198,8 +222,9 @@ class Predictive(ControlLaw):
         best = min(self.tried, key=lambda c: c.cost)
         figures = {**best.numbers, "cost": best.cost, "cost_given": self.tried[0].cost, "tried": len(self.tried)}
         note = (
-            f"{len(self.tried)} sets of numbers were tried in closed loops over the model with errors of gain and "
-            f"dead time, with loads and noise; the cost fell from {self.tried[0].cost:.3g} to {best.cost:.3g} %."
+            f"{len(self.tried)} sets of numbers were tried in closed loops over the model with errors of gain, pace "
+            f"and dead time, with loads and noise; the cost fell from {self.tried[0].cost:.3g} to {best.cost:.3g}, "
+            "where 1 is the errors with the first numbers, and .1 a travel of 1 % of the MVs' range a sample."
         )
         return Analysis(figures, notes=(note,))
 
@@ -219,7 +244,7 @@ class Predictive(ControlLaw):
         plan, ahead = self.planner(start, now["sp"], torch.clamp(now["z"], -1.0, 1.0), plan)
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
         info = [
-            self.y_scale * mean[..., self.observer.n_x : self.observer.n_x + n_cv],
+            self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
             self.y_center + self.y_scale * ahead,
             boost[..., :n_cv],
         ]
@@ -229,13 +254,13 @@ class Predictive(ControlLaw):
     def _estimated(self, now: Named, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """[x, d], the boost, what of the estimate goes to the next state, and the plan to begin at."""
         sizes = [1, *self.kept.values(), self.n_dv] if self.n_dv else [1, *self.kept.values()]
-        started, mean, packed, drift, plan, *dv = torch.split(state, sizes, dim=-1)
+        started, mean, packed, drift, squares, plan, *dv = torch.split(state, sizes, dim=-1)
         n_a, n_mv = self.observer.n_a, now["z"].shape[-1]
         square = packed.index_select(-1, self.whole).reshape(*packed.shape[:-2], n_a, n_a)
         acted = torch.cat([now["v"][..., :n_mv], *dv], dim=-1)
-        seen, boost = self.observer(now["y"], acted, Estimate(mean, square, drift))
+        seen, boost = self.observer(now["y"], acted, Estimate(mean, square, drift, squares))
         flat = seen.covariance.flatten(-2).index_select(-1, self.upper).unsqueeze(-2)
-        known = torch.cat([seen.mean, flat, seen.drift, plan @ self.shift], dim=-1)
+        known = torch.cat([seen.mean, flat, seen.drift, seen.squares, plan @ self.shift], dim=-1)
         past = torch.where(started > 0, known, now["past"])
         n_plan = self.moves.count
         return past[..., :n_a], started * boost, past[..., :-n_plan], past[..., -n_plan:]

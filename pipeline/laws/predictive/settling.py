@@ -17,6 +17,8 @@ STEP = 0.3  # of an MV, up and down
 BEFORE, AFTER = 200, 150  # samples at each level, and after the step
 BAND = 0.1  # share of the whole answer within which it has settled
 LEAST_ANSWER = 0.02  # share of the largest answer of an output; smaller ones have no settling time
+STEADY = 0.9  # share of its slope before that an output keeps which never comes to rest
+TINY = 1e-12
 SHARE = 0.9  # of the steps that the horizon is long enough for
 SHORTEST, LONGEST = 12, 50
 EXPLODED = 100.0  # scaled; a state this large that grows on fourfold in half of BEFORE comes from an unstable model
@@ -62,12 +64,18 @@ def step_responses(model: Identified, mv_of: Callable[[Tensor], Tensor]) -> Arra
 def settling_times(responses: Array) -> Array:
     """Samples (answers,) until each answer stays within BAND of its end, of responses (runs, n, n_y).
 
-    An output that a step hardly moves has no answer. One that never settles, as a level, takes nearly all samples.
+    An output that a step hardly moves has no answer. One that goes on and on, as a level, settles twice as late as it
+    first moves as fast as later on: so long it takes to set it moving, and to stop it.
     """
     change = responses[:, -1] - responses[:, 0]  # (runs, n_y)
     away = np.abs(responses - responses[:, -1:]) > BAND * np.abs(change)[:, None]
     last = np.where(away, np.arange(responses.shape[1])[:, None], -1).max(axis=1) + 1
-    return np.asarray(last[np.abs(change) > LEAST_ANSWER * np.abs(change).max(axis=0)], dtype=np.float64)
+    slope = np.abs(np.diff(responses, axis=1))  # (runs, n - 1, n_y)
+    begun, middle, end = (np.median(part, axis=1) for part in np.array_split(slope, 3, axis=1))
+    goes_on = np.median(end / np.maximum(middle, TINY), axis=0) > STEADY  # (n_y,)
+    moving = 2 * (slope >= (1 - BAND) * begun[:, None]).argmax(axis=1) + 2
+    found = np.where(goes_on, moving, last)
+    return np.asarray(found[np.abs(change) > LEAST_ANSWER * np.abs(change).max(axis=0)], dtype=np.float64)
 
 
 def advanced(model: Identified, x: Tensor, mv: Tensor) -> Tensor:

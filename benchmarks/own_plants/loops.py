@@ -1,0 +1,97 @@
+"""The tests of a plant, and closed loops of laws over it, all tests side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from plant import OwnPlant
+
+from pipeline.laws.base import ControlLaw
+from pipeline.plants.simulator import Array
+from pipeline.simulation.scenario import Scenario
+
+HELD_OUT = (71, 72, 73)
+LEVELS = 8
+LOAD = 10.0  # [%] of an MV's range
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Of loops: error [% of the set points' range], error at the end of each hold, and MV travel [% a sample]."""
+
+    nmae: float
+    end: float
+    travel: float
+
+
+def tests_of(plant: OwnPlant) -> dict[str, list[Scenario]]:
+    """Random set points; and at each of three set points, loads of 10 % of each MV's range that come and go."""
+    hold = plant.hold
+    sequences, loads = [], []
+    for seed in HELD_OUT:
+        rng = np.random.default_rng(seed)
+        levels = plant.set_points(rng, LEVELS)
+        sequences.append(_test(plant, "set points", np.repeat(levels, hold, axis=0), {}, rng, seed))
+        level = plant.set_points(rng, 1, inner=0.2)
+        names, changes = plant.load_names(), {}
+        for i, name in enumerate(names):
+            course = [0.0] * 5
+            for j in range(len(names)):
+                course += [LOAD * (i == j)] * hold + [0.0] * hold + [-LOAD * (i == j)] * hold
+            changes[name] = np.array(course)
+        n = len(changes[names[0]])
+        loads.append(_test(plant, "loads", np.repeat(level, n, axis=0), changes, rng, seed))
+    return {"set points": sequences, "loads": loads}
+
+
+def _test(
+    plant: OwnPlant, name: str, sp: Array, changes: dict[str, Array], rng: np.random.Generator, seed: int
+) -> Scenario:
+    drift = plant.drift(len(sp), rng)
+    first = plant.with_parameters({key: float(values[0]) for key, values in drift.items()})
+    return Scenario(name, "", sp, *first.rest(sp[0]), changes=changes | drift, hold=plant.hold, seed=seed)
+
+
+@torch.no_grad()
+def closed(laws: ControlLaw, plant: OwnPlant, tests: list[Scenario], count: int | None = None) -> tuple[Array, Array]:
+    """True outputs (count, tests, n, n_cv) and MVs (count, tests, n, n_mv); without a count those of one law.
+
+    ``laws`` are ``count`` laws side by side. Measurement noise by each test's seed, the same for all laws.
+    """
+    c, b, n = count or 1, len(tests), tests[0].samples
+    n_pv, n_mv = len(plant.pv_signals), len(plant.mv_signals)
+    noise = np.stack([np.random.default_rng((t.seed or 0) + 1).standard_normal((n, n_pv)) for t in tests])
+    noise = noise * plant.noise_std
+    p = np.stack([t.parameters(plant) for t in tests])  # (b, n, n_p)
+    advance = plant.transition.map(c * b)
+    x = np.tile(np.stack([t.x0 for t in tests]), (c, 1))  # (c b, n_x)
+    mv = torch.from_numpy(np.tile(np.stack([t.mv0 for t in tests]), (c, 1, 1)))
+    state = torch.zeros(c, b, laws.n_state, dtype=torch.float64)
+    none = torch.zeros(c, b, 0, dtype=torch.float64)
+    sp = torch.from_numpy(np.stack([t.sp for t in tests]))
+    y, u = np.empty((c, b, n, n_pv)), np.empty((c, b, n, n_mv))
+    for k in range(n):
+        y[:, :, k] = plant.measured(x).reshape(c, b, n_pv)
+        pv = torch.from_numpy(y[:, :, k] + noise[:, k])
+        wanted = sp[:, k].expand(c, -1, -1)
+        if count is None:
+            one, after, _ = laws(wanted[0], pv[0], none[0], mv[0], state[0])
+            mv, state = one[None], after[None]
+        else:
+            mv, state, _ = laws(wanted, pv, none, mv, state)
+        u[:, :, k] = mv.numpy()
+        table = np.tile(p[:, k], (c, 1))
+        x = np.array(advance(x.T, u[:, :, k].reshape(c * b, n_mv).T, np.zeros((0, c * b)), table.T)).T
+    return y, u
+
+
+def scores(plant: OwnPlant, tests: list[Scenario], y: Array, u: Array) -> Score:
+    """Of loops with outputs y (tests, n, n_cv) and MVs u (tests, n, n_mv)."""
+    span = np.array([s.high - s.low for s in plant.sp_signals])
+    error = np.abs(y - np.stack([t.sp for t in tests])) / span
+    late = np.arange(error.shape[1]) % plant.hold >= plant.hold - 5
+    reach = np.array([s.high - s.low for s in plant.mv_signals])
+    travel = np.abs(np.diff(u, axis=1)) / reach
+    return Score(*(100 * float(part.mean()) for part in (error, error[:, late], travel)))

@@ -1,0 +1,81 @@
+"""The benchmark's own plants: their rests, records and closed loops are what they are said to be."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.simulation.simulate import simulate_closed
+
+FOLDER = Path(__file__).parents[2] / "benchmarks" / "own_plants"
+MODULES = ("plant", "development", "untouched", "record", "loops")
+
+
+@pytest.fixture(scope="module")
+def own() -> Any:
+    """The benchmark's modules by name; their short names are free again afterwards."""
+    sys.path.insert(0, str(FOLDER))
+    try:
+        loaded: dict[str, ModuleType] = {name: importlib.import_module(name) for name in MODULES}
+    finally:
+        sys.path.remove(str(FOLDER))
+        for name in MODULES:
+            sys.modules.pop(name, None)
+    return SimpleNamespace(**loaded)
+
+
+class Proportional(torch.nn.Module):
+    """A stand-in for a law of one loop: a move in proportion to the error, the samples counted in its state."""
+
+    n_state = 1
+
+    def forward(self, sp: Any, pv: Any, dv: Any, mv: Any, state: Any) -> tuple[Any, Any, Any]:
+        return torch.clamp(mv + 0.2 * (sp - pv), 0.0, 100.0), state + 1, pv[..., :0]
+
+
+@pytest.mark.parametrize("name", ["coupled", "level"])
+def test_a_plant_rests_where_it_says_and_loads_move_it(own: Any, name: str) -> None:
+    plant = {p.name: p for p in own.development.DEVELOPMENT}[name]()
+    sp = plant.set_points(np.random.default_rng(0), 1)[0]
+    x, mv = plant.rest(sp)
+    np.testing.assert_allclose(plant.measure(x), sp, atol=1e-6)
+    step, p = plant.stepper(), plant.parameters()
+    np.testing.assert_allclose(step(x, mv, np.zeros(0), p), x, atol=1e-5)
+    assert len(plant.load_names()) == len(plant.mv_signals)
+    for i, load in enumerate(plant.load_names()):
+        pushed = mv + 10.0 * np.eye(len(mv))[i]
+        np.testing.assert_allclose(
+            step(x, mv, np.zeros(0), plant.parameters({load: 10.0})), step(x, pushed, np.zeros(0), p)
+        )
+
+
+@pytest.mark.parametrize("name", ["exchanger", "level", "recycle", "drifting"])
+def test_a_record_repeats_and_stays_within_the_signals(own: Any, name: str) -> None:
+    plant = {p.name: p for p in (*own.development.DEVELOPMENT, *own.untouched.UNTOUCHED)}[name]()
+    record, again = (own.record.record_of(plant, 400) for _ in range(2))
+    assert record.digest() == again.digest()
+    assert ((record.mv >= 0) & (record.mv <= 100)).all()
+    assert len(np.unique(record.mv)) > 8
+    assert record.pv.std() > 3 * plant.noise[0]
+
+
+def test_loops_side_by_side_are_the_closed_loop_of_one(own: Any) -> None:
+    plant = own.development.Exchanger()
+    law, tests = Proportional(), own.loops.tests_of(plant)["loads"]
+    y, u = own.loops.closed(law, plant, tests)
+
+    def step(sp: Any, pv: Any, mv: Any) -> tuple[Any, Any]:
+        return np.clip(mv + 0.2 * (sp - pv), 0, 100), np.zeros(0)
+
+    alone = simulate_closed(plant, step, tests[1], noise=plant.noise_std, seed=tests[1].seed + 1)
+    np.testing.assert_allclose(y[0, 1], alone.pv, atol=1e-9)
+    np.testing.assert_allclose(u[0, 1], alone.mv, atol=1e-9)
+    score = own.loops.scores(plant, tests, y[0], u[0])
+    assert score.nmae == pytest.approx(100 * np.mean([np.abs(t.sp - r) for t, r in zip(tests, y[0], strict=True)]) / 25)
