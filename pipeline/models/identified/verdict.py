@@ -185,9 +185,11 @@ def response_figures(
     n_y = len(pvs)
     middle = np.median(data.v, axis=0)
     size = 0.3 * data.v.std(axis=0)
-    length = 2 * POINTS
+    length, rests = 2 * POINTS, [_middle_rest(m, data) for m in members]
     while True:
-        found = np.array([step_responses(m, _middle_rest(m, data), middle, size, length)[..., :n_y] for m in members])
+        found = np.array(
+            [step_responses(m, x, middle, size, length)[..., :n_y] for m, x in zip(members, rests, strict=True)]
+        )
         late = np.abs(found[:, :, -1] - found[:, :, -length // 5]).max()
         if length >= LONGEST or late < 0.02 * np.abs(found).max():
             break
