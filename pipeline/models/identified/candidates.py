@@ -213,10 +213,7 @@ def wild(model: Dynamics, v: Array, n_y: int) -> bool:
     middle = np.median(x, axis=0)
     x = middle + AROUND * (x - middle)
     for shift in range(0, 60, 7):
-        inputs = v[np.roll(rows, shift)]
-        with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(100):
-                x = model.advance(x, inputs)
+        x, _ = model.hold(x, v[np.roll(rows, shift)], 100)
     return not np.abs(x[:, :n_y]).max() < WILD
 
 

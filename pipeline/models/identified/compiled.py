@@ -127,3 +127,35 @@ def propagate(
                     row[of_b1 + h] += through
                     row[of_w2 + i * n_h + h] += t[k, h]
         s[:] = ahead
+
+
+@compiled
+def hold_inputs(
+    a: Array, w1: Array, w2: Array, drive: Array, lift: Array, periods: int, x: Array, moved: Array
+) -> None:
+    """Runs of n models side by side under constant inputs: ``x`` (n, n_x) goes on by ``periods``.
+
+    ``drive`` (n, n_x) is B v + c, ``lift`` (n, n_h) W1 v + b1; ``moved`` (n,) receives the largest change of a state
+    in the last period.
+    """
+    n_x, n_h = len(a), w1.shape[0]
+    ahead, hidden = np.empty(n_x), np.empty(n_h)
+    for run in range(len(x)):
+        for _ in range(periods):
+            for h in range(n_h):
+                total = lift[run, h]
+                for j in range(n_x):
+                    total += w1[h, j] * x[run, j]
+                hidden[h] = np.tanh(total)
+            moved[run] = 0.0
+            for i in range(n_x):
+                total = drive[run, i]
+                for j in range(n_x):
+                    total += a[i, j] * x[run, j]
+                for h in range(n_h):
+                    total += w2[i, h] * hidden[h]
+                ahead[i] = total
+            for i in range(n_x):
+                change = abs(ahead[i] - x[run, i])
+                moved[run] = max(moved[run], change) if change == change else np.inf
+                x[run, i] = ahead[i]

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.models.identified.compiled import run_rows
+from pipeline.models.identified.compiled import hold_inputs, run_rows
 from pipeline.plants.identified import StateEquation
 from pipeline.plants.simulator import Array
 
@@ -82,6 +82,17 @@ class Dynamics(StateEquation):
         t = np.tanh(np.concatenate([x, v], axis=-1) @ self.w1.T + self.b1)
         through = (self.w2 * (1 - t * t)[..., None, :]) @ self.w1
         return self.a + through[..., : self.n_x], self.b + through[..., self.n_x :]
+
+    def hold(self, x: Array, v: Array, periods: int) -> tuple[Array, Array]:
+        """(states (n, n_x), largest change of each in the last period (n,)) after ``periods`` of constant inputs.
+
+        From states x (n, n_x) under v (n, n_v); not finite where a run explodes.
+        """
+        ahead, moved = np.array(x, dtype=np.float64), np.zeros(len(x))
+        drive, lift = v @ self.b.T + self.c, v @ self.w1[:, self.n_x :].T + self.b1
+        w1 = np.ascontiguousarray(self.w1[:, : self.n_x])
+        hold_inputs(self.a, w1, np.ascontiguousarray(self.w2), drive, lift, periods, ahead, moved)
+        return ahead, moved
 
     def free_run(self, start: Array, data: Stretch, correction: float = 0.0) -> tuple[Array, Array] | None:
         """(predicted states (n, n_x), states that the next prediction starts from (n, n_x)); None where it explodes.

@@ -15,6 +15,7 @@ from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
+from pipeline.models.identified.residual_tests import residual_figures
 from pipeline.models.identified.selection import Selection
 from pipeline.models.identified.stability import stability_figures
 from pipeline.models.identified.structure import Problem, Structure
@@ -24,7 +25,6 @@ from pipeline.models.identified.verdict import (
     free_run_figures,
     gain_figures,
     gains,
-    residual_figures,
     response_figures,
     structure_figures,
 )

@@ -21,13 +21,10 @@ FAR = 0.25
 def settle(model: Dynamics, v: Array, start: Array | None = None, periods: int = SETTLE) -> tuple[Array, Array]:
     """(states (n, n_x), whether each stands still (n,)) after a free run under constant inputs v (n, n_v)."""
     x = np.zeros((len(v), model.n_x)) if start is None else np.array(start)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(0, periods, 50):
-            for _ in range(50):
-                before, x = x, model.advance(x, v)
-            moved = np.abs(x - before).max(axis=1)
-            if not np.any(moved > 1e-7):
-                break
+    for _ in range(0, periods, 50):
+        x, moved = model.hold(x, v, 50)
+        if not np.any(moved > 1e-7):
+            break
     still = (moved < 1e-5) & (np.abs(x).max(axis=1) < FARTHEST)
     return x, still
 

@@ -1,4 +1,4 @@
-"""The verdict on an identified model: free run, gains and dead times with bands, residual, stability."""
+"""The verdict on an identified model: its structure, its free run, gains and dead times with bands."""
 
 from __future__ import annotations
 
@@ -18,9 +18,6 @@ from pipeline.models.identified.structure import Problem
 from pipeline.models.identified.trial import Trial
 from pipeline.plants.simulator import Array
 from serving.manifest import Signal
-
-LAGS = 25
-"""Lags of the residual's correlations."""
 
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places of an input over its data at which the local gain is taken."""
@@ -185,9 +182,11 @@ def response_figures(
     n_y = len(pvs)
     middle = np.median(data.v, axis=0)
     size = 0.3 * data.v.std(axis=0)
-    length = 2 * POINTS
+    length, rests = 2 * POINTS, [_middle_rest(m, data) for m in members]
     while True:
-        found = np.array([step_responses(m, _middle_rest(m, data), middle, size, length)[..., :n_y] for m in members])
+        found = np.array(
+            [step_responses(m, x, middle, size, length)[..., :n_y] for m, x in zip(members, rests, strict=True)]
+        )
         late = np.abs(found[:, :, -1] - found[:, :, -length // 5]).max()
         if length >= LONGEST or late < 0.02 * np.abs(found).max():
             break
@@ -212,40 +211,3 @@ def _middle_rest(model: Dynamics, data: ScaledRecord) -> Array:
     start = rest_map(model, data.y, data.v, 0)[0] @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
     x, still = settle(model, middle[None], start[None])
     return x[0] if still[0] else start
-
-
-# ---------------------------------------------------------------------- the residual
-def residual_figures(
-    residuals: Sequence[Array], inputs: Sequence[Array], names: Sequence[str]
-) -> dict[str, dict[str, float]]:
-    """Of each PV's free-run residual: shares of its correlations outside the 99 % band of a white one.
-
-    ``autocorrelated`` over lags 1 .. 25, ``input_correlated`` with the inputs at lags 0 .. 25; .01 is what chance
-    gives. A share of the second far above that says that dynamics are missing; the first also sees coloured noise.
-    """
-    e = np.concatenate([r - r.mean(axis=0) for r in residuals])
-    v = np.concatenate([u - u.mean(axis=0) for u in inputs])
-    n = len(e)
-    if n <= 2 * LAGS:
-        return {}
-    figures = {}
-    for i, name in enumerate(names):
-        own = _correlations(e[:, i], e[:, i])
-        bound = 2.58 / np.sqrt(n)
-        cross = []
-        for u in v.T:
-            # Correlated inputs widen the band: the product of both autocorrelations, after Bartlett.
-            wide = np.sqrt(max(1 + 2 * float(np.sum(own[1:] * _correlations(u, u)[1:])), 1.0))
-            cross.append(np.abs(_correlations(e[:, i], u)) > bound * wide)
-        figures[name] = {
-            "autocorrelated": float(np.mean(np.abs(own[1:]) > bound)),
-            "input_correlated": float(np.mean(cross)),
-        }
-    return figures
-
-
-def _correlations(later: Array, earlier: Array) -> Array:
-    """Correlation coefficients of later(k) and earlier(k - l), l = 0 .. ``LAGS``."""
-    norm = max(float(np.linalg.norm(later) * np.linalg.norm(earlier)), 1e-300)
-    n = len(later)
-    return np.array([float(later[lag:] @ earlier[: n - lag]) for lag in range(LAGS + 1)]) / norm

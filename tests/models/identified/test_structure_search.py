@@ -71,7 +71,7 @@ def test_a_pole_at_one_stays_only_where_the_plant_integrates(record: Record, int
     at_one = {k: replace(f, model=replace(f.model, a=pole_at_one(f.model.a))) for k, f in trial.fits.items()}
     again = search.settling([Trial(trial.structure, at_one)])[0]
     poles = [np.abs(np.linalg.eigvals(f.model.a)).max() for f in again.fits.values()]
-    assert (min(poles) > 0.995) is integrates
+    assert bool(min(poles) > 0.995) is integrates
     assert again.error == pytest.approx(trial.error, rel=0.05)
 
 
