@@ -14,6 +14,7 @@ from pipeline.historian.findings import Finding
 from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.grid import Grid, Sampling
 from pipeline.historian.linear import Linear
+from pipeline.metrics import Array
 from pipeline.records.record import Record
 
 COARSE = 0.002  # of the usual span: a converter's step that a model feels
@@ -68,6 +69,17 @@ def of_grid(grid: Grid) -> list[Finding]:
             )
             found.append(Finding("bridged", tag, words))
     return found
+
+
+def of_mode(series: Series, values: Array) -> list[Finding]:
+    """How often a loop was switched, of a mode's values (n,) on the grid; nothing where it never was."""
+    known = values[np.isfinite(values)]
+    switches = int(np.count_nonzero(np.diff(known)))
+    if not switches:
+        return []
+    rows = ", ".join(f"{name} in {int(np.sum(known == i))} rows" for i, name in enumerate(series.categories))
+    words = f"{switches} switches: {rows}; --without-mode leaves the rows of a mode out"
+    return [Finding("mode", series.tag, words)]
 
 
 def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Finding]:

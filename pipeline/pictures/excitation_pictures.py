@@ -7,6 +7,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
+from pipeline.historian.excerpt import evenly
 from pipeline.historian.excitation import (
     ALIKE,
     ENOUGH_MOVES,
@@ -15,7 +16,6 @@ from pipeline.historian.excitation import (
     moves_of,
     spectra_of,
 )
-from pipeline.historian.excerpt import evenly
 from pipeline.historian.findings import InputReport, Verdict
 from pipeline.historian.screening import Screened, models_of
 from pipeline.historian.spectra import Spectrum

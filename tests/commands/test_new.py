@@ -78,11 +78,11 @@ def test_without_roles_a_table_is_written_corrected_and_read(capsys: pytest.Capt
     table = Path("tank-tags.csv")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [(r["tag"], r["role"], r["unit"]) for r in rows] == [
-        ("TIC-101.PV", "pv", "degC"), ("TIC-101.OP", "mv", "%"), ("FI-7", "", "kg/h"),
+        ("TIC-101.PV", "pv", "degC"), ("TIC-101.OP", "mv", "%"), ("FI-7", "dv", "kg/h"),
     ]  # fmt: skip
     assert main(["new", "tank", "x.csv"]) == 2  # a corrected table is not lost
     assert "is there already" in capsys.readouterr().err
-    table.write_text(table.read_text().replace("FI-7,,FI-7,", "FI-7,dv,Flow,"))
+    table.write_text(table.read_text().replace("FI-7,dv,FI-7,", "FI-7,dv,Flow,"))
     assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 0
     params, _ = read_back("tank")
     assert [s.name for s in (*params.pv, *params.mv, *params.dv)] == ["TIC-101.PV", "TIC-101.OP", "Flow"]
