@@ -188,7 +188,7 @@ def sayings(verdict: Verdict) -> list[str]:
                 continue
             words = [f"gain {gain:.3g}"] if gain else ["gain not clear"]
             words += [f"first answer after {first:g} s"] if first is not None else []
-            words += [f"settled after {i.settling_s:g} s"] if i.settling_s and gain else []
+            words += [f"the slowest settles in {i.settling_s:g} s"] if i.settling_s and gain else []
             lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
     return lines
 

@@ -50,7 +50,7 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
         )
         found.append(Finding("repeated", series.tag, words))
     step = quantum(values)
-    if span > 0 and step > COARSE * span:
+    if span > 0 and step > COARSE * span and role in {"pv", "dv"}:  # an MV is moved in steps
         noise = noise_sd(values)
         words = f"moves in steps of {step:.4g}, {100 * step / span:.2g} % of its span"
         words += ", more than its noise" if step > 2 * noise else ""
