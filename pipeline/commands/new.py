@@ -17,7 +17,7 @@ from pipeline.errors import PipelineError, RecordError
 from pipeline.files import draft_folder_of, write_json, write_text
 from pipeline.historian.excerpt import evenly
 from pipeline.historian.findings import Screening, Verdict
-from pipeline.historian.guessing import guesses
+from pipeline.historian.guessing import controlled_first, guesses
 from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
 from pipeline.historian.step_test import StepTest, planned
@@ -72,6 +72,7 @@ def run(options: argparse.Namespace) -> int:
     check_tags(tags, where)
     units = units_of(options.files)
     tags = named([t if t.unit or t.role == "mode" else _with_unit(t, units) for t in tags])
+    tags = controlled_first(tags)
     values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
     export = read_export(options.files, values, modes, options.time, options.time_format)
     found = screened(name, export, tags, options.period, options.hold, options.without_mode)
@@ -187,7 +188,7 @@ def sayings(verdict: Verdict) -> list[str]:
                 continue
             words = [f"gain {gain:.3g}"] if gain else ["gain not clear"]
             words += [f"first answer after {first:g} s"] if first is not None else []
-            words += [f"settled after {i.settling_s:g} s"] if i.settling_s and gain else []
+            words += [f"the slowest settles in {i.settling_s:g} s"] if i.settling_s and gain else []
             lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
     return lines
 

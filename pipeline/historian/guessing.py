@@ -10,7 +10,10 @@ import numpy as np
 
 from pipeline.historian.cells import sentinels, unit_slips, usual
 from pipeline.historian.character import quantum
+from pipeline.historian.excitation import FOLLOWS, follows
 from pipeline.historian.export import Export, Series
+from pipeline.historian.grid import proposed_period, resampled
+from pipeline.historian.linear import fitted
 from pipeline.historian.reason import Reason
 from pipeline.historian.tags import Guess, Tag
 
@@ -21,6 +24,9 @@ ENDINGS: tuple[tuple[str, str], ...] = (
     (r"(^|[ ._:/-])(pv|cv|me|meas|istwert|x)([ ._:/-]|$)", "pv"),
 )
 HELD_SHARE = 0.9  # of the readings equal to the one before: moved in steps
+LEAST_GOOD = 0.5  # share of the readings of a tag that is tried as a disturbance
+MOST_TRIED, MOST_READINGS = 60, 20_000
+STRONG = 25.0  # strength of an answer, as SEEN of excitation, for a guess
 LOOP = re.compile(r"^(?P<loop>.*?)[ ._:/-]+[A-Za-z ]+$")
 
 
@@ -39,7 +45,56 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
         free = [g for g in found if not g.tag.role and g.good > 0 and g.step >= 0 and g.tag.low is not None]
         own = [g for g in free if g.tag.tag in loops] or free[:1]
         found = [replace(g, tag=replace(g.tag, role="pv")) if g in own else g for g in found]
-    return found
+    return disturbances(found, export)
+
+
+def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:
+    """The tags, the PVs whose loop has a set point before the others."""
+    loops = {m["loop"] for t in tags if t.role == "sp" and (m := LOOP.match(t.tag))}
+
+    def after(tag: Tag) -> bool:
+        match = LOOP.match(tag.tag)
+        return tag.role == "pv" and not (match is not None and match["loop"] in loops)
+
+    return tuple(sorted(tags, key=after)) if loops else tuple(tags)
+
+
+def disturbances(found: Sequence[Guess], export: Export) -> list[Guess]:
+    """The guesses, tags without a role that a PV answers to, and that do not answer to it, as measured disturbances."""
+    pvs, mvs = ([g.tag.tag for g in found if g.tag.role == role] for role in ("pv", "mv"))
+    free = [g.tag.tag for g in found if not g.tag.role and g.good > LEAST_GOOD and g.tag.low is not None]
+    if not pvs or not mvs or not free:
+        return list(found)
+    names = dict.fromkeys((*pvs, *mvs, *free[:MOST_TRIED]))
+    own = {name: _excerpt(export.series[name]) for name in names}
+    grid, _ = resampled(
+        [own[n] for n in (*pvs, *free[:MOST_TRIED])], [own[n] for n in mvs], proposed_period([own[pvs[0]]])
+    )
+    causes: dict[str, str] = {}
+    for pv in pvs:
+        y = grid.value[pv]
+        for name in free[:MOST_TRIED]:
+            u = [*(grid.value[m] for m in mvs), grid.value[name]]
+            model = fitted(y, u, grid.piece)
+            seen = model is not None and model.strength[len(mvs)] > STRONG
+            if seen and follows(grid.value[name], y, grid.piece) < FOLLOWS and name not in causes:
+                causes[name] = pv
+    return [
+        replace(
+            g, tag=replace(g.tag, role="dv"), remark=f"{g.remark}; guessed: {causes[g.tag.tag]} answers".strip("; ")
+        )
+        if g.tag.tag in causes
+        else g
+        for g in found
+    ]
+
+
+def _excerpt(series: Series) -> Series:
+    """The first readings of a tag, those without a reason; codes for missing values left out."""
+    n = min(len(series), MOST_READINGS)
+    value, code = series.value[:n].copy(), series.code[:n].copy()
+    code[sentinels(np.where(code == Reason.GOOD, value, np.nan))[0] & (code == Reason.GOOD)] = Reason.SENTINEL
+    return Series(series.tag, series.time_s[:n], value, code)
 
 
 def _guess(series: Series, unit: str) -> Guess:

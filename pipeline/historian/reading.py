@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
@@ -113,11 +114,11 @@ def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> 
     counts: Counter[str] = Counter()
     values = {v: bare(v) for v in layout.values if not wanted or {v, bare(v)} & wanted or layout.kind == "long"}
     qualities = {v: layout.quality[v] for v in values if v in layout.quality}
-    names = [n for n in dict.fromkeys((layout.time, layout.tag, *values, *qualities.values())) if n]
+    names = [n for n in dict.fromkeys((layout.date, layout.time, layout.tag, *values, *qualities.values())) if n]
     try:
         for block in source.blocks(names):
             counts["rows_read"] += block.num_rows
-            seconds = layout.clock.seconds(block.column(layout.time))
+            seconds = layout.clock.seconds(_stamps(block, layout))
             timed = np.isfinite(seconds)
             if not timed.all():
                 counts["timeless"] += int(np.count_nonzero(~timed))
@@ -137,6 +138,14 @@ def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> 
             "--time-format"
         )
     return gather.series(), counts
+
+
+def _stamps(block: Any, layout: Layout) -> Any:
+    """The column of times, put together where day and hour stand apart."""
+    if not layout.date:
+        return block.column(layout.time)
+    parts = [pc.utf8_trim_whitespace(pc.cast(block.column(c), pa.string())) for c in (layout.date, layout.time)]
+    return pc.binary_join_element_wise(*parts, " ")
 
 
 def _long_block(gather: _Gather, layout: Layout, block: Any, seconds: Any, wanted: set[str]) -> None:

@@ -14,6 +14,7 @@ from pipeline.historian.findings import Finding
 from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.grid import Grid, Sampling
 from pipeline.historian.linear import Linear
+from pipeline.metrics import Array
 from pipeline.records.record import Record
 
 COARSE = 0.002  # of the usual span: a converter's step that a model feels
@@ -49,7 +50,7 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
         )
         found.append(Finding("repeated", series.tag, words))
     step = quantum(values)
-    if span > 0 and step > COARSE * span:
+    if span > 0 and step > COARSE * span and role in {"pv", "dv"}:  # an MV is moved in steps
         noise = noise_sd(values)
         words = f"moves in steps of {step:.4g}, {100 * step / span:.2g} % of its span"
         words += ", more than its noise" if step > 2 * noise else ""
@@ -68,6 +69,17 @@ def of_grid(grid: Grid) -> list[Finding]:
             )
             found.append(Finding("bridged", tag, words))
     return found
+
+
+def of_mode(series: Series, values: Array) -> list[Finding]:
+    """How often a loop was switched, of a mode's values (n,) on the grid; nothing where it never was."""
+    known = values[np.isfinite(values)]
+    switches = int(np.count_nonzero(np.diff(known)))
+    if not switches:
+        return []
+    rows = ", ".join(f"{name} in {int(np.sum(known == i))} rows" for i, name in enumerate(series.categories))
+    words = f"{switches} switches: {rows}; --without-mode leaves the rows of a mode out"
+    return [Finding("mode", series.tag, words)]
 
 
 def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Finding]:

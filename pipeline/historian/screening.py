@@ -22,7 +22,7 @@ from pipeline.historian.linear import Linear, fitted
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
 from pipeline.historian.reason import Reason
-from pipeline.historian.remarks import of_grid, of_models, of_series
+from pipeline.historian.remarks import of_grid, of_mode, of_models, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.static import explained
 from pipeline.historian.tags import Tag
@@ -92,11 +92,15 @@ def screened(
             own[t.tag].lighten()
     findings += stretches(grid, signals, by_tag)
     findings += inputs_and_answers(grid, signals)
+    findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
     code = row_codes(grid, signals, tags, own, without_modes)
     record = record_of(grid, code, signals)
     excerpt = evenly(record)
     models = models_of(excerpt)
-    moved = max((len(moves_of(grid.value[t.tag][code == 0][:SEEN], record.run[:SEEN])) for t in tags if t.role == "sp"), default=0)
+    moved = max(
+        (len(moves_of(grid.value[t.tag][code == 0][:SEEN], record.run[:SEEN])) for t in tags if t.role == "sp"),
+        default=0,
+    )
     findings += of_models(excerpt, models)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags

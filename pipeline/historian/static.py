@@ -54,8 +54,7 @@ def explained(y: Array, u: Sequence[Array], piece: NDArray[np.int64]) -> tuple[A
     return out, _settling(full, np.array([float(np.std(c[rows])) for c in u]), blocks)
 
 
-def _inputs(
-    u: Sequence[Array], centre: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
+def _inputs(u: Sequence[Array], centre: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
     first, last = int(rows[0]) - blocks[-1][1], int(rows[-1]) + 1
     first = max(first, 0)
     columns = [blocks_of(c[first:last] - m, rows - first, blocks) for c, m in zip(u, centre, strict=True)]

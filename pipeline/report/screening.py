@@ -12,6 +12,7 @@ from pipeline.files import write_text
 from pipeline.historian.reason import Reason
 from pipeline.historian.screening import Screened
 from pipeline.historian.step_test import StepTest
+from pipeline.pictures.excitation_pictures import inputs, verdict
 from pipeline.pictures.screening_pictures import details, readings, trends
 from pipeline.report.templating import render
 
@@ -25,7 +26,13 @@ VERDICTS = {
 def write_page(path: Path, found: Screened, test: StepTest | None) -> None:
     """Write the page of a screening, whole or not at all."""
     report = found.report
-    pictures = {"trends": trends(found), "details": details(found), "readings": readings(found)}
+    pictures = {
+        "trends": trends(found),
+        "details": details(found),
+        "readings": readings(found),
+        "inputs": inputs(found),
+        "verdict": verdict(found),
+    }
     content = {
         "r": report,
         "verdict": VERDICTS[report.verdict.carries],

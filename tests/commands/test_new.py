@@ -78,11 +78,11 @@ def test_without_roles_a_table_is_written_corrected_and_read(capsys: pytest.Capt
     table = Path("tank-tags.csv")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [(r["tag"], r["role"], r["unit"]) for r in rows] == [
-        ("TIC-101.PV", "pv", "degC"), ("TIC-101.OP", "mv", "%"), ("FI-7", "", "kg/h"),
+        ("TIC-101.PV", "pv", "degC"), ("TIC-101.OP", "mv", "%"), ("FI-7", "dv", "kg/h"),
     ]  # fmt: skip
     assert main(["new", "tank", "x.csv"]) == 2  # a corrected table is not lost
     assert "is there already" in capsys.readouterr().err
-    table.write_text(table.read_text().replace("FI-7,,FI-7,", "FI-7,dv,Flow,"))
+    table.write_text(table.read_text().replace("FI-7,dv,FI-7,", "FI-7,dv,Flow,"))
     assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 0
     params, _ = read_back("tank")
     assert [s.name for s in (*params.pv, *params.mv, *params.dv)] == ["TIC-101.PV", "TIC-101.OP", "Flow"]
@@ -103,6 +103,52 @@ def test_a_constant_mv_gets_a_step_test_and_no_section(capsys: pytest.CaptureFix
     assert np.ptp(values) > 10
     at, hold = (np.array([float(r[c]) for r in rows]) for c in ("at [s]", "hold [min]"))
     np.testing.assert_allclose(np.diff(at), 60 * hold[:-1], rtol=1e-3)
+
+
+def test_data_that_carry_no_model_are_refused_unless_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    """Swapped tags: refused with the report and the step test; a second try needs no cleaning; --anyway adds it."""
+    write(Path("x.csv"), cells(clean(2500)))
+    swapped = ["--pv", "TIC-101.OP[%]", "--mv", "TIC-101.PV[degC]", "--dv", "FI-7[kg/h]"]
+    before = Path("params.yaml").read_bytes()
+    for _ in range(2):
+        assert main(["new", "tank", "x.csv", *swapped]) == 2
+        error = capsys.readouterr().err
+        assert "are the two swapped" in error
+        assert "step_test.csv, or give --anyway" in error
+        assert Path("params.yaml").read_bytes() == before
+        assert {p.name for p in Path("data/tank").iterdir()} == {"screening.json", "screening.html", "step_test.csv"}
+    assert main(["new", "tank", "x.csv", *swapped, "--anyway"]) == 0
+    assert Path("data/tank/record.parquet").exists()
+    assert main(["new", "tank", "x.csv", *swapped, "--anyway"]) == 2  # a plant that was added is not overwritten
+    assert "already" in capsys.readouterr().err
+
+
+def test_the_verdict_is_on_the_page_and_in_json(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean(2500)))
+    assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    (valve, flow) = json.loads(Path("data/tank/screening.json").read_text())["verdict"]["inputs"]
+    assert valve["gain"]["TIC-101.PV"] == pytest.approx(0.8, rel=0.1)
+    assert flow["gain"]["TIC-101.PV"] == pytest.approx(-0.02, rel=0.3)
+    assert 0.5 < valve["band_share"] <= 1
+    assert Path("data/tank/screening.html").read_text().count('src="data:image/png') == 4  # no detail without a fault
+    assert "TIC-101.OP -> TIC-101.PV: gain 0." in capsys.readouterr().out
+
+
+def test_guesses_tell_disturbances_from_the_rest_and_controlled_variables_come_first() -> None:
+    """A flow that the PV answers to is a disturbance, noise is none; a PV whose loop has a set point is the first."""
+    data = clean(2500)
+    random = np.random.default_rng(1)
+    rows = [
+        [r[0], f"{random.normal(80, 1):.2f}", r[1], r[2], r[3], "55", f"{random.normal(3, 0.1):.3f}"]
+        for r in cells(data)
+    ]
+    header = ("timestamp", "TI-9.PV", "TIC-101.PV", "TIC-101.OP", "FI-7", "TIC-101.SP", "PI-3")
+    write(Path("x.csv"), rows, header)
+    assert main(["new", "tank", "x.csv"]) == 0
+    roles = {r["tag"]: r["role"] for r in csv.DictReader(Path("tank-tags.csv").read_text().splitlines())}
+    assert (roles["FI-7"], roles["PI-3"], roles["TIC-101.SP"]) == ("dv", "", "sp")
+    assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 0
+    assert [s.name for s in read_back("tank")[0].pv] == ["TIC-101.PV", "TI-9.PV"]
 
 
 BAD: dict[str, tuple[list[str], str]] = {

@@ -223,3 +223,22 @@ def test_the_decimal_sign_is_told_from_the_separator(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_text('time;a;b\n0;"1.234,5";2\n1;3,25;4\n2;3,25;4\n')
     assert (sniff(path).separator, sniff(path).decimal) == (";", ",")
+
+
+@pytest.mark.parametrize(
+    ("day", "hour"), [("%Y-%m-%d", "%H:%M:%S"), ("%d.%m.%Y", "%H:%M:%S"), ("%d-%b-%y", "%H:%M:%S")]
+)
+def test_day_and_hour_in_two_columns(day: str, hour: str, tmp_path: Path) -> None:
+    rows = [[utc(day)(float(r[0])), utc(hour)(float(r[0])), *r[1:]] for r in cells(DATA)]
+    check(write(tmp_path / "x.csv", rows, ("Date", "Time", *NAMES)))
+
+
+def test_a_long_export_may_have_day_and_hour_apart(tmp_path: Path) -> None:
+    rows = [
+        [name, utc("%d.%m.%Y")(float(r[0])), utc("%H:%M:%S")(float(r[0])), value]
+        for r in cells(DATA)
+        for name, value in zip(NAMES, r[1:], strict=True)
+    ]
+    export = read_export([write(tmp_path / "x.csv", rows, ("tag", "Datum", "Uhrzeit", "value"))], NAMES)
+    np.testing.assert_allclose(export.series[NAMES[0]].value, DATA.pv)
+    np.testing.assert_allclose(export.series[NAMES[0]].time_s, DATA.time_s)
