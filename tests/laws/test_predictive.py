@@ -470,6 +470,17 @@ def test_set_points_of_trials_are_within_reach_of_their_own_plants() -> None:
     assert drawn.abs().max() <= 1.5
 
 
+def test_a_level_beside_an_output_that_rests_leaves_it_its_set_points() -> None:
+    """y0 is a level filled by u0, y1 = u1 at rest, behind a lag: the set points of y1 are MVs within reach."""
+    a, b = np.diag([1.0, 0.8]), np.diag([0.1, 0.2])
+    model = scaled_model(2, 2, 0, 2, a=a, b=b, rest=np.eye(2, 5))
+    sp = Trials.draw(model, made_signals(2, 2), 15, seed=0).sp[:, :LOOPS]
+    assert sp[..., 0].std() > 0.5
+    assert sp[..., 1].std() > 0.3
+    assert sp[..., 1].abs().max() <= 0.8
+    assert sp[..., 0].abs().max() <= 1.5
+
+
 def test_a_searched_law_costs_no_more_than_the_given_one() -> None:
     params = Predictive.Params(tuning="search", horizon=8, moves=3, passes=1, sweeps=2)
     law = Predictive.design(params, {"identified": first_order(pole=0.5)}, made_signals(), None)

@@ -73,34 +73,26 @@ class Trials:
         low, high = (np.array([getattr(s, end) for s in signals.mv]) for end in ("low", "high"))
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         signs = rng.choice([-1.0, 1.0], (loops, n_mv)) if n_mv > 1 else np.ones((loops, 1))
-        gain = np.tile(GAINS, 2)[:, None] ** signs
-        pace = np.tile(PACES, 2)[:, None]
+        gain, pace, late = np.tile(GAINS, 2)[:, None] ** signs, np.tile(PACES, 2)[:, None], np.tile(LATE, 2)[:, None]
+        # Every set point is a rest under MVs that act; a plant with another gain is given others for them.
         acting = middle + half * rng.uniform(-REACH, REACH, (HOLDS + 1, loops, n_mv))
         acting[:, LOOPS:] = middle + 0.6 * (acting[:1, LOOPS:] - middle)
-        rests, moving = _rests(model, acting.reshape(-1, n_mv))
-        x = rests.reshape(HOLDS + 1, loops, -1)
-        y = model.measured(x.clamp(-SPAN / 2, SPAN / 2))[..., :n_cv].numpy().copy()
-        free = model.measured(torch.from_numpy(rng.uniform(-1.5, 1.5, (HOLDS + 1, loops, model.n_x))))[
-            ..., :n_cv
-        ].numpy()
-        y[..., moving[:n_cv]] = free[..., moving[:n_cv]]
-        y[:, LOOPS:] = y[:1, LOOPS:]
-        x0 = x[0].clone()
-        x0[:, :n_cv] = torch.from_numpy((y[0] - model.y_center[:n_cv].numpy()) / model.y_scale[:n_cv].numpy())
-        steps = rng.uniform(0.5, 1.0, (HOLDS, LOOPS, 1)) * rng.choice([-1.0, 0.0, 1.0], (HOLDS, LOOPS, max(n_mv, n_cv)))
-        course = np.concatenate([np.zeros_like(steps[:1].repeat(horizon, axis=0)), np.repeat(steps, hold, axis=0)])
-        walk = np.cumsum(DRIFT * rng.normal(size=(n, LOOPS, course.shape[-1])), axis=0)
-        course[:, WALKS] = np.clip(walk, -1, 1)[:, WALKS]
-        bias, load = np.zeros((n, loops, n_mv)), np.zeros((n, loops, model.n_y))
-        at_mv = [i for i in range(LOOPS) if i not in AT_OUTPUT]
-        bias[:, [LOOPS + i for i in at_mv]] = BIAS * half * course[:, at_mv, :n_mv]
-        load[:, [LOOPS + i for i in AT_OUTPUT], :n_cv] = LOAD / horizon * course[:, AT_OUTPUT, :n_cv]
-        noise = (model.noise * model.y_scale).numpy() * rng.normal(size=(n, loops, model.n_y))
+        x0, levels = _rests(model, acting, rng)
+        levels[:, LOOPS:] = levels[:1, LOOPS:]
+        x0[:, : model.n_y] = levels[0]
+        sp = model.measured(levels)[..., :n_cv]
+        sp = torch.cat([sp[:1].expand(horizon, -1, -1), sp[1:].repeat_interleave(hold, dim=0)])
         mv0 = np.clip(middle + (acting[0] - middle) / gain, low, high)
-        late = np.tile(LATE, 2)[:, None]
-        sp = np.concatenate([np.repeat(y[:1], horizon, axis=0), np.repeat(y[1:], hold, axis=0)])
-        tensors = (x0, mv0, gain, pace, late, sp, bias, load, noise)
-        return cls(model, signals, horizon, *(torch.as_tensor(t) for t in tensors))
+        course = _courses(rng, horizon, hold, max(n_mv, n_cv))
+        bias, load = np.zeros((n, loops, n_mv)), np.zeros((n, loops, model.n_y))
+        for i in range(LOOPS):
+            if i in AT_OUTPUT:
+                load[:, LOOPS + i, :n_cv] = LOAD / horizon * course[:, i, :n_cv]
+            else:
+                bias[:, LOOPS + i] = BIAS * half * course[:, i, :n_mv]
+        noise = (model.noise * model.y_scale).numpy() * rng.normal(size=(n, loops, model.n_y))
+        drawn = (torch.as_tensor(t) for t in (mv0, gain, pace, late, sp, bias, load, noise))
+        return cls(model, signals, horizon, x0, *drawn)
 
     @torch.no_grad()
     def run(self, laws: ControlLaw, count: int) -> Outcome:
@@ -133,15 +125,27 @@ class Trials:
         return Outcome(error[:, :LOOPS].numpy(), error[:, LOOPS:].numpy(), moved.numpy())
 
 
-def _rests(model: Identified, mv: Array) -> tuple[Tensor, Array]:
-    """States (n, n_x) after SETTLE samples under mv (n, n_mv), and which outputs (n_y,) never come to rest.
+def _courses(rng: np.random.Generator, horizon: int, hold: int, count: int) -> Array:
+    """Loads (n, LOOPS, count) within -1..1, none over the first horizon: steps, or random walks in the loops WALKS."""
+    steps = rng.uniform(0.5, 1.0, (HOLDS, LOOPS, 1)) * rng.choice([-1.0, 0.0, 1.0], (HOLDS, LOOPS, count))
+    course = np.repeat(steps, hold, axis=0)
+    course[:, WALKS] = np.clip(np.cumsum(DRIFT * rng.normal(size=course[:, WALKS].shape), axis=0), -1, 1)
+    return np.concatenate([np.zeros((horizon, LOOPS, count)), course])
 
-    Where an output runs away, the state is that of a rest in the middle of the record.
+
+def _rests(model: Identified, mv: Array, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """States (loops, n_x) after SETTLE samples under the first of mv (n, loops, n_mv), and outputs (n, loops, n_y).
+
+    An output that never comes to rest has random values within its record's range, and where anything runs away the
+    state is that of a rest in the middle of the record. All scaled.
     """
-    v = torch.cat([torch.from_numpy(mv), model.v_center[model.n_mv :].expand(len(mv), -1)], dim=-1)
-    x = start = late = model.at_rest(model.y_center.expand(len(mv), -1), v)
+    dv = model.v_center[model.n_mv :]
+    v = torch.cat([torch.from_numpy(mv), dv.expand(*mv.shape[:-1], -1)], dim=-1)
+    x = start = late = model.at_rest(model.y_center.expand(*v.shape[:-1], -1), v)
     for k in range(SETTLE):
         x, late = model(torch.cat([x, v], dim=-1)), x if k == SETTLE * 2 // 3 else late
-    moved, lately = ((x - since)[:, : model.n_y].abs().median(dim=0).values for since in (start, late))
-    within = x.abs().amax(dim=-1, keepdim=True) < 2 * SPAN
-    return torch.where(within, x, start), (lately > STILL * moved).numpy()
+    moved, lately = ((x - since)[..., : model.n_y].abs().flatten(0, 1).median(dim=0).values for since in (start, late))
+    free = torch.from_numpy(rng.uniform(-1.5, 1.5, (*mv.shape[:-1], model.n_y)))
+    y = torch.nan_to_num(x[..., : model.n_y]).clamp(-SPAN / 2, SPAN / 2)
+    within = x[0].abs().amax(dim=-1, keepdim=True) < 2 * SPAN
+    return torch.where(within, x[0], start[0]), torch.where(lately > STILL * moved, free, y)
