@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -20,6 +20,8 @@ from pipeline.evaluation.typed_json import read_mapping
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]
+WITHHELD = "withheld.json"
+"""In the place of a law's metrics.json: why it was not designed for the plant."""
 
 
 class NotMeasuredError(PipelineError):
@@ -35,7 +37,7 @@ class Evidence:
 
     Without a named metric, a figure is in the case's metric, ``Case.metric``. ``model_folder`` = work/<case>/models
     holds the predictions of the model sets. ``own_data``: models are trained on a user's data, not on the case's
-    experiments.
+    experiments. ``withheld`` says of laws that do not suit the plant why.
     """
 
     case: Case
@@ -44,6 +46,7 @@ class Evidence:
     models: Mapping[str, Mapping[str, Any]]
     model_folder: Path = Path()
     own_data: bool = False
+    withheld: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def load(
@@ -76,7 +79,9 @@ class Evidence:
             evidence[name] = LawEvidence(metrics, folder / "trajectories.npz", step_us)
         sets = {p.parent.name: p for p in sorted(models.glob("*/metrics.json"))}
         model_sets = {n: read_mapping(p) for n, p in sets.items() if models_of is None or n in models_of}
-        return cls(case, bounds, evidence, model_sets, models, own_data)
+        reasons = {p.parent.name: str(read_mapping(p)["why"]) for p in sorted(validation.glob(f"*/{WITHHELD}"))}
+        withheld = {n: why for n, why in reasons.items() if laws is None or n in laws}
+        return cls(case, bounds, evidence, model_sets, models, own_data, withheld)
 
     @cached_property
     def grounds(self) -> Grounds | None:
@@ -192,9 +197,18 @@ class Evidence:
         own, bound = self.figure(law, scenario), self.bound(scenario, None, kind)
         return None if own is None or bound is None else ratio_to_bound(own, bound, self.floor(scenario))
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the tests run on a person's own simulator."""
+        return self.case.on_models and self.case.stand_in == "simulator"
+
     def gate_ratio(self, law: str, scenario: str) -> float | None:
-        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide."""
-        own, bound = self.figure(law, scenario), self.bound(scenario)
+        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide.
+
+        A simulator has no NMPC; the baseline's error stands in its place in all tests.
+        """
+        bound = self.figure(self.case.baseline, scenario) if self.simulated else self.bound(scenario)
+        own = self.figure(law, scenario)
         return None if own is None or bound is None else gate_ratio(own, bound, self.floor(scenario))
 
     def score(self, law: str) -> float | None:

@@ -80,6 +80,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "met": sum(row.holds is True for row in judged.acceptance),
         "statements": judged.statements,
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
+        "withheld": evidence.withheld,
+        "gate_of": f"{case.baseline}'s" if evidence.simulated else "NMPC's",
         "laws": [_law(evidence, law) for law in evidence.laws],
         "scenarios": _rows(evidence),
         "further": _further(evidence),

@@ -22,7 +22,7 @@ from pipeline.config.params import (
     sections,
 )
 from pipeline.config.plants import PlantParams, own_plants
-from pipeline.errors import ParamsError, PipelineError
+from pipeline.errors import LawError, ParamsError, PipelineError
 from pipeline.evaluation.case import Case
 from pipeline.laws import LAWS
 from pipeline.laws.fitting import require_fit
@@ -66,7 +66,19 @@ def notes() -> list[str]:
                 lines.append(f"case {name!r} has no bounds; run `loopwright bounds {name}`")
         except LoopwrightError as error:
             lines.append(" ".join(str(error).split()))
-    return lines
+    return lines + [line for name in sections("controllers") if (line := _withheld(name))]
+
+
+def _withheld(controller: str) -> str:
+    """Why a controller of a plant without equations will not be designed; empty where it will be."""
+    params = ControllerParams.read(controller)
+    case = all_cases()[params.case]
+    try:
+        if case.ready:
+            require_fit(LAWS[params.law], case.plant)
+    except LawError as error:
+        return f"controllers.{controller}: {error}"
+    return ""
 
 
 def _case_of(name: str) -> Case:
@@ -142,7 +154,6 @@ def _controller(name: str) -> None:
         if not case.ready:
             continue
         try:
-            require_fit(law, plant)
             law.check(settings, parts, plant)
         except PipelineError as error:
             raise ParamsError(f"{place}: {error}") from None

@@ -40,13 +40,16 @@ def design(name: str) -> None:
     seeds = sorted(int(p.name.removeprefix("seed")) for p in models.glob("seed*"))
     if not seeds:
         raise LawError(f"{where}: {models} holds no models; run the fit stage of that model set first")
-    try:
-        require_fit(law, case.plant)
-    except LawError as error:
-        raise LawError(f"{where}: {error}") from None
-    data = read_json(models / "metrics.json").get("data", {})
     folder = design_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
+    try:
+        require_fit(law, case.plant)
+    except LawError as error:  # the other controllers of the plant go on
+        print(f"design {name}: {error}", file=sys.stderr)
+        folder.mkdir(parents=True)
+        write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "withheld": str(error)})
+        return
+    data = read_json(models / "metrics.json").get("data", {})
     provenance = {"params_sha256": digest(forms), "commit": _commit(), "versions": _versions()}
     work = [(form, seed) for form in forms for seed in seeds]
     arguments = (params, read, models, case.plant, provenance, data)

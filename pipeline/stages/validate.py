@@ -19,6 +19,7 @@ from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.evidence import WITHHELD
 from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
 from pipeline.evaluation.reached import grounds_of, widest
@@ -43,6 +44,7 @@ FIELDS = ("time_s", "sp", "pv", "mv", "info")  # of the trajectories that are ke
 def validate(name: str) -> None:
     """Run every file of ``controllers.<name>`` over its plant; ship the best by the development sequences.
 
+    A law that was not designed, because it does not suit the plant, leaves the reason.
     A law that locks up anywhere is not shipped. On a plant's equations that is an error; where tests run on models of
     a record, the case goes on without it, and its report says why.
     """
@@ -50,6 +52,15 @@ def validate(name: str) -> None:
     choices = parse(CaseParams, read_section("cases", params.case), f"cases.{params.case}")
     case = choose(all_cases(), params.case, "case", f"controllers.{name}").with_held_out(choices.held_out_seeds)
     case.tests()  # before hours of closed loops: raises where there are none
+    folder = validation_folder(params.case, params.name)
+    designed = read_json(design_folder(params.case, params.name) / "metrics.json")
+    if why := designed.get("withheld"):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        write_json(folder / WITHHELD, {"why": why})
+        write_json(step_time_file(params.case, params.name), {})
+        withhold(ARTIFACTS / params.case / f"{params.name}.onnx", why)
+        return
     seeds = sorted(
         int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.name) / BASE).glob("*.onnx")
     )
@@ -68,10 +79,8 @@ def validate(name: str) -> None:
     refused = bool(locked_up) and not params.as_printed
     if refused and not case.on_models:
         raise LawError(withheld)
-    folder = validation_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    designed = read_json(design_folder(params.case, params.name) / "metrics.json")
     replayed = _replayed(case, source, folder / "replay.npz")
     metrics = replace(_metrics(params, case, designed, trials, shipped), replay=replayed)
     metrics.write(folder / "metrics.json")

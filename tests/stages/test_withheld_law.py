@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from identified_models import scaled_model
+from identified_models import first_order, scaled_model
 from own_cases import case_of, section
 
 from pipeline.evaluation.law_evidence import LawEvidence, LawMetrics
+from pipeline.stages.check import notes
 from pipeline.stages.design import design
+from pipeline.stages.report import report
 from pipeline.stages.validate import validate
 
 POLES = (0.6, 0.55, 0.65)
@@ -49,3 +51,36 @@ def test_no_file_is_shipped_and_the_reason_stays(metrics: LawMetrics) -> None:
     assert why.startswith("controllers.it-pid locked up on ")
     assert set(metrics.locked_up) >= {"held_out", "spoilt"}
     assert LawEvidence(metrics, Path("trajectories.npz")).withheld
+
+
+def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A one-step law over four periods of dead time, beside a PID that goes on."""
+    monkeypatch.chdir(tmp_path)
+    mv = np.repeat(np.random.default_rng(0).uniform(-0.6, 0.6, (40, 1)), 10, axis=0)
+    y = np.zeros((400, 1))
+    for k in range(4, 399):
+        y[k + 1] = 0.6 * y[k] + 0.8 * mv[k - 4]
+    case = case_of(section(1, 1), [first_order(pole, dead=4) for pole in POLES], y, mv)
+    (case.models.parent / "metrics.json").write_text(json.dumps({"data": {"0": "x"}, "parts": {}}))
+    tree = yaml.safe_load(Path("params.yaml").read_text())
+    own = {"case": "it", "model": "identified"}
+    tree |= {
+        "cases": {"it": {"held_out_seeds": [9001, 9002]}},
+        "models": {"it-identified": {**own, "data": "data/it/record.parquet", "parts": {}}},
+        "controllers": {
+            "it-pid": {**own, "name": "pid", "law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 4.0},
+            "it-one_step": {**own, "name": "one_step", "law": "gauss_newton_pid"},
+        },
+    }
+    Path("params.yaml").write_text(yaml.safe_dump(tree))
+    why = "law 'gauss_newton_pid' is withheld: y0 answers 5 samples after u0 moves, the law looks 1 ahead"
+    assert any(line.startswith(f"controllers.it-one_step: {why}") for line in notes())
+    for name in ("it-one_step", "it-pid"):
+        design(name)
+        validate(name)
+    assert json.loads(Path("artifacts/it/one_step.json").read_text())["withheld"].startswith(why)
+    assert not Path("artifacts/it/one_step.onnx").exists()
+    report("it")
+    assert f"**`one_step` was not designed:** {why}" in Path("artifacts/it/report.md").read_text()
