@@ -54,7 +54,8 @@ def _words(level: Array, curve: Array, z: Array, e: Array, first: NDArray[np.int
     if min(ramp, left) > (1 - EXPLAINED) * none:
         size = 100 * float(np.ptp(level)) / span
         return (
-            f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; loads that nobody measures"
+            f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; loads that "
+            "nobody measures, or an answer far from linear"
         )
     if ramp < left + 0.05 * none:
         change = float(slope[-1])
