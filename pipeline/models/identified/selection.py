@@ -48,14 +48,15 @@ class Selection:
 
     @property
     def nonlinear(self) -> bool:
-        """Whether the network wins by more than its spread, and by more than ``GAIN``."""
+        """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``."""
         if self.network is None:
             return False
-        return self.network.error + max(self.network.spread, GAIN * self.linear.error) < self.linear.error
+        uncertain = self.network.spread / np.sqrt(self.network.seeds)
+        return self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error
 
     @property
     def chosen(self) -> Trial:
-        """The network where it wins by more than its spread, else the linear model."""
+        """The network where it wins by more than its uncertainty, else the linear model."""
         return self.network if self.network is not None and self.nonlinear else self.linear
 
     @property
