@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 
@@ -93,6 +93,16 @@ class Part(ABC):
     @abstractmethod
     def learn(self, source: Source) -> Learnt:
         """The trained model. Raises ModelError without the needed data, PlantError without the equations."""
+
+
+def groundworks(parts: Iterable[Part]) -> list[Groundwork[Any]]:
+    """The work that some parts need, equal ones once."""
+    return list(dict.fromkeys(work for part in parts if (work := part.groundwork()) is not None))
+
+
+def done(works: Iterable[Groundwork[Any]], source: Source, label: str) -> dict[Groundwork[Any], Any]:
+    """The result of each groundwork on a source."""
+    return {work: work.done(source, label) for work in works}
 
 
 @dataclass(frozen=True, kw_only=True)

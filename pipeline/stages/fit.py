@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import statistics
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
 from pipeline.files import write_json
 from pipeline.models import MODELS, Part, Source
-from pipeline.models.part import Groundwork
+from pipeline.models.part import Groundwork, done, groundworks
 from pipeline.records.record import Record
 from pipeline.stages.paths import model_folder
 
@@ -35,7 +35,8 @@ def fit(name: str) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     data = data_files(params.data)
     label = f"fit {name}"
-    shared = {seed: _shared(parts.values(), _source(data, case, seed), label) for seed in data}
+    needed = groundworks(parts.values())
+    shared = {seed: done(needed, _source(data, case, seed), label) for seed in data if needed}
     work = [(seed, part) for seed in data for part in parts]
     learnt = parallel_map(partial(_learn, parts, data, case, shared, folder), work, label)
     results = dict(zip(work, learnt, strict=True))
@@ -78,12 +79,6 @@ def data_files(data: Path) -> dict[int, Path | None]:
     return dict(sorted(files.items()))
 
 
-def _shared(parts: Iterable[Part], source: Source, label: str) -> dict[Groundwork[Any], Any]:
-    """The results of the work that parts share, each done once."""
-    needed = dict.fromkeys(work for part in parts if (work := part.groundwork()) is not None)
-    return {work: work.done(source, label) for work in needed}
-
-
 def _learn(
     parts: Mapping[str, Part],
     data: Mapping[int, Path | None],
@@ -93,7 +88,7 @@ def _learn(
     item: tuple[int, str],
 ) -> tuple[str | None, dict[str, Any], Mapping[str, Any] | None]:
     seed, name = item
-    source = replace(_source(data, case, seed), groundwork=shared[seed])
+    source = replace(_source(data, case, seed), groundwork=shared.get(seed, {}))
     learnt = parts[name].learn(source)
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:

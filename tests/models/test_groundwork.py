@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from pipeline.models.part import Groundwork, Source
+from pipeline.models.part import Groundwork, Source, done, groundworks
 from pipeline.plants.signals import Signals
-from pipeline.stages.fit import _shared
 from serving.manifest import Signal
 
 Y, U = Signal("y", "m", 0.0, 1.0), Signal("u", "V", 0.0, 1.0)
@@ -40,7 +39,7 @@ class Needs:
 def test_equal_work_is_done_once_and_a_part_alone_needs_none() -> None:
     DONE.clear()
     parts = [Needs(Count(1)), Needs(Count(2)), Needs(Count(1)), Needs(None)]
-    results = _shared(parts, SOURCE, "fit")  # type: ignore[arg-type]
+    results = done(groundworks(parts), SOURCE, "fit")  # type: ignore[arg-type]
     assert DONE == [1, 2]
     assert results == {Count(1): 10, Count(2): 20}
 

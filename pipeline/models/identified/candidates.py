@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import ModelError
+from pipeline.models.identified.drift import PERIODS, error_beyond_drift
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
 from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
@@ -15,8 +16,6 @@ from pipeline.models.identified.output_error import (
     Fitted,
     OutputError,
     fit_starts,
-    free_run_error,
-    overall,
     residuals,
 )
 from pipeline.models.identified.rests import settle
@@ -153,13 +152,13 @@ def _network(problem: Problem, task: Task) -> Fitted:
     return replace(found, work=work + by_way.work + at_once.work + after.work + found.work)
 
 
-def judged_again(problem: Problem, task: tuple[Structure, int, Fitted]) -> Fitted:
-    """A fit with its held-out error under the problem's way to judge; one that exploded stays so."""
+def judged_beyond_drift(problem: Problem, task: tuple[Structure, int, Fitted]) -> Fitted:
+    """A fit whose held-out error leaves out drift of gain and level; one that exploded stays so."""
     structure, fold, fitted = task
     if not np.isfinite(fitted.held_out):
         return fitted
-    errors, _ = free_run_error(fitted.model, problem.held(structure, fold), problem.judged)
-    return replace(fitted, held_out=overall(errors))
+    part = len(problem.data) // PERIODS
+    return replace(fitted, held_out=error_beyond_drift(fitted.model, problem.held(structure, fold), part))
 
 
 def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:

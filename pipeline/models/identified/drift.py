@@ -44,11 +44,7 @@ def drift_share(model: Dynamics, data: Sequence[Stretch]) -> Array:
         power = float(np.mean(residual**2))
         if power <= MUCH**2 * floor:
             continue
-        left = 0.0
-        for rows in np.array_split(np.arange(len(y)), PERIODS):
-            design = np.column_stack([predicted[rows, i], np.ones(len(rows))])
-            own = y[rows, i] - design @ np.linalg.lstsq(design, y[rows, i], rcond=1e-10)[0]
-            left += float(own @ own) / len(y)
+        left = float(np.mean(_beyond(y[:, i], predicted[:, i], -(-len(y) // PERIODS)) ** 2))
         shares[i] = max(0.0, (power - left) / (power - floor))
     return np.minimum(shares, 1.0)
 
@@ -56,3 +52,23 @@ def drift_share(model: Dynamics, data: Sequence[Stretch]) -> Array:
 def drifts(model: Dynamics, data: Sequence[Stretch]) -> bool:
     """Whether drift explains most of what a free run misses of any output."""
     return bool(drift_share(model, data).max() > EXPLAINED)
+
+
+def error_beyond_drift(model: Dynamics, data: Sequence[Stretch], part: int) -> float:
+    """Rms error of a free run, beyond a gain and a level of each ``part`` rows; infinite where it explodes."""
+    n_y, found = data[0].y.shape[1], []
+    for start, stretch in zip(fit_starts(model, data), data, strict=True):
+        run = model.free_run(start, stretch)
+        if run is None:
+            return np.inf
+        found.append(np.column_stack([_beyond(stretch.y[:, i], run[0][:, i], part) for i in range(n_y)]))
+    return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+
+
+def _beyond(y: Array, predicted: Array, part: int) -> Array:
+    """Residual (n,) of y (n,) on a gain and a level of ``predicted`` (n,) for each ``part`` rows."""
+    found = []
+    for rows in np.array_split(np.arange(len(y)), max(round(len(y) / part), 1)):
+        design = np.column_stack([predicted[rows], np.ones(len(rows))])
+        found.append(y[rows] - design @ np.linalg.lstsq(design, y[rows], rcond=1e-10)[0])
+    return np.concatenate(found)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from pipeline.engine.parallel import parallel_map
-from pipeline.models.identified.candidates import Start, Task, find_start, fit, judged_again
+from pipeline.models.identified.candidates import Start, Task, find_start, fit, judged_beyond_drift
 from pipeline.models.identified.output_error import Fitted
 from pipeline.models.identified.structure import Budget, Problem, Structure
 from pipeline.models.identified.trial import Trial
@@ -54,10 +54,10 @@ class Rounds:
                 trial.fits[task.fold, task.seed] = outcome
         return list(trials.values()), reasons
 
-    def judged_again(self, trials: Sequence[Trial]) -> list[Trial]:
-        """The trials with held-out errors under this problem's way to judge."""
+    def judged_beyond_drift(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The trials with held-out errors that leave out drift of gain and level."""
         tasks = [(t.structure, fold, fitted) for t in trials for (fold, _), fitted in t.fits.items()]
-        found = iter(parallel_map(partial(judged_again, self.problem), tasks, f"{self.label}: judged again"))
+        found = iter(parallel_map(partial(judged_beyond_drift, self.problem), tasks, f"{self.label}: judged again"))
         return [Trial(t.structure, {key: next(found) for key in t.fits}) for t in trials]
 
     def affordable(self, structures: Sequence[Structure], iterations: int, share: float) -> list[Structure]:

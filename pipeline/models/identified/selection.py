@@ -45,18 +45,18 @@ class Selection:
     spent: float  # nominal seconds
     settles: bool  # whether the linear model comes to rest by itself
     drifts: bool  # whether gain or level move inside the record
-    judged: float  # correction of the free runs over held-out rows by which candidates were compared
 
     @property
     def nonlinear(self) -> bool:
-        """Whether the network wins by more than its spread, and by more than ``GAIN``."""
+        """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``."""
         if self.network is None:
             return False
-        return self.network.error + max(self.network.spread, GAIN * self.linear.error) < self.linear.error
+        uncertain = self.network.spread / np.sqrt(self.network.seeds)
+        return self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error
 
     @property
     def chosen(self) -> Trial:
-        """The network where it wins by more than its spread, else the linear model."""
+        """The network where it wins by more than its uncertainty, else the linear model."""
         return self.network if self.network is not None and self.nonlinear else self.linear
 
     @property
@@ -75,7 +75,8 @@ def select(
     Then networks on the best of them, in rounds that keep fewer and train them longer. When the budget is spent, what
     there is decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
     much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or, where the
-    plant drifts inside the record, in slowly corrected ones. Raises ModelError where no candidate can be fitted.
+    plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no candidate can be
+    fitted.
     """
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
@@ -97,15 +98,11 @@ def select(
     drifting = correction is None and best is not None and _drifts(rounds.problem, min(best, linear[0], key=_trained))
     if correction is None and best is not None and (drifting or _misses(rounds.problem, best, DRIFTS)):
         finalists += networks.corrected(best, SLOW)
-    judged = rounds.problem.judged
     if drifting:
         # Plain free runs would rank candidates by how they follow what no model can.
         linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
-        judged, again = SLOW, replace(rounds, problem=replace(rounds.problem, judged=SLOW))
-        linear, finalists = smallest_first(again.judged_again(linear)), again.judged_again(finalists)
-    return Selection(
-        linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles, drifting, judged
-    )
+        linear, finalists = smallest_first(rounds.judged_beyond_drift(linear)), rounds.judged_beyond_drift(finalists)
+    return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles, drifting)
 
 
 def _trained(trial: Trial) -> float:

@@ -46,4 +46,4 @@ class StructureSearch(Groundwork[Searched]):
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction)
-        return Searched(replace(problem, settles=selection.settles, judged=selection.judged), selection, scales)
+        return Searched(replace(problem, settles=selection.settles), selection, scales)

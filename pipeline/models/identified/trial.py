@@ -46,6 +46,11 @@ class Trial:
         return float(np.sqrt(np.mean([np.var(errors) for errors in finite])))
 
     @property
+    def seeds(self) -> int:
+        """The fewest fits of a fold that did not explode, one at least."""
+        return max(min(sum(np.isfinite(f.held_out) for f in self.of_fold(k)) for k in self.folds), 1)
+
+    @property
     def folds(self) -> list[int]:
         """The folds that it was fitted on."""
         return sorted({k for k, _ in self.fits})

@@ -50,7 +50,7 @@ def structure_figures(selection: Selection) -> dict[str, Any]:
         "correction": s.correction,
         "same_row": s.same_row,
         "drifts": selection.drifts,
-        "judged_with_correction": selection.judged,
+        "judged": "free run" + (" beyond a gain and a level of each part of the record" if selection.drifts else ""),
         "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
         "held_out_spread": chosen.spread,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import made_plants
 import numpy as np
 
-from pipeline.models.identified.drift import drift_share, drifts
+from pipeline.models.identified.drift import drift_share, drifts, error_beyond_drift
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 
 MODEL = Dynamics.linear(np.array([[0.9]]), np.array([[0.1]]))
@@ -33,6 +33,14 @@ def test_noise_and_a_missing_curve_are_not() -> None:
     assert drift_share(MODEL, [record()])[0] == 0
     assert drift_share(MODEL, [record(curve=0.4)])[0] < 0.3
     assert not drifts(MODEL, [record(curve=0.4)])
+
+
+def test_the_error_beyond_drift_is_that_of_the_dynamics() -> None:
+    wandering, curved = record(gain=0.4, level=0.3), record(curve=0.4)
+    assert error_beyond_drift(MODEL, [wandering], ROWS // 40) < 1.5 * 0.05
+    assert error_beyond_drift(MODEL, [curved], ROWS // 40) > 3 * 0.05
+    twice = Dynamics.linear(MODEL.a, 2 * MODEL.b)
+    assert error_beyond_drift(twice, [wandering], ROWS // 40) < 1.5 * 0.05
 
 
 def test_a_run_that_explodes_shows_nothing() -> None:

@@ -19,7 +19,7 @@ from pipeline.models.identified.identified_part import IdentifiedPart
 from pipeline.models.part import Learnt, Source
 
 LINEAR = IdentifiedPart(orders=(2, 3), units=())
-SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.15)
+SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.05)
 
 
 def identified(learnt: Learnt) -> Identified:
