@@ -39,8 +39,9 @@ HEAD = (
 def pid_of(plant: OwnPlant) -> ControlLaw | None:
     """The PID tuned on the true plant; None where it controls no such plant."""
     pid = LAWS["pid"]
+    simulated = SpoiltPlant(plant, {}) if len(plant.mv_signals) == 1 else plant
     try:
-        return pid.design(pid.Params(), {}, plant.signals, SpoiltPlant(plant, {})).eval()
+        return pid.design(pid.Params(), {}, plant.signals, simulated).eval()
     except PipelineError as error:
         print(f"  {plant.name}: no PID: {error}", file=sys.stderr)
         return None
