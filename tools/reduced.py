@@ -27,6 +27,9 @@ SMALL: dict[str, Any] = {
     "free_run_iterations": 5,
     "long_run": 200,
     "sizes": [3, 5],
+    "orders": [2, 3],
+    "units": [4],
+    "minutes": 0.1,
 }
 LONG = {"jacket_pulses"}  # experiments whose records determine no model when they are short
 TRAINER = {"kind": "lm", "iterations": 15}
