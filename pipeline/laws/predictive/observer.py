@@ -15,7 +15,9 @@ from pipeline.laws.predictive.product import product
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Stage
 
-NOISE_FLOOR = 1e-3  # scaled; a model that claims less noise would believe rounding
+NOISE_FLOOR = (
+    1e-2  # scaled; a model that claims less noise would believe rounding, and lose the digits of its covariance
+)
 LOAD_CHANGE = 3e-5  # scaled
 FIRST_LOAD = 0.05  # scaled, a period: standard deviation of a load before anything was seen of it
 FORGETTING = 0.5  # of the mean innovation
