@@ -27,16 +27,16 @@ FOLDER = Path(tempfile.gettempdir()) / "loopwright_own_plants"
 CODE = Path(__file__).parents[2] / "pipeline" / "models"
 
 
-def model_of(plant: OwnPlant, rows: int, minutes: float = IdentifiedPart.minutes) -> tuple[Identified, float]:
+def model_of(plant: OwnPlant, rows: int, minutes: float | None = None) -> tuple[Identified, float]:
     """The model fitted to the plant's record with all defaults, and the processor time [s] that the fit took.
 
-    ``minutes`` is the budget of its search.
+    ``minutes`` is the budget of its search; None: as many as the part takes by itself.
     A file is named after the record and the code of the models, so that a change of either fits again.
     """
     record, code = record_of(plant, rows), hashlib.sha256()
     for file in sorted(CODE.rglob("*.py")):
         code.update(file.read_bytes())
-    path = FOLDER / f"{plant.name}-{rows}-{minutes:g}-{record.digest()[:12]}-{code.hexdigest()[:12]}.pickle"
+    path = FOLDER / f"{plant.name}-{rows}-{minutes or 'default'}-{record.digest()[:12]}-{code.hexdigest()[:12]}.pickle"
     if not path.exists():
         began = time.process_time()
         model = IdentifiedPart(minutes=minutes).learn(Source(record, plant.signals)).model
@@ -47,7 +47,7 @@ def model_of(plant: OwnPlant, rows: int, minutes: float = IdentifiedPart.minutes
 
 def bound_of(plant: OwnPlant) -> float:
     """Set-point nMAE [%] of the NMPC that knows the equations and the state, without noise."""
-    tests = tests_of(plant)["set points"]
+    tests = [t.scenario for t in tests_of(plant)["set points"]]
     known = [inspect.getsource(type(plant)), *(t.digest() for t in tests)]
     path = FOLDER / f"{plant.name}-nmpc-{hashlib.sha256(''.join(known).encode()).hexdigest()[:12]}.pickle"
     if not path.exists():
