@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import ModelError
-from pipeline.models.identified.drift import PERIODS, error_beyond_drift
+from pipeline.models.identified.drift import error_beyond_drift
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
 from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
@@ -152,13 +152,12 @@ def _network(problem: Problem, task: Task) -> Fitted:
     return replace(found, work=work + by_way.work + at_once.work + after.work + found.work)
 
 
-def judged_beyond_drift(problem: Problem, task: tuple[Structure, int, Fitted]) -> Fitted:
-    """A fit whose held-out error leaves out drift of gain and level; one that exploded stays so."""
+def judged_beyond_drift(problem: Problem, rows: int, task: tuple[Structure, int, Fitted]) -> Fitted:
+    """A fit whose held-out error leaves out a gain and a level of each ``rows`` rows; one that exploded stays so."""
     structure, fold, fitted = task
     if not np.isfinite(fitted.held_out):
         return fitted
-    part = len(problem.data) // PERIODS
-    return replace(fitted, held_out=error_beyond_drift(fitted.model, problem.held(structure, fold), part))
+    return replace(fitted, held_out=error_beyond_drift(fitted.model, problem.held(structure, fold), rows))
 
 
 def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,48 +11,75 @@ from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.output_error import fit_starts
 from pipeline.plants.simulator import Array
 
-PERIODS = 8
-"""Parts of the record that get a gain and a level of their own."""
+PARTS = (8, 16, 32, 64, 128)
+"""Numbers of parts of the record that get a gain and a level of their own: drift may be slow or quick."""
+
+LEAST_ROWS = 50
+"""Of a part."""
 
 EXPLAINED = 0.5
 """Share of the residual's power, beyond the noise, that they must explain."""
+
+AS_GOOD = 0.05
+"""Smaller share at which longer parts still count as the best, because they leave less to chance."""
 
 MUCH = 1.5
 """Residual over noise of a model that may lack something."""
 
 
-def drift_share(model: Dynamics, data: Sequence[Stretch]) -> Array:
-    """Share (n_y,) of what a free run misses that a gain and a level of each part of the record explain.
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Share of what a free run misses that moving gains and levels explain, and the rows over which they hold."""
 
-        y = g_p y_hat + l_p,   p = 1 .. ``PERIODS`` in the order of time
+    share: float
+    rows: int
 
-    0 for an output that it misses by less than ``MUCH`` times the noise, and for a run that explodes.
+    @property
+    def found(self) -> bool:
+        """Whether drift explains most of it."""
+        return self.share > EXPLAINED
+
+
+def drift_of(model: Dynamics, data: Sequence[Stretch]) -> Drift:
+    """How much of what a free run misses is drift: of the output where that is most.
+
+        y = g_p y_hat + l_p,   p = 1 .. P in the order of time
+
+    A gain and a level of part p come from the parts beside it. So they cannot follow what the model lacks, which
+    differs from move to move, but only what goes on from part to part. The longest parts that explain nearly the most
+    count. The share is 0 for an output that the run misses by less than ``MUCH`` times the noise after one gain and
+    one level of the whole record, and for a run that explodes.
     """
-    n_y = data[0].y.shape[1]
-    starts = fit_starts(model, data)
-    runs = [model.free_run(x, part) for x, part in zip(starts, data, strict=True)]
+    rows = sum(len(part.y) for part in data)
+    none = Drift(0.0, rows // PARTS[0])
+    runs = [model.free_run(x, part) for x, part in zip(fit_starts(model, data), data, strict=True)]
     if any(run is None for run in runs):
-        return np.zeros(n_y)
-    y = np.concatenate([part.y for part in data])
-    predicted = np.concatenate([run[0][:, :n_y] for run in runs if run is not None])
-    shares = np.zeros(n_y)
-    for i in range(n_y):
-        residual = y[:, i] - predicted[:, i]
-        noise = np.concatenate([np.diff(p.y[:, i]) for p in data]) - np.concatenate(
-            [np.diff(r[0][:, i]) for r in runs if r is not None]
-        )
-        floor = float(np.mean(noise**2)) / 2
-        power = float(np.mean(residual**2))
+        return none
+    found = [none]
+    for i in range(data[0].y.shape[1]):
+        both = [(part.y[:, i], run[0][:, i]) for part, run in zip(data, runs, strict=True) if run is not None]
+        floor = float(np.mean(np.concatenate([np.diff(y - predicted) for y, predicted in both]) ** 2)) / 2
+        y, predicted = (np.concatenate(series) for series in zip(*both, strict=True))
+        power = float(np.mean(_beyond(y, predicted, len(y)) ** 2))
         if power <= MUCH**2 * floor:
             continue
-        left = float(np.mean(_beyond(y[:, i], predicted[:, i], -(-len(y) // PERIODS)) ** 2))
-        shares[i] = max(0.0, (power - left) / (power - floor))
-    return np.minimum(shares, 1.0)
+        for parts in PARTS:
+            if len(y) >= parts * LEAST_ROWS:
+                left = float(np.mean(_beyond_neighbours(y, predicted, parts) ** 2))
+                found.append(Drift(min((power - left) / (power - floor), 1.0), len(y) // parts))
+    best = max(drift.share for drift in found)
+    return max((drift for drift in found if drift.share > best - AS_GOOD), key=lambda drift: drift.rows)
 
 
-def drifts(model: Dynamics, data: Sequence[Stretch]) -> bool:
-    """Whether drift explains most of what a free run misses of any output."""
-    return bool(drift_share(model, data).max() > EXPLAINED)
+def _beyond_neighbours(y: Array, predicted: Array, parts: int) -> Array:
+    """Residual (n,) of y (n,) on a gain and a level of ``predicted`` (n,), of each part by the parts beside it."""
+    pieces = np.array_split(np.arange(len(y)), parts)
+    found = []
+    for p, rows in enumerate(pieces):
+        beside = np.concatenate([*pieces[max(p - 1, 0) : p], *pieces[p + 1 : p + 2]])
+        gain, level = _line(y[beside], predicted[beside])
+        found.append(y[rows] - gain * predicted[rows] - level)
+    return np.concatenate(found)
 
 
 def error_beyond_drift(model: Dynamics, data: Sequence[Stretch], part: int) -> float:
@@ -69,6 +97,13 @@ def _beyond(y: Array, predicted: Array, part: int) -> Array:
     """Residual (n,) of y (n,) on a gain and a level of ``predicted`` (n,) for each ``part`` rows."""
     found = []
     for rows in np.array_split(np.arange(len(y)), max(round(len(y) / part), 1)):
-        design = np.column_stack([predicted[rows], np.ones(len(rows))])
-        found.append(y[rows] - design @ np.linalg.lstsq(design, y[rows], rcond=1e-10)[0])
+        gain, level = _line(y[rows], predicted[rows])
+        found.append(y[rows] - gain * predicted[rows] - level)
     return np.concatenate(found)
+
+
+def _line(y: Array, predicted: Array) -> tuple[float, float]:
+    """Gain and level of y (n,) on ``predicted`` (n,) by least squares."""
+    design = np.column_stack([predicted, np.ones(len(predicted))])
+    gain, level = np.linalg.lstsq(design, y, rcond=1e-10)[0]
+    return float(gain), float(level)

@@ -54,10 +54,12 @@ class Rounds:
                 trial.fits[task.fold, task.seed] = outcome
         return list(trials.values()), reasons
 
-    def judged_beyond_drift(self, trials: Sequence[Trial]) -> list[Trial]:
-        """The trials with held-out errors that leave out drift of gain and level."""
+    def judged_beyond_drift(self, trials: Sequence[Trial], rows: int) -> list[Trial]:
+        """The trials with held-out errors that leave out a gain and a level of each ``rows`` rows."""
         tasks = [(t.structure, fold, fitted) for t in trials for (fold, _), fitted in t.fits.items()]
-        found = iter(parallel_map(partial(judged_beyond_drift, self.problem), tasks, f"{self.label}: judged again"))
+        found = iter(
+            parallel_map(partial(judged_beyond_drift, self.problem, rows), tasks, f"{self.label}: judged again")
+        )
         return [Trial(t.structure, {key: next(found) for key in t.fits}) for t in trials]
 
     def affordable(self, structures: Sequence[Structure], iterations: int, share: float) -> list[Structure]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.models.identified.candidates import misses
-from pipeline.models.identified.drift import drifts
+from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
 from pipeline.models.identified.rounds import Rounds
@@ -95,13 +95,15 @@ def select(
     networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
     finalists = networks.finalists(units) if _misses(rounds.problem, linear[0], WHITE) else []
     best = best_of(finalists)
-    drifting = correction is None and best is not None and _drifts(rounds.problem, min(best, linear[0], key=_trained))
+    drift = _drift(rounds.problem, min(best, linear[0], key=_trained)) if correction is None and best else None
+    drifting = drift is not None and drift.found
     if correction is None and best is not None and (drifting or _misses(rounds.problem, best, DRIFTS)):
         finalists += networks.corrected(best, SLOW)
-    if drifting:
+    if drift is not None and drifting:
         # Plain free runs would rank candidates by how they follow what no model can.
         linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
-        linear, finalists = smallest_first(rounds.judged_beyond_drift(linear)), rounds.judged_beyond_drift(finalists)
+        linear = smallest_first(rounds.judged_beyond_drift(linear, drift.rows))
+        finalists = rounds.judged_beyond_drift(finalists, drift.rows)
     return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles, drifting)
 
 
@@ -109,8 +111,8 @@ def _trained(trial: Trial) -> float:
     return trial.of_fold(trial.folds[0])[0].trained
 
 
-def _drifts(problem: Problem, trial: Trial) -> bool:
-    return drifts(trial.of_fold(trial.folds[0])[0].model, problem.whole(trial.structure))
+def _drift(problem: Problem, trial: Trial) -> Drift:
+    return drift_of(trial.of_fold(trial.folds[0])[0].model, problem.whole(trial.structure))
 
 
 def _with_correction(trial: Trial, correction: float) -> Trial:

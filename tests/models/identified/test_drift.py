@@ -5,18 +5,18 @@ from __future__ import annotations
 import made_plants
 import numpy as np
 
-from pipeline.models.identified.drift import drift_share, drifts, error_beyond_drift
+from pipeline.models.identified.drift import drift_of, error_beyond_drift
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 
 MODEL = Dynamics.linear(np.array([[0.9]]), np.array([[0.1]]))
 ROWS = 4000
 
 
-def record(gain: float = 0.0, level: float = 0.0, curve: float = 0.0) -> Stretch:
+def record(gain: float = 0.0, level: float = 0.0, curve: float = 0.0, periods: int = 1) -> Stretch:
     """The model's answer with a gain and a level that wander, or behind a curved valve; noise of sd .05."""
     rng = np.random.default_rng(0)
     v = made_plants.random_holds(rng, ROWS, 20, -2.0, 2.0)
-    x, y, phase = 0.0, np.empty(ROWS), 2 * np.pi * np.arange(ROWS) / ROWS
+    x, y, phase = 0.0, np.empty(ROWS), 2 * np.pi * periods * np.arange(ROWS) / ROWS
     for k in range(ROWS):
         y[k] = (1 + gain * np.sin(phase[k])) * x + level * np.cos(phase[k])
         x = 0.9 * x + 0.1 * (v[k] + curve * (v[k] ** 2 - 1))
@@ -24,15 +24,26 @@ def record(gain: float = 0.0, level: float = 0.0, curve: float = 0.0) -> Stretch
 
 
 def test_a_wandering_gain_or_level_is_drift() -> None:
-    assert drift_share(MODEL, [record(gain=0.4)])[0] > 0.7
-    assert drift_share(MODEL, [record(level=0.3)])[0] > 0.7
-    assert drifts(MODEL, [record(gain=0.4)])
+    assert drift_of(MODEL, [record(gain=0.4)]).share > 0.7
+    assert drift_of(MODEL, [record(level=0.3)]).share > 0.7
+    assert drift_of(MODEL, [record(gain=0.4)]).found
+
+
+def test_quick_drift_is_found_over_shorter_parts() -> None:
+    slow, quick = drift_of(MODEL, [record(gain=0.4)]), drift_of(MODEL, [record(gain=0.4, periods=6)])
+    assert quick.found
+    assert quick.rows < slow.rows
+
+
+def test_a_gain_that_is_wrong_all_along_is_not() -> None:
+    wrong = Dynamics.linear(MODEL.a, 2 * MODEL.b)
+    assert drift_of(wrong, [record()]).share == 0
 
 
 def test_noise_and_a_missing_curve_are_not() -> None:
-    assert drift_share(MODEL, [record()])[0] == 0
-    assert drift_share(MODEL, [record(curve=0.4)])[0] < 0.3
-    assert not drifts(MODEL, [record(curve=0.4)])
+    assert drift_of(MODEL, [record()]).share == 0
+    assert drift_of(MODEL, [record(curve=0.4)]).share < 0.3
+    assert not drift_of(MODEL, [record(curve=0.4)]).found
 
 
 def test_the_error_beyond_drift_is_that_of_the_dynamics() -> None:
@@ -44,4 +55,4 @@ def test_the_error_beyond_drift_is_that_of_the_dynamics() -> None:
 
 
 def test_a_run_that_explodes_shows_nothing() -> None:
-    assert not drifts(Dynamics.linear(np.array([[1.5]]), np.array([[0.1]])), [record()])
+    assert not drift_of(Dynamics.linear(np.array([[1.5]]), np.array([[0.1]])), [record()]).found
