@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import casadi as ca
+import numpy as np
 from plant import OwnPlant, column, lags, signal, states, valves
 
+from pipeline.plants.simulator import Array
 from serving.manifest import Signal
 
 
@@ -122,4 +124,30 @@ class Level(OwnPlant):
         return column(0.012 * (x[1] - 45) / width, *lags(x[1:], self.loaded(mv)[0], 8.0))
 
 
-DEVELOPMENT: tuple[type[OwnPlant], ...] = (Exchanger, Inverse, Coupled, Level, Noisy)
+@dataclass(frozen=True)
+class Drifting(OwnPlant):
+    """A heater that fouls and is cleaned: its gain moves by a factor of 1.7 while the record is taken, and in use."""
+
+    fouling: float = field(default=0.3, metadata={"unit": "-"})
+    name: ClassVar[str] = "drifting"
+    title: ClassVar[str] = "Gain that drifts"
+    noise: ClassVar[tuple[float, ...]] = (0.2,)
+    hold: ClassVar[int] = 60
+    moves: ClassVar[tuple[int, int]] = (5, 50)
+    state_signals: ClassVar[tuple[Signal, ...]] = states(3)
+    mv_signals: ClassVar[tuple[Signal, ...]] = valves()
+    pv_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 0.0, 120.0),)
+    sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 35.0, 60.0),)
+
+    def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
+        """dx/dt [degC/s]."""
+        heat = (self.loaded(mv)[0] * (1 - 0.5 * self.fouling)) * 0.8
+        return column((x[1] - x[0]) / 15, (20 + x[2] - x[1]) / 60, (heat - x[2]) / 20)
+
+    def drift(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
+        """Fouling within 0 and .8, up and down every 1,200 samples or so."""
+        at, phase = np.arange(n), rng.uniform(0, 2 * np.pi)
+        return {"fouling": 0.4 + 0.4 * np.sin(2 * np.pi * at / 1_200 + phase)}
+
+
+DEVELOPMENT: tuple[type[OwnPlant], ...] = (Exchanger, Inverse, Coupled, Level, Noisy, Drifting)

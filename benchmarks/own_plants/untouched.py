@@ -110,29 +110,58 @@ class Triple(OwnPlant):
 
 
 @dataclass(frozen=True)
-class Drifting(OwnPlant):
-    """A heater that fouls and is cleaned: its gain moves by a factor of 1.7 while the record is taken, and in use."""
+class Fading(OwnPlant):
+    """A reactor whose catalyst fades by a third and is renewed, with a gain that falls with the feed."""
 
-    fouling: float = field(default=0.3, metadata={"unit": "-"})
-    name: ClassVar[str] = "drifting"
-    title: ClassVar[str] = "Gain that drifts"
+    activity: float = field(default=0.85, metadata={"unit": "-"})
+    name: ClassVar[str] = "fading"
+    title: ClassVar[str] = "Catalyst that fades"
     noise: ClassVar[tuple[float, ...]] = (0.2,)
-    hold: ClassVar[int] = 60
-    moves: ClassVar[tuple[int, int]] = (5, 50)
-    state_signals: ClassVar[tuple[Signal, ...]] = states(3)
+    hold: ClassVar[int] = 70
+    moves: ClassVar[tuple[int, int]] = (5, 60)
+    state_signals: ClassVar[tuple[Signal, ...]] = states(5)
     mv_signals: ClassVar[tuple[Signal, ...]] = valves()
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 0.0, 120.0),)
-    sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 35.0, 60.0),)
+    sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 44.0, 58.0),)
 
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
-        """dx/dt [degC/s]."""
-        heat = (self.loaded(mv)[0] * (1 - 0.5 * self.fouling)) * 0.8
-        return column((x[1] - x[0]) / 15, (20 + x[2] - x[1]) / 60, (heat - x[2]) / 20)
+        """dx/dt [degC/s]: the reactor behind a feed line of three lags, and its sensor."""
+        feed = ca.fmax(0.0, x[2]) / 100
+        heat = 25 + 70 * self.activity * feed / (0.3 + feed)
+        return column((x[1] - x[0]) / 12, (heat - x[1]) / 70, *lags(x[2:], self.loaded(mv)[0], 6.0))
 
     def drift(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
-        """Fouling within 0 and .8, up and down every 1,200 samples or so."""
-        at, phase = np.arange(n), rng.uniform(0, 2 * np.pi)
-        return {"fouling": 0.4 + 0.4 * np.sin(2 * np.pi * at / 1_200 + phase)}
+        """Down from 1 to .65 within 700 to 1,500 samples, and up again within 30."""
+        course: list[float] = []
+        while len(course) < 2 * n + 1_500:
+            course += [*np.linspace(1.0, 0.65, int(rng.integers(700, 1_500))), *np.linspace(0.65, 1.0, 30)]
+        start = int(rng.integers(0, 1_500))
+        return {"activity": np.array(course[start : start + n])}
+
+
+@dataclass(frozen=True)
+class Swell(OwnPlant):
+    """A boiler's drum: cold feed makes the bubbles shrink first, and the level integrates; in an operator's hand."""
+
+    name: ClassVar[str] = "swell"
+    title: ClassVar[str] = "Integrator with inverse response"
+    noise: ClassVar[tuple[float, ...]] = (0.3,)
+    hold: ClassVar[int] = 80
+    moves: ClassVar[tuple[int, int]] = (5, 40)
+    hand: ClassVar[str] = "operator"
+    state_signals: ClassVar[tuple[Signal, ...]] = states(3)
+    mv_signals: ClassVar[tuple[Signal, ...]] = valves()
+    pv_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 0.0, 100.0),)
+    sp_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 35.0, 65.0),)
+
+    def output(self, x: Any) -> Any:
+        """Water and bubbles."""
+        return x[0] + x[1]
+
+    def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
+        """dx/dt [%/s]: the water, the bubbles, and the feed valve."""
+        feed = x[2] - 48
+        return column(0.008 * feed, (-0.15 * feed - x[1]) / 25, (self.loaded(mv)[0] - x[2]) / 10)
 
 
 @dataclass(frozen=True)
@@ -202,4 +231,14 @@ class Oscillating(OwnPlant):
         return column(x[1], omega**2 * (x[2] - x[0]) - 2 * damping * omega * x[1], (force - x[2]) / 15)
 
 
-UNTOUCHED: tuple[type[OwnPlant], ...] = (Delayed, Titration, Pipe, Triple, Drifting, Recycle, Turning, Oscillating)
+UNTOUCHED: tuple[type[OwnPlant], ...] = (
+    Delayed,
+    Titration,
+    Pipe,
+    Triple,
+    Fading,
+    Swell,
+    Recycle,
+    Turning,
+    Oscillating,
+)

@@ -74,8 +74,27 @@ def test_loops_side_by_side_are_the_closed_loop_of_one(own: Any) -> None:
     def step(sp: Any, pv: Any, mv: Any) -> tuple[Any, Any]:
         return np.clip(mv + 0.2 * (sp - pv), 0, 100), np.zeros(0)
 
-    alone = simulate_closed(plant, step, tests[1], noise=plant.noise_std, seed=tests[1].seed + 1)
+    second = tests[1].scenario
+    alone = simulate_closed(plant, step, second, noise=plant.noise_std, seed=second.seed + 1)
     np.testing.assert_allclose(y[0, 1], alone.pv, atol=1e-9)
     np.testing.assert_allclose(u[0, 1], alone.mv, atol=1e-9)
     score = own.loops.scores(plant, tests, y[0], u[0])
-    assert score.nmae == pytest.approx(100 * np.mean([np.abs(t.sp - r) for t, r in zip(tests, y[0], strict=True)]) / 25)
+    errors = [np.abs(t.scenario.sp - r) for t, r in zip(tests, y[0], strict=True)]
+    assert score.nmae == pytest.approx(100 * np.mean(errors) / 25)
+
+
+def test_an_upset_reaches_the_output_beside_the_plant(own: Any) -> None:
+    plant = own.development.Coupled()
+    tests = own.loops.tests_of(plant)["upsets"]
+
+    class Still(Proportional):
+        """A law that leaves the MVs alone."""
+
+        def forward(self, sp: Any, pv: Any, dv: Any, mv: Any, state: Any) -> tuple[Any, Any, Any]:
+            return mv, state, pv[..., :0]
+
+    y, _ = own.loops.closed(Still(), plant, tests)
+    np.testing.assert_allclose(y[0], np.stack([t.scenario.sp + t.upset for t in tests]), atol=1e-3)
+    tenth = 0.1 * np.array([s.high - s.low for s in plant.sp_signals])
+    for i in range(2):
+        assert tests[0].upset[:, i].max() == pytest.approx(tenth[i], rel=1e-3)
