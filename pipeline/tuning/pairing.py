@@ -12,6 +12,8 @@ from pipeline.plants.simulator import Array
 Pairs = tuple[tuple[int, int], ...]
 """(CV, MV) of each loop, in the order of the MVs."""
 
+ONE_LOOP: Pairs = ((0, 0),)
+
 INDEPENDENT = 1e-6  # least ratio of singular values, of gains in shares of their largest, at which CVs can be held
 
 

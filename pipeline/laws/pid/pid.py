@@ -2,42 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
 from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
+from pipeline.laws.pid.tuned import by_simulation, linearization, tuned
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.base import Model
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.linearization import Linearization
+from pipeline.plants.equations import equations
 from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.tuning import rules as tuning
-from pipeline.tuning.development import DevelopmentLoops
-from pipeline.tuning.loop_search import Loops, searched
-from pipeline.tuning.pairing import Pairs, pairings
-from pipeline.tuning.reduction import LagWithDeadTime, start_lag
+from pipeline.plants.simulator import Simulator
+from pipeline.tuning.loop_search import Loops
+from pipeline.tuning.pairing import ONE_LOOP, Pairs, pairings
 from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
 
-HOLD = 100  # samples of a development set point
-HOLDS = (30, 400)  # where it follows the plant's settling time
 EXAMINED = 40  # linear closed loops over a range of the CV
-
-
-@runtime_checkable
-class HoldsLinearization(Protocol):
-    """A model that is a plant linearized at a steady state."""
-
-    def linearization(self) -> Linearization:
-        """The linearization, per second."""
 
 
 class PID(ControlLaw):
@@ -132,7 +119,7 @@ class PID(ControlLaw):
         signals: Signals,
         settings: PidSettings | Loops | list[PidSettings] | list[Loops],
         mv_rate: float | None = None,
-        pairs: Pairs = ((0, 0),),
+        pairs: Pairs = ONE_LOOP,
     ) -> None:
         """The law with ``settings`` of its loop, or of each of ``pairs`` (CV, MV), which are in the order of the MVs.
 
@@ -171,82 +158,21 @@ class PID(ControlLaw):
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
         """The PID tuned as ``params`` says, on part ``linearized`` or on the plant; raises LawError."""
-        law = cls._tuned(params, models, signals, plant)
-        law.examined_cv = params.examined_cv
+        found = tuned(params, models, signals, plant, partial(cls, signals, mv_rate=params.mv_rate))
+        law = cls(signals, found.settings, params.mv_rate, found.pairs)
+        law.examined_cv, law.relative_gains = params.examined_cv, found.relative_gains
         return law
 
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
-        if _simulated(params, plant):
+        if by_simulation(params, plant):
             pairings(StepResponses.near_start(plant).share)
         elif params.tuning == "optimized":
             require_single_loop(plant.signals, cls.name)
-            AllPole.near(_linearization(params, models, plant))
+            AllPole.near(linearization(params, models, plant))
         else:
-            cls._tuned(params, models, plant.signals, plant)
-
-    @classmethod
-    def _tuned(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        p, given = params, params.given()
-        if plant is not None and _simulated(p, plant):
-            return cls._searched(p, signals, plant)
-        require_single_loop(signals, cls.name)
-        if p.tuning == "manual":
-            if p.kc is None or p.ti_s is None:
-                raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
-            return cls(signals, given, p.mv_rate)
-        lin = _linearization(params, models, plant)
-        if p.tuning == "itae":
-            settings = tuning.itae_pid(LagWithDeadTime.of(lin), signals.period_s, p.sampling)
-        elif p.tuning == "simc":
-            settings = tuning.simc_pid(AllPole.of(lin), signals.period_s, p.lambda_s)
-        elif p.tuning == "imc" and p.lambda_s is not None:
-            settings = tuning.imc_pid(AllPole.of(lin), p.lambda_s)
-        elif p.tuning == "imc":
-            settings = tuning.robust_imc(lin, signals.period_s)
-        elif p.tuning == "optimized":
-            if plant is None:
-                raise LawError("PID tuning `optimized` needs a simulator; take manual, imc, simc or itae")
-            known, hold = equations(plant, "PID tuning `optimized` on a linearized plant"), p.development_hold or HOLD
-            loops = DevelopmentLoops.draw(known, p.development_seeds, p.development_set_points, hold)
-            free = p.set_point_weight is None
-
-            def cost(rows: Sequence[PidSettings]) -> Array:
-                law = cls(signals, list(rows), p.mv_rate)
-                return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
-
-            settings = tuning.optimized_imc(AllPole.near(lin), signals.period_s, cost, given, optimize_weight=free)
-            return cls(signals, settings, p.mv_rate)
-        else:
-            raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
-        rest = {name: getattr(given, name) for name in ("filter_s", "tracking_s", "set_point_weight")}
-        return cls(signals, replace(settings, **rest), p.mv_rate)
-
-    @classmethod
-    def _searched(cls, params: Any, signals: Signals, plant: Simulator) -> Self:
-        """The cheapest numbers in closed loop over the plant and its variations, of the best two pairings."""
-        responses = StepResponses.near_start(plant)
-        hold = params.development_hold or int(np.clip(2 * responses.settling, *HOLDS))
-        drawn = (params.development_seeds, params.development_set_points, hold)
-        plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
-        found: tuple[float, Loops] = (np.inf, ())
-        for pairs, table in pairings(responses.share)[:2]:
-
-            def cost(rows: Sequence[Loops], pairs: Pairs = pairs) -> Array:
-                law = cls(signals, list(rows), params.mv_rate, pairs)
-                weighted = params.criterion == "itae"
-                each = [loops.error(law, law.n_state, len(rows), time_weighted=weighted) for loops in plants]
-                return np.asarray(np.mean(each, axis=0))
-
-            processes = [responses.process(*pair) for pair in pairs]
-            tried = searched(processes, signals.period_s, cost, params.given(), params.set_point_weight)
-            if tried[0] < found[0]:
-                found, best, gains = tried, pairs, table
-        law = cls(signals, found[1], params.mv_rate, best)
-        if len(best) > 1:
-            law.relative_gains = tuple(float(gains[cv, cv]) for cv, _ in best)
-        return law
+            tuned(params, models, plant.signals, plant, partial(cls, plant.signals, mv_rate=params.mv_rate))
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
@@ -298,27 +224,3 @@ class PID(ControlLaw):
 def _of(values: Tensor, which: Tensor | None) -> Tensor:
     """The entries ``which`` of the last dimension; all of them for None."""
     return values if which is None else values.index_select(-1, which)
-
-
-def _simulated(params: Any, plant: Simulator) -> bool:
-    """Whether the numbers are searched over the plant as it is, because it has no equations or several loops."""
-    known = isinstance(plant, EquationPlant) and len(plant.sp_signals) == len(plant.mv_signals) == 1
-    return params.tuning == "optimized" and params.operating_cv is None and not known
-
-
-def _linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:
-    """The linearization of the part ``linearized`` if there is one, else of the plant at ``operating_cv``.
-
-    A plant without equations is approximated by one or two lags near its start.
-    """
-    if "linearized" in models:
-        part = models["linearized"]
-        if not isinstance(part, HoldsLinearization):
-            raise LawError(f"law 'pid' needs a part 'linearized' that is a linearization; got one of kind {part.kind}")
-        return part.linearization()
-    if plant is not None and params.operating_cv is None and not isinstance(plant, EquationPlant):
-        return start_lag(plant)
-    known = equations(plant, f"PID tuning {params.tuning!r} without a part `linearized`")
-    sp = known.sp_signals[0]
-    cv = 0.5 * (sp.low + sp.high) if params.operating_cv is None else params.operating_cv
-    return known.linearize(*known.steady_state_at(cv))

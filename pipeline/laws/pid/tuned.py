@@ -1,0 +1,136 @@
+"""The numbers of the PID: given, by a rule, or by a search in closed loop over a plant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from pipeline.errors import LawError
+from pipeline.laws.base import ControlLaw, require_single_loop
+from pipeline.models.base import Model
+from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.linearization import Linearization
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array, Simulator
+from pipeline.tuning import rules
+from pipeline.tuning.development import DevelopmentLoops
+from pipeline.tuning.loop_search import Loops, searched
+from pipeline.tuning.pairing import ONE_LOOP, Pairs, pairings
+from pipeline.tuning.reduction import LagWithDeadTime, start_lag
+from pipeline.tuning.responses import StepResponses
+from pipeline.tuning.rules import AllPole, PidSettings
+
+HOLD = 100  # samples of a development set point
+HOLDS = (30, 400)  # where it follows the plant's settling time
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """Settings of one loop, or of the loop of each pair with the pairs' relative gains."""
+
+    settings: PidSettings | Loops
+    pairs: Pairs = ONE_LOOP
+    relative_gains: tuple[float, ...] = ()
+
+
+class LawOf(Protocol):
+    """The law with candidates for its settings side by side."""
+
+    def __call__(self, settings: list[PidSettings] | list[Loops], *, pairs: Pairs = ONE_LOOP) -> ControlLaw:
+        """One module for all of ``settings``."""
+
+
+@runtime_checkable
+class HoldsLinearization(Protocol):
+    """A model that is a plant linearized at a steady state."""
+
+    def linearization(self) -> Linearization:
+        """The linearization, per second."""
+
+
+def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None, law_of: LawOf) -> Tuned:
+    """The numbers that ``params`` of the PID ask for; raises LawError where their tuning does not apply."""
+    p, given = params, params.given()
+    if plant is not None and by_simulation(p, plant):
+        return _searched(p, signals, plant, law_of)
+    require_single_loop(signals, "pid")
+    if p.tuning == "manual":
+        if p.kc is None or p.ti_s is None:
+            raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
+        return Tuned(given)
+    lin = linearization(params, models, plant)
+    if p.tuning == "itae":
+        settings = rules.itae_pid(LagWithDeadTime.of(lin), signals.period_s, p.sampling)
+    elif p.tuning == "simc":
+        settings = rules.simc_pid(AllPole.of(lin), signals.period_s, p.lambda_s)
+    elif p.tuning == "imc" and p.lambda_s is not None:
+        settings = rules.imc_pid(AllPole.of(lin), p.lambda_s)
+    elif p.tuning == "imc":
+        settings = rules.robust_imc(lin, signals.period_s)
+    elif p.tuning == "optimized":
+        if plant is None:
+            raise LawError("PID tuning `optimized` needs a simulator; take manual, imc, simc or itae")
+        known, hold = equations(plant, "PID tuning `optimized` on a linearized plant"), p.development_hold or HOLD
+        loops = DevelopmentLoops.draw(known, p.development_seeds, p.development_set_points, hold)
+        free = p.set_point_weight is None
+
+        def cost(rows: Sequence[PidSettings]) -> Array:
+            law = law_of(list(rows))
+            return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
+
+        settings = rules.optimized_imc(AllPole.near(lin), signals.period_s, cost, given, optimize_weight=free)
+        return Tuned(settings)
+    else:
+        raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
+    rest = {name: getattr(given, name) for name in ("filter_s", "tracking_s", "set_point_weight")}
+    return Tuned(replace(settings, **rest))
+
+
+def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> Tuned:
+    """The cheapest numbers in closed loop over the plant and its variations, of the best two pairings."""
+    responses = StepResponses.near_start(plant)
+    hold = params.development_hold or int(np.clip(2 * responses.settling, *HOLDS))
+    drawn = (params.development_seeds, params.development_set_points, hold)
+    plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
+    found: tuple[float, Loops] = (np.inf, ())
+    for pairs, table in pairings(responses.share)[:2]:
+
+        def cost(rows: Sequence[Loops], pairs: Pairs = pairs) -> Array:
+            law = law_of(list(rows), pairs=pairs)
+            weighted = params.criterion == "itae"
+            each = [loops.error(law, law.n_state, len(rows), time_weighted=weighted) for loops in plants]
+            return np.asarray(np.mean(each, axis=0))
+
+        processes = [responses.process(*pair) for pair in pairs]
+        tried = searched(processes, signals.period_s, cost, params.given(), params.set_point_weight)
+        if tried[0] < found[0]:
+            found, best, gains = tried, pairs, table
+    relative = tuple(float(gains[cv, cv]) for cv, _ in best) if len(best) > 1 else ()
+    return Tuned(found[1], best, relative)
+
+
+def by_simulation(params: Any, plant: Simulator) -> bool:
+    """Whether the numbers are searched over the plant as it is, because it has no equations or several loops."""
+    known = isinstance(plant, EquationPlant) and len(plant.sp_signals) == len(plant.mv_signals) == 1
+    return params.tuning == "optimized" and params.operating_cv is None and not known
+
+
+def linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:
+    """The linearization of the part ``linearized`` if there is one, else of the plant at ``operating_cv``.
+
+    A plant without equations is approximated by one or two lags near its start.
+    """
+    if "linearized" in models:
+        part = models["linearized"]
+        if not isinstance(part, HoldsLinearization):
+            raise LawError(f"law 'pid' needs a part 'linearized' that is a linearization; got one of kind {part.kind}")
+        return part.linearization()
+    if plant is not None and params.operating_cv is None and not isinstance(plant, EquationPlant):
+        return start_lag(plant)
+    known = equations(plant, f"PID tuning {params.tuning!r} without a part `linearized`")
+    sp = known.sp_signals[0]
+    cv = 0.5 * (sp.low + sp.high) if params.operating_cv is None else params.operating_cv
+    return known.linearize(*known.steady_state_at(cv))
