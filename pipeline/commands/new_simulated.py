@@ -13,11 +13,13 @@ from pipeline.files import sha256, write_json
 from pipeline.historian.findings import Finding
 from pipeline.historian.made import judged_record
 from pipeline.historian.screening import Screened
+from pipeline.plants.fmu.table import FmuTable
 from pipeline.plants.simulator_file import FileSimulator
 
 SLOW, WANTED = 120, 60  # periods of the settling time: above the first, the period becomes long enough for the second
+LONGER = (10, 100, 1000)  # steps of a simulator in a period, tried where it does not settle
 SEED = 0
-SIMULATOR = "simulator.py"  # its copy beside the record
+SIMULATOR = "simulator"  # its copy beside the record, with the ending of the file
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +32,18 @@ class Simulated:
     found: Screened
 
 
-def simulated(name: str, path: Path, rows: int, period_s: float | None) -> Simulated:
-    """The whole experiment; PlantError where the simulator fails, RecordError for a period that it cannot have."""
-    plant = FileSimulator(path, name)
+def simulated(name: str, path: Path, rows: int, period_s: float | None, table: FmuTable | None = None) -> Simulated:
+    """The whole experiment; ``table`` belongs to an FMU.
+
+    Raises PlantError where the simulator fails, and RecordError for a period that it cannot have.
+    """
+    plant = FileSimulator(path, name, table=table)
     test = first_test(plant)
-    every = _every(plant, test, period_s)
-    if every > 1:
-        plant = FileSimulator(path, name, every)
+    if period_s is None and plant.strides and not test.settles:
+        plant, test = _longer(plant, test)
+    every = plant.every * _every(plant, test, period_s)
+    if every > plant.every:
+        plant = FileSimulator(path, name, every, table)
         test = first_test(plant)
     plan = planned(plant, test, rows)
     record = excited(plant, plan, SEED)
@@ -47,8 +54,26 @@ def simulated(name: str, path: Path, rows: int, period_s: float | None) -> Simul
 
 def keep(made: Simulated, folder: Path) -> None:
     """Copy the simulator beside its record, for the validation, and write what the first test showed."""
-    shutil.copyfile(made.plant.path, folder / SIMULATOR)
+    copy = folder / copy_name(made.plant.path)
+    shutil.copyfile(made.plant.path, copy)
+    if made.plant.table:
+        made.plant.table.write_beside(copy)
     write_json(folder / "first_test.json", made.test.to_dict())
+
+
+def _longer(plant: FileSimulator, test: FirstTest) -> tuple[FileSimulator, FirstTest]:
+    """The plant and its test with a longer period, if it settles then: many FMUs propose steps for a fast solver."""
+    for every in LONGER:
+        longer = FileSimulator(plant.path, plant.name, every, plant.table)
+        again = first_test(longer)
+        if again.settles:
+            return longer, again
+    return plant, test
+
+
+def copy_name(simulator: Path) -> str:
+    """The name of a simulator's copy beside its record."""
+    return SIMULATOR + simulator.suffix.lower()
 
 
 def _every(plant: FileSimulator, test: FirstTest, period_s: float | None) -> int:
