@@ -66,8 +66,10 @@ def described(path: Path) -> Description:
     if not zipfile.is_zipfile(path):
         raise PlantError(f"{path} is no FMU: it is no zip file")
     try:
-        model = package.read_model_description(str(path), validate=False)
-        platforms = package.supported_platforms(str(path))
+        with path.open("rb") as file:  # fmpy leaves a path open where it fails
+            model = package.read_model_description(file, validate=False)
+        with zipfile.ZipFile(path) as content:
+            names = content.namelist()
     except Exception as error:
         raise PlantError(f"{path} is no FMU that can be read: {_one_line(error)}") from None
     version = int(str(model.fmiVersion).partition(".")[0])
@@ -78,12 +80,11 @@ def described(path: Path) -> Description:
         raise PlantError(f"{path} is an FMU for model exchange only, which has no solver; export it for co-simulation")
     if can.needsExecutionTool:
         raise PlantError(f"{path} runs only beside the tool that made it; export it with its own solver")
-    if package.platform not in platforms:
-        has = ", ".join(p for p in platforms if p != "c-code") or "none"
-        words = "; it holds C sources: `fmpy compile FILE` adds a library" if "c-code" in platforms else ""
+    here = package.platform if version == 2 else package.platform_tuple
+    if f"binaries/{here}/{can.modelIdentifier}{package.sharedLibraryExtension}" not in names:
+        has = sorted({n.split("/")[1] for n in names if n.startswith("binaries/") and n.count("/") > 1})
         raise PlantError(
-            f"{path} has no library for this machine, {package.platform}; it has {has}; export it for "
-            f"{package.platform}{words}"
+            f"{path} has no library for this machine, {here}; it has {', '.join(has) or 'none'}; export it for {here}"
         )
     scalar = {v.name: v for v in model.modelVariables if v.type in REAL and not v.dimensions}
     begins = _number(model.defaultExperiment and model.defaultExperiment.startTime)

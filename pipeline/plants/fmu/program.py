@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import final
 
@@ -37,11 +38,11 @@ class FmuFile:
                                   for role in ("pv", "mv", "dv"))  # fmt: skip
         self._outputs = [v.reference for v in pv]
         self._inputs = [v.reference for v in (*self._mv, *self._dv)]
-        self._step_s = table.step_s
         groups = {role: tuple(r.signal for r in table.of(role)) for role in ("pv", "mv", "dv")}
         self.interface = Interface(table.step_s, groups["pv"], groups["mv"], groups["dv"], strides=self._of.any_step)
         self._folder = Folder(self._of)
-        self._memory = memory_of(self._of, self._folder.path, self._play)
+        play = partial(_play, self._inputs, table.step_s)  # not a method: the FMU ends with the last reference to it
+        self._memory = memory_of(self._of, self._folder.path, play)
         self._folder.loaded()
 
     def start(self) -> tuple[Array, Array, Array]:
@@ -73,11 +74,6 @@ class FmuFile:
             f"{self.path}: {words}; name variables and ranges by --mv, --pv, --dv or in the table of --tags"
         )
 
-    def _play(self, instance: Instance, move: bytes) -> None:
-        *_, done, length, steps = numbers = np.frombuffer(move)
-        for k in range(int(steps)):
-            instance.step(self._inputs, numbers[:-3], (done + k * length) * self._step_s, length * self._step_s)
-
     def _state(self, instance: Instance, periods: float, state: Array) -> Array:
         return np.concatenate([instance.get(self._outputs), [periods], state])
 
@@ -97,3 +93,9 @@ def variable_of(of: Description, name: str, role: str) -> Variable:
             f"{inputs}"
         )
     return found
+
+
+def _play(references: list[int], step_s: float, instance: Instance, move: bytes) -> None:
+    *_, done, length, steps = numbers = np.frombuffer(move)
+    for k in range(int(steps)):
+        instance.step(references, numbers[:-3], (done + k * length) * step_s, length * step_s)
