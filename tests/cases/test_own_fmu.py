@@ -14,7 +14,7 @@ from pipeline.__main__ import main
 from pipeline.cases import all_cases
 from pipeline.cases.own_simulator import SimulatedCase
 from pipeline.commands.new_fmu import MISSING, proposals, table_from
-from pipeline.commands.new_simulated import WANTED, simulated
+from pipeline.commands.new_simulated import SLOW, WANTED, simulated
 from pipeline.files import sha256
 from pipeline.plants.fmu.description import described
 from pipeline.plants.simulator_file import FileSimulator
@@ -107,7 +107,8 @@ def test_a_short_step_for_a_fast_solver_becomes_a_period_that_suits_the_plant(
     assert table.step_s == 1.5
     made = simulated("basin", path, 500, None, table)
     assert made.test.settles
-    assert made.plant.period_s == pytest.approx(1590 / WANTED, rel=0.2)
+    assert WANTED / 1.2 < made.test.settling_periods <= SLOW
+    assert made.test.settling_periods * made.plant.period_s == pytest.approx(1590, rel=0.05)
 
 
 def test_the_period_is_the_step_where_the_fmu_takes_any(tmp_path: Path) -> None:
