@@ -88,7 +88,8 @@ class Replayed:
     """A digest of all moves since the start; the FMU goes there from the nearest state before that is at hand.
 
     At hand are the start, the state that each instance is in, and, where the FMU keeps states in its own memory, the
-    last KEPT of them. A state is known in the process that made it, and the start in every one.
+    last KEPT that were replayed: a state that tests went on from twice is one that more will go on from. A state is
+    known in the process that made it, and the start in every one.
     """
 
     def __init__(self, of: Description, instances: Sequence[Instance], play: Play) -> None:
@@ -108,10 +109,6 @@ class Replayed:
         """PlantError for a state that another process made."""
         here = state.astype("<u8").view(np.uint8).reshape(2, 8)[:, :6].tobytes()
         instance = self._brought(here)
-        if self._keeps and here not in self._kept:
-            self._kept[here] = instance.save()
-            if len(self._kept) > KEPT:
-                instance.free(self._kept.popitem(last=False)[1])
         self._moved(instance, move)
         after = hashlib.blake2b(here + move, digest_size=DIGEST).digest()
         self._past[after] = here + move
@@ -139,13 +136,17 @@ class Replayed:
             instance = self._begun()
         for move in reversed(moves):
             self._moved(instance, move)
+        if self._keeps and moves:
+            self._kept[to] = instance.save()
+            if len(self._kept) > KEPT:
+                instance.free(self._kept.popitem(last=False)[1])
         return instance
 
     def _moved(self, instance: Instance, move: bytes) -> None:
         try:
             self._play(instance, move)
         except PlantError:
-            self._unused.append(instance)  # in no known state; it begins anew
+            self._unused.append(instance)  # in no known state
             raise
 
     def _begun(self) -> Instance:
@@ -154,7 +155,12 @@ class Replayed:
         return instance
 
     def _free(self) -> Instance:
-        return self._unused.pop() if self._unused else self._places.popitem(last=False)[1]
+        """An instance that nobody needs where it is: it may be in any state, but in none that failed."""
+        if not self._unused:
+            return self._places.popitem(last=False)[1]
+        instance = self._unused.pop()
+        instance.begin()
+        return instance
 
 
 def _numbers(digest: bytes) -> Array:
