@@ -95,7 +95,7 @@ def _findings(plant: FileSimulator, test: FirstTest, plan: Plan) -> list[Finding
         words += f"; the period is {plant.every} steps of the simulator, so that an answer takes {WANTED} or so"
     found = [Finding("first_test", plant.name, words)]
     if not test.at_rest:
-        words = "start() is no rest: the process variables move without a step, so settling and gains are rough"
+        words = "the start is no rest: the process variables move without a step, so settling and gains are rough"
         found.append(Finding("first_test", plant.name, words))
     for j, s in enumerate(plant.mv_signals):
         kind = "gain" if test.settles else "slope a period"

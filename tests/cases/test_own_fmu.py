@@ -16,9 +16,11 @@ from pipeline.cases.own_simulator import SimulatedCase
 from pipeline.commands.new_fmu import MISSING, proposals, table_from
 from pipeline.commands.new_simulated import SLOW, WANTED, simulated
 from pipeline.files import sha256
+from pipeline.historian.tags import Tag
 from pipeline.plants.fmu.description import described
 from pipeline.plants.simulator_file import FileSimulator
 from pipeline.stages.check import mistakes
+from serving.manifest import Signal
 
 ROLES = ["--pv", "oxygen", "--mv", "air[%]", "--dv", "uptake=24..40"]
 ROWS = ["--rows", "600"]
@@ -142,6 +144,18 @@ def test_what_an_fmu_cannot_be_told_is_one_line_and_writes_nothing(
     assert says in error
     assert error.count("\n") == 1
     assert not Path("data").exists()
+
+
+def test_a_name_with_brackets_becomes_one_that_a_controller_can_have(tmp_path: Path) -> None:
+    path = fmu(tmp_path, CLEAR.replace('"oxygen"', '"basin[2].oxygen"'))
+    tags = [Tag("basin[2].oxygen", "pv"), Tag("air", "mv", "percent", 10.0)]
+    table = table_from(path, tags, "t.csv", None)
+    assert table is not None
+    assert [(r.variable, r.signal) for r in table.rows] == [
+        ("basin[2].oxygen", Signal("basin-2-.oxygen", "mg/l", 0.0, 9.0)),
+        ("air", Signal("air", "percent", 10.0, 100.0)),  # a person's word counts before the FMU's
+    ]
+    assert FileSimulator(path, table=table).measure(FileSimulator(path, table=table).start[0]) > 4
 
 
 def test_proposals_are_inputs_and_outputs_alone(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from fmu_parts import EXAMPLE, FMI_2, FMI_3, KEEPS_2, KEEPS_3, TABLE, WRITES_2, 
 
 from pipeline.errors import PlantError
 from pipeline.plants.fmu.folder import PREFIX
+from pipeline.plants.fmu.instance import Instance
 from pipeline.plants.fmu.memory import INSTANCES, KEPT
 from pipeline.plants.fmu.table import FmuRow, FmuTable
 from pipeline.plants.simulator_file import FileSimulator
@@ -253,6 +254,12 @@ def test_after_a_step_that_failed_it_goes_on_from_any_state(name: str, tmp_path:
     with pytest.raises(PlantError, match="below zero"):
         one.step(x, np.array([-5.0]), dv, p)
     np.testing.assert_array_equal(one.measure(one.step(x, np.array([20.0]), dv, p)), expected)
+
+
+def test_an_fmu_that_does_not_go_back_to_its_state_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Instance, "restore", lambda *of: None)
+    with pytest.raises(PlantError, match="a step from the same state gives another result when it is done again"):
+        plant(fmu(tmp_path))
 
 
 def test_a_state_of_another_process_is_refused_where_it_cannot_be_known(tmp_path: Path) -> None:
