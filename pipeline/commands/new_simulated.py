@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline.errors import RecordError
@@ -18,6 +18,7 @@ from pipeline.plants.simulator_file import FileSimulator
 
 SLOW, WANTED = 120, 60  # periods of the settling time: above the first, the period becomes long enough for the second
 LONGER = (10, 100, 1000)  # steps of a simulator in a period, tried where it does not settle
+RESTS_AFTER = (2, 8)  # settling times at an FMU's start values, tried where its start is no rest
 SEED = 0
 SIMULATOR = "simulator"  # its copy beside the record, with the ending of the file
 
@@ -45,6 +46,8 @@ def simulated(name: str, path: Path, rows: int, period_s: float | None, table: F
     if every > plant.every:
         plant = FileSimulator(path, name, every, table)
         test = first_test(plant)
+    if plant.table and not test.at_rest:
+        plant, test = _rested(plant, plant.table, test)
     plan = planned(plant, test, rows)
     record = excited(plant, plan, SEED)
     files = [{"file": str(path), "sha256": sha256(path)}]
@@ -71,6 +74,17 @@ def _longer(plant: FileSimulator, test: FirstTest) -> tuple[FileSimulator, First
     return plant, test
 
 
+def _rested(plant: FileSimulator, table: FmuTable, test: FirstTest) -> tuple[FileSimulator, FirstTest]:
+    """The plant and its test after a time at its start values, if it rests then: many FMUs begin with a transient."""
+    for times in RESTS_AFTER:
+        rest = replace(table, rest_periods=times * test.settling_periods * plant.every)
+        later = FileSimulator(plant.path, plant.name, plant.every, rest)
+        again = first_test(later)
+        if again.at_rest:
+            return later, again
+    return plant, test
+
+
 def copy_name(simulator: Path) -> str:
     """The name of a simulator's copy beside its record."""
     return SIMULATOR + simulator.suffix.lower()
@@ -94,6 +108,12 @@ def _findings(plant: FileSimulator, test: FirstTest, plan: Plan) -> list[Finding
     if plant.every > 1:
         words += f"; the period is {plant.every} steps of the simulator, so that an answer takes {WANTED} or so"
     found = [Finding("first_test", plant.name, words)]
+    if plant.table and plant.table.rest_periods:
+        rest_s = plant.table.rest_periods * plant.table.step_s
+        words = (
+            f"the FMU does not start at rest; the experiment and the tests begin after {rest_s:g} s at its start values"
+        )
+        found.append(Finding("first_test", plant.name, words))
     if not test.at_rest:
         words = "the start is no rest: the process variables move without a step, so settling and gains are rough"
         found.append(Finding("first_test", plant.name, words))

@@ -6,6 +6,7 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from fmu_parts import EXAMPLE, FMI_2, fmu
@@ -15,9 +16,11 @@ from pipeline.cases import all_cases
 from pipeline.cases.own_simulator import SimulatedCase
 from pipeline.commands.new_fmu import MISSING, proposals, table_from
 from pipeline.commands.new_simulated import SLOW, WANTED, simulated
+from pipeline.excitation.first_test import first_test
 from pipeline.files import sha256
 from pipeline.historian.tags import Tag
 from pipeline.plants.fmu.description import described
+from pipeline.plants.fmu.instance import Instance
 from pipeline.plants.simulator_file import FileSimulator
 from pipeline.stages.check import mistakes
 from serving.manifest import Signal
@@ -111,6 +114,34 @@ def test_a_short_step_for_a_fast_solver_becomes_a_period_that_suits_the_plant(
     assert made.test.settles
     assert WANTED / 1.2 < made.test.settling_periods <= SLOW
     assert made.test.settling_periods * made.plant.period_s == pytest.approx(1590, rel=0.05)
+
+
+def test_an_fmu_that_begins_with_a_transient_is_given_time_to_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = Instance.begin
+
+    def blown(self: Instance) -> None:
+        """The start after ten minutes of too much air."""
+        begin(self)
+        self.step([0], np.array([95.0]), 0.0, 600.0)
+        self._call("set", [0], [40.0])
+
+    monkeypatch.setattr(Instance, "begin", blown)
+    path = fmu(tmp_path, CLEAR)
+    table = table_from(path, (), "", None)
+    assert not first_test(FileSimulator(path, table=table)).at_rest
+    made = simulated("basin", path, 500, None, table)
+    assert made.test.at_rest
+    assert made.plant.table is not None
+    assert made.plant.table.rest_periods >= 2 * 50
+    assert any("begin after" in f.words for f in made.found.report.findings)
+    x, mv = made.plant.start
+    assert mv.tolist() == [40.0]
+    beside = made.plant.table.write_beside(path)
+    again = FileSimulator(path)
+    np.testing.assert_array_equal(again.measure(again.start[0]), made.plant.measure(x))
+    assert beside.is_file()
 
 
 def test_the_period_is_the_step_where_the_fmu_takes_any(tmp_path: Path) -> None:

@@ -275,7 +275,10 @@ def test_the_table_beside_an_fmu_is_read_and_its_mistakes_are_one_line(tmp_path:
     beside = TABLE.write_beside(path)
     assert FileSimulator(path).table == TABLE
     text = beside.read_text()
-    for wrong, says in ((text.replace('"mv"', '"op"'), "role 'op'; pv, mv, dv are known"), ("{}", "step_s")):
+    for wrong, says in (
+        (text.replace('"mv"', '"op"'), "role 'op'; pv, mv, dv are known"),
+        ("{}", "KeyError: 'variables'"),
+    ):
         beside.write_text(wrong)
         with pytest.raises(PlantError) as error:
             FileSimulator(path)

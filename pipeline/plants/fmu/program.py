@@ -24,8 +24,8 @@ PERIODS = 1  # numbers of a state between the PVs and the FMU's own: the periods
 class FmuFile:
     """An FMU with the table of its signals.
 
-    A state is (PVs (n_pv,), periods since the start, the FMU's own state as ``memory`` writes it). The FMU's start
-    values are the start; MVs and measured disturbances begin where the inputs do.
+    A state is (PVs (n_pv,), periods since the start, the FMU's own state as ``memory`` writes it). MVs and
+    measured disturbances begin with the start values of the inputs.
 
     Raises PlantError for what ``described`` refuses, a variable that the FMU does not have or that cannot take its
     role, and every call that fails.
@@ -34,10 +34,11 @@ class FmuFile:
     def __init__(self, path: Path, table: FmuTable) -> None:
         self.path = path
         self._of = described(path)
-        pv, self._mv, self._dv = ([variable_of(self._of, r.variable, role) for r in table.of(role)]
+        pv, mv, dv = ([variable_of(self._of, r.variable, role) for r in table.of(role)]
                                   for role in ("pv", "mv", "dv"))  # fmt: skip
         self._outputs = [v.reference for v in pv]
-        self._inputs = [v.reference for v in (*self._mv, *self._dv)]
+        self._inputs = [v.reference for v in (*mv, *dv)]
+        self._n_mv, self._rest = len(mv), table.rest_periods
         groups = {role: tuple(r.signal for r in table.of(role)) for role in ("pv", "mv", "dv")}
         self.interface = Interface(table.step_s, groups["pv"], groups["mv"], groups["dv"], strides=self._of.any_step)
         self._folder = Folder(self._of)
@@ -46,10 +47,11 @@ class FmuFile:
         self._folder.loaded()
 
     def start(self) -> tuple[Array, Array, Array]:
-        """The FMU after its initialization, and its inputs there."""
+        """The FMU after its initialization, and ``rest_periods`` more, and its inputs there."""
         instance, state = self._memory.start()
-        inputs = instance.get(self._inputs)
-        return self._state(instance, 0.0, state), inputs[: len(self._mv)], inputs[len(self._mv) :]
+        mv, dv = np.split(instance.get(self._inputs), [self._n_mv])
+        x = self._state(instance, 0.0, state)
+        return self.step(x, mv, dv, self._rest) if self._rest else x, mv, dv
 
     def step(self, x: Array, mv: Array, dv: Array, periods: int) -> Array:
         """One communication step of all the periods, where the FMU takes steps of any length; else one a period."""

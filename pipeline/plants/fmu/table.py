@@ -25,10 +25,14 @@ class FmuRow:
 
 @dataclass(frozen=True, slots=True)
 class FmuTable:
-    """The signals, controlled PVs first, and the communication step [s], which is the period of the simulator."""
+    """The signals, controlled PVs first, and the communication step [s], which is the period of the simulator.
+
+    ``rest_periods``: the inputs keep their start values for so long before an experiment starts.
+    """
 
     step_s: float
     rows: tuple[FmuRow, ...]
+    rest_periods: int = 0
 
     def of(self, role: str) -> tuple[FmuRow, ...]:
         """The rows of a role, in their order."""
@@ -38,7 +42,7 @@ class FmuTable:
         """Write the table beside an FMU, and its path."""
         rows = [{"variable": r.variable, "role": r.role, "signal": r.signal.to_dict()} for r in self.rows]
         path = table_path(fmu)
-        write_json(path, {"step_s": self.step_s, "variables": rows})
+        write_json(path, {"step_s": self.step_s, "rest_periods": self.rest_periods, "variables": rows})
         return path
 
     @classmethod
@@ -52,7 +56,8 @@ class FmuTable:
             )
         content = read_json(path)
         try:
-            return cls(float(content["step_s"]), tuple(_row(row) for row in content["variables"]))
+            rows = tuple(_row(row) for row in content["variables"])
+            return cls(float(content["step_s"]), rows, int(content["rest_periods"]))
         except (KeyError, TypeError, ValueError, LoopwrightError) as error:
             raise PlantError(f"{path}: {type(error).__name__}: {error}; `loopwright new` writes a right one") from None
 
