@@ -28,6 +28,7 @@ NAMES: dict[int, dict[str, str]] = {
     },
 }  # fmt: skip
 WARNING = 1  # status of a message: those above it say why a call failed
+BACK_LATER = False  # noSetFMUStatePriorToCurrentPoint: a test may go back to a state before this step
 State = Any
 """A state inside the FMU's own memory."""
 
@@ -68,7 +69,7 @@ class Instance:
             self._call("set", list(references), values.tolist())
         now = self._of.begins_s + after_s
         what = f"doStep from {now:g} s on for {length_s:g} s"
-        ended = self._try(what, self._fmu.doStep, now, length_s)
+        ended = self._try(what, self._fmu.doStep, now, length_s, BACK_LATER)
         if ended is not None and (ended[1] or ended[2]):
             raise PlantError(f"{self._of.path}: {what}: it {'ends the simulation' if ended[1] else 'returns early'}")
 
