@@ -15,7 +15,7 @@ from pipeline.config.plants import PlantParams
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Array, Case
 from pipeline.plants.simulator import Simulator
-from pipeline.plants.simulator_file import FileSimulator
+from pipeline.plants.simulator_file import FileSimulator, files_of
 from pipeline.simulation.scenario import Scenario
 
 LOADS = "load_"  # at the start of a parameter that is a load
@@ -89,4 +89,4 @@ def simulated_case(name: str) -> Case:
     file = PlantParams.read(name).simulator
     if file is None:
         raise ParamsError(f"plants.{name} has no simulator; `loopwright new NAME --simulator FILE` gives it one")
-    return own_case(name, SimulatedCase, simulator_file=file, reads=(file,))
+    return own_case(name, SimulatedCase, simulator_file=file, reads=files_of(file))

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_plant import entries_of
-from pipeline.commands.new_simulated import SIMULATOR, Simulated, keep, simulated
+from pipeline.commands.new_fmu import table_from, write_table
+from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
@@ -22,6 +23,7 @@ from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
 from pipeline.historian.step_test import StepTest, planned
 from pipeline.historian.tags import ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
+from pipeline.plants.simulator_file import is_fmu
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
 
@@ -38,7 +40,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("name", metavar="NAME", help="of the plant: small letters, digits and _")
     add("files", metavar="FILE", type=Path, nargs="*", help="exports: .csv, .txt, .gz, .parquet")
     add("--anyway", action="store_true", help="add the plant even where the data cannot carry a model")
-    add("--simulator", metavar="FILE", type=Path, help="a class with start, step and measure, instead of exports")
+    add("--simulator", metavar="FILE", type=Path, help="a Python class or an FMU, instead of exports")
     add("--rows", metavar="N", type=_rows, default=8_000, help="of the experiment on a simulator (8000)")
     for role in ROLES:
         form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"
@@ -62,14 +64,9 @@ def run(options: argparse.Namespace) -> int:
         return _simulated(name, folder, options)
     if not options.files:
         raise RecordError("no file is named; give one or more exports, or --simulator FILE")
-    given = [parse_tag(text, role) for role in ROLES for text in getattr(options, role)]
-    if given and options.tags:
-        raise RecordError("--tags and options of roles are both given; give one of them")
-    if not given and not options.tags:
+    tags, _ = _tags(options)
+    if not tags:
         return _table(name, options)
-    where = str(options.tags) if options.tags else "the options"
-    tags = read_tags(options.tags) if options.tags else tuple(given)
-    check_tags(tags, where)
     units = units_of(options.files)
     tags = named([t if t.unit or t.role == "mode" else _with_unit(t, units) for t in tags])
     tags = controlled_first(tags)
@@ -79,11 +76,38 @@ def run(options: argparse.Namespace) -> int:
     return _write(name, folder, found, options.anyway)
 
 
+def _tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
+    """The tags that a person gave, and where they stand."""
+    given = tuple(parse_tag(text, role) for role in ROLES for text in getattr(options, role))
+    if given and options.tags:
+        raise RecordError("--tags and options of roles are both given; give one of them")
+    found, where = (read_tags(options.tags), str(options.tags)) if options.tags else (given, "the options")
+    if found or options.tags:
+        check_tags(found, where)
+    return found, where
+
+
 def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
-    if options.files or options.tags or any(getattr(options, role) for role in ROLES):
+    path: Path = options.simulator
+    tags, where = _tags(options)
+    if options.files or (tags and not is_fmu(path)):
         raise RecordError("--simulator and an export or its tags are both given; give one of them")
-    made = simulated(name, options.simulator, options.rows, options.period)
+    table = None
+    if is_fmu(path):
+        table = table_from(path, tags, where, options.period)
+        if table is None:
+            return _proposed(name, path)
+    made = simulated(name, path, options.rows, options.period, table)
     return _write(name, folder, made.found, options.anyway, made)
+
+
+def _proposed(name: str, fmu: Path) -> int:
+    path = Path(f"{name}-tags.csv")
+    n = write_table(path, fmu)
+    print(f"{path}: {n} inputs and outputs of {fmu}, inputs as mv, outputs as pv; nothing else was written\n"
+          f"correct role, unit, low and high there (an empty role leaves a variable out), then:\n"
+          f"  loopwright new {name} --simulator {fmu} --tags {path}")  # fmt: skip
+    return 0
 
 
 def _table(name: str, options: argparse.Namespace) -> int:
@@ -121,7 +145,11 @@ def _write(name: str, folder: Path, found: Screened, anyway: bool, made: Simulat
         write_page(draft / "screening.html", found, test)
     if not usable:
         try:
-            add_entries(entries_of(name, plant | ({"simulator": (folder / SIMULATOR).as_posix()} if made else {})))
+            add_entries(
+                entries_of(
+                    name, plant | ({"simulator": (folder / copy_name(made.plant.path)).as_posix()} if made else {})
+                )
+            )
         except PipelineError:
             shutil.rmtree(folder)
             raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline.errors import RecordError
@@ -13,11 +13,14 @@ from pipeline.files import sha256, write_json
 from pipeline.historian.findings import Finding
 from pipeline.historian.made import judged_record
 from pipeline.historian.screening import Screened
+from pipeline.plants.fmu.table import FmuTable
 from pipeline.plants.simulator_file import FileSimulator
 
 SLOW, WANTED = 120, 60  # periods of the settling time: above the first, the period becomes long enough for the second
+LONGER = (10, 100, 1000)  # steps of a simulator in a period, tried where it does not settle
+RESTS_AFTER = (2, 8)  # settling times at an FMU's start values, tried where its start is no rest
 SEED = 0
-SIMULATOR = "simulator.py"  # its copy beside the record
+SIMULATOR = "simulator"  # its copy beside the record, with the ending of the file
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +33,21 @@ class Simulated:
     found: Screened
 
 
-def simulated(name: str, path: Path, rows: int, period_s: float | None) -> Simulated:
-    """The whole experiment; PlantError where the simulator fails, RecordError for a period that it cannot have."""
-    plant = FileSimulator(path, name)
+def simulated(name: str, path: Path, rows: int, period_s: float | None, table: FmuTable | None = None) -> Simulated:
+    """The whole experiment; ``table`` belongs to an FMU.
+
+    Raises PlantError where the simulator fails, and RecordError for a period that it cannot have.
+    """
+    plant = FileSimulator(path, name, table=table)
     test = first_test(plant)
-    every = _every(plant, test, period_s)
-    if every > 1:
-        plant = FileSimulator(path, name, every)
+    if period_s is None and plant.strides and not test.settles:
+        plant, test = _longer(plant, test)
+    every = plant.every * _every(plant, test, period_s)
+    if every > plant.every:
+        plant = FileSimulator(path, name, every, table)
         test = first_test(plant)
+    if plant.table and not test.at_rest:
+        plant, test = _rested(plant, plant.table, test)
     plan = planned(plant, test, rows)
     record = excited(plant, plan, SEED)
     files = [{"file": str(path), "sha256": sha256(path)}]
@@ -47,8 +57,37 @@ def simulated(name: str, path: Path, rows: int, period_s: float | None) -> Simul
 
 def keep(made: Simulated, folder: Path) -> None:
     """Copy the simulator beside its record, for the validation, and write what the first test showed."""
-    shutil.copyfile(made.plant.path, folder / SIMULATOR)
+    copy = folder / copy_name(made.plant.path)
+    shutil.copyfile(made.plant.path, copy)
+    if made.plant.table:
+        made.plant.table.write_beside(copy)
     write_json(folder / "first_test.json", made.test.to_dict())
+
+
+def _longer(plant: FileSimulator, test: FirstTest) -> tuple[FileSimulator, FirstTest]:
+    """The plant and its test with a longer period, if it settles then: many FMUs propose steps for a fast solver."""
+    for every in LONGER:
+        longer = FileSimulator(plant.path, plant.name, every, plant.table)
+        again = first_test(longer)
+        if again.settles:
+            return longer, again
+    return plant, test
+
+
+def _rested(plant: FileSimulator, table: FmuTable, test: FirstTest) -> tuple[FileSimulator, FirstTest]:
+    """The plant and its test after a time at its start values, if it rests then: many FMUs begin with a transient."""
+    for times in RESTS_AFTER:
+        rest = replace(table, rest_periods=times * test.settling_periods * plant.every)
+        later = FileSimulator(plant.path, plant.name, plant.every, rest)
+        again = first_test(later)
+        if again.at_rest:
+            return later, again
+    return plant, test
+
+
+def copy_name(simulator: Path) -> str:
+    """The name of a simulator's copy beside its record."""
+    return SIMULATOR + simulator.suffix.lower()
 
 
 def _every(plant: FileSimulator, test: FirstTest, period_s: float | None) -> int:
@@ -69,8 +108,14 @@ def _findings(plant: FileSimulator, test: FirstTest, plan: Plan) -> list[Finding
     if plant.every > 1:
         words += f"; the period is {plant.every} steps of the simulator, so that an answer takes {WANTED} or so"
     found = [Finding("first_test", plant.name, words)]
+    if plant.table and plant.table.rest_periods:
+        rest_s = plant.table.rest_periods * plant.table.step_s
+        words = (
+            f"the FMU does not start at rest; the experiment and the tests begin after {rest_s:g} s at its start values"
+        )
+        found.append(Finding("first_test", plant.name, words))
     if not test.at_rest:
-        words = "start() is no rest: the process variables move without a step, so settling and gains are rough"
+        words = "the start is no rest: the process variables move without a step, so settling and gains are rough"
         found.append(Finding("first_test", plant.name, words))
     for j, s in enumerate(plant.mv_signals):
         kind = "gain" if test.settles else "slope a period"

@@ -1,76 +1,76 @@
-"""A plant from a person's own file: one class with ``start``, ``step``, ``measure`` and its signals."""
+"""A plant from a person's own file, a Python class or an FMU: its period, loads and checks are those of any plant."""
 
 from __future__ import annotations
 
-import importlib.util
-import inspect
-import re
-import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
 from pipeline.errors import PlantError
+from pipeline.plants.fmu.program import FmuFile
+from pipeline.plants.fmu.table import FmuTable, table_path
+from pipeline.plants.program import Program
+from pipeline.plants.python_file import EXAMPLE, PythonFile
 from pipeline.plants.simulator import Array, Simulator
-from serving.errors import LoopwrightError
-from serving.manifest import Signal
 
-NAME = re.compile(r"[A-Za-z0-9_.\-/:#]{1,64}")
-METHODS = ("start", "step", "measure")
-EXAMPLE = "examples/own_simulator/heater.py shows one"
-NOISE_SHARE = 0.002  # of a PV's range, where the class states no noise
+FMU = ".fmu"
+NOISE_SHARE = 0.002  # of a PV's range, where the file states no noise
 
 
+@final
 class FileSimulator(Simulator):
-    """The class in a file as a plant.
-
-    The class has ``period_s`` [s], ``pv`` and ``mv``, and may have ``dv`` and ``noise``: name -> (unit, low, high),
-    of ``noise`` name of a PV -> standard deviation in its unit. Its methods, for states x (n_x,) of any meaning:
-
-        start()        -> x, mv or x, mv, dv     a rest
-        step(x, mv, dv) -> x                     one period later; nothing may be kept beside x
-        measure(x)     -> pv
+    """The program in a file as a plant: ``PythonFile``, or ``FmuFile`` with the table of its variables.
 
     Parameters, by name: ``load_MV`` (0, in the MV's unit) is added to each MV behind the controller's back, within
     the MV's range. It is the load that a test can put on any plant.
 
-    ``every``: steps of the class in a period of the plant, its MVs held; a controller samples it every ``every``-th.
+    ``every``: periods of the program in one of the plant, its MVs held. ``table``: None for the one beside the FMU.
 
-    Raises PlantError for a file without such a class, and for whatever its methods raise or return by mistake.
+    Raises PlantError for a file that holds no such program, and for whatever the program does by mistake.
     """
 
-    def __init__(self, path: Path, name: str = "", every: int = 1) -> None:
+    def __init__(self, path: Path, name: str = "", every: int = 1, table: FmuTable | None = None) -> None:
         self.path, self.every = Path(path), every
-        self._own = _made(self.path)
-        groups = {role: self._signals(role) for role in ("pv", "mv", "dv")}
-        for role in ("pv", "mv"):
-            if not groups[role]:
-                raise self._wrong(f"{role} is empty or missing; one signal or more is wanted")
-        period = getattr(self._own, "period_s", None)
-        if not isinstance(period, int | float) or not 0 < period < np.inf:
-            raise self._wrong(f"period_s is {period!r}; a positive number of seconds is wanted")
+        if not self.path.is_file():
+            words = f"give a Python file with the class of your plant ({EXAMPLE}), or an FMU"
+            raise PlantError(f"{self.path}: no such file; {words}")
+        self.table = FmuTable.beside(self.path) if table is None and is_fmu(self.path) else table
+        self._program: Program = PythonFile(self.path) if self.table is None else FmuFile(self.path, self.table)
+        has = self._program.interface
+        for role, signals in (("pv", has.pv), ("mv", has.mv)):
+            if not signals:
+                raise self._program.wrong(f"{role} is empty or missing; one signal or more is wanted")
+        if not 0 < has.period_s < np.inf:
+            raise self._program.wrong(f"period_s is {has.period_s!r}; a positive number of seconds is wanted")
         # The attributes that other plants have by their class, this one has by its file.
         vars(self).update(
             name=name or self.path.stem,
             title=(name or self.path.stem).replace("_", " ").capitalize(),
-            period_s=every * float(period),
-            sp_signals=groups["pv"],
-            **{f"{role}_signals": signals for role, signals in groups.items()},
+            period_s=every * has.period_s,
+            sp_signals=has.pv,
+            pv_signals=has.pv,
+            mv_signals=has.mv,
+            dv_signals=has.dv,
         )
-        self._low, self._high = (np.array([getattr(s, end) for s in groups["mv"]]) for end in ("low", "high"))
+        self._low, self._high = (np.array([getattr(s, end) for s in has.mv]) for end in ("low", "high"))
         self._x0, self._mv0, self._dv0 = self._started()
         self._noise = self._stated_noise()
         self._check()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return FileSimulator, (self.path, self.name, self.every)
+        return FileSimulator, (self.path, self.name, self.every, self.table)
+
+    @property
+    def strides(self) -> bool:
+        """Whether a step of many periods is as much work as a step of one."""
+        return self._program.interface.strides
 
     # ------------------------------------------------------------------ what a closed loop needs
     @property
     def start(self) -> tuple[Array, Array]:
-        """(x (n_x,), mv (n_mv,)) as the class says."""
+        """(x (n_x,), mv (n_mv,)) as the program says."""
         return self._x0.copy(), self._mv0.copy()
 
     @property
@@ -84,15 +84,13 @@ class FileSimulator(Simulator):
         return self._noise.copy()
 
     def step(self, x: Array, mv: Array, dv: Array, p: Array) -> Array:
-        """The state (n_x,) one period later; PlantError names the line of the file where it fails."""
+        """The state (n_x,) one period later; PlantError where the program fails."""
         acting = np.minimum(np.maximum(mv + p, self._low), self._high)
-        for _ in range(self.every):
-            x = self._array("step", self._called("step", x.copy(), acting, np.array(dv, dtype=np.float64)), x.shape)
-        return x
+        return self._program.step(x, acting, dv, self.every)
 
     def measure(self, x: Array) -> Array:
         """The process variables (n_pv,) of a state (n_x,)."""
-        return self._array("measure", self._called("measure", x.copy()), (len(self.pv_signals),))
+        return self._program.measure(x)
 
     # ------------------------------------------------------------------ parameters
     def parameter_names(self) -> tuple[str, ...]:  # type: ignore[override]  # they follow the signals of the file
@@ -112,47 +110,24 @@ class FileSimulator(Simulator):
             values[key] = float(value)
         return np.array(list(values.values()))
 
-    # ------------------------------------------------------------------ reading the class
-    def _signals(self, role: str) -> tuple[Signal, ...]:
-        stated = getattr(self._own, role, {})
-        form = f"{role} must be a dict, name: (unit, low, high)"
-        if not isinstance(stated, Mapping):
-            raise self._wrong(f"{form}, not {stated!r}")
-        found = []
-        for name, row in stated.items():
-            if not NAME.fullmatch(str(name)):
-                raise self._wrong(f"{role} has the name {name!r}; letters, digits and _ . - / : # are allowed")
-            try:
-                unit, low, high = row
-                found.append(Signal(str(name), str(unit), float(low), float(high)))
-            except (TypeError, ValueError):
-                raise self._wrong(f"{form}; {name!r} has {row!r}") from None
-            except LoopwrightError as error:
-                raise self._wrong(str(error)) from None
-        return tuple(found)
-
+    # ------------------------------------------------------------------ checks
     def _started(self) -> tuple[Array, Array, Array]:
-        given = self._called("start")
-        n = 3 if self.dv_signals else 2
-        if not isinstance(given, tuple | list) or len(given) != n:
-            raise self._wrong(f"start() must return {'x, mv, dv' if n == 3 else 'x, mv'}")
-        x = self._array("start (x)", given[0], None)
-        mv = self._array("start (mv)", given[1], (len(self.mv_signals),))
-        dv = self._array("start (dv)", given[2] if n == 3 else [], (len(self.dv_signals),))
+        x, mv, dv = self._program.start()
         for signals, values in ((self.mv_signals, mv), (self.dv_signals, dv)):
             for s, v in zip(signals, values, strict=True):
                 if not s.low <= v <= s.high:
-                    raise self._wrong(f"start() has {s.name} = {v:g}, outside its range {s.low:g} to {s.high:g}")
+                    words = f"it starts with {s.name} = {v:g}, outside its range {s.low:g} to {s.high:g}"
+                    raise self._program.wrong(words)
         return x, mv, dv
 
     def _stated_noise(self) -> Array:
-        stated = getattr(self._own, "noise", {})
+        stated = self._program.interface.noise or {}
         unknown = [n for n in stated if n not in {s.name for s in self.pv_signals}]
         if unknown:
-            raise self._wrong(f"noise names {unknown[0]!r}, which is no pv")
-        noise = np.array([float(stated.get(s.name, NOISE_SHARE * (s.high - s.low))) for s in self.pv_signals])
+            raise self._program.wrong(f"noise names {unknown[0]!r}, which is no pv")
+        noise = np.array([stated.get(s.name, NOISE_SHARE * (s.high - s.low)) for s in self.pv_signals])
         if not np.all(np.isfinite(noise) & (noise >= 0)):
-            raise self._wrong(f"noise is {stated!r}; standard deviations of 0 or more are wanted")
+            raise self._program.wrong(f"noise is {stated!r}; standard deviations of 0 or more are wanted")
         return noise
 
     def _check(self) -> None:
@@ -163,54 +138,18 @@ class FileSimulator(Simulator):
         for mv in (self._low, self._high):
             self.step(first, mv, dv, p)
         again = self.step(self._x0, self._mv0, dv, p)
-        if not np.array_equal(first, again):
-            raise self._wrong(
-                "step() gives another state when it is called again with the same one: it keeps something of its own; "
-                "put all that the plant remembers into x, and draw no random numbers"
+        if not np.array_equal(self._program.compared(first), self._program.compared(again)):
+            raise self._program.wrong(
+                "a step from the same state gives another result when it is done again: the simulator keeps something "
+                "of its own; all that the plant remembers must stand in the state, and no random numbers be drawn"
             )
 
-    # ------------------------------------------------------------------ calling it
-    def _called(self, method: str, *arguments: Array) -> Any:
-        try:
-            return getattr(self._own, method)(*arguments)
-        except Exception as error:
-            rows = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(self.path)]
-            where = f"line {rows[-1].lineno}, {method}()" if rows else f"{method}()"
-            raise PlantError(f"{self.path}: {where}: {type(error).__name__}: {error}") from None
 
-    def _array(self, what: str, given: Any, shape: tuple[int, ...] | None) -> Array:
-        try:
-            values = np.atleast_1d(np.array(given, dtype=np.float64))
-        except (TypeError, ValueError):
-            raise self._wrong(f"{what} gave {given!r}; numbers are wanted") from None
-        if values.ndim != 1 or (shape is not None and values.shape != shape):
-            raise self._wrong(f"{what} gave shape {values.shape}; {shape or '(n_x,)'} is wanted")
-        return values
-
-    def _wrong(self, words: str) -> PlantError:
-        return PlantError(f"{self.path}: {words}; {EXAMPLE}")
+def is_fmu(path: Path) -> bool:
+    """Whether a simulator's file is an FMU, by its ending."""
+    return path.suffix.lower() == FMU
 
 
-def _made(path: Path) -> Any:
-    """An instance of the one class of the file that has METHODS."""
-    if not path.is_file():
-        raise PlantError(f"{path}: no such file; give a Python file with the class of your plant ({EXAMPLE})")
-    spec = importlib.util.spec_from_file_location(f"own_simulator_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise PlantError(f"{path} is no Python file; give one with the class of your plant ({EXAMPLE})")
-    module = importlib.util.module_from_spec(spec)
-    makes: Callable[[], Any]
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise PlantError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from None
-    own = [c for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module.__name__]
-    fit = [c for c in own if all(callable(getattr(c, m, None)) for m in METHODS)]
-    if len(fit) != 1:
-        has = f"it has {', '.join(c.__name__ for c in fit or own) or 'no class'}"
-        raise PlantError(f"{path}: one class with {', '.join(METHODS)} is wanted; {has}; {EXAMPLE}")
-    (makes,) = fit
-    try:
-        return makes()
-    except Exception as error:
-        raise PlantError(f"{path}: {fit[0].__name__}() failed: {type(error).__name__}: {error}") from None
+def files_of(path: Path) -> tuple[Path, ...]:
+    """All files that a simulator in a file consists of."""
+    return (path, table_path(path)) if is_fmu(path) else (path,)
