@@ -28,6 +28,7 @@ class StructureSearch(Groundwork[Searched]):
     """The choices of params.yaml that decide the search."""
 
     kind: str
+    all_measured: bool  # all PVs are outputs, not the controlled ones alone
     orders: tuple[int, int] | None
     units: tuple[int, ...]
     correction: float | None
@@ -37,7 +38,7 @@ class StructureSearch(Groundwork[Searched]):
     def done(self, source: Source, label: str) -> Searched:
         """The search over the source's record; ModelError where it cannot carry a model."""
         record = informative(source.data(self.kind), self.rows)
-        n_y = len(source.signals.sp)
+        n_y = len(source.signals.pv if self.all_measured else source.signals.sp)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
         problem = Problem(data, folds(record), len(source.signals.mv), source.seed, self.correction or 0.0)
