@@ -46,10 +46,11 @@ class IdentifiedPart(Part):
     """A linear or nonlinear state-space model of the process variables, its structure chosen by held-out free runs.
 
     The outputs are the ``controlled`` variables, or all ``measured`` process variables: a second one tells of states
-    that the controlled one hides. The inputs are all MVs and measured disturbances. ``member`` numbers the
-    models of an ensemble: 0 is fitted to all rows, 1 and 2 to the rows of one fold each, with other seeds. ``orders``
-    are the least and the most states tried (None: 2 to 8, and two more for each further output); ``units`` the
-    numbers of tanh units tried, none for linear models only. ``correction`` is the share of the output's error that
+    that the controlled one hides. The inputs are all MVs and measured disturbances. ``member`` numbers the models of
+    an ensemble: 0 is fitted to all rows, 1 and 2 to the rows of one fold each, with other seeds. ``orders`` are the
+    least and the most states tried (None: 2 to 8, and two more for each further output); beside them, ``lagged``
+    offers past outputs and inputs as states, up to 18 of them. ``units`` are the numbers of tanh units tried, none
+    for linear models only. ``correction`` is the share of the output's error that
     each sample of a training run takes back, None: 0, or .05 where that does better in plain free runs; a number
     given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
     one core (None: 2, and 2 more for each further output), counted in nominal work so that results are reproducible;
@@ -61,6 +62,7 @@ class IdentifiedPart(Part):
     member: int = 0
     outputs: Literal["controlled", "measured"] = "controlled"
     orders: tuple[int, int] | None = None
+    lagged: bool = True
     units: tuple[int, ...] = UNITS
     correction: float | None = None
     minutes: float | None = None
@@ -88,6 +90,7 @@ class IdentifiedPart(Part):
             self.model.kind,
             self.outputs == "measured",
             self.orders,
+            self.lagged,
             tuple(self.units),
             self.correction,
             self.minutes,

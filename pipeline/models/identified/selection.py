@@ -67,22 +67,27 @@ class Selection:
 
 
 def select(
-    rounds: Rounds, *, orders: Sequence[int], units: Sequence[int], correction: float | None = None
+    rounds: Rounds,
+    *,
+    orders: Sequence[int],
+    units: Sequence[int],
+    correction: float | None = None,
+    lagged: bool = True,
 ) -> Selection:
     """The search over one record.
 
     Linear candidates first: balanced starts of each order with and without the dead times that the impulse
-    response shows, and lagged starts; where the record leaves it open, with the MVs acting in their own row too.
-    Then networks on the best of them, unless its residual is white and follows no curve of its state and its inputs, in
-    rounds that keep fewer and train them longer. When the budget is spent, what
-    there is decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
+    response shows, and lagged starts unless ``lagged`` is false; where the record leaves it open, with the MVs acting
+    in their own row too. Then networks on the best of them, unless its residual is white and follows no curve of its
+    state and its inputs, in rounds that keep fewer and train them longer. When the budget is spent, what there is
+    decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
     much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or, where the
     plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no candidate can be
     fitted.
     """
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
-    linear = search.finish(search.first_round(orders, given))
+    linear = search.finish(search.first_round(orders, given, lagged))
     if _integrates(linear[0]):
         settling = [t for t in search.settling(linear) if not _integrates(t) and t.error <= NEARLY * linear[0].error]
         linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear

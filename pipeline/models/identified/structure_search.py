@@ -30,6 +30,7 @@ class StructureSearch(Groundwork[Searched]):
     kind: str
     all_measured: bool  # all PVs are outputs, not the controlled ones alone
     orders: tuple[int, int] | None
+    lagged: bool
     units: tuple[int, ...]
     correction: float | None
     minutes: float | None
@@ -46,5 +47,5 @@ class StructureSearch(Groundwork[Searched]):
         least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
-        selection = select(rounds, orders=orders, units=self.units, correction=self.correction)
+        selection = select(rounds, orders=orders, units=self.units, correction=self.correction, lagged=self.lagged)
         return Searched(replace(problem, settles=selection.settles), selection, scales)
