@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -43,12 +43,14 @@ NEAR = 1.05
 
 @dataclass(frozen=True, kw_only=True)
 class IdentifiedPart(Part):
-    """A linear or nonlinear state-space model of all controlled variables, its structure chosen by held-out free runs.
+    """A linear or nonlinear state-space model of the process variables, its structure chosen by held-out free runs.
 
-    The outputs are the controlled variables; the inputs all MVs and measured disturbances. ``member`` numbers the
-    models of an ensemble: 0 is fitted to all rows, 1 and 2 to the rows of one fold each, with other seeds. ``orders``
-    are the least and the most states tried (None: 2 to 8, and two more for each further output); ``units`` the
-    numbers of tanh units tried, none for linear models only. ``correction`` is the share of the output's error that
+    The outputs are the ``controlled`` variables, or all ``measured`` process variables: a second one tells of states
+    that the controlled one hides. The inputs are all MVs and measured disturbances. ``member`` numbers the models of
+    an ensemble: 0 is fitted to all rows, 1 and 2 to the rows of one fold each, with other seeds. ``orders`` are the
+    least and the most states tried (None: 2 to 8, and two more for each further output); beside them, ``lagged``
+    offers past outputs and inputs as states, up to 18 of them. ``units`` are the numbers of tanh units tried, none
+    for linear models only. ``correction`` is the share of the output's error that
     each sample of a training run takes back, None: 0, or .05 where that does better in plain free runs; a number
     given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
     one core (None: 2, and 2 more for each further output), counted in nominal work so that results are reproducible;
@@ -58,7 +60,9 @@ class IdentifiedPart(Part):
 
     model: ClassVar[type[Model]] = Identified
     member: int = 0
+    outputs: Literal["controlled", "measured"] = "controlled"
     orders: tuple[int, int] | None = None
+    lagged: bool = True
     units: tuple[int, ...] = UNITS
     correction: float | None = None
     minutes: float | None = None
@@ -67,6 +71,8 @@ class IdentifiedPart(Part):
     def __post_init__(self) -> None:
         if self.member not in (0, 1, 2):
             raise ValueError(f"member is {self.member}; an ensemble has the members 0, 1 and 2")
+        if self.outputs not in ("controlled", "measured"):
+            raise ValueError(f"outputs is {self.outputs!r}; allowed are controlled, measured")
         if self.orders is not None and not 1 <= self.orders[0] <= self.orders[1]:
             raise ValueError(f"orders are {list(self.orders)}; give the least and the most, e.g. [2, 8]")
         if any(n < 1 for n in self.units):
@@ -81,14 +87,21 @@ class IdentifiedPart(Part):
     def groundwork(self) -> StructureSearch:
         """The search for the structure, which all members share."""
         return StructureSearch(
-            self.model.kind, self.orders, tuple(self.units), self.correction, self.minutes, self.rows
+            self.model.kind,
+            self.outputs == "measured",
+            self.orders,
+            self.lagged,
+            tuple(self.units),
+            self.correction,
+            self.minutes,
+            self.rows,
         )
 
     def learn(self, source: Source) -> Learnt:
         """Search, fit the member, and report on the class of model over rows that its fold's fits never saw."""
-        n_y, n_mv = len(source.signals.sp), len(source.signals.mv)
         searched = source.result(self.groundwork())
         problem, selection, scales = searched.problem, searched.selection, searched.scales
+        n_y, n_mv = len(scales.y_scale), len(source.signals.mv)
         structure = selection.chosen.structure
         fitted = within_limits(problem, structure, _member(problem, selection, self.member))
         noise, found, whole = _residuals(problem, structure, fitted.model)

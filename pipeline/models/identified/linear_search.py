@@ -51,12 +51,15 @@ class LinearSearch:
             starts |= rounds.starts([replace(none, delays=first.dead_times)])
         return cls(rounds, starts)
 
-    def first_round(self, orders: Sequence[int], correction: float) -> list[Trial]:
-        """The candidates after a short training on the first fold, best first; ModelError where none can be fitted."""
+    def first_round(self, orders: Sequence[int], correction: float, lagged: bool = True) -> list[Trial]:
+        """The candidates after a short training on the first fold, best first; ModelError where none can be fitted.
+
+        Without ``lagged`` the balanced ones alone.
+        """
         n_y, n_v = self.rounds.problem.data.y.shape[1], self.rounds.problem.data.v.shape[1]
         options = list(dict.fromkeys(s.delays for s, _ in self.starts))
         structures = [Structure("balanced", n, (0, 0), d) for d in options for n in orders]
-        for y_lags, v_lags in LAGS:
+        for y_lags, v_lags in LAGS if lagged else ():
             order = y_lags * n_y + (v_lags - 1) * n_v
             if order <= MOST_STATES:
                 structures.extend(Structure("lagged", order, (y_lags, v_lags), d) for d in options)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.models.identified.candidates import misses
+from pipeline.models.identified.curvature import curved
 from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
@@ -32,7 +33,7 @@ GAIN = 0.01
 """Least relative gain of a network over the linear model, beside its spread."""
 
 WHITE = 1.01
-"""Residual over noise up to which a linear model leaves nothing to gain, so that no network is tried."""
+"""Residual over noise up to which a linear model leaves nothing to gain but curves of its state and its inputs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,21 +67,27 @@ class Selection:
 
 
 def select(
-    rounds: Rounds, *, orders: Sequence[int], units: Sequence[int], correction: float | None = None
+    rounds: Rounds,
+    *,
+    orders: Sequence[int],
+    units: Sequence[int],
+    correction: float | None = None,
+    lagged: bool = True,
 ) -> Selection:
     """The search over one record.
 
     Linear candidates first: balanced starts of each order with and without the dead times that the impulse
-    response shows, and lagged starts; where the record leaves it open, with the MVs acting in their own row too.
-    Then networks on the best of them, in rounds that keep fewer and train them longer. When the budget is spent, what
-    there is decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
+    response shows, and lagged starts unless ``lagged`` is false; where the record leaves it open, with the MVs acting
+    in their own row too. Then networks on the best of them, unless its residual is white and follows no curve of its
+    state and its inputs, in rounds that keep fewer and train them longer. When the budget is spent, what there is
+    decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
     much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or, where the
     plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no candidate can be
     fitted.
     """
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
-    linear = search.finish(search.first_round(orders, given))
+    linear = search.finish(search.first_round(orders, given, lagged))
     if _integrates(linear[0]):
         settling = [t for t in search.settling(linear) if not _integrates(t) and t.error <= NEARLY * linear[0].error]
         linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear
@@ -93,7 +100,8 @@ def select(
     offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
     settles = not _integrates(linear[0])
     networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
-    finalists = networks.finalists(units) if _misses(rounds.problem, linear[0], WHITE) else []
+    lacking = _misses(rounds.problem, linear[0], WHITE) or _curved(rounds.problem, linear[0])
+    finalists = networks.finalists(units) if lacking else []
     best = best_of(finalists)
     drift = _drift(rounds.problem, min(best, linear[0], key=_trained)) if correction is None and best else None
     drifting = drift is not None and drift.found
@@ -122,6 +130,12 @@ def _with_correction(trial: Trial, correction: float) -> Trial:
 def _integrates(trial: Trial) -> bool:
     poles = np.linalg.eigvals(trial.of_fold(trial.folds[0])[0].model.a)
     return bool(np.abs(poles).max() > INTEGRATES)
+
+
+def _curved(problem: Problem, trial: Trial) -> bool:
+    fold = trial.folds[0]
+    best = trial.of_fold(fold)[0]
+    return curved(best.model, best.starts, problem.train(trial.structure, fold), trial.structure.correction)
 
 
 def _misses(problem: Problem, trial: Trial, ratio: float) -> bool:

@@ -28,7 +28,9 @@ class StructureSearch(Groundwork[Searched]):
     """The choices of params.yaml that decide the search."""
 
     kind: str
+    all_measured: bool  # all PVs are outputs, not the controlled ones alone
     orders: tuple[int, int] | None
+    lagged: bool
     units: tuple[int, ...]
     correction: float | None
     minutes: float | None
@@ -37,7 +39,7 @@ class StructureSearch(Groundwork[Searched]):
     def done(self, source: Source, label: str) -> Searched:
         """The search over the source's record; ModelError where it cannot carry a model."""
         record = informative(source.data(self.kind), self.rows)
-        n_y = len(source.signals.sp)
+        n_y = len(source.signals.pv if self.all_measured else source.signals.sp)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
         problem = Problem(data, folds(record), len(source.signals.mv), source.seed, self.correction or 0.0)
@@ -45,5 +47,5 @@ class StructureSearch(Groundwork[Searched]):
         least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
-        selection = select(rounds, orders=orders, units=self.units, correction=self.correction)
+        selection = select(rounds, orders=orders, units=self.units, correction=self.correction, lagged=self.lagged)
         return Searched(replace(problem, settles=selection.settles), selection, scales)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import made_plants
@@ -53,6 +54,16 @@ def test_two_by_two_with_a_measured_disturbance() -> None:
     assert noise_sd(learnt, "y1") == pytest.approx(0.1, rel=0.1)
     model = identified(learnt)
     assert (model.n_y, model.n_mv, model.n_dv) == (2, 2, 1)
+
+
+def test_a_second_process_variable_is_an_output_where_all_measured_ones_are() -> None:
+    record, signals = made_plants.two_by_two(600), made_plants.signals_of(2, 2)
+    source = Source(record, replace(signals, sp=signals.pv[:1]))
+    small = replace(LINEAR, minutes=0.02)
+    alone, both = (identified(replace(small, outputs=o).learn(source)) for o in ("controlled", "measured"))
+    assert (alone.n_y, both.n_y) == (1, 2)
+    assert small.groundwork() != replace(small, outputs="measured").groundwork()
+    assert both.y_center.numpy() == pytest.approx(record.pv.mean(axis=0))
 
 
 def test_an_integrator_keeps_its_slope_and_its_poles_inside() -> None:
@@ -123,6 +134,7 @@ def test_a_long_record_gives_its_liveliest_blocks() -> None:
     ("options", "message"),
     [
         ({"member": 3}, "member is 3; an ensemble has"),
+        ({"outputs": "all"}, "outputs is 'all'; allowed are controlled, measured"),
         ({"orders": [3, 2]}, r"orders are \[3, 2\]; give the least"),
         ({"units": [0]}, r"units are \[0\]; each must be"),
         ({"minutes": 0.0}, "minutes is 0; it must be positive"),
