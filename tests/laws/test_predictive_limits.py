@@ -8,6 +8,7 @@ import pytest
 import torch
 from identified_models import TOP, first_order, made_signals, random_model, scaled_model
 from predictive_loops import closed, law_of
+from scipy.optimize import brentq
 
 from pipeline.config.params import parse
 from pipeline.errors import LawError, ParamsError
@@ -17,7 +18,7 @@ from pipeline.laws.predictive.moves import Moves
 from pipeline.laws.predictive.params import PredictiveParams, limits_of
 from pipeline.laws.predictive.plan import Cost, Planner
 from pipeline.laws.predictive.predictive import Predictive
-from pipeline.laws.predictive.soft_limits import EPS, PRICE, SoftLimits
+from pipeline.laws.predictive.soft_limits import EPS, PRICE, SOFT, SoftLimits
 from pipeline.models.identified.identified import Identified
 from pipeline.plants.equations import EquationPlant
 
@@ -55,32 +56,38 @@ def test_limits_that_are_far_away_leave_the_plan_as_it_is() -> None:
 
 
 # ---------------------------------------------------------------------- the cost
-@pytest.mark.parametrize("seed", range(5))
-def test_the_push_is_the_slope_of_the_penalty_and_its_quadratic_lies_above(seed: int) -> None:
-    """s (y - y0) + w (y - y0)^2/2 touches the penalty at a y0 beyond a limit, and lies above it elsewhere."""
-    rng, price = np.random.default_rng(seed), 7.0
-    low, high = np.tile([-1.0, -np.inf], 3), np.tile([1.0, 0.5], 3)
-    limits = SoftLimits(torch.from_numpy(low[:2]), torch.from_numpy(high[:2]), price, horizon=3)
+def slope_at(beyond: float, price: float) -> float:
+    """p'(b) as its formula stands."""
+    return price * beyond**2 / ((abs(beyond) + SOFT) * np.sqrt(beyond**2 + EPS**2)) * np.sign(beyond)
 
-    def penalty(y: np.ndarray) -> np.ndarray:
-        beyond = np.maximum(y - high, 0) + np.maximum(low - y, 0)
-        return price * np.sqrt(beyond**2 + EPS**2)
 
-    y0 = rng.uniform(-2, 2, 6)
-    weight, slope = (t.numpy() for t in limits(torch.from_numpy(y0)))
-    np.testing.assert_allclose(slope, (penalty(y0 + 1e-6) - penalty(y0 - 1e-6)) / 2e-6, atol=1e-6)
-    beyond = weight > 0
-    np.testing.assert_array_equal(beyond, (y0 < low) | (y0 > high))
-    steps = rng.normal(size=(200, 6))
-    above = penalty(y0) + slope * steps + 0.5 * weight * steps**2 - penalty(y0 + steps)
-    assert above[:, beyond].min() > -1e-12
+def test_the_push_begins_at_the_limit_without_a_jump_and_grows_to_its_price() -> None:
+    y = torch.linspace(-3, 3, 12_001, dtype=torch.float64)
+    limits = SoftLimits(torch.tensor([-1.0]).double(), torch.tensor([0.5]).double(), 7.0, horizon=len(y))
+    weight, slope = (t.numpy() for t in limits(y))
+    beyond = (y - y.clamp(-1.0, 0.5)).numpy()
+    np.testing.assert_allclose(slope, [slope_at(b, 7.0) for b in beyond], atol=1e-12)
+    np.testing.assert_allclose(slope, weight * beyond)
+    assert not weight[np.abs(beyond) < 1e-12].any()
+    assert (np.diff(slope) >= -1e-12).all()  # the cost is convex
+    assert np.abs(np.diff(weight)).max() < 0.25 * weight.max()  # in steps of .0005
+    assert 6.9 < slope[-1] < 7.0
+    assert -7.0 < slope[0] < -6.9
+
+
+def test_a_variable_without_a_limit_is_never_pushed() -> None:
+    limits = SoftLimits(torch.tensor([-np.inf, -1.0]), torch.tensor([1.0, np.inf]), 7.0, horizon=2)
+    weight, slope = limits(torch.tensor([-9.0, 9.0, 2.0, -2.0], dtype=torch.float64))
+    assert ((weight > 0) == torch.tensor([False, False, True, True])).all()
+    assert (slope.sign() == torch.tensor([0, 0, 1, -1])).all()
 
 
 @pytest.mark.parametrize("seed", [3, 4, 8])
 def test_the_plan_costs_nearly_the_least_that_a_plan_can_cost(seed: int) -> None:
     """A linear model makes the cost convex, and a convex solver finds its minimum.
 
-    A weight that appears where a sample crosses a limit lets passes end beside the minimum, not at it.
+    Weights that appear where a sample crosses a limit let passes end beside the minimum, not at it; the solver's cost
+    lacks the small rounding of the corner.
     """
     model, n = random_model(seed, n_y=2, n_mv=2, n_hidden=0), 15
     moves = Moves.over(n, 4, 2)
@@ -127,7 +134,7 @@ def test_an_overshoot_stays_within_the_limit_and_goes_beyond_without_it(sign: fl
     given = {"cv_high": (high,)} if sign > 0 else {"cv_low": (-high,)}
     held, free = (sign * closed(law_of(model, **p), model, sign * sp)[0] for p in (given, {}))
     assert free.max() - high > 0.02
-    assert held.max() - high < 0.006
+    assert held.max() - high < 0.01
     assert abs(held[39, 0] - 1.0) < 0.005
 
 
@@ -135,13 +142,13 @@ def test_an_overshoot_stays_within_the_limit_and_goes_beyond_without_it(sign: fl
 def test_a_limit_of_one_variable_goes_before_the_set_point_of_another(gain: float) -> None:
     """y1 wants 1.5 for which y2 would end at .75 gain; its limit is at .3 gain, where y1 is .6.
 
-    The errors would gain less than (2 + gain)/gain of what y2 goes beyond, so it goes beyond by no more than
-    eps l/sqrt(rho^2 - l^2) for that l.
+    The errors would gain less than l = (2 + gain)/gain of what y2 goes beyond, so it goes beyond by no more than the
+    b at which the slope of the limit's cost is l.
     """
     model, sp = two_by_one(gain), np.tile([1.5, 0.0], (80, 1))
     free, held = (closed(law_of(model, **SMALL, cv_high=high), model, sp)[0] for high in (None, (None, 0.3 * gain)))
     most = (2 + gain) / gain
-    allowed = EPS * most / np.sqrt(PRICE**2 - most**2)
+    allowed = brentq(lambda b: slope_at(b, PRICE) - most, 0.0, 1.0)
     assert free[-1, 1] > 0.6 * gain
     assert held[-1, 1] - 0.3 * gain < allowed
     assert held[:, 1].max() - 0.3 * gain < max(allowed, 0.01)
