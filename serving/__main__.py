@@ -28,8 +28,8 @@ def run_inspect(options: argparse.Namespace) -> None:
 def bench_options(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``bench``."""
     parser.add_argument("file", metavar="FILE", help="a controller's .onnx file")
-    parser.add_argument("--steps", type=_positive, default=5_000, metavar="N", help="hot steps (5000)")
-    parser.add_argument("--loop-steps", type=_positive, default=500, metavar="N", help="steps in the loop (500)")
+    parser.add_argument("--steps", type=_positive, default=20_000, metavar="N", help="hot steps (20000)")
+    parser.add_argument("--loop-steps", type=_positive, default=1_000, metavar="N", help="steps in the loop (1000)")
     parser.add_argument("--period-ms", type=_positive, default=10, metavar="MS", help="period of the loop (10)")
 
 

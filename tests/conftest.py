@@ -54,7 +54,10 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "self_tuning_pid": [{"prefilter": (0.5,), "forgetting": 1.0}],
     "model_reference": [{"order": 4}],
     "pi_reference": [{"tuning": "manual", "kc": -45.0, "ti_s": 5.0, "order": 1}],
-    "predictive": [{"passes": 1, "mv_rate": 20.0, "speed": 0.5}],
+    "predictive": [
+        {"passes": 1, "mv_rate": 20.0, "speed": 0.5},
+        {"passes": 1, "moves": 3, "preview": "ramp", "cv_high": (9.0,)},
+    ],
     "local_pid_network": [{"blending": "outputs"}, {"blending": "velocity"}],
 }
 # The plant that a law is for; the others are designed over the first case's.

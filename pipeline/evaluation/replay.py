@@ -68,30 +68,35 @@ class Replay:
         return {name: getattr(self, name) for name in ("time_s", "sp", "pv", "asked", "done")}
 
 
-def replay(law: Steps, record: Record, signals: Signals, ahead: int) -> Replay:
+def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row: bool = False) -> Replay:
     """A law over the last fifth of a record, at most ``MOST`` rows, with the recorded PVs, disturbances and MVs.
 
     No set point stands in a record. The law is given where the operation went: the mean of each recorded CV over the
-    next ``ahead`` samples of its run. ``signals`` are the law's. Raises RecordError where there are no two rows.
+    next ``ahead`` samples of its run. ``signals`` are the law's. An MV acts on the outputs of the next row, or with
+    ``same_row`` on those of its own: then what was done at a row stands in the next one, and the last row of a run,
+    which has none, is left out. Raises RecordError where there are no two rows.
     """
     n = len(record)
     first = max(n - round(UNSEEN * n), n - MOST, 0)
-    if n - first < 2:
-        raise RecordError(f"the record has {n} rows, too few to replay its last fifth; record more")
     rows, n_sp, n_pv = np.arange(first, n), len(signals.sp), len(signals.pv)
     begins = np.flatnonzero(np.r_[True, record.run[1:] != record.run[:-1]])
     ends = np.append(begins[1:], n)[np.searchsorted(begins, rows, side="right") - 1]
-    ends = np.minimum(rows + ahead, ends)
+    known = rows + same_row < ends
+    rows, ends = rows[known], np.minimum(rows + ahead, ends)[known]
+    if len(rows) < 2:
+        raise RecordError(f"the record has {n} rows, too few to replay its last fifth; record more")
     sp = np.array([record.pv[k:end, :n_sp].mean(axis=0) for k, end in zip(rows, ends, strict=True)])
-    asked, state = np.empty((len(rows), record.mv.shape[1])), law.cold_state()
+    done = record.mv[rows + same_row]
+    asked, state = np.empty(done.shape), law.cold_state()
     for i, k in enumerate(rows):
         fresh = i == 0 or k in begins
         state = law.cold_state() if fresh else state
-        before = record.mv[k if fresh else k - 1]
+        # What acted over the last period; nobody knows it of the first row of a run, unless it stands in that row.
+        before = record.mv[k if same_row or fresh else k - 1]
         try:
             pv, dv = record.pv[k, :n_pv], record.dv[k]
             asked[i], state, _ = law.step(sp=sp[i], pv=pv, dv=dv, mv_applied=before, state=state)
         except LoopwrightError:
             asked[i], state = np.nan, law.cold_state()
     time_s = record.period_s * np.arange(len(rows), dtype=np.float64)
-    return Replay(time_s, sp, record.pv[rows, :n_sp], asked, record.mv[rows])
+    return Replay(time_s, sp, record.pv[rows, :n_sp], asked, done)

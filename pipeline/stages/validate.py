@@ -22,6 +22,7 @@ from pipeline.evaluation.case import Case
 from pipeline.evaluation.evidence import WITHHELD
 from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
+from pipeline.evaluation.model_evidence import identified_part
 from pipeline.evaluation.reached import grounds_of, widest
 from pipeline.evaluation.replay import replay
 from pipeline.evaluation.trial import Metrics, Trial, step_us, try_file
@@ -81,7 +82,8 @@ def validate(name: str) -> None:
         raise LawError(withheld)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    replayed = _replayed(case, source, folder / "replay.npz")
+    models = read_json(model_folder(params.case, params.model) / "metrics.json") if case.on_models else {}
+    replayed = _replayed(case, models, source, folder / "replay.npz")
     metrics = replace(_metrics(params, case, designed, trials, shipped), replay=replayed)
     metrics.write(folder / "metrics.json")
     took = step_us(Controller(source), next(iter(shipped.curves.values())), case.plant.dv_nominal)
@@ -91,7 +93,6 @@ def validate(name: str) -> None:
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)
     _keep_analysis(params, shipped.seed, folder / "analysis.npz")
-    models = read_json(model_folder(params.case, params.model) / "metrics.json") if case.on_models else {}
     evidence = _evidence(case, base, shipped, grounds_of(case, models, [metrics.reached]))
     if (analysis := metrics.forms[BASE].analysis) is not None:
         evidence["analysis"] = analysis.figures
@@ -111,12 +112,16 @@ def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:
     return {test: {str(t.seed): t.locked_up[test] for t in base if test in t.locked_up} for test in tests}
 
 
-def _replayed(case: Case, file: Path, path: Path) -> dict[str, dict[str, float]]:
-    """Figures of the file over the last rows of the plant's record, their curves kept; none without a record."""
+def _replayed(case: Case, models: Mapping[str, Any], file: Path, path: Path) -> dict[str, dict[str, float]]:
+    """Figures of the file over the last rows of the plant's record, their curves kept; none without a record.
+
+    ``models`` is metrics.json of the law's model set, which says in which row of the record an MV acts.
+    """
     if case.replayed is None:
         return {}
     record, ahead = case.replayed
-    found = replay(Controller(file), record, case.plant.signals, ahead)
+    structure = identified_part({"": models}).get("structure") or {}
+    found = replay(Controller(file), record, case.plant.signals, ahead, same_row=bool(structure.get("same_row")))
     np.savez_compressed(path, **cast(dict[str, Any], found.arrays()))
     return found.figures(record)
 

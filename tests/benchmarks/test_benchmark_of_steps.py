@@ -40,7 +40,7 @@ class Bench:
         self.rows_before.append(len(self.shown.splitlines()) - TITLE)
         self.now += 3.0
         self.calls += 1
-        return tuple(SimpleNamespace(p50=x) for x in (self.hot_us, self.hot_us, 9 * self.hot_us))
+        return tuple(SimpleNamespace(p50=x, alone=4 * x) for x in (self.hot_us, self.hot_us, 9 * self.hot_us))
 
 
 def run(step: ModuleType, bench: Bench, monkeypatch: pytest.MonkeyPatch, *options: str) -> int:
@@ -94,3 +94,11 @@ def test_the_perfect_models_step_is_sampled(step: ModuleType, monkeypatch: pytes
     assert samples == 16  # the first after 30 s is not begun
     assert step.nmpc_median_us("thiosulfate_cstr", 50, 0.0)[1] == step.LEAST_SAMPLES
     assert step.nmpc_median_us("thiosulfate_cstr", 5, 1e9)[1] == 5
+
+
+def test_a_long_tail_is_a_complaint_about_a_law_of_long_steps_alone(step: ModuleType) -> None:
+    assert step.complaints("predictive", 300.0, 300.0, 30.0, 3.5) == ["p99.9 over 3 p50"]
+    assert step.complaints("predictive", 300.0, 300.0, 30.0, 2.5) == []
+    assert step.complaints("predictive", 300.0, 300.0, 30.0, float("nan")) == []
+    assert step.complaints("inc", 5.0, 5.0, 300.0, 9.0) == []
+    assert step.complaints("predictive", 501.0, 300.0, 30.0, 1.0) == ["hot over 500"]

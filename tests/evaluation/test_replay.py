@@ -88,6 +88,50 @@ def test_the_figures_count_in_shares_of_the_range() -> None:
     assert replay(Law(more=5.0), data, SIGNALS, ahead=5).figures(data)["u"]["at_end"] == 100
 
 
+@dataclass
+class Velocity:
+    """Moves the applied MV by the error and by its change."""
+
+    def cold_state(self) -> np.ndarray:
+        return np.zeros(2)
+
+    def step(self, **inputs: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        started, last = inputs["state"]
+        error = inputs["sp"][0] - inputs["pv"][0]
+        move = 0.3 * error + 0.5 * (error - last) * started
+        return inputs["mv_applied"] + move, np.array([1.0, error]), np.zeros(0)
+
+
+def operation(same_row: bool) -> Record:
+    """One operation of a lag in two runs; a logger stores the MV of a period with its first row, or with the next."""
+    rng = np.random.default_rng(1)
+    y, acting = np.zeros(N), rng.uniform(-0.8, 0.8, N)
+    for k in range(1, N):
+        y[k] = 0.8 * y[k - 1] + 0.5 * acting[k - 1]
+    stored = np.roll(acting, 1) if same_row else acting
+    return Record.of(SIGNALS, 5 + y[:, None], stored[:, None], run=np.repeat([0, 1], [88, 12]))
+
+
+def test_an_operation_is_the_same_in_whichever_row_its_moves_stand() -> None:
+    usual = replay(Velocity(), operation(False), SIGNALS, ahead=4)
+    late = replay(Velocity(), operation(True), SIGNALS, ahead=4, same_row=True)
+    kept = np.setdiff1d(np.arange(20), [7, 19])  # the last row of a run has no move in the late record
+    np.testing.assert_array_equal(late.done, usual.done[kept])
+    np.testing.assert_array_equal(late.sp, usual.sp[kept])
+    np.testing.assert_array_equal(late.pv, usual.pv[kept])
+    fresh = np.isin(kept, [0, 8])  # what acted before the first row stands in the late record alone
+    np.testing.assert_array_equal(late.asked[~fresh], usual.asked[kept][~fresh])
+    wrong = replay(Velocity(), operation(True), SIGNALS, ahead=4)
+    assert np.abs(wrong.asked - usual.asked)[1:8].min() > 0
+
+
+def test_a_late_record_knows_what_acted_before_its_first_row() -> None:
+    law, data = Law(), operation(True)
+    replay(law, data, SIGNALS, ahead=4, same_row=True)
+    applied = np.array([given["mv_applied"] for given in law.given])
+    np.testing.assert_array_equal(applied, data.mv[[*range(80, 87), *range(88, 99)]])
+
+
 def test_a_record_that_is_too_short_says_so() -> None:
     short = Record.of(SIGNALS, np.zeros((3, 1)), np.zeros((3, 1)))
     with pytest.raises(RecordError, match="3 rows, too few to replay"):

@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from identified_models import first_order, made_signals, random_model, scaled_model
+from predictive_loops import NONE, closed, law_of, row
 from torch import Tensor
 
 from pipeline.errors import LawError
@@ -40,21 +41,12 @@ from pipeline.models.static.mlp import MLP
 from serving import Controller
 from serving.manifest import Signal
 
-NONE = torch.zeros(0, dtype=torch.float64)
 few = settings(max_examples=15, deadline=None)
 seeds = st.integers(0, 2**16)
 
 
 def same(z: Tensor) -> Tensor:
     return z
-
-
-def law_of(model: Identified, **params) -> Predictive:
-    return Predictive(made_signals(model.n_y, model.n_mv, model.n_dv), model, Predictive.Params(**params)).eval()
-
-
-def row(*values: float) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 # ---------------------------------------------------------------------- moves
@@ -124,7 +116,7 @@ def test_the_plan_is_the_minimum_of_its_cost(sp: float, rate: float | None) -> N
     rates = None if rate is None else torch.full((2,), rate, dtype=torch.float64)
     planner = Planner(horizon, moves, Cost((1.0, 0.5), 0.2, 0.1, 0.3), passes=60, sweeps=30, rate=rates)
     start, applied, wanted = torch.zeros(1, 6, dtype=torch.float64), row(0.2, -0.1)[None], row(sp, -0.2)[None]
-    plan, ahead = planner(start, wanted, applied, torch.zeros(1, moves.count, dtype=torch.float64))
+    plan, ahead = planner(start, wanted.repeat(1, 15), applied, torch.zeros(1, moves.count, dtype=torch.float64))
 
     z = cp.Variable(moves.count)
     free = horizon(start, torch.zeros_like(plan))
@@ -278,27 +270,6 @@ def test_an_unstable_model_is_refused(n_hidden: int) -> None:
 
 
 # ---------------------------------------------------------------------- closed loops
-def closed(law: Predictive, plant: Identified, sp: np.ndarray, *, load=None, dv=None, noise=0.0, seed=0, mv=None):
-    """PVs and MVs (n, .) of a loop over a plant that starts at rest at zero, and the law's info."""
-    n, rng = len(sp), np.random.default_rng(seed)
-    x, state = torch.zeros(plant.n_x, dtype=torch.float64), torch.zeros(law.n_state, dtype=torch.float64)
-    applied = torch.zeros(plant.n_mv, dtype=torch.float64) if mv is None else mv
-    ys, mvs, infos = [], [], []
-    with torch.no_grad():
-        for k in range(n):
-            y = plant.measured(x)
-            disturbance = NONE if dv is None else row(dv[k])
-            seen = y + noise * torch.from_numpy(rng.normal(size=plant.n_y))
-            applied, state, info = law(torch.from_numpy(sp[k]), seen, disturbance, applied, state)
-            ys.append(y.numpy())
-            mvs.append(applied.numpy())
-            infos.append(info.numpy())
-            x = plant(torch.cat([x, applied, disturbance]))
-            if load is not None:
-                x[: plant.n_y] += torch.from_numpy(np.atleast_1d(load[k]))
-    return np.array(ys), np.array(mvs), np.array(infos)
-
-
 @given(gain=st.floats(0.6, 1.6), load=st.floats(-0.1, 0.1), sp=st.floats(-1.0, 1.0))
 @few
 def test_a_wrong_gain_and_a_load_leave_no_offset(gain: float, load: float, sp: float) -> None:
@@ -388,9 +359,10 @@ def test_speed_moves_faster_and_caution_follows_loads_slower() -> None:
     assert found[1] < found[0]
 
 
-def test_more_mvs_disturbances_and_a_rate_export(tmp_path) -> None:
+def test_more_mvs_disturbances_a_rate_limits_and_a_recipe_export(tmp_path) -> None:
     model = random_model(2, n_y=2, n_mv=2, n_dv=1, n_x=5, n_hidden=4)
-    law = law_of(model, horizon=10, moves=3, passes=1, sweeps=2, mv_rate=0.1)
+    more = {"mv_rate": 0.1, "cv_low": (None, -1.0), "cv_high": (None, 1.0), "preview": "ramp"}
+    law = law_of(model, horizon=8, moves=2, passes=1, sweeps=2, **more)
     manifest = export(law, tmp_path / "law.onnx", case="made", provenance={})
     assert manifest.info == ("load_u0", "load_u1", "next_y0", "next_y1", "boost_y0", "boost_y1")
     assert Controller(tmp_path / "law.onnx").cold_state().shape == (law.n_state,)

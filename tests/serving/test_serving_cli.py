@@ -83,11 +83,16 @@ def test_json(pi_file: Path, capsys: Capture) -> None:
 def test_bench(pi_file: Path, capsys: Capture) -> None:
     assert main(["bench", str(pi_file), "--steps", "50", "--loop-steps", "10"]) == 0
     head, *rows = capsys.readouterr().out.splitlines()
-    assert head.split() == ["step", "[us]", "p50", "p99", "p99.9"]
+    *rows, note = rows
+    assert head.split() == ["step", "[us]", "p50", "p99", "p99.9", "waited", "p99.9", "of", "the", "others"]
     assert [row[:22].strip() for row in rows] == ["hot", "every 10 ms, warmed", "every 10 ms, cold"]
     for row in rows:
-        p50, p99, p999 = map(float, row[22:].split())
-        assert 0 < p50 <= p99 <= p999
+        p50, p99, p999, waited, _, alone, _, times, _ = row[22:].split()
+        assert 0 < float(p50) <= float(p99) <= float(p999)
+        assert 0 <= float(waited) <= 100
+        assert not float(alone) > float(p999)
+        assert float(times) == pytest.approx(float(alone) / float(p50), abs=0.06, nan_ok=True)
+    assert "other programs" in note
 
 
 def test_errors_are_one_line(pi_file: Path, tmp_path: Path, capsys: Capture) -> None:

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from pipeline.cases.thiosulfate_cstr.case import TJ, ThiosulfateCstrCase
 from pipeline.engine.command import run_stage
 from pipeline.errors import LawError
 from pipeline.evaluation.law_evidence import LawMetrics
+from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario, held
 from pipeline.stages import validate as stage
 from serving import Controller
@@ -121,3 +123,20 @@ def test_a_sound_law_is_shipped_without_a_word(made: Callable[..., None]) -> Non
     assert list(measured.forms["base"].tests) == ["step", "step_noise"]
     with np.load(MEASURED.with_name("trajectories.npz")) as curves:
         assert curves[f"longer/base/{measured.shipped_seed}/pv"].shape == (160, 2)
+
+
+@pytest.mark.parametrize("same_row", [True, False])
+def test_the_replay_takes_the_row_convention_of_the_law_s_model(same_row: bool, tmp_path: Path) -> None:
+    rng, signals = np.random.default_rng(0), ShortCase().plant.signals
+    pv, mv = (
+        rng.uniform([s.low for s in group], [s.high for s in group], (50, len(group)))
+        for group in (signals.pv, signals.mv)
+    )
+    record = Record.of(signals, pv, mv)
+    case: Any = SimpleNamespace(replayed=(record, 5), plant=ShortCase().plant)
+    seeds = {"0": {"structure": {"same_row": same_row}}}
+    models = {"parts": {"identified": {"kind": "identified", "per_seed": seeds}}}
+    figures = stage._replayed(case, models, FILE, tmp_path / "replay.npz")
+    assert figures[signals.mv[0].name]["refused"] == 0
+    with np.load(tmp_path / "replay.npz") as rows:
+        np.testing.assert_array_equal(rows["done"], record.mv[41:] if same_row else record.mv[40:])

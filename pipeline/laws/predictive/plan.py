@@ -13,6 +13,7 @@ from pipeline.laws.base import hold_numbers
 from pipeline.laws.predictive.horizon import LinearHorizon, NetworkHorizon
 from pipeline.laws.predictive.moves import Moves
 from pipeline.laws.predictive.product import product
+from pipeline.laws.predictive.soft_limits import SoftLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +32,7 @@ class Cost:
 class Planner(nn.Module):
     """The plan z that is best over the horizon.
 
-        min  sum_k sum_o q_o sqrt((y_o(k) - r_o)^2 + eps^2) + mu sum_j |z_j - z_{j-1}|^2,   |z| <= 1
+        min  sum_k sum_o q_o sqrt((y_o(k) - r_o(k))^2 + eps^2) + mu sum_j |z_j - z_{j-1}|^2,   |z| <= 1
 
     z_0 is the applied MV. Each pass takes the free run y and its slopes S at the present plan, the weights
     w = q/sqrt(e^2 + eps^2) of the errors e = y - r, and the plan that is best for the quadratic cost
@@ -42,7 +43,8 @@ class Planner(nn.Module):
     point is a minimum of the cost itself, whatever the damping kappa. Without damping full steps over a strongly
     bent model can throw the plan from pass to pass, and the loop then amplifies rounding. An error counts by its
     size, not by its square: large ones do not decide alone. With ``rate`` (n_mv,) each move differs from the one
-    before by at most its length in samples times the rate.
+    before by at most its length in samples times the rate. What ``limits`` cost is added, by a quadratic of the same
+    kind; no quadratic stands for a limit that the present plan keeps, so that it does not slow down the approach.
 
     Source: iteratively reweighted least squares, Huber, Robust Statistics, section 7.8; coordinate descent, Wright,
     Mathematical Programming 151 (2015) 3.
@@ -67,9 +69,12 @@ class Planner(nn.Module):
         passes: int,
         sweeps: int,
         rate: Tensor | None = None,
+        limits: SoftLimits | None = None,
     ) -> None:
         super().__init__()
+        self.limits = limits
         self.horizon, self.passes, self.sweeps, self.m = horizon, passes, sweeps, moves.count
+        self.n_cv = len(cost.weights)
         first, eye = torch.from_numpy(moves.first), torch.eye(moves.count, dtype=torch.float64)
         buffers = {
             "rate": None if rate is None else rate.repeat(len(moves.starts)) * torch.from_numpy(moves.lengths),
@@ -85,21 +90,24 @@ class Planner(nn.Module):
             self.register_buffer(name, values)
         hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
 
-    def forward(self, start: Tensor, sp: Tensor, applied: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
         """The plan (..., 1, m), and the outputs (..., 1, n_cv) that it gives at the next sample.
 
-        From ``start`` (..., 1, n_x + n_y + n_dv), with set points ``sp`` (..., 1, n_cv), the ``applied`` MV
-        (..., 1, n_mv) within -1..1, beginning at ``plan``; all scaled.
+        From ``start`` (..., 1, n_x + n_y + n_dv), with the set points ``wanted`` (..., 1, N n_cv) over the horizon,
+        the ``applied`` MV (..., 1, n_mv) within -1..1, beginning at ``plan``; all scaled.
         """
-        n_cv = sp.shape[-1]
-        wanted = sp.repeat(*(1 for _ in sp.shape[:-1]), self.weights.shape[-1] // n_cv)
+        n_cv = self.n_cv
         held, at = applied @ self.applied, applied @ self.first
         for _ in range(self.passes):
             run = self.horizon(start, plan)
             error = run.y - wanted
             weight = self.weights / torch.sqrt(error * error + self.eps_squared)
-            curvature = product(run.slopes * weight, run.slopes_t, self.moved)
-            pull = product(weight * (plan @ run.slopes - error), run.slopes_t, held)
+            push = None if self.limits is None else self.limits(run.y)
+            both = weight if push is None else weight + push.weight
+            curvature = product(run.slopes * both, run.slopes_t, self.moved)
+            moved = plan @ run.slopes
+            back = weight * (moved - error) if push is None else both * moved - weight * error - push.slope
+            pull = product(back, run.slopes_t, held)
             before = plan
             diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
             plan = self.descended(curvature * self.stiff, pull + self.damping * diagonal * plan, plan, at)

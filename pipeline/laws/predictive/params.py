@@ -1,0 +1,140 @@
+"""The predictive law's parameters, and what of them must fit the plant's signals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Literal
+
+import numpy as np
+
+from pipeline.errors import LawError
+from pipeline.laws.predictive.loads import Where
+from pipeline.models.identified.identified import Identified
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
+
+Limits = tuple[float | None, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
+class PredictiveParams:
+    """Two knobs, and the numbers behind them, which follow from the model where they are None.
+
+    ``speed`` > 0: 2 moves as boldly as a quarter of ``move_weight``. ``caution`` > 0: 2 follows loads as slowly
+    as a quarter of ``q_d``. ``horizon`` N samples, 8 or more; None: 90 % of the model's step responses settle
+    within it, 12 to 50. ``moves`` of each MV in a plan; None: 8 of one MV, 5 of each of several.
+    ``move_weight`` lambda > 0 of squared moves, mu = lambda (N - dead time)/10, MVs in units of half their range.
+    ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
+    by their size. ``weights`` > 0 of the CVs in units of their standard deviation; None: all 1. ``q_x`` and
+    ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's; q_d
+    None: 3e-5 over the noise. ``loads`` act on the ``mvs`` or the ``outputs``.
+    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or
+    more; None: .5 of one MV, .25 of several.
+    ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses speed, caution
+    and horizon in closed loops over the model with wrong gains and loads, drawn by ``seed``. ``mv_rate`` [mv]:
+    largest MV change a sample, which the plan knows; None: unlimited.
+    ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has none; None: no limits. A set point
+    beyond a limit counts as one at the limit. ``preview`` of the set points: ``held``, as they are now; ``ramp``, a
+    known recipe, whose slope goes on.
+    """
+
+    speed: float = 1.0
+    caution: float = 1.0
+    horizon: int | None = None
+    moves: int | None = None
+    move_weight: float = 0.1
+    eps: float = 0.1
+    weights: tuple[float, ...] | None = None
+    q_x: float = 0.01
+    q_d: float | None = None
+    loads: Where = "mvs"
+    damping: float | None = None
+    passes: int = 2
+    sweeps: int = 4
+    tuning: Literal["given", "search"] = "given"
+    seed: int = 0
+    mv_rate: float | None = None
+    cv_low: Limits = None
+    cv_high: Limits = None
+    preview: Literal["held", "ramp"] = "held"
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "caution", "move_weight", "eps", "q_x", "q_d"):
+            given = getattr(self, name)
+            if given is not None and not 0 < given < np.inf:
+                raise ValueError(f"{name} is {given}; it must be above 0, and finite")
+        words = {"loads": ("mvs", "outputs"), "tuning": ("given", "search"), "preview": ("held", "ramp")}
+        for name, allowed in words.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} is {getattr(self, name)!r}; allowed are {', '.join(allowed)}")
+        if self.damping is not None and not 0 <= self.damping < np.inf:
+            raise ValueError(f"damping is {self.damping}; it must be 0 or above, and finite")
+        for name, least in (("horizon", 8), ("moves", 1), ("passes", 1), ("sweeps", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name} is {value}; it must be at least {least}")
+        if any(not 0 < w < np.inf for w in self.weights or ()):
+            raise ValueError(f"weights are {list(self.weights or ())}; each must be above 0, and finite")
+        for i, (low, high) in enumerate(zip_longest(self.cv_low or (), self.cv_high or ())):
+            if low is not None and high is not None and not low < high:
+                raise ValueError(
+                    f"cv_low[{i}] is {low} and cv_high[{i}] {high}; a low limit must be below the high one"
+                )
+
+
+def weights_of(signals: Signals, params: PredictiveParams) -> tuple[float, ...]:
+    """One weight a set point; LawError for another number."""
+    weights: tuple[float, ...] = tuple(params.weights or (1.0 for _ in signals.sp))
+    if len(weights) != len(signals.sp):
+        raise LawError(f"law 'predictive' has {len(weights)} weights; give one for each set point ({_names(signals)})")
+    return weights
+
+
+def limits_of(signals: Signals, params: PredictiveParams) -> tuple[Array, Array] | None:
+    """The CVs' limits (n_cv,) and (n_cv,) [pv], infinite where a CV has none; None where no CV has one.
+
+    LawError for another number of limits than of set points, or for one outside the signal's range.
+    """
+    found = []
+    for name, none in (("cv_low", -np.inf), ("cv_high", np.inf)):
+        given = getattr(params, name) or (None,) * len(signals.sp)
+        if len(given) != len(signals.sp):
+            raise LawError(
+                f"law 'predictive' has {len(given)} limits in {name}; give one for each set point "
+                f"({_names(signals)}), null where there is none"
+            )
+        for signal, limit in zip(signals.pv, given, strict=False):
+            if limit is not None and not signal.low <= limit <= signal.high:
+                raise LawError(
+                    f"law 'predictive': {name} of {signal.name} is {limit}, outside the signal's range "
+                    f"[{signal.low:g}, {signal.high:g}] {signal.unit}; give a limit within it, or null for none"
+                )
+        found.append(np.array([none if limit is None else limit for limit in given]))
+    low, high = found
+    return (low, high) if np.isfinite(found).any() else None
+
+
+def refuse_discrete(signals: Signals) -> None:
+    """LawError for an MV that has only some values."""
+    for s in signals.mv:
+        if s.values:
+            raise LawError(
+                f"law 'predictive' moves its MVs continuously; {s.name} has only the values {list(s.values)}: "
+                "leave out `values` of the signal, or choose a law for discrete MVs"
+            )
+
+
+def check_sizes(signals: Signals, model: Identified) -> None:
+    """LawError unless the model has the plant's MVs and measured disturbances, and all set points as outputs."""
+    plant = (len(signals.mv), len(signals.dv))
+    if (model.n_mv, model.n_dv) != plant or not len(signals.sp) <= model.n_y <= len(signals.pv):
+        raise LawError(
+            f"law 'predictive': the identified model has {model.n_y} outputs, {model.n_mv} MVs and {model.n_dv} "
+            f"measured disturbances; the plant has {len(signals.sp)} set points among {len(signals.pv)} PVs, "
+            f"{plant[0]} MVs and {plant[1]} measured disturbances: identify the model from this plant's record"
+        )
+
+
+def _names(signals: Signals) -> str:
+    return ", ".join(s.name for s in signals.sp)
