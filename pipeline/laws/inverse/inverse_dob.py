@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
+from pipeline.laws.ranges import OfRange, in_units
 from pipeline.models.base import Model
 from pipeline.models.static.pair import Layout, Pair, candidates
 from pipeline.plants.signals import Signals
@@ -63,7 +64,7 @@ class ObserverLaw(ControlLaw):
 
         observer_gain: float
         integral_gain: float
-        band: float
+        band: float = OfRange(0.02)
         observed: str | None = None
         mv_rate: float | None = None
 
@@ -83,6 +84,7 @@ class ObserverLaw(ControlLaw):
 
     def __init__(self, signals: Signals, forward: Model, observer: Model, params: Params, sections: int = 1) -> None:
         super().__init__(signals, params.mv_rate)
+        params = in_units(params, signals, self.name)
         names = [s.name for s in signals.pv]
         if params.observed is not None and params.observed not in names:
             raise LawError(f"observed is {params.observed!r}; the process variables are {', '.join(names)}")
@@ -209,7 +211,7 @@ class ForwardDob(ObserverLaw):
         self.register_buffer("part", self.span / self.SECTIONS)
         self.register_buffer("chord", self.part / self.SECTIONS)
         self.register_buffer("cuts", self.part * torch.linspace(0, 1, self.SECTIONS + 1, dtype=torch.float64))
-        hold_numbers(self, flat=1e-12)
+        hold_numbers(self, flat=1e-12 * (signals.sp[0].high - signals.sp[0].low))
 
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
         """As in ObserverLaw."""
