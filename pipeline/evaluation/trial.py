@@ -113,14 +113,15 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
     """One closed loop; an extra entry of info is 1 if the controller refused the step.
 
-    The MV then stays at its last value, as in the real loop's HOLD. Measured disturbances stay nominal.
+    The MV then stays at its last value, as in the real loop's HOLD.
     """
     plant, state = test.plant or case.plant, controller.cold_state()
-    dv = plant.dv_nominal
+    measured = iter(test.disturbances(plant))
     n_info = len(controller.manifest.info)
 
     def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, Array]:
         nonlocal state
+        dv = next(measured)
         try:
             mv, state, info = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=mv_applied, state=state)
         except LoopwrightError:
