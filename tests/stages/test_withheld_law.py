@@ -48,7 +48,7 @@ def test_no_file_is_shipped_and_the_reason_stays(metrics: LawMetrics) -> None:
     assert metrics.lock_ups > 0
     assert not Path("artifacts/it/pid.onnx").exists()
     why = json.loads(Path("artifacts/it/pid.json").read_text())["withheld"]
-    assert why.startswith("controllers.it-pid locked up on ")
+    assert why.startswith("controllers.it-pid locked up or left its limits on ")
     assert set(metrics.locked_up) >= {"held_out", "spoilt"}
     assert LawEvidence(metrics, Path("trajectories.npz")).withheld
 
