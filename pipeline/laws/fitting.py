@@ -39,8 +39,10 @@ def require_fit(law: type[ControlLaw], plant: Simulator) -> None:
             f"{law.looks_ahead} ahead; {INSTEAD}"
         )
     if responses.starts_inverse(0, 0):
+        y = responses.y[0, 0] * np.sign(responses.gain[0, 0])
         raise LawError(
-            f"law {law.name!r} is withheld: {cv} first goes the other way after {mv} moves, and a law that looks "
+            f"law {law.name!r} is withheld: {cv} first goes the other way after {mv} moves, by "
+            f"{100 * -y.min() / abs(y[-1]):.0f} % of its answer at sample {int(y.argmin()) + 1}, and a law that looks "
             f"{law.looks_ahead} sample ahead follows it there; {INSTEAD}"
         )
 
