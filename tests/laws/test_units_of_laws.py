@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import FORMS, QUICK, plant_of, quick_parts, rest_points
+from conftest import CALM, FORMS, QUICK, plant_of, quick_parts, rest_points
 
 from pipeline.config.params import parse
 from pipeline.errors import LawError, ParamsError
@@ -21,6 +21,7 @@ from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
 from pipeline.models.local.local_models import LocalModels
 from pipeline.models.static.mlp import MLP
 from pipeline.plants.signals import Signals
+from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_closed
 from serving.manifest import Signal
 
@@ -91,6 +92,16 @@ def scaled_part(name: str, model: Model, n_pv: int) -> Model:
     return with_buffers(model, {"low": inputs, "span": inputs, "weights": out})  # radial basis functions
 
 
+def designed(name: str, **form: Any) -> ControlLaw:
+    """A law with its defaults, but for ``form`` and what makes it quick."""
+    plant, cls = plant_of(name), LAWS[name]
+    return cls.design(cls.Params(**{**quick(name), **form}), quick_parts(plant.name), plant.signals, plant).eval()
+
+
+def quick(name: str) -> dict[str, Any]:
+    return {key: value for key, value in QUICK[name].items() if key not in CALM}
+
+
 def closed_loop(law: ControlLaw, levels: np.ndarray, pv_by: float, mv_by: np.ndarray, loop_test: Any) -> np.ndarray:
     """MVs (n, n_mv) in the plant's units; the law's units lie between it and the plant."""
     plant = plant_of(law.name)
@@ -114,11 +125,11 @@ def closed_loop(law: ControlLaw, levels: np.ndarray, pv_by: float, mv_by: np.nda
     ids=lambda v: v if isinstance(v, str) else "-".join(map(str, v.values())),
 )
 def test_other_units_give_the_same_closed_loop(
-    name: str, form: dict[str, Any], make_law: Callable[..., ControlLaw], loop_test: Any
+    name: str, form: dict[str, Any], loop_test: Callable[..., Scenario]
 ) -> None:
     plant, cls = plant_of(name), LAWS[name]
-    one = make_law(name, **form)
-    given = {key: in_other_units(value, factor(key, name)) for key, value in {**QUICK[name], **form}.items()}
+    one = designed(name, **form)
+    given = {key: in_other_units(value, factor(key, name)) for key, value in {**quick(name), **form}.items()}
     if "training" in given:
         given["training"] = dataclasses.replace(given["training"], noise=given["training"].noise * PV)
     models = {key: scaled_part(key, m, len(plant.pv_signals)) for key, m in quick_parts(plant.name).items()}
@@ -132,8 +143,8 @@ def test_other_units_give_the_same_closed_loop(
     np.testing.assert_allclose(turned / span, found / span, rtol=0, atol=1e-5)
 
 
-def test_what_is_stated_is_taken_as_it_is_and_what_is_not_follows_from_the_range(make_law: Any) -> None:
-    law = make_law("gauss_newton_pid", slope_min=0.25)
+def test_what_is_stated_is_taken_as_it_is_and_what_is_not_follows_from_the_range() -> None:
+    law = designed("gauss_newton_pid", slope_min=0.25)
     sp = law.signals.sp[0]
     span = sp.high - sp.low
     assert float(law.gains.slope_min) == 0.25
@@ -150,12 +161,12 @@ def test_a_default_is_shown_with_its_unit_and_travels_to_another_process() -> No
     assert OfRange(0.5, -1).over(4.0) == 0.125
 
 
-def test_a_stated_bound_beside_a_default_one_is_checked_once_the_range_is_known(make_law: Any) -> None:
+def test_a_stated_bound_beside_a_default_one_is_checked_once_the_range_is_known() -> None:
     given = {"gain_low": [300.0, 0.0, 0.0]}
     params = parse(LAWS["linearized_pid"].Params, given, "controllers.it")  # 300 may be below 100 / range
     with pytest.raises(LawError, match=r"law 'linearized_pid': gain_low is \[300.0, 0.0, 0.0\] and gain_high \[100.0"):
-        make_law("linearized_pid", gain_low=params.gain_low)
+        designed("linearized_pid", gain_low=params.gain_low)
     with pytest.raises(ParamsError, match="gain_low is"):
         parse(LAWS["linearized_pid"].Params, {**given, "gain_high": [200.0, 1.0, 1.0]}, "controllers.it")
     with pytest.raises(LawError, match=r"law 'linearized_pid': penalty_low is 0\.5 and penalty_start 0\.001"):
-        make_law("linearized_pid", penalty_low=0.5)
+        designed("linearized_pid", penalty_low=0.5)
