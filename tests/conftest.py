@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -31,6 +32,12 @@ from pipeline.simulation.simulate import simulate_batch
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
 QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
+# Low gains: inputs drawn over whole ranges would drive the MV to its ends, where laws cannot be told apart.
+CALM: dict[str, Any] = {"penalty": 1.0, "stiffness": 1e-3, "gain_high": (10.0,) * 3, "slope_min": 1e-3}
+for _name in ("linearized_pid", "gauss_newton_pid", "minimum_variance", "recursive_pid", "self_tuning_pid"):
+    _known = {f.name for f in dataclasses.fields(LAWS[_name].Params)}
+    _calm = {**CALM, "penalty": 0.1} if _name in ("gauss_newton_pid", "minimum_variance") else CALM
+    QUICK[_name] |= {key: value for key, value in _calm.items() if key in _known}
 QUICK["predictive"] |= {"horizon": 8, "moves": 4}
 QUICK["pid"] |= {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613}
 for _name in ("model_reference", "model_reference_two_error", "pi_reference"):

@@ -25,13 +25,15 @@ def section(n_y: int, n_mv: int, **more: Any) -> dict[str, Any]:
     return {"period_s": 1.0, "pv": pv, "mv": mv, "dv": [], "data": "data/it/record.parquet", "source": [], **more}
 
 
-def case_of(entry: dict[str, Any], models: list[Any], pv: np.ndarray, mv: np.ndarray) -> OwnCase:
+def case_of(
+    entry: dict[str, Any], models: list[Any], pv: np.ndarray, mv: np.ndarray, dv: np.ndarray | None = None
+) -> OwnCase:
     """The case in the present folder with a record and models, the first of them the law's."""
     Path("params.yaml").write_text(yaml.safe_dump({"plants": {"it": entry}, "cases": {}}))
-    groups = {k: tuple(Signal(**s) for s in entry[k]) for k in ("pv", "mv")}
-    signals = Signals(1.0, groups["pv"], groups["pv"], (), groups["mv"])
+    groups = {k: tuple(Signal(**s) for s in entry[k]) for k in ("pv", "mv", "dv")}
+    signals = Signals(1.0, groups["pv"], groups["pv"], groups["dv"], groups["mv"])
     Path("data/it").mkdir(parents=True, exist_ok=True)
-    Record.of(signals, pv, mv).write(Path(entry["data"]))
+    Record.of(signals, pv, mv, dv=dv).write(Path(entry["data"]))
     folder = Path("work/it/models/identified/seed0")
     folder.mkdir(parents=True, exist_ok=True)
     for name, model in zip(("identified", "plant1", "plant2"), models, strict=True):

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.reach import LOAD, Reach
 from pipeline.config.plants import PlantParams, SignalParams
 from pipeline.errors import PlantError
@@ -28,8 +29,11 @@ from serving.manifest import Signal
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBER_NUMBERS = (1, 2)
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
-LOAD_AT = 5  # sample at which a load begins
+LOAD_AT = 5  # sample at which a load or a step of a measured disturbance begins
+MEASURED = "measured"  # the test with steps of the measured disturbances
 PERCENT = "% of range"
+GATE = {"held_out": 0.5, "held_out_noise": 0.2, "load": 0.15, "spoilt": 0.15}
+GATE_WITH_MEASURED = {"held_out": 0.5, "held_out_noise": 0.2, "load": 0.1, MEASURED: 0.1, "spoilt": 0.1}
 GAINS, SPEEDS, DELAYS = (0.8, 1.25), (1.25, 0.8), (1.0, 0.0)  # factors of gain and time constant; [periods]
 
 
@@ -105,7 +109,7 @@ class OwnCase(Case):
 
     development_seeds: ClassVar[tuple[int, ...]] = (1,)
     development_noise: ClassVar[bool] = True
-    gate: ClassVar[Mapping[str, float]] = {"held_out": 0.5, "held_out_noise": 0.2, "load": 0.15, "spoilt": 0.15}
+    gate: ClassVar[Mapping[str, float]] = GATE
     on_models: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 1
     unforeseen: ClassVar[bool] = True
@@ -217,16 +221,29 @@ class OwnCase(Case):
         return figures | {mae_of(s): mae(test.sp[:, i], pv[:, i]) for i, s in enumerate(signals)}
 
     def _test(
-        self, name: str, title: str, sp: Array, plant: IdentifiedPlant, seed: int | None, changed: Mapping[str, float]
+        self,
+        name: str,
+        title: str,
+        sp: Array,
+        plant: IdentifiedPlant,
+        seed: int | None,
+        changed: Mapping[str, float],
+        dv: Array | None = None,
     ) -> Scenario:
         # A load begins after some samples: a law that begins with it could take it for a part of its start.
         late: Array = (np.arange(len(sp)) >= LOAD_AT).astype(np.float64)
         changes = {k: v * late if k.startswith("load_") else np.full(len(sp), float(v)) for k, v in changed.items()}
         x0, mv0 = plant.start
-        return Scenario(name, title, sp, x0, mv0, changes, self.hold if seed is not None else 0, seed, plant=plant)
+        return Scenario(
+            name, title, sp, x0, mv0, changes, self.hold if seed is not None else 0, seed, plant=plant, dv=dv
+        )
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
-        """Set points on the other models; the same on spoilt ones; and a load on each CV, upwards and downwards."""
+        """Set points on the other models; the same on spoilt ones; loads; and steps of the measured disturbances.
+
+        There is a load on each CV, upwards and downwards, which no controller sees. Each measured disturbance that
+        moves in the record steps upwards and downwards too.
+        """
         return dict(self._scenarios)
 
     @cached_property
@@ -248,7 +265,7 @@ class OwnCase(Case):
                 self._test(
                     "load",
                     loads,
-                    np.tile(p.measure(p.start[0])[: len(cvs)], (2 * self.hold, 1)),
+                    self._resting_at(p),
                     p,
                     None,
                     {f"load_{cv.name}": (1 - 2 * i) * reach.load(p, j)},
@@ -256,7 +273,27 @@ class OwnCase(Case):
                 for j, cv in enumerate(cvs)
                 for _, p, i in pairs
             ),
+            **self._measured([(p, i == 0) for _, p, i in pairs]),
         }
+
+    def _resting_at(self, plant: OwnPlant) -> Array:
+        """Set points (2 hold, n_cv) where a plant rests."""
+        return np.tile(plant.measure(plant.start[0])[: len(self.signals.sp)], (2 * self.hold, 1))
+
+    def _measured(self, pairs: Sequence[tuple[OwnPlant, bool]]) -> dict[str, tuple[Scenario, ...]]:
+        """The test with steps of each measured disturbance, on plants, upwards or not; empty where there is none."""
+        dvs, samples = self.signals.dv, 2 * self.hold
+        title = f"A step of {dvs[0].name}" if len(dvs) == 1 else "A step of a measured disturbance, each in turn"
+        found, moved = [], []
+        for j in range(len(dvs)):
+            for plant, upwards in pairs:
+                level = level_of(plant, self.record, j, upwards)
+                dv = course(plant.dv_nominal, j, level, samples, LOAD_AT)
+                found.append(self._test(MEASURED, f"{title}, and back", self._resting_at(plant), plant, None, {}, dv))
+                moved.append(level != plant.dv_nominal[j])
+        # One at rest stands for all where the record has none that moves: the gate counts on the test.
+        kept = [test for test, moves in zip(found, moved, strict=True) if moves] or found[:1]
+        return {MEASURED: tuple(kept)} if kept else {}
 
     def development(self) -> tuple[Scenario, ...]:
         """Sequences on the law's own model as it is, and with errors: as it is, a law that knows it has no rival."""
@@ -285,6 +322,7 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "data": params.data,
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
         "__module__": base.__module__,
+        **({"gate": GATE_WITH_MEASURED} if dv else {}),
     }
     return type("OwnPlantCase", (base,), own | further)((9001, 9002, 9003))
 

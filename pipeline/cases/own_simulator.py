@@ -53,11 +53,13 @@ class SimulatedCase(OwnCase):
             cv = [s.name for s in self.simulator.pv_signals].index(key.removeprefix(LOADS))
             name, size = self._load_on_mv(cv)
             changes[name] = size * np.sign(values)
-        sp = test.sp
-        if changes:  # a load is tested at rest
+        sp, dv = test.sp, test.dv
+        if dv is not None:  # the same steps from where the simulator is
+            dv = dv - dv[0] + self.simulator.dv_nominal
+        if changes or dv is not None:  # such a test begins at rest
             sp = np.tile(self.simulator.measure(x0)[: sp.shape[1]], (len(sp), 1))
         title = test.title.replace("models identified from the record", "the simulator")
-        return replace(test, title=title, sp=sp, plant=self.simulator, x0=x0, mv0=mv0, changes=changes)
+        return replace(test, title=title, sp=sp, plant=self.simulator, x0=x0, mv0=mv0, changes=changes, dv=dv)
 
     def _load_on_mv(self, cv: int) -> tuple[str, float]:
         """The load [MV's unit] that moves a CV by LOAD standard deviations within a hold, if no controller acts."""

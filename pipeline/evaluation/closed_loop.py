@@ -25,6 +25,7 @@ SMALLEST_STEP = 0.02  # of the CV's range: a smaller move of the set point has n
 STEP_BAND = 0.02  # settled: within this fraction of the step ...
 RANGE_BAND = 0.002  # ... or of the CV's range, whichever is wider (a disturbance test has no step)
 FAR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
+LEFT = 0.25  # of the CV's range: farther beyond its ends no overshoot leads
 
 
 def holds(n: int, hold: int) -> list[slice]:
@@ -127,6 +128,16 @@ def locked_up(
         if stuck.any() and np.all(e[half] > FAR * wide, axis=0).any():
             return True
     return False
+
+
+def left_limits(pv: ArrayLike, *, low: ArrayLike, high: ArrayLike) -> bool:
+    """Whether a CV goes beyond its range [low, high] (n_cv,) by more than ``LEFT`` of it. pv (n, n_cv), without noise.
+
+    A loop that swings or drifts so far need not be saturated, so that no lock-up tells of it.
+    """
+    y, bottom, top = (np.asarray(values, dtype=np.float64) for values in (pv, low, high))
+    room = LEFT * (top - bottom)
+    return bool(np.any((y < bottom - room) | (y > top + room)))
 
 
 def closed_loop_metrics(

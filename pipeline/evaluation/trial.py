@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.evaluation.case import Case
-from pipeline.evaluation.closed_loop import locked_up
+from pipeline.evaluation.closed_loop import left_limits, locked_up
 from pipeline.evaluation.law_evidence import BASE
 from pipeline.evaluation.metric import mean_of_draws, together
 from pipeline.evaluation.reached import reached_by, widest
@@ -113,14 +113,15 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
     """One closed loop; an extra entry of info is 1 if the controller refused the step.
 
-    The MV then stays at its last value, as in the real loop's HOLD. Measured disturbances stay nominal.
+    The MV then stays at its last value, as in the real loop's HOLD.
     """
     plant, state = test.plant or case.plant, controller.cold_state()
-    dv = plant.dv_nominal
+    measured = iter(test.disturbances(plant))
     n_info = len(controller.manifest.info)
 
     def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, Array]:
         nonlocal state
+        dv = next(measured)
         try:
             mv, state, info = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=mv_applied, state=state)
         except LoopwrightError:
@@ -132,13 +133,19 @@ def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array 
 
 
 def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
-    """Whether the loop locked up at an end of an MV, or the controller refused a step."""
+    """Whether the loop locked up at an end of an MV, or the controller refused a step.
+
+    A controller refuses to give an MV beyond its range. Where the tests run on models, a CV far beyond its range counts
+    too: equations hold far from where they were meant, a model of a record does not.
+    """
     n = test.sp.shape[1]
     # As many MVs as set points; a further one may have a part that rests at an end.
     mvs, spans = case.plant.mv_signals[:n], [s.high - s.low for s in case.plant.sp_signals]
     limits = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
     jammed = locked_up(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=spans)
-    return jammed or bool(loop.info[:, -1].any())
+    ends = {end: [getattr(s, end) for s in case.plant.sp_signals] for end in ("low", "high")}
+    left = case.on_models and left_limits(loop.pv[:, :n], **ends)
+    return jammed or left or bool(loop.info[:, -1].any())
 
 
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:

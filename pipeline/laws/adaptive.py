@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
 from pipeline.laws.gain_update import PidForm, gain_update
+from pipeline.laws.ranges import OfRange, ascend, in_units
 from pipeline.models.memory import Memory, Named, Slot, Stage, constant
 from pipeline.plants.signals import Signals
 
@@ -25,12 +26,14 @@ CONFIDENCE = 0.99  # of the update criterion: noise alone triggers it in 1 % of 
 class AdaptiveParams:
     """Settings of an adaptive PID. Moves are in units of half the MV's range, errors in the PV's unit.
 
+    Defaults in the PV's unit are shares of the range of its set point, see ``OfRange``.
+
     Parameters
     ----------
     penalty
         mu > 0, the weight of the move [pv^2].
     stiffness
-        lambda > 0, the weight of a change of the gains; a small value only selects among equally good gains.
+        lambda > 0 [pv^4], the weight of a change of the gains; a small value only selects among equally good gains.
     weights
         How easily kc, Ki and Kd change.
     gain_low, gain_high
@@ -52,18 +55,18 @@ class AdaptiveParams:
         Largest change of the MV per sample [mv]; None is unlimited.
     """
 
-    penalty: float = 1.0
-    stiffness: float = 1e-3
+    penalty: float = OfRange(1e-3, 2)
+    stiffness: float = OfRange(1e-9, 4)
     weights: Three = (1.0, 1.0, 1.0)
     gain_low: Three = (0.0, 0.0, 0.0)
-    gain_high: Three = (10.0, 10.0, 10.0)
+    gain_high: Three = (OfRange(100.0, -1), OfRange(100.0, -1), OfRange(100.0, -1))
     gains: Three | None = None
     momentum: float = 0.0
     window: int | None = None
     noise_variance: float | None = None
     preview: Literal["held", "ramp"] = "held"
     plant_gain: Literal["auto", "positive", "negative"] = "auto"
-    slope_min: float = 1e-3
+    slope_min: float = OfRange(1e-4)
     mv_rate: float | None = None
 
     def __post_init__(self) -> None:
@@ -74,7 +77,7 @@ class AdaptiveParams:
             raise ValueError(f"slope_min is {self.slope_min}; it must be 0 or above, or the guard lets everything pass")
         if not min(self.weights) > 0:
             raise ValueError(f"weights is {list(self.weights)}; each must be above 0")
-        if not all(0 <= low < high for low, high in zip(self.gain_low, self.gain_high, strict=True)):
+        if not all(low >= 0 and ascend(low, high) for low, high in zip(self.gain_low, self.gain_high, strict=True)):
             raise ValueError(
                 f"gain_low is {list(self.gain_low)} and gain_high {list(self.gain_high)}; 0 <= low < high must hold"
             )
@@ -274,6 +277,7 @@ class AdaptivePid(ControlLaw):
     ) -> None:
         super().__init__(signals, params.mv_rate)
         require_single_loop(signals, self.name)
+        params = in_units(params, signals, self.name)
         unit = signed_unit(signals, params.plant_gain, b)
         self.params, self.model = params, model(unit)
         self.gains = AdaptiveGains(params, signals, unit, params.gains or minimum_variance_gains(a, b * unit, params))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any, ClassVar, Self, TypeAlias, TypeVar
@@ -105,6 +105,8 @@ class ControlLaw(nn.Module, ABC):
     one_loop: ClassVar[bool] = True  # whether it controls one variable by one
     # Samples after a move within which the plant must have answered, the right way; None: any dead time suits.
     looks_ahead: ClassVar[int | None] = None
+    # Samples after a move within which some PV must have answered, to tell of disturbances; None: any plant suits.
+    observes_within: ClassVar[int | None] = None
     parts: ClassVar[Mapping[str, str]] = {}  # what `design` needs of the model set: part name -> what it must be
     n_state: int
     info: tuple[str, ...]
@@ -137,8 +139,8 @@ class ControlLaw(nn.Module, ABC):
         """One step."""
 
     @classmethod
-    def needs(cls, params: Any) -> tuple[str, ...]:
-        """Names of the parts that ``design`` needs with these parameters."""
+    def needs(cls, params: Any, given: Collection[str] = ()) -> tuple[str, ...]:
+        """Names of the parts that ``design`` needs with these parameters, of a set with the parts ``given``."""
         return tuple(cls.parts)
 
     @classmethod

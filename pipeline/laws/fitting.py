@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, require_single_loop
+from pipeline.laws.base import ControlLaw
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.simulator import Simulator
-from pipeline.tuning.responses import StepResponses
+from pipeline.tuning.responses import ANSWERS, SHORTEST, STEP, StepResponses
 
 INSTEAD = "choose law 'predictive' or 'pid', or remove the section"
 
@@ -14,13 +16,19 @@ INSTEAD = "choose law 'predictive' or 'pid', or remove the section"
 def require_fit(law: type[ControlLaw], plant: Simulator) -> None:
     """Raise LawError, with what was found of the plant, where the law's needs are not met.
 
-    They are the law's ``one_loop`` and ``looks_ahead``, held against step responses near the plant's start. A plant
-    in equations is left alone: who wrote them down chooses the law.
+    They are the law's ``one_loop``, ``observes_within`` and ``looks_ahead``, held against step responses near the
+    plant's start. A plant in equations is left alone: who wrote them down chooses the law.
     """
     if isinstance(plant, EquationPlant):
         return
-    if law.one_loop:
-        require_single_loop(plant.signals, law.name)
+    n_sp, n_mv = len(plant.sp_signals), len(plant.mv_signals)
+    if law.one_loop and (n_sp, n_mv) != (1, 1):
+        raise LawError(
+            f"law {law.name!r} is withheld: it controls one variable by one; got {n_sp} set points and {n_mv} MVs; "
+            f"{INSTEAD}"
+        )
+    if law.observes_within is not None:
+        _require_an_observation(law, law.observes_within, plant)
     if law.looks_ahead is None:
         return
     responses, cv, mv = StepResponses.near_start(plant), plant.pv_signals[0].name, plant.mv_signals[0].name
@@ -31,7 +39,30 @@ def require_fit(law: type[ControlLaw], plant: Simulator) -> None:
             f"{law.looks_ahead} ahead; {INSTEAD}"
         )
     if responses.starts_inverse(0, 0):
+        y = responses.y[0, 0] * np.sign(responses.gain[0, 0])
         raise LawError(
-            f"law {law.name!r} is withheld: {cv} first goes the other way after {mv} moves, and a law that looks "
+            f"law {law.name!r} is withheld: {cv} first goes the other way after {mv} moves, by "
+            f"{100 * -y.min() / abs(y[-1]):.0f} % of its answer at sample {int(y.argmin()) + 1}, and a law that looks "
             f"{law.looks_ahead} sample ahead follows it there; {INSTEAD}"
+        )
+
+
+def _require_an_observation(law: type[ControlLaw], within: int, plant: Simulator) -> None:
+    """LawError unless a PV answers the MV in time: in a period by more than a tenth of its fastest change in one."""
+    (x, mv), signal = plant.start, plant.mv_signals[0]
+    size = STEP * (signal.high - signal.low) * (1 if mv[0] < signal.middle else -1)
+    moved = np.stack([mv, mv + size * (np.arange(len(mv)) == 0)])
+    x, advance, course = np.tile(x, (2, 1)), plant.many(2), []
+    for _ in range(SHORTEST):
+        x = advance(x, moved)
+        course.append(plant.measured(x))
+    answer = np.abs(np.diff(np.array(course), axis=1)[:, 0])  # (n, n_pv)
+    change = np.abs(np.diff(answer, axis=0, prepend=0.0))
+    answered = change > ANSWERS * change.max(axis=0)
+    after = np.where(answered.any(axis=0), 1 + answered.argmax(axis=0), SHORTEST)
+    if min(after) > within:
+        found = ", ".join(f"{s.name} answers after {k}" for s, k in zip(plant.pv_signals, after, strict=True))
+        raise LawError(
+            f"law {law.name!r} is withheld: no PV answers within {within} sample after {signal.name} moves "
+            f"({found}), and the law takes what it sees by then for a disturbance; {INSTEAD}"
         )

@@ -34,7 +34,7 @@ class SampledPlan:
 
 
 def transition(plant: IdentifiedPlant) -> ca.Function:
-    """CasADi function (x, mv, p, delayed) -> x one period later; as ``IdentifiedPlant.step`` at nominal disturbances.
+    """CasADi function (x, mv, p, delayed, dv) -> x one period later; as ``IdentifiedPlant.step``.
 
     ``p`` (n_p,) are the plant's parameters, ``delayed`` (most_dead_time + 1,) the shares of the present and the past
     MVs that a dead time lets act (``shares``); p's own entry for the dead time is not used.
@@ -46,8 +46,8 @@ def transition(plant: IdentifiedPlant) -> ca.Function:
     first = (plant.start[1] - f.v_center[:m]) / f.v_scale[:m]
     held = ca.vertcat((mv - f.v_center[:m]) / f.v_scale[:m], x[n:])
     acting = sum(delayed[k] * held[k * m : (k + 1) * m] for k in range(most + 1))
-    dv = (plant.dv_nominal - f.v_center[m:]) / f.v_scale[m:]
-    v = ca.vertcat(first + p[:m] * (acting - first), dv)
+    dv = ca.SX.sym("dv", len(plant.dv_signals))
+    v = ca.vertcat(first + p[:m] * (acting - first), (dv - f.v_center[m:]) / f.v_scale[m:])
     remembers = ca.DM(shift_rows(f).astype(np.float64))
 
     def advanced(at: Any) -> Any:
@@ -59,7 +59,8 @@ def transition(plant: IdentifiedPlant) -> ca.Function:
     slower, faster = x[:n] + (ahead - x[:n]) / p[m], ahead + (1 / p[m] - 1) * (second - ahead)
     ahead = remembers * ahead + (1 - remembers) * ca.if_else(p[m] < 1, faster, slower)
     load = ca.vertcat(p[m + 2 :] / f.y_scale, np.zeros(n - n_y))
-    return ca.Function("transition", [x, mv, p, delayed], [ca.densify(ca.vertcat(ahead + load, held[: most * m]))])
+    after_a_period = ca.densify(ca.vertcat(ahead + load, held[: most * m]))
+    return ca.Function("transition", [x, mv, p, delayed, dv], [after_a_period])
 
 
 def shares(plant: IdentifiedPlant, p: Array) -> Array:
@@ -90,15 +91,15 @@ class SampledHorizon:
         x, z, s = ca.vertsplit(table, [0, self._n_x, self._n_x + self._m, self._rows])
         p = ca.MX.sym("p", len(plant.parameter_names()))
         x0, delayed, sp = ca.MX.sym("x0", self._n_x), ca.MX.sym("d", plant.most_dead_time + 1), ca.MX.sym("r", n_cv)
-        starts = ca.horzcat(x0, x[:, :-1])
-        every = [ca.repmat(value, 1, n) for value in (p, delayed)]
+        starts, dv = ca.horzcat(x0, x[:, :-1]), ca.MX.sym("dv", len(plant.dv_signals))
+        every = [ca.repmat(value, 1, n) for value in (p, delayed, dv)]
         gap = x - transition(plant).map(n)(starts, self._low + self._span * z, *every)
         y = f.y_center[:n_cv] + f.y_scale[:n_cv] * x[:n_cv, :]
         error = (ca.repmat(sp, 1, n) - y) / self._cv_span
         moves = z[:, 1:] - z[:, :-1]
         cost = ca.sum1(ca.vec(s)) + MOVE_WEIGHT[False] * ca.sumsqr(moves)
         bound = ca.vertcat(ca.vec(gap), ca.vec(s - error), ca.vec(s + error))
-        problem: Any = {"x": w, "p": ca.vertcat(x0, sp, p, delayed), "f": cost, "g": bound}
+        problem: Any = {"x": w, "p": ca.vertcat(x0, sp, p, delayed, dv), "f": cost, "g": bound}
         options: Any = {
             "expand": True,
             "print_time": False,
@@ -121,16 +122,16 @@ class SampledHorizon:
         self._bounds = {"lbx": low.ravel("F"), "ubx": high.ravel("F"), "lbg": np.zeros(free.size), "ubg": free}
 
     def solve(
-        self, x0: Array, mv: Array, sp: Array, p: Array, before: SampledPlan | None = None, age: int = 0
+        self, x0: Array, mv: Array, sp: Array, p: Array, dv: Array, before: SampledPlan | None = None, age: int = 0
     ) -> SampledPlan:
-        """The plan from a state x0 (n_x,) to set points sp (n_cv,) under parameters p (n_p,).
+        """The plan from a state x0 (n_x,) to set points sp (n_cv,) under parameters p (n_p,) and dv (n_dv,).
 
         It begins with the rest of the plan ``before`` after ``age`` samples, its last period repeated, else with
         mv (n_mv,) held.
         """
-        arguments: dict[str, Any] = {"p": np.concatenate([x0, sp, p, shares(self.plant, p)]), **self._bounds}
+        arguments: dict[str, Any] = {"p": np.concatenate([x0, sp, p, shares(self.plant, p), dv]), **self._bounds}
         if before is None:
-            arguments["x0"] = self._held(x0, mv, sp, p).ravel("F")
+            arguments["x0"] = self._held(x0, mv, sp, p, dv).ravel("F")
         else:
             at = np.minimum(np.arange(self.n) + age, self.n - 1)
             arguments["x0"] = self._table(before.values)[:, at].ravel("F")
@@ -154,11 +155,11 @@ class SampledHorizon:
         """All variables as rows (states, moves, slacks) by samples."""
         return values.reshape(self._rows, self.n, order="F")
 
-    def _held(self, x0: Array, mv: Array, sp: Array, p: Array) -> Array:
+    def _held(self, x0: Array, mv: Array, sp: Array, p: Array, dv: Array) -> Array:
         """All variables with the MVs held."""
         values, x = np.zeros((self._rows, self.n)), x0
         for k in range(self.n):
-            x = self.plant.step(x, mv, self.plant.dv_nominal, p)
+            x = self.plant.step(x, mv, dv, p)
             error = np.abs(sp - self.plant.measured(x)[: self._n_cv]) / self._cv_span
             values[:, k] = np.concatenate([np.clip(x, -1e3, 1e3), (mv - self._low) / self._span, error])
         return values
@@ -169,31 +170,32 @@ def run_sampled(
 ) -> dict[str, float]:
     """Figures of the NMPC over one test on its plant, by ``score``, with its ``failures``; it sees no noise.
 
-    It sees the set points of now and thinks that they stay. Parameters it knows one sample late, as an observer tells
-    them at best. A plan is followed while it comes true, at most ``1 / EVERY`` of the horizon, or to its end once
-    nothing is left of the error.
+    It sees the set points and the measured disturbances of now and thinks that they stay. Parameters it knows one
+    sample late, as an observer tells them at best. A plan is followed while it comes true, at most ``1 / EVERY`` of
+    the horizon, or to its end once nothing is left of the error.
     """
     plant = horizon.plant
-    parameters = test.parameters(plant)
+    parameters, measured = test.parameters(plant), test.disturbances(plant)
     x, mv, age, failures = test.x0, test.mv0, 0, 0
     plan: SampledPlan | None = None
     states, moves = [], []
     for k in range(test.samples):
-        sp, p = test.sp[k], parameters[max(k - 1, 0)]
-        same = k > 0 and np.array_equal(sp, test.sp[k - 1]) and np.array_equal(p, parameters[max(k - 2, 0)])
+        sp, p, dv = test.sp[k], parameters[max(k - 1, 0)], measured[k]
+        before = (test.sp[k - 1], parameters[max(k - 2, 0)], measured[k - 1])
+        same = k > 0 and all(map(np.array_equal, (sp, p, dv), before))
         expected = (
             plan is not None and same and np.max(np.abs(x - plan.x[age])) <= CAME_TRUE * max(1.0, np.abs(x).max())
         )
         arrived = plan is not None and age < horizon.n and float(plan.error[age:].max()) <= ARRIVED
         if plan is None or not expected or age >= (horizon.n if arrived else max(horizon.n // EVERY, 1)):
-            found = horizon.solve(x, mv, sp, p, plan if expected else None, age)
+            found = horizon.solve(x, mv, sp, p, dv, plan if expected else None, age)
             if not found.solved and plan is not None and expected:
-                found = horizon.solve(x, mv, sp, p)
+                found = horizon.solve(x, mv, sp, p, dv)
             failures += not found.solved
             plan, age = found, 0
         states.append(x)
         mv = plan.mv[age]
         moves.append(mv)
-        x, age = plant.step(x, mv, plant.dv_nominal, parameters[k]), age + 1
+        x, age = plant.step(x, mv, dv, parameters[k]), age + 1
     figures = score(test, plant.measured(np.array(states)), np.array(moves))
     return {**figures, "failures": float(failures)}

@@ -64,16 +64,22 @@ FAST = "shaded: swings too fast to draw, with their mean"
 
 
 class LoopPanels:
-    """Each controlled variable with its set point, each MV, and the error of the late part where a test has one.
+    """Each controlled variable with its set point, each MV, and each measured disturbance that a test moves.
 
-    A discrete MV has a narrow strip with its allowed values as ticks. A law whose continuous MV rings
-    (``rings``) has a panel of its own for it, so that it hides no other law's. ``loops`` are the curves
-    to come by their label, the first in front; ``reference`` (n, 1) is the course that the controlled
-    variable should take where that is not the set point.
+    A test with a late part has the error in it too. A discrete MV has a narrow strip with its allowed values as
+    ticks. A law whose continuous MV rings (``rings``) has a panel of its own for it, so that it hides no other law's.
+    ``loops`` are the curves to come by their label, the first in front; ``reference`` (n, 1) is the course that the
+    controlled variable should take where that is not the set point; ``dv`` (n, n_dv) are the measured disturbances.
     """
 
     def __init__(
-        self, case: Case, title: str, loops: Mapping[str, Loop], late_from: int = 0, reference: Array | None = None
+        self,
+        case: Case,
+        title: str,
+        loops: Mapping[str, Loop],
+        late_from: int = 0,
+        reference: Array | None = None,
+        dv: Array | None = None,
     ) -> None:
         self.ranks = {label: rank for rank, label in enumerate(loops)}
         self.late_from, self.reference = late_from, reference
@@ -84,12 +90,18 @@ class LoopPanels:
         self.hidden = False
         ordered = sorted({place for row in self.places.values() for place in row})
         above = [CV_HEIGHT] if len(cvs) == 1 else [SHARED_HEIGHT] * len(cvs)
-        heights = [*above, *([1.6] if late_from else []), *(self._height(*place) for place in ordered)]
-        more = 1.2 * bool(late_from) + INCHES * (sum(above) - CV_HEIGHT + sum(heights[-len(ordered) :]) - MV_HEIGHT)
+        below = [self._height(*place) for place in ordered]
+        self.moved = _moved(case.plant_class.dv_signals, dv)
+        heights = [*above, *([1.6] if late_from else []), *below, *[OWN_HEIGHT] * len(self.moved)]
+        more = 1.2 * bool(late_from) + INCHES * (
+            sum(above) - CV_HEIGHT + sum(below) - MV_HEIGHT + OWN_HEIGHT * len(self.moved)
+        )
         self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + more), layout="constrained")
         panels = list(self.canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}))
         self.cvs: list[Axes] = panels[: len(cvs)]
-        self.mvs: dict[tuple[int, str], Axes] = dict(zip(ordered, panels[-len(ordered) :], strict=True))
+        first_mv = len(panels) - len(self.moved) - len(ordered)
+        self.mvs: dict[tuple[int, str], Axes] = dict(zip(ordered, panels[first_mv:], strict=False))
+        self.dvs: list[Axes] = panels[len(panels) - len(self.moved) :]
         self.error: Axes | None = panels[len(cvs)] if late_from else None
         self.bottom = panels[-1]
         self.cvs[0].set_title(title)
@@ -102,7 +114,9 @@ class LoopPanels:
                 axes.set_title(owner, loc="right", fontsize="small", fontweight="normal", pad=2.0)
             if mv.values is not None:
                 _allow_only(axes, mv)
-        if len(self.mvs) > 1 or len(cvs) > 1:
+        for axes, (signal, _) in zip(self.dvs, self.moved, strict=True):
+            axes.set_ylabel(signal_label(signal))
+        if len(self.mvs) + len(self.dvs) > 1 or len(cvs) > 1:
             self.canvas.align_ylabels(panels)
         if self.error is not None:
             self.error.set_ylabel(axis_label("error", cvs[0].unit))
@@ -159,12 +173,19 @@ class LoopPanels:
             axes.margins(x=0.01)
         if self.reference is not None and len(self.reference) == len(time):
             self.cvs[0].plot(time, first(self.reference), label="reference", zorder=5, **REFERENCE)
+        for axes, (_, values) in zip(self.dvs, self.moved, strict=True):
+            axes.step(time[: len(values)], values[: len(time)], where="post", **SET_POINT)
         self.bottom.set_xlabel(words)
         handles, labels = self.cvs[0].get_legend_handles_labels()
         if self.hidden:
             handles, labels = [*handles, Patch(color="black", alpha=0.25, linewidth=0)], [*labels, FAST]
         legend_below(self.canvas, handles, labels)
         return self.canvas
+
+
+def _moved(signals: Sequence[Signal], dv: Array | None) -> list[tuple[Signal, Array]]:
+    """The measured disturbances that a test moves, each with its course (n,)."""
+    return [] if dv is None else [(s, v) for s, v in zip(signals, dv.T, strict=True) if np.ptp(v) > 0]
 
 
 def _column(values: Array, i: int) -> Array:
@@ -245,7 +266,8 @@ def _picture(evidence: Evidence, scenario: str, title: str, drawn: Mapping[str, 
     tests = evidence.tests.get(scenario.removesuffix(NOISE_SUFFIX), ())
     loops = {label: loop for label, (loop, _) in drawn.items()}
     reference = tests[0].reference if tests else None
-    panels = LoopPanels(evidence.case, title, loops, evidence.late_from(scenario), reference)
+    dv = tests[0].dv if tests else None
+    panels = LoopPanels(evidence.case, title, loops, evidence.late_from(scenario), reference, dv)
     for label, (loop, colour) in drawn.items():
         panels.add(loop, label, colour)
     return panels.finish(next(iter(loops.values())))
@@ -354,6 +376,20 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas:
         label = f"{law_name(baseline)}, {metric.short} {_error(error, metric)}"
         drawn[label] = other, colour_of(baseline, evidence.laws, baseline)
     return _picture(evidence, scenario, title, drawn)
+
+
+def disturbance_picture(evidence: Evidence, scenario: str) -> Canvas:
+    """The first sequence of a test that moves a measured disturbance, under the best law and the baseline."""
+    laws, metric = dict.fromkeys((evidence.best or "", evidence.case.baseline)), evidence.case.criterion
+    drawn = {}
+    for law in laws:
+        loop = evidence.loop(Curve(law), scenario)
+        if loop is not None:
+            label = f"{law_name(law)}, {metric.short} {_error(evidence.figure(law, scenario), metric)}"
+            drawn[label] = loop, colour_of(law, evidence.laws, evidence.case.baseline)
+    if not drawn:
+        raise NotMeasuredError
+    return _picture(evidence, scenario, evidence.scenarios[scenario], drawn)
 
 
 def _error(value: float | None, metric: Metric) -> str:

@@ -16,7 +16,7 @@ from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.model_evidence import candidates, identified_part
 from pipeline.pictures.drawing import STYLE, CasePicture, Draw, save
 from pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
-from pipeline.pictures.loop_pictures import info_picture, loops_picture, overview_picture
+from pipeline.pictures.loop_pictures import disturbance_picture, info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
 from pipeline.pictures.replay_pictures import replay_picture
 from pipeline.pictures.words import scenario_name
@@ -36,7 +36,8 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
     The case's own figures are ``figure_05.png`` and so on, with the best controller added;
     ``closed_loop_<law>.png`` shows each law beside the case's baseline on the test that weighs most, and
     ``closed_loop.png`` the best one; ``candidates_<set>_<part>.png`` the search over a model's
-    size; ``own`` are the pictures that only this case has.
+    size; ``closed_loop_test_<test>.png`` a test that moves measured disturbances; ``own`` are the pictures that only
+    this case has.
     Raises ReportError where two pictures have the same file name.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -63,6 +64,10 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                     drawn["closed_loop.png"] = f"{law.title} on {untuned}"
             with suppress(NotMeasuredError):
                 keep(f"replay_{name}", replay_picture(evidence, name), f"{law.title}, replayed over the record")
+        for test, sequences in evidence.tests.items():
+            if sequences[0].dv is not None:
+                with suppress(NotMeasuredError):
+                    keep(f"closed_loop_test_{test}", disturbance_picture(evidence, test), evidence.scenarios[test])
         for table in (t for name, model in evidence.models.items() for t in candidates(name, model)):
             words = f"Lags and widths tried for {table['part']} of the model {table['model']}"
             keep(

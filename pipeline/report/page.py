@@ -161,6 +161,7 @@ def _locked(evidence: Evidence, law: str) -> dict[str, str]:
     own = evidence.laws[law].metrics
     return {
         "law": law,
+        "did": "locked up or left its limits" if evidence.case.on_models else "locked up",
         "loops": "one closed loop" if own.lock_ups == 1 else f"{own.lock_ups} closed loops",
         "tests": lock_up_text(own.locked_up),
         "why": ". It is shipped as printed, to reproduce the paper" if own.as_printed else ". It is not shipped",

@@ -35,6 +35,7 @@ class SimulatedPlant:
         self._step, self._parameters = plant.stepper(), plant.parameters()
         self._places = {plant.parameter_names().index(name): values for name, values in run.changes.items()}
         self.k = 0
+        self._dv = run.dv
         self.x, self.mv = run.x0.copy(), run.mv0.copy()
 
     @property
@@ -42,16 +43,21 @@ class SimulatedPlant:
         """True process variables, shape (n_pv,)."""
         return self.plant.measure(self.x)
 
+    @property
+    def dv(self) -> Array:
+        """Measured disturbances, shape (n_dv,)."""
+        return self.plant.dv_nominal if self._dv is None else self._dv[min(self.k, len(self._dv) - 1)]
+
     def read(self) -> Sample:
         """Process variables with their noise, and the MV that was applied."""
-        return Sample(pv=self.pv + self.run.noise[self.k], mv_applied=self.mv, dv=self.plant.dv_nominal)
+        return Sample(pv=self.pv + self.run.noise[self.k], mv_applied=self.mv, dv=self.dv)
 
     def write(self, mv: Array) -> None:
         """Hold ``mv`` for one period."""
         for place, values in self._places.items():
             self._parameters[place] = values[self.k]
         self.mv = mv
-        self.x = self._step(self.x, mv, self.plant.dv_nominal, self._parameters)
+        self.x = self._step(self.x, mv, self.dv, self._parameters)
         self.k += 1
         if not np.isfinite(self.x).all():
             raise PlantError(

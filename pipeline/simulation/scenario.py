@@ -21,7 +21,8 @@ class Scenario:
     """One closed-loop test.
 
     At sample k the PV is measured, the error sp(k) - pv(k) counted, and the law's move acts over
-    [k, k+1). ``changes`` holds plant parameters over every period, which no controller sees.
+    [k, k+1). ``changes`` holds plant parameters over every period, which no controller sees. ``dv`` holds the
+    measured disturbances, which a controller is given at sample k and which act over [k, k+1).
     """
 
     name: str
@@ -35,6 +36,7 @@ class Scenario:
     late_from: int = 0  # where above 0: the sample from which `sse_late` counts, once the set point is within reach
     plant: Simulator | None = None  # what the test runs on, where that is not the case's plant
     reference: Array | None = None  # (n, 1) what the CV should do, where that is not to be at its set point at once
+    dv: Array | None = None  # (n, n_dv) measured disturbances at every sample; None: they stay at the plant's own
 
     def __post_init__(self) -> None:
         what = f"scenario {self.name!r}"
@@ -46,6 +48,8 @@ class Scenario:
                 raise PlantError(f"{what}: {key} has shape {values.shape}; give one value a period, ({n},)")
         if self.reference is not None and self.reference.shape != self.sp.shape:
             raise PlantError(f"{what}: reference has shape {self.reference.shape}; give that of sp, {self.sp.shape}")
+        if self.dv is not None and (self.dv.ndim != 2 or len(self.dv) != n):
+            raise PlantError(f"{what}: dv has shape {self.dv.shape}; give (n, n_dv) with a row for each of {n} samples")
 
     @property
     def samples(self) -> int:
@@ -63,6 +67,18 @@ class Scenario:
             table[:, plant.parameter_names().index(key)] = values
         return table
 
+    def disturbances(self, plant: Simulator) -> Array:
+        """Measured disturbances at every sample, shape (n, n_dv); PlantError for another number than the plant's."""
+        nominal = plant.dv_nominal
+        if self.dv is None:
+            return np.tile(nominal, (self.samples, 1))
+        if self.dv.shape[1:] != nominal.shape:
+            raise PlantError(
+                f"scenario {self.name!r} has {self.dv.shape[1]} measured disturbances; plant {plant.name!r} has "
+                f"{len(nominal)}"
+            )
+        return self.dv
+
     def digest(self) -> str:
         """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""
 
@@ -74,6 +90,8 @@ class Scenario:
         what: list[Any] = [text, self.hold, *([self.late_from] if self.late_from else [])]
         if self.reference is not None:
             what.append(digits(self.reference))
+        if self.dv is not None:
+            what.append(["dv", *digits(self.dv)])
         if self.plant is not None:
             what.append([self.plant.name, *digits(self.plant.parameters())])
         return digest(what)

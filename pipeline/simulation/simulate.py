@@ -66,7 +66,7 @@ def simulate_batch(plant: Simulator, x0: Array, mv: Array) -> Array:
 def simulate_closed(
     plant: Simulator, step: Step, test: Scenario, *, noise: Sequence[float] | Array | None = None, seed: int = 0
 ) -> Trajectory:
-    """Close the loop of a controller over a plant, whose measured disturbances stay nominal.
+    """Close the loop of a controller over a plant; its measured disturbances are those of the test.
 
     ``step(sp, pv, mv_applied) -> (mv, info)``; at sample 0 ``mv_applied`` is the test's ``mv0``. ``noise`` holds
     the standard deviation of the Gaussian measurement noise of each PV, in the PV's unit; ``seed`` is its seed.
@@ -76,7 +76,7 @@ def simulate_closed(
     n, n_mv = test.samples, len(plant.mv_signals)
     parameters = test.parameters(plant)
     deviation = noise_draws(plant, n, noise, np.random.default_rng(seed))
-    advance, dv = plant.stepper(), plant.dv_nominal
+    advance, dv = plant.stepper(), test.disturbances(plant)
     x, pv, mv, info = np.empty((n + 1, plant.n_x)), np.empty(deviation.shape), np.empty((n, n_mv)), []
     x[0] = _checked("x0", test.x0, x.shape[1:])
     applied = _checked("mv0", test.mv0, (n_mv,))
@@ -87,7 +87,7 @@ def simulate_closed(
         if not np.isfinite(applied).all():
             raise PlantError(f"plant {plant.name!r}: the controller's MV is {applied} at sample {k}; it must be finite")
         info.append(np.asarray(row, dtype=np.float64).ravel())
-        x[k + 1] = advance(x[k], applied, dv, parameters[k])
+        x[k + 1] = advance(x[k], applied, dv[k], parameters[k])
         if not np.isfinite(x[k + 1]).all():
             _check_finite(plant, x[: k + 2])
     time_s = np.arange(n, dtype=np.float64) * plant.period_s

@@ -50,6 +50,7 @@ class Timetable:
     noise: Array  # (n, n_pv)
     manual: tuple[ManualSpan, ...] = ()
     marks: dict[float, str] = field(default_factory=dict)  # time [s] -> what happened there
+    dv: Array | None = None  # (n, n_dv) measured disturbances; None: the plant's own
 
     def manual_at(self, time_s: float) -> ManualSpan | None:
         """The manual span that holds at ``time_s``."""
@@ -110,6 +111,7 @@ def timetable(
         _check_range("a start at", plant.pv_signals[0], start_cv)
     changes: dict[str, Array] = {}
     marks: dict[float, str] = {}
+    measured: Array | None = None
     if set_points:
         x0, mv0, start = _rest(plant, start_cv)
         spans = [t for s in manual for t in (s.start_s, s.end_s) if math.isfinite(t)]
@@ -126,12 +128,13 @@ def timetable(
         x0, mv0 = (test.x0, test.mv0) if start_cv is None else _rest(plant, start_cv)[:2]
         sp = _stretched(test.sp, n)
         changes = {name: _stretched(values, n) for name, values in test.changes.items()}
+        measured = None if test.dv is None else _stretched(test.dv, n)
         if changes:
             marks[0.0] = ", ".join(changes)
     nominal = dict(zip(plant.parameter_names(), plant.parameters(), strict=True))
     for event in sorted(disturbances, key=lambda e: e.time_s):
         if event.name in {s.name for s in plant.dv_signals}:
-            raise ParamsError(f"{event.name!r} is a measured disturbance, which stays nominal in every simulation")
+            raise ParamsError(f"{event.name!r} is a measured disturbance, which only a test moves")
         if event.name not in nominal:
             raise ParamsError(f"plant {plant.name!r} has no parameter {event.name!r}{nearest(event.name, nominal)}")
         k = _sample(plant, event, n)
@@ -146,7 +149,7 @@ def timetable(
                 f"manual from {span.start_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s"
             )
         marks.setdefault(span.start_s, "manual")
-    return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks)
+    return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks, measured)
 
 
 def _set_point(plant: Simulator, event: Event) -> int:

@@ -145,7 +145,7 @@ def _controller(name: str) -> None:
         if isinstance(p, LinearizedPart)
     }
     for place, settings in read.items():
-        lacking = [part for part in law.needs(settings) if described and part not in described]
+        lacking = [part for part in law.needs(settings, described) if described and part not in described]
         if lacking:
             raise ParamsError(
                 f"{place}: law {params.law!r} needs a part {lacking[0]!r}; model set {params.model!r} has "

@@ -46,8 +46,8 @@ def validate(name: str) -> None:
     """Run every file of ``controllers.<name>`` over its plant; ship the best by the development sequences.
 
     A law that was not designed, because it does not suit the plant, leaves the reason.
-    A law that locks up anywhere is not shipped. On a plant's equations that is an error; where tests run on models of
-    a record, the case goes on without it, and its report says why.
+    A law that locks up anywhere is not shipped, nor one that leaves its limits on a model of a record. On a plant's
+    equations that is an error; where tests run on models, the case goes on without it, and its report says why.
     """
     params = ControllerParams.read(name)
     choices = parse(CaseParams, read_section("cases", params.case), f"cases.{params.case}")
@@ -75,7 +75,8 @@ def validate(name: str) -> None:
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))
     source = controller_file(params.case, params.name, BASE, shipped.seed)
     locked_up = _locked_up(base)
-    withheld = f"controllers.{name} locked up on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
+    how = "locked up or left its limits" if case.on_models else "locked up"
+    withheld = f"controllers.{name} {how} on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
     withheld += "numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
     refused = bool(locked_up) and not params.as_printed
     if refused and not case.on_models:

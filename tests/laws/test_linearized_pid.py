@@ -16,6 +16,7 @@ from pipeline.export.graph import law_graph
 from pipeline.laws.base import ControlLaw
 from pipeline.laws.gain_update import gain_update
 from pipeline.laws.linearized.linearized_pid import LinearizedPid
+from pipeline.laws.ranges import in_units
 from pipeline.models.lagged.instantaneous import linearize
 from pipeline.models.lagged.nnarx import NNARX
 
@@ -43,7 +44,8 @@ class Plain:
     """The law as the formulas stand: plain Python, one sample at a time, the penalty doubled in a loop."""
 
     def __init__(self, model: NNARX, start: np.ndarray, **params) -> None:
-        self.model, self.z, self.p = model, start, LinearizedPid.Params(**params)
+        self.model, self.z = model, start
+        self.p = in_units(LinearizedPid.Params(**params), PH.plant.signals, "linearized_pid")
         self.past, self.change, self.squares = None, np.zeros(3), []
         (self.mu, self.mu_low), self.offset = self.p.penalties, None
 
@@ -181,7 +183,7 @@ def test_guard_keeps_the_gains(model: NNARX) -> None:
 
 def test_first_gains_are_the_pid_that_the_central_model_asks_for(model: NNARX) -> None:
     """A linear model of two lags makes the minimum-variance law a PID: its gains give the same move."""
-    law = ph_law(model, slope_min=1e6, gain_high=(100.0,) * 3)
+    law = ph_law(model, penalty=1.0, slope_min=1e6, gain_high=(100.0,) * 3)
     kc, ki, kd = law.gains.slots["gains"].start({"y": torch.zeros(1)}).tolist()
     slopes = linearize(model, model.net.x_center).slopes
     a1, a2, b = -float(slopes[0]), -float(slopes[1]), UNIT * float(slopes[2])
@@ -231,7 +233,7 @@ def test_few_operators(model: NNARX, params: dict, most: int) -> None:
         ({"offset_filter": 0.0}, "offset_filter"),
         ({"trust": 1.5}, "trust"),
         ({"preview": "known"}, "preview"),
-        ({"penalty_low": 30.0}, "penalty_low"),
+        ({"penalty": 20.0, "penalty_low": 30.0}, "penalty_low"),
         ({"eps_low": 0.3}, "eps_low"),
         ({"adaptive": True}, "eps_high"),
         ({"penalti": 1.0}, "did you mean 'penalty'"),

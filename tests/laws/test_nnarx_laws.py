@@ -107,7 +107,7 @@ def test_what_it_cannot_use_is_said(model: NNARX) -> None:
     with pytest.raises(LawError, match="slope over the MV is 0"):
         ph_law(NNARX(2, 2), "linearized_pid")
     with pytest.raises(LawError, match="first gains"):
-        ph_law(model, "linearized_pid", gains=(20.0, 1.0, 1.0))
+        ph_law(model, "linearized_pid", gains=(20.0, 1.0, 1.0), gain_high=(10.0,) * 3)
 
 
 @pytest.mark.parametrize("name", LAWS)

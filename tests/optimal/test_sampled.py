@@ -44,7 +44,7 @@ def test_the_solver_s_equation_is_the_plant_s(seed: int, dead: float, tau: float
     plant, rng = plant_of(seed), np.random.default_rng(seed)
     p = plant.parameters({"gain_u1": 1.3, "time_constant": tau, "dead_time": dead, "load_y0": 0.2})
     x, mv = rng.normal(size=plant.n_x), rng.normal(size=2)
-    ours = np.array(transition(plant)(x, mv, p, shares(plant, p))).ravel()
+    ours = np.array(transition(plant)(x, mv, p, shares(plant, p), plant.dv_nominal)).ravel()
     np.testing.assert_allclose(ours, plant.step(x, mv, plant.dv_nominal, p), atol=1e-12)
 
 

@@ -48,7 +48,7 @@ def test_no_file_is_shipped_and_the_reason_stays(metrics: LawMetrics) -> None:
     assert metrics.lock_ups > 0
     assert not Path("artifacts/it/pid.onnx").exists()
     why = json.loads(Path("artifacts/it/pid.json").read_text())["withheld"]
-    assert why.startswith("controllers.it-pid locked up on ")
+    assert why.startswith("controllers.it-pid locked up or left its limits on ")
     assert set(metrics.locked_up) >= {"held_out", "spoilt"}
     assert LawEvidence(metrics, Path("trajectories.npz")).withheld
 
@@ -62,7 +62,9 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     y = np.zeros((400, 1))
     for k in range(4, 399):
         y[k + 1] = 0.6 * y[k] + 0.8 * mv[k - 4]
-    case = case_of(section(1, 1), [first_order(pole, dead=4) for pole in POLES], y, mv)
+    inflow = np.repeat(np.resize([0.3, 0.0, -0.3], 40), 10)[:, None]
+    lags = [first_order(pole, dead=4, disturbance=0.5) for pole in POLES]
+    case = case_of(section(1, 1, dv=[{"name": "d0", "unit": "V", "low": -1.0, "high": 1.0}]), lags, y, mv, inflow)
     (case.models.parent / "metrics.json").write_text(json.dumps({"data": {"0": "x"}, "parts": {}}))
     tree = yaml.safe_load(Path("params.yaml").read_text())
     own = {"case": "it", "model": "identified"}
@@ -76,11 +78,15 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     }
     Path("params.yaml").write_text(yaml.safe_dump(tree))
     why = "law 'gauss_newton_pid' is withheld: y0 answers 5 samples after u0 moves, the law looks 1 ahead"
-    assert any(line.startswith(f"controllers.it-one_step: {why}") for line in notes())
+    assert f"controllers.it-one_step: {why}; choose law 'predictive' or 'pid', or remove the section" in notes()
     for name in ("it-one_step", "it-pid"):
         design(name)
         validate(name)
     assert json.loads(Path("artifacts/it/one_step.json").read_text())["withheld"].startswith(why)
     assert not Path("artifacts/it/one_step.onnx").exists()
     report("it")
-    assert f"**`one_step` was not designed:** {why}" in Path("artifacts/it/report.md").read_text()
+    page = Path("artifacts/it/report.md").read_text()
+    assert f"**`one_step` was not designed:** {why}" in page
+    # The PID met the steps of the measured disturbance too, and the report shows them.
+    assert "| A step of d0, and back, 2 draws |" in page
+    assert Path("artifacts/it/figures/closed_loop_test_measured.png").stat().st_size > 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar, NamedTuple, Self
@@ -100,7 +100,7 @@ class FuzzyLaw(ControlLaw):
         )
 
     @classmethod
-    def needs(cls, params: Any) -> tuple[str, ...]:
+    def needs(cls, params: Any, given: Collection[str] = ()) -> tuple[str, ...]:
         """The part that ``params.part`` names, if it does."""
         return () if params.part is None else (params.part,)
 

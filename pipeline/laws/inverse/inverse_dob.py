@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
+from pipeline.laws.base import (
+    Analysis,
+    ControlLaw,
+    Stepped,
+    hold_numbers,
+    require_kind,
+    require_part,
+    require_single_loop,
+)
+from pipeline.laws.inverse.learnt_parts import learnt_parts
+from pipeline.laws.inverse.self_chosen import LONGEST, Choice
+from pipeline.laws.ranges import OfRange, in_units
 from pipeline.models.base import Model
+from pipeline.models.identified.identified import Identified
 from pipeline.models.static.pair import Layout, Pair, candidates
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
 # Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
 FOLLOWED = 1e-3
+OWN_CHOICE = ("identified",)  # parts of a set from which a law chooses and learns its networks itself
 ONE_PERIOD = "a network of task forward over one period, its target the observed PV"
 
 
@@ -32,6 +45,20 @@ def _rising(forward: Model, signals: Signals) -> bool:
     with torch.no_grad():
         at = candidates(forward, states, ends)
     return float((at[:, 1] - at[:, 0]).sum()) >= 0
+
+
+def _place(observed: str | None, signals: Signals) -> int | None:
+    names = [s.name for s in signals.pv]
+    if observed is not None and observed not in names:
+        raise LawError(f"observed is {observed!r}; the process variables are {', '.join(names)}")
+    return None if observed is None else names.index(observed)
+
+
+def _model_of_all(models: Mapping[str, Model], signals: Signals, law: str) -> Identified:
+    model = require_kind(models, Identified, law, " of all PVs")
+    if model.n_y != len(signals.pv):
+        raise LawError(f"law {law!r} needs a model of all {len(signals.pv)} PVs; part 'identified' has {model.n_y}")
+    return model
 
 
 class ObserverLaw(ControlLaw):
@@ -57,13 +84,16 @@ class ObserverLaw(ControlLaw):
         """Numbers of the law.
 
         ``observer_gain`` L in (0, 1]; ``integral_gain`` ki >= 0 a sample; ``band`` [cv] the error below
-        which the integral acts; ``observed`` the name of the PV that part ``observer`` predicts, None for the
-        last; ``mv_rate`` [mv] the largest change a sample, None unlimited.
+        which the integral acts; ``horizon`` h in periods and ``observed``, the name of a PV: None lets the law
+        choose from the part ``identified``, see ``Choice``. Where the set has parts of the law's own, these state
+        their horizon, and ``observed`` is the PV that part ``observer`` predicts, None for the last; ``mv_rate``
+        [mv] the largest change a sample, None unlimited.
         """
 
         observer_gain: float
         integral_gain: float
-        band: float
+        band: float = OfRange(0.02)
+        horizon: int | None = None
         observed: str | None = None
         mv_rate: float | None = None
 
@@ -74,7 +104,11 @@ class ObserverLaw(ControlLaw):
                 raise ValueError(
                     f"integral_gain is {self.integral_gain} and band {self.band}; they must be >= 0 and > 0"
                 )
+            if self.horizon is not None and not 1 <= self.horizon <= LONGEST:
+                raise ValueError(f"horizon is {self.horizon}; give 1 to {LONGEST} periods, or leave it out")
 
+    observes_within: ClassVar[int | None] = 1
+    choice: Choice | None = None
     # In the order of the constructor's arguments.
     parts: ClassVar[Mapping[str, str]] = {"forward": "a network of task forward", "observer": ONE_PERIOD}
     span: Tensor
@@ -83,11 +117,10 @@ class ObserverLaw(ControlLaw):
 
     def __init__(self, signals: Signals, forward: Model, observer: Model, params: Params, sections: int = 1) -> None:
         super().__init__(signals, params.mv_rate)
+        params = in_units(params, signals, self.name)
         names = [s.name for s in signals.pv]
-        if params.observed is not None and params.observed not in names:
-            raise LawError(f"observed is {params.observed!r}; the process variables are {', '.join(names)}")
-        self.params = params
-        self.observed = len(names) - 1 if params.observed is None else names.index(params.observed)
+        place = _place(params.observed, signals)
+        self.params, self.observed = params, len(names) - 1 if place is None else place
         self.n_pv = n = len(names)
         self.n_state = n + 4  # started, x(k-1), d, I, mv(k-1)
         self.info = ("sp_requested", "sp_min", "sp_max", "disturbance", "integral")
@@ -128,11 +161,33 @@ class ObserverLaw(ControlLaw):
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
-        """The law over its ``parts``, each of the PVs and one more input; raises LawError."""
+        """The law over its ``parts``, each of the PVs and one more input, or over ``identified``; raises LawError."""
         require_single_loop(signals, cls.name)
+        choice = None
+        if cls.needs(params, models) == OWN_CHOICE:
+            model = _model_of_all(models, signals, cls.name)
+            choice = Choice.of(model, signals, params.horizon, _place(params.observed, signals))
+            models = learnt_parts(model, signals, choice)
+            params = replace(params, observed=signals.pv[choice.observed].name)
+        elif params.horizon is not None:
+            raise LawError(
+                f"law {cls.name!r}: horizon is {params.horizon}, but the set has parts of the law's own; give "
+                "`horizon` to its parts 'forward' and 'inverse', or leave these parts out"
+            )
         networks = [require_part(models, part, cls.name, len(signals.pv) + 1, 1) for part in cls.parts]
-        law: Any = cls  # a final class, with as many networks as it has parts
-        return law(signals, *networks, params)
+        final: Any = cls  # with as many networks as it has parts
+        law: Self = final(signals, *networks, params)
+        law.choice = choice
+        return law
+
+    @classmethod
+    def needs(cls, params: Any, given: Collection[str] = ()) -> tuple[str, ...]:
+        """Its ``parts``; the identified model alone, for a set that has one and no network of the law's own."""
+        return OWN_CHOICE if set(given) & {"identified", *cls.parts} == {"identified"} else tuple(cls.parts)
+
+    def analysis(self, plant: Simulator | None) -> Analysis:
+        """What the law chose itself; empty where its parts were given."""
+        return Analysis() if self.choice is None else self.choice.analysis(self.signals)
 
     @abstractmethod
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
@@ -209,7 +264,7 @@ class ForwardDob(ObserverLaw):
         self.register_buffer("part", self.span / self.SECTIONS)
         self.register_buffer("chord", self.part / self.SECTIONS)
         self.register_buffer("cuts", self.part * torch.linspace(0, 1, self.SECTIONS + 1, dtype=torch.float64))
-        hold_numbers(self, flat=1e-12)
+        hold_numbers(self, flat=1e-12 * (signals.sp[0].high - signals.sp[0].low))
 
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
         """As in ObserverLaw."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from pipeline.laws.adaptive import signed_unit, target, target_slots
 from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
 from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid, central_model, next_output
+from pipeline.laws.ranges import OfRange, in_units
 from pipeline.models.base import Model
 from pipeline.models.lagged.next_output import GaussNewton
 from pipeline.models.lagged.nnarx import NNARX
@@ -44,9 +45,8 @@ class GaussNewtonPid(NnarxPid):
 
     @dataclass(frozen=True, slots=True)
     class Params(NnarxParams):
-        """As NnarxParams, with a smaller penalty; ``relinearize`` is the number of linearizations, 1 or more."""
+        """As NnarxParams; ``relinearize`` is the number of linearizations, 1 or more."""
 
-        penalty: float = 0.1
         relinearize: int = 5
 
         def __post_init__(self) -> None:
@@ -56,7 +56,7 @@ class GaussNewtonPid(NnarxPid):
 
     def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         super().__init__(signals, model, params, info=("linearization_error",))
-        self.search = GaussNewton(self.model, params.relinearize, params.penalty, params.slope_min)
+        self.search = GaussNewton(self.model, params.relinearize, self.params.penalty, self.params.slope_min)
 
     def formulas(self, p: Named) -> Named:
         """Those of the model, and the moves that the actuator can make."""
@@ -94,7 +94,7 @@ class MinimumVariance(ControlLaw):
 
     @dataclass(frozen=True, slots=True)
     class Params:
-        """Numbers of the law; the MV counts in units of half its range.
+        """Numbers of the law; the MV counts in units of half its range. Defaults in pv are shares of its range.
 
         ``penalty`` mu > 0 of the move [pv^2]; ``relinearize`` the linearizations a sample, 1 or more;
         ``preview`` of r(t+1) and ``plant_gain`` as in AdaptiveParams; ``slope_min`` [pv] a slope
@@ -102,11 +102,11 @@ class MinimumVariance(ControlLaw):
         ``mv_rate`` [mv] the largest change a sample, None unlimited.
         """
 
-        penalty: float = 0.1
+        penalty: float = OfRange(1e-3, 2)
         relinearize: int = 5
         preview: Literal["held", "ramp"] = "held"
         plant_gain: Literal["auto", "positive", "negative"] = "auto"
-        slope_min: float = 1e-3
+        slope_min: float = OfRange(1e-4)
         offset_filter: float = 1.0
         mv_rate: float | None = None
 
@@ -123,6 +123,7 @@ class MinimumVariance(ControlLaw):
     def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
         require_single_loop(signals, self.name)
+        params = in_units(params, signals, self.name)
         unit = signed_unit(signals, params.plant_gain, float(central_model(model).b[0]))
         self.model = next_output(self.name, model, unit, params.offset_filter)
         self.search = GaussNewton(self.model, params.relinearize, params.penalty, params.slope_min)

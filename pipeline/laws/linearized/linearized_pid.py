@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pipeline.laws.base import Stepped, hold_numbers
 from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
+from pipeline.laws.ranges import ascend, in_units
 from pipeline.models.lagged.next_output import Ahead
 from pipeline.models.lagged.nnarx import NNARX
 from pipeline.models.memory import Named, Slot, constant
@@ -55,7 +56,7 @@ class LinearizedPid(NnarxPid):
         def __post_init__(self) -> None:
             NnarxParams.__post_init__(self)
             start, low = self.penalties
-            if not 0 < low <= start:
+            if not (low > 0 and (low == start or ascend(low, start))):
                 raise ValueError(f"penalty_low is {low} and penalty_start {start}; give 0 < low <= start")
             if not (0 <= self.eps_low < self.eps_high or (self.eps_low == self.eps_high == 0 and not self.adaptive)):
                 raise ValueError(f"eps_low is {self.eps_low} and eps_high {self.eps_high}; give 0 <= low < high")
@@ -75,6 +76,7 @@ class LinearizedPid(NnarxPid):
     none: Tensor  # (1,) larger than any penalty
 
     def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
+        params = in_units(params, signals, self.name)
         start, low = params.penalties
         more = {"penalty": Slot(1, constant(torch.tensor([start], dtype=torch.float64)))} if params.adaptive else {}
         super().__init__(signals, model, params, more, ("linearization_error", *more))

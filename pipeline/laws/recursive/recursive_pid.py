@@ -65,7 +65,7 @@ class RecursivePid(AdaptivePid):
         more = {"offset": Slot(1, constant(torch.zeros(1, dtype=torch.float64)))}
         slopes = model.weight[: model.n_y], float(model.weight[model.n_y])
         super().__init__(signals, params, -slopes[0], slopes[1], model_for, more, ("offset",))
-        hold_numbers(self, penalty=params.penalty, alpha=self.model.half_y * params.offset_filter)
+        hold_numbers(self, penalty=self.params.penalty, alpha=self.model.half_y * params.offset_filter)
 
     def formulas(self, p: Named) -> Named:
         """The model's terms, r(t+1) less the known part of y(t+1), and (1 - alpha) d1."""

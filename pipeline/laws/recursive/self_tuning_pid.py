@@ -12,6 +12,7 @@ from torch import Tensor
 from pipeline.laws.adaptive import signed_unit
 from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_single_loop
 from pipeline.laws.gain_update import PidForm
+from pipeline.laws.ranges import OfRange, in_units
 from pipeline.laws.recursive.arx_law import estimator, require_arx
 from pipeline.models.base import Model
 from pipeline.models.lagged.arx import ARX
@@ -54,6 +55,8 @@ class SelfTuningPid(ControlLaw):
     class Params:
         """Numbers of the law; MVs count in units of half the MV's range, PVs in their own.
 
+        Defaults in the PV's unit are shares of the range of its set point, see ``OfRange``.
+
         ``prefilter``: p_1, p_2, p_3 of P, fewer are followed by zeros; ``integral``: the integral action
         constant nu > 0 [1/pv]. ``forgetting`` in (0, 1] and ``covariance``, the first and largest one of
         parameters and signals scaled to the order of one, are the estimator's. ``gain_high``: upper bounds of
@@ -66,9 +69,9 @@ class SelfTuningPid(ControlLaw):
         integral: float
         forgetting: float
         covariance: float
-        gain_high: tuple[float, float, float] = (10.0, 10.0, 10.0)
+        gain_high: tuple[float, float, float] = (OfRange(100.0, -1), OfRange(100.0, -1), OfRange(100.0, -1))
         plant_gain: Literal["auto", "positive", "negative"] = "auto"
-        slope_min: float = 1e-3
+        slope_min: float = OfRange(1e-4)
         mv_rate: float | None = None
 
         def __post_init__(self) -> None:
@@ -90,6 +93,7 @@ class SelfTuningPid(ControlLaw):
     def __init__(self, signals: Signals, model: ARX, params: Params) -> None:
         super().__init__(signals, params.mv_rate)
         require_single_loop(signals, self.name)
+        params = in_units(params, signals, self.name)
         unit = signed_unit(signals, params.plant_gain, float(model.weight[model.n_y]))
         self.model = estimator(self.name, signals, model, unit, params, params.prefilter, TERMS)
         n, nu = self.model.size, params.integral

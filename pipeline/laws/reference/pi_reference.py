@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
 
@@ -65,7 +65,7 @@ class PiReference(ReferenceLaw):
         self.stage = self.prepared(formulas)
 
     @classmethod
-    def needs(cls, params: Any) -> tuple[str, ...]:
+    def needs(cls, params: Any, given: Collection[str] = ()) -> tuple[str, ...]:
         """No part where ``kc`` and ``ti_s`` are given."""
         return () if params.tuning == "manual" else tuple(cls.parts)
 

@@ -51,6 +51,7 @@ class ReferenceLaw(ControlLaw):
     """
 
     parts: ClassVar[Mapping[str, str]] = {"state_space": "kind state_space"}
+    looks_ahead: ClassVar[int | None] = 1  # its plant's network knows the PVs and the MV of now alone
     followed: Tensor  # (1,) [mv]
 
     def __init__(self, signals: Signals, model: ReferenceModel, mv_rate: float | None = None) -> None:
