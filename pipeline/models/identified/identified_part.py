@@ -71,8 +71,6 @@ class IdentifiedPart(Part):
     def __post_init__(self) -> None:
         if self.member not in (0, 1, 2):
             raise ValueError(f"member is {self.member}; an ensemble has the members 0, 1 and 2")
-        if self.outputs not in ("controlled", "measured"):
-            raise ValueError(f"outputs is {self.outputs!r}; allowed are controlled, measured")
         if self.orders is not None and not 1 <= self.orders[0] <= self.orders[1]:
             raise ValueError(f"orders are {list(self.orders)}; give the least and the most, e.g. [2, 8]")
         if any(n < 1 for n in self.units):

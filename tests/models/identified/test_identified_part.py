@@ -134,7 +134,7 @@ def test_a_long_record_gives_its_liveliest_blocks() -> None:
     ("options", "message"),
     [
         ({"member": 3}, "member is 3; an ensemble has"),
-        ({"outputs": "all"}, "outputs is 'all'; allowed are controlled, measured"),
+        ({"outputs": "all"}, "outputs is 'all'; known: controlled, measured"),
         ({"orders": [3, 2]}, r"orders are \[3, 2\]; give the least"),
         ({"units": [0]}, r"units are \[0\]; each must be"),
         ({"minutes": 0.0}, "minutes is 0; it must be positive"),

@@ -52,6 +52,17 @@ def test_members_share_one_search() -> None:
     assert PART.groundwork() not in works
 
 
+def test_without_lagged_candidates_all_have_the_orders_that_are_given() -> None:
+    source = Source(made_plants.second_order(400), made_plants.signals_of(1, 1))
+    small = replace(PART, units=())
+    starts = {}
+    for lagged in (False, True):
+        trials = replace(small, lagged=lagged).groundwork().done(source, "search").selection.finalists
+        starts[lagged] = {t.structure.start for t in trials}
+        assert lagged or all(t.structure.order == 2 for t in trials)
+    assert starts == {False: {"balanced"}, True: {"balanced", "lagged"}}
+
+
 def test_a_budget_bounds_the_work_and_keeps_the_best_so_far() -> None:
     source = Source(made_plants.hammerstein(300), made_plants.signals_of(1, 1))
     small, large = (replace(PART, minutes=m).groundwork().done(source, "search").selection for m in (1e-5, 0.02))
