@@ -32,7 +32,8 @@ from pipeline.simulation.simulate import simulate_batch
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
 QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
-# Low gains: inputs drawn over whole ranges would drive the MV to its ends, where laws cannot be told apart.
+# Lower gains than the defaults, whose loops test_units_of_laws.py runs: over quick networks of an unstable plant and
+# inputs drawn over whole ranges the defaults keep the MV at its ends, where laws cannot be told apart.
 CALM: dict[str, Any] = {"penalty": 1.0, "stiffness": 1e-3, "gain_high": (10.0,) * 3, "slope_min": 1e-3}
 for _name in ("linearized_pid", "gauss_newton_pid", "minimum_variance", "recursive_pid", "self_tuning_pid"):
     _known = {f.name for f in dataclasses.fields(LAWS[_name].Params)}

@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from pipeline.cases import CASES, all_cases
-from pipeline.cases.own_plant import GAINS, LOAD_AT, OwnCase, own_case
+from pipeline.cases.own_model import GAINS
+from pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
 from pipeline.cases.reach import LOAD
 from pipeline.errors import ParamsError, PlantError
 from pipeline.plants.signals import Signals
