@@ -110,14 +110,17 @@ def _record(path: Path | None, case: Case) -> Record | None:
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Median over the seeds of every number, nested mappings kept; lists and texts are left out."""
+    """Median of every number over the seeds that have it, nested mappings kept; lists and texts are left out."""
     rows = list(per_seed.values())
     medians: dict[str, Any] = {}
-    for key, value in rows[0].items():
-        if isinstance(value, Mapping):
-            medians[key] = _median({str(i): row[key] for i, row in enumerate(rows) if key in row})
-        elif isinstance(value, (int, float)):
-            medians[key] = statistics.median(row[key] for row in rows if key in row)
+    for key in dict.fromkeys(key for row in rows for key in row):
+        values = [row[key] for row in rows if key in row]
+        nested = {str(i): value for i, value in enumerate(values) if isinstance(value, Mapping)}
+        numbers = [value for value in values if isinstance(value, (int, float))]
+        if nested:
+            medians[key] = _median(nested)
+        elif numbers:
+            medians[key] = statistics.median(numbers)
     return medians
 
 
