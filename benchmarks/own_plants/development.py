@@ -150,4 +150,34 @@ class Drifting(OwnPlant):
         return {"fouling": 0.4 + 0.4 * np.sin(2 * np.pi * at / 1_200 + phase)}
 
 
-DEVELOPMENT: tuple[type[OwnPlant], ...] = (Exchanger, Inverse, Coupled, Level, Noisy, Drifting)
+@dataclass(frozen=True)
+class Fading(OwnPlant):
+    """A reactor whose catalyst fades by a third and is renewed, with a gain that falls with the feed."""
+
+    activity: float = field(default=0.85, metadata={"unit": "-"})
+    name: ClassVar[str] = "fading"
+    title: ClassVar[str] = "Catalyst that fades"
+    noise: ClassVar[tuple[float, ...]] = (0.2,)
+    hold: ClassVar[int] = 70
+    moves: ClassVar[tuple[int, int]] = (5, 60)
+    state_signals: ClassVar[tuple[Signal, ...]] = states(5)
+    mv_signals: ClassVar[tuple[Signal, ...]] = valves()
+    pv_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 0.0, 120.0),)
+    sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 44.0, 58.0),)
+
+    def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
+        """dx/dt [degC/s]: the reactor behind a feed line of three lags, and its sensor."""
+        feed = ca.fmax(0.0, x[2]) / 100
+        heat = 25 + 70 * self.activity * feed / (0.3 + feed)
+        return column((x[1] - x[0]) / 12, (heat - x[1]) / 70, *lags(x[2:], self.loaded(mv)[0], 6.0))
+
+    def drift(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
+        """Down from 1 to .65 within 700 to 1,500 samples, and up again within 30."""
+        course: list[float] = []
+        while len(course) < 2 * n + 1_500:
+            course += [*np.linspace(1.0, 0.65, int(rng.integers(700, 1_500))), *np.linspace(0.65, 1.0, 30)]
+        start = int(rng.integers(0, 1_500))
+        return {"activity": np.array(course[start : start + n])}
+
+
+DEVELOPMENT: tuple[type[OwnPlant], ...] = (Exchanger, Inverse, Coupled, Level, Noisy, Drifting, Fading)

@@ -49,11 +49,14 @@ class Selection:
 
     @property
     def nonlinear(self) -> bool:
-        """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``."""
+        """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``.
+
+        In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides.
+        """
         if self.network is None:
             return False
-        uncertain = self.network.spread / np.sqrt(self.network.seeds)
-        return self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error
+        uncertain = 0.0 if self.drifts else self.network.spread / np.sqrt(self.network.seeds)
+        return bool(self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error)
 
     @property
     def chosen(self) -> Trial:
@@ -103,10 +106,16 @@ def select(
     lacking = _misses(rounds.problem, linear[0], WHITE) or _curved(rounds.problem, linear[0])
     finalists = networks.finalists(units) if lacking else []
     best = best_of(finalists)
-    drift = _drift(rounds.problem, min(best, linear[0], key=_trained)) if correction is None and best else None
+    drift = None
+    if correction is None and best is not None:
+        seen = [linear[0], best]
+        if _misses(rounds.problem, best, DRIFTS):
+            # Models whose training runs take their error back are not bent to follow a drift, so that they show it.
+            corrected = networks.corrected(best, SLOW)
+            finalists += corrected
+            seen += corrected[:1]
+        drift = max((_drift(rounds.problem, trial) for trial in seen), key=lambda found: found.share)
     drifting = drift is not None and drift.found
-    if correction is None and best is not None and (drifting or _misses(rounds.problem, best, DRIFTS)):
-        finalists += networks.corrected(best, SLOW)
     if drift is not None and drifting:
         # Plain free runs would rank candidates by how they follow what no model can.
         linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
