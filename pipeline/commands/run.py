@@ -53,7 +53,10 @@ def run(options: argparse.Namespace) -> int:
         return 0
     code = repro(*(["--keep-going"] if options.keep_going else []), *targets) if changed else 0
     if code == 0:
-        show_results(ARTIFACTS)
+        # Somebody who asked for one case need not look for it in the table of all.
+        asked = options.targets if targets and all(t.startswith("report@") for t in targets) else [None]
+        for case in asked:
+            show_results(ARTIFACTS, case=case)
         if targets and not any(t.startswith("report") for t in targets):
             print("the table is of the last report; `loopwright run CASE` makes the report of these results")
     return code

@@ -48,7 +48,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     events("--sp", "[NAME=]VALUE[@S]", "set point from time S on; of several set points with its name")
     add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
     add("--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this CV")
-    events("--disturbance", "NAME=VALUE[@S]", "plant parameter from time S on")
+    events("--disturbance", "NAME=VALUE[@S]", "measured disturbance or plant parameter from time S on")
     events("--noise", "PV=STD", "standard deviation of a measurement's noise, over the whole run")
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip

@@ -47,6 +47,9 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(f"overview   {artifacts / 'report.html'} (and .md)")
         console.print(f"a case     {where / 'report.html'}; its tests here: loopwright results CASE")
     else:
+        best = next((law.law for law in standings[case].laws if law.best), None)
+        if best is not None:
+            console.print(f"the best   {where / f'{best}.onnx'}")
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
     console.print(f"try one    loopwright simulate {where / '<law>.onnx'}")
     console.print(f"read one   loopwright inspect {where / '<law>.onnx'}")

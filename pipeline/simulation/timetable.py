@@ -132,14 +132,23 @@ def timetable(
         if changes:
             marks[0.0] = ", ".join(changes)
     nominal = dict(zip(plant.parameter_names(), plant.parameters(), strict=True))
+    places = {s.name: j for j, s in enumerate(plant.dv_signals)}
     for event in sorted(disturbances, key=lambda e: e.time_s):
-        if event.name in {s.name for s in plant.dv_signals}:
-            raise ParamsError(f"{event.name!r} is a measured disturbance, which only a test moves")
-        if event.name not in nominal:
-            raise ParamsError(f"plant {plant.name!r} has no parameter {event.name!r}{nearest(event.name, nominal)}")
+        if event.name not in {**nominal, **places}:
+            what = "measured disturbance or parameter" if places else "parameter"
+            near = nearest(event.name, [*places, *nominal])
+            raise ParamsError(f"plant {plant.name!r} has no {what} {event.name!r}{near}")
         k = _sample(plant, event, n)
-        changes.setdefault(event.name, np.full(n, nominal[event.name]))[k:] = event.value
-        text = f"{event.name} = {event.value:g} {plant.parameter_units()[event.name]}".strip()
+        if event.name in places:
+            signal = plant.dv_signals[places[event.name]]
+            _check_range("a measured disturbance", signal, event.value)
+            measured = np.tile(plant.dv_nominal, (n, 1)) if measured is None else measured
+            measured[k:, places[event.name]] = event.value
+            unit = signal.unit
+        else:
+            changes.setdefault(event.name, np.full(n, nominal[event.name]))[k:] = event.value
+            unit = plant.parameter_units()[event.name]
+        text = f"{event.name} = {event.value:g} {unit}".strip()
         at = k * plant.period_s
         marks[at] = f"{marks[at]}, {text}" if at in marks else text
     for span in manual:

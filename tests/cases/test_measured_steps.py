@@ -15,13 +15,14 @@ from own_cases import case_of, section
 
 from pipeline.cases.measured_steps import ROOM
 from pipeline.cases.own_plant import GATE, LOAD_AT, MEASURED, OwnCase
-from pipeline.errors import PlantError
+from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.trial import close_loop
 from pipeline.laws.predictive.predictive import Predictive
 from pipeline.models import load_model
 from pipeline.optimal.sampled import SampledHorizon, run_sampled
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.simulation.simulate import Trajectory, simulate_closed
+from pipeline.simulation.timetable import Timetable, parse_event, timetable
 from serving.controller import Controller
 
 POLES, GAIN = (0.8, 0.78, 0.82), 2.0
@@ -69,6 +70,20 @@ def test_the_plant_rests_before_the_step_and_is_moved_by_it(case: OwnCase) -> No
         assert np.ptp(loop.pv[: LOAD_AT + 1]) < 1e-9
         assert loop.pv[LOAD_AT + case.hold, 0] - loop.pv[0, 0] == pytest.approx(test.dv[LOAD_AT, 0], abs=1e-3)
         assert loop.pv[-1, 0] == pytest.approx(loop.pv[0, 0], abs=1e-3)
+
+
+def test_a_simulation_moves_the_measured_disturbance_that_is_named(case: OwnCase) -> None:
+    def run(text: str) -> Timetable:
+        moves = [parse_event("y0=0.1", "[NAME=]VALUE[@S]")]
+        return timetable(case.plant, set_points=moves, disturbances=[parse_event(text, "NAME=VALUE[@S]")])
+
+    moved = run("d0=0.5@10").dv
+    assert moved is not None
+    assert np.all(moved[:10, 0] == case.plant.dv_nominal[0])
+    assert np.all(moved[10:, 0] == 0.5)
+    for text, said in (("d0=5", "outside"), ("d1=0.1", "no measured disturbance or parameter 'd1'")):
+        with pytest.raises(ParamsError, match=said):
+            run(text)
 
 
 def test_a_step_that_no_mv_could_balance_is_made_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
