@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline.cases import CASES
 from pipeline.cases.own_plant import entries_of
 from pipeline.commands.new_fmu import table_from, write_table
-from pipeline.commands.new_simulated import SIMULATOR, Simulated, copy_name, keep, simulated
+from pipeline.commands.new_replaced import REFUSED, check_replaceable, wishes_lost
+from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
@@ -23,26 +23,15 @@ from pipeline.historian.guessing import controlled_first, guesses
 from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
 from pipeline.historian.step_test import StepTest, planned
-from pipeline.historian.tags import ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
+from pipeline.historian.tags import EXPLAINED, RANGES, ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
 from pipeline.plants.simulator_file import is_fmu
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
 
 DATA = Path("data")
-REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added
-OWN = {*REFUSED, "record.parquet", "first_test.json"}  # what is written for a plant, and its simulator
 LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
          "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip
-
-RANGES = """low, high of an mv: the range that the controller may command, not the transmitter's span
-low, high of a pv or dv: the range in which a reading can be true"""
-EXPLAINED = f"""role: pv (to be controlled), mv (what the controller commands), dv (measured disturbance),
-  sp (set point of a loop), mode (of a loop); empty leaves a tag out
-name: of the signal in reports and in the controller
-{RANGES}
-step, good_percent, remark: the smallest difference of two readings, the share of good ones, what was seen; only to
-  read. docs/tag_table.md says more"""
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     replace: bool = options.replace
     folder = DATA / name
     if replace:
-        _check_replaceable(name, folder)
+        check_replaceable(name, folder)
     check_name(name, replace=replace)
     if folder.exists() and not _refused(folder) and not replace:
         raise RecordError(f"{folder} is there already; choose another name, or give --replace")
@@ -143,7 +132,7 @@ def _table(name: str, options: argparse.Namespace) -> int:
 def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace, made: Simulated | None = None) -> int:
     """All files at once, then the section; neither without the other. Where both fail, a replaced plant stays."""
     report, verdict = found.report, found.report.verdict
-    usable = _usable(found, options.anyway)
+    usable, lost = _usable(found, options.anyway), list[str]()
     if usable and folder.exists() and not _refused(folder):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
     earlier = folder.with_name(f".{name}-replaced")
@@ -164,8 +153,10 @@ def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace
             folder.rename(earlier)
     if not usable:
         simulator = {"simulator": (folder / copy_name(made.plant.path)).as_posix()} if made else {}
+        entries = entries_of(name, plant | simulator)
         try:
-            add_entries(entries_of(name, plant | simulator), replace=options.replace)
+            lost = wishes_lost(name, entries)
+            add_entries(entries, replace=options.replace)
         except PipelineError:
             shutil.rmtree(folder)
             if earlier.exists():
@@ -173,18 +164,11 @@ def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace
             raise
     shutil.rmtree(earlier, ignore_errors=True)
     _tell(name, folder, report, test, not usable)
+    for wish in lost:
+        print(f"replaced, write it into params.yaml again if you want it: controllers.{wish}")
     if usable:
         print(f"loopwright new: {name} was not added to params.yaml: {usable}", file=sys.stderr)
     return 2 if usable else 0
-
-
-def _check_replaceable(name: str, folder: Path) -> None:
-    """RecordError where --replace would take more away than an earlier `loopwright new` wrote."""
-    if name in CASES:
-        raise RecordError(f"{name} is a case of this project, which --replace never replaces; choose another name")
-    foreign = sorted(p.name for p in folder.glob("*") if p.name not in OWN and p.name.partition(".")[0] != SIMULATOR)
-    if foreign:
-        raise RecordError(f"{folder} holds {foreign[0]}, which `new` did not write; move it, then --replace works")
 
 
 def _usable(found: Screened, anyway: bool) -> str:

@@ -159,6 +159,8 @@ def test_a_plant_is_replaced_on_request_and_kept_where_the_new_data_fail(capsys:
     assert main(["new", "tank", "x.csv", *ROLES]) == 0
     with Path("params.yaml").open("a") as file:
         file.write("  # Another plant.\n  kettle: {period_s: 1} # kept\n")
+    text = Path("params.yaml").read_text()
+    Path("params.yaml").write_text(text.replace("name: predictive,", "name: predictive, mv_rate: 5,"))
     first = {p: p.read_bytes() for p in (Path("params.yaml"), *Path("data/tank").iterdir())}
     capsys.readouterr()
     assert main(["new", "tank", "x.csv", *ROLES]) == 2
@@ -168,6 +170,7 @@ def test_a_plant_is_replaced_on_request_and_kept_where_the_new_data_fail(capsys:
     assert Path("data/tank-refused/step_test.csv").exists()
     assert {p: p.read_bytes() for p in first} == first
     assert main(["new", "tank", "x.csv", *ROLES[:-2], "--replace"]) == 0
+    assert "again if you want it: controllers.tank-predictive: mv_rate: 5" in capsys.readouterr().out
     params, record = read_back("tank")
     assert params.dv == ()
     assert record.dv.shape[1] == 0
