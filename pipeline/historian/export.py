@@ -19,6 +19,7 @@ from pipeline.metrics import Array
 MOST_PASSES = 20  # over the same time; more is disorder
 LEAST_OVERLAP = 5  # readings
 SENT_AGAIN = 0.9  # of the values of two passes that are equal: sent twice, and no ambiguous clock
+NO_CUTS = np.zeros(0, dtype=np.int64)
 SHARED = 0.4  # of the readings have the stamp of the one before: stamps are rounded
 
 
@@ -77,18 +78,21 @@ class Export:
     notes: tuple[str, ...] = ()
 
 
-def in_order(series: Series) -> Series:
+def in_order(series: Series, files: NDArray[np.int64] = NO_CUTS) -> Series:
     """The readings sorted by time; of equal times the last good one stays, the others are DUPLICATE.
 
     Two passes over the same time with other values are CLOCK, both of them: a clock was set back, or zones are mixed.
     What one pass holds and another one too was sent again: the first stays, the others are DUPLICATE. What is left and
-    shares rounded stamps in equal numbers is spread evenly over them.
+    shares rounded stamps in equal numbers is spread evenly over them. ``files`` are the readings, (m,), with which the
+    second and later files begin; where the times are in disorder, a file counts as a pass.
     """
     t = series.time_s
     back = np.flatnonzero(np.diff(t) < 0)
     if 0 < len(back) <= MOST_PASSES:  # more is disorder
         series.code[_ambiguous(t, series.value, back + 1) & series.good] = Reason.CLOCK
-        series.code[_in_another_pass(t, series.value, back + 1) & series.good] = Reason.DUPLICATE
+    if back.size or files.size:
+        cuts = back + 1 if len(back) <= MOST_PASSES else files
+        series.code[_in_another_pass(t, series.value, cuts) & series.good] = Reason.DUPLICATE
     if back.size:
         order = np.argsort(t, kind="stable")
         series.time_s, series.value, series.code = t[order], series.value[order], series.code[order]
@@ -183,4 +187,6 @@ def joined(parts: list[Series]) -> Series:
     parts = sorted(parts, key=lambda p: float(p.time_s[0]) if len(p) else 0.0)
     texts = sum((p.texts for p in parts), Counter[str]())
     time_s, value = (np.concatenate([getattr(p, key) for p in parts]) for key in ("time_s", "value"))
-    return in_order(Series(parts[0].tag, time_s, value, np.concatenate([p.code for p in parts]), texts, names))
+    files = np.cumsum([len(p) for p in parts[:-1]])
+    code = np.concatenate([p.code for p in parts])
+    return in_order(Series(parts[0].tag, time_s, value, code, texts, names), files[files < len(time_s)])

@@ -29,6 +29,8 @@ SENT: dict[str, tuple[list[list[list[str]]], int]] = {
     "a file and its later part": ([ROWS, ROWS[99:]], N - 99),
     "the later part first": ([ROWS[99:], ROWS], N - 99),
     "two times in one file": ([[*ROWS, *ROWS]], N),
+    "thirty files, each twice": ([p for k in range(0, N, 50) for p in 2 * [ROWS[k : k + 50]]], N),
+    "two files in disorder": ([[ROWS[k] for k in np.random.default_rng(s).permutation(N)] for s in (1, 2)], N),
     "each row twice": ([[row for row in ROWS for _ in range(2)]], N),
     "rounded stamps, the same file twice": ([MINUTES, MINUTES], N),
     "rounded stamps, two times in one file": ([[*MINUTES, *MINUTES]], N),
