@@ -119,6 +119,12 @@ def overlapping() -> Export:
     return Export({"a.csv": (HEADER, rows[:2400]), "b.csv": (HEADER, rows[1600:])})
 
 
+def the_same_twice() -> Export:
+    """One export, given two times."""
+    rows = cells(CLEAN)
+    return Export({"a.csv": (HEADER, rows), "b.csv": (HEADER, rows)})
+
+
 def regulation() -> Export:
     """A PI loop at one set point: the valve answers to noise and loads."""
     random = np.random.default_rng(3)
@@ -314,6 +320,7 @@ KINDS: tuple[Kind, ...] = (
     Kind("half of the rows lost", lambda: lost(0.5)),
     Kind("a block of 400 rows again, with later times", a_block_twice),
     Kind("two files that overlap", overlapping),
+    Kind("the same file twice", the_same_twice),
     Kind("half the rate in the second half", thinned),
     Kind("stamps to the minute", lambda: stamps(local("%Y-%m-%d %H:%M"))),
     Kind("means over ten rows, repeated", averaged),

@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline.cases.own_plant import entries_of
 from pipeline.commands.new_fmu import table_from, write_table
+from pipeline.commands.new_replaced import REFUSED, check_replaceable, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
@@ -22,13 +23,12 @@ from pipeline.historian.guessing import controlled_first, guesses
 from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
 from pipeline.historian.step_test import StepTest, planned
-from pipeline.historian.tags import ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
+from pipeline.historian.tags import EXPLAINED, RANGES, ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
 from pipeline.plants.simulator_file import is_fmu
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
 
 DATA = Path("data")
-REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added
 LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
          "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip
@@ -40,6 +40,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("name", metavar="NAME", help="of the plant: small letters, digits and _")
     add("files", metavar="FILE", type=Path, nargs="*", help="exports: .csv, .txt, .gz, .parquet")
     add("--anyway", action="store_true", help="add the plant even where the data cannot carry a model")
+    add("--replace", action="store_true", help="put the plant in place of an own plant of this name and its entries")
     add("--simulator", metavar="FILE", type=Path, help="a Python class or an FMU, instead of exports")
     add("--rows", metavar="N", type=_rows, default=8_000, help="of the experiment on a simulator (8000)")
     for role in ROLES:
@@ -56,10 +57,13 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """0 where the plant was added or a table of tags written; 2 where the record cannot be used, after the report."""
     name: str = options.name
-    check_name(name)
+    replace: bool = options.replace
     folder = DATA / name
-    if folder.exists() and not _refused(folder):
-        raise RecordError(f"{folder} is there already; choose another name, or remove the folder")
+    if replace:
+        check_replaceable(name, folder)
+    check_name(name, replace=replace)
+    if folder.exists() and not _refused(folder) and not replace:
+        raise RecordError(f"{folder} is there already; choose another name, or give --replace")
     if options.simulator:
         return _simulated(name, folder, options)
     if not options.files:
@@ -73,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
     values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
     export = read_export(options.files, values, modes, options.time, options.time_format)
     found = screened(name, export, tags, options.period, options.hold, options.without_mode)
-    return _write(name, folder, found, options.anyway)
+    return _write(name, folder, found, options)
 
 
 def _tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
@@ -98,13 +102,14 @@ def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
         if table is None:
             return _proposed(name, path)
     made = simulated(name, path, options.rows, options.period, table)
-    return _write(name, folder, made.found, options.anyway, made)
+    return _write(name, folder, made.found, options, made)
 
 
 def _proposed(name: str, fmu: Path) -> int:
     path = Path(f"{name}-tags.csv")
     n = write_table(path, fmu)
     print(f"{path}: {n} inputs and outputs of {fmu}, inputs as mv, outputs as pv; nothing else was written\n"
+          f"{RANGES}\n"
           f"correct role, unit, low and high there (an empty role leaves a variable out), then:\n"
           f"  loopwright new {name} --simulator {fmu} --tags {path}")  # fmt: skip
     return 0
@@ -120,18 +125,19 @@ def _table(name: str, options: argparse.Namespace) -> int:
     for role, tags in roles.items():
         print(f"  {role:5} {', '.join(tags) or '-'}")
     files = " ".join(map(str, options.files))
-    print(f"correct role, unit, low and high there (an empty role leaves a tag out), then:\n"
-          f"  loopwright new {name} {files} --tags {path}")  # fmt: skip
+    print(f"{EXPLAINED}\ncorrect the table, then:\n  loopwright new {name} {files} --tags {path}")
     return 0
 
 
-def _write(name: str, folder: Path, found: Screened, anyway: bool, made: Simulated | None = None) -> int:
-    """All files at once, then the section; neither without the other."""
+def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace, made: Simulated | None = None) -> int:
+    """All files at once, then the section; neither without the other. Where both fail, a replaced plant stays."""
     report, verdict = found.report, found.report.verdict
-    usable = _usable(found, anyway)
+    usable, lost = _usable(found, options.anyway), list[str]()
+    if usable and folder.exists() and not _refused(folder):
+        folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
+    earlier = folder.with_name(f".{name}-replaced")
+    shutil.rmtree(earlier, ignore_errors=True)
     test = planned(verdict.inputs, found.record.mv[-1], report.period_s) if verdict.carries != "yes" else None
-    if folder.exists():
-        shutil.rmtree(folder)  # of a refusal
     with draft_folder_of(folder) as draft:
         if not usable:
             found.record.write(draft / "record.parquet")
@@ -143,17 +149,23 @@ def _write(name: str, folder: Path, found: Screened, anyway: bool, made: Simulat
         if test:
             write_text(draft / "step_test.csv", test.table())
         write_page(draft / "screening.html", found, test)
+        if folder.exists():
+            folder.rename(earlier)
     if not usable:
+        simulator = {"simulator": (folder / copy_name(made.plant.path)).as_posix()} if made else {}
+        entries = entries_of(name, plant | simulator)
         try:
-            add_entries(
-                entries_of(
-                    name, plant | ({"simulator": (folder / copy_name(made.plant.path)).as_posix()} if made else {})
-                )
-            )
+            lost = wishes_lost(name, entries)
+            add_entries(entries, replace=options.replace)
         except PipelineError:
             shutil.rmtree(folder)
+            if earlier.exists():
+                earlier.rename(folder)
             raise
+    shutil.rmtree(earlier, ignore_errors=True)
     _tell(name, folder, report, test, not usable)
+    for wish in lost:
+        print(f"replaced, write it into params.yaml again if you want it: controllers.{wish}")
     if usable:
         print(f"loopwright new: {name} was not added to params.yaml: {usable}", file=sys.stderr)
     return 2 if usable else 0

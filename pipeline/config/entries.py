@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,11 @@ Entries = Mapping[str, Mapping[str, Any]]
 """Section -> name of the entry -> its values."""
 
 
-def add_entries(entries: Entries, path: Path = PARAMS_FILE) -> None:
+def add_entries(entries: Entries, path: Path = PARAMS_FILE, *, replace: bool = False) -> None:
     """Add entries to the ends of their sections, a section that is missing at the end of the file; all or nothing.
 
-    Raises ParamsError where an entry of that name exists, or where a section is not written as a block.
+    ``replace`` takes entries of the same names out first. Raises ParamsError where an entry of that name exists
+    without it, or where a section is not written as a block.
     """
     try:
         text = path.read_bytes().decode("utf-8")
@@ -33,7 +35,14 @@ def add_entries(entries: Entries, path: Path = PARAMS_FILE) -> None:
     for section, added in entries.items():
         there = wanted.get(section) or {}
         taken = sorted(set(there) & set(added))
-        if taken:
+        if taken and replace:
+            for name in taken:
+                left = _without(text, section, name)
+                if left == text:
+                    raise ParamsError(f"{path}: {section}.{name} is not written as a block; remove it by hand")
+                text = left
+            there = {key: value for key, value in there.items() if key not in added}
+        elif taken:
             raise ParamsError(f"{path}: {section} has {taken[0]!r} already; remove it, or choose another name")
         wanted[section] = {**there, **added}
         text = _with_lines(text, section, _lines(added), end)
@@ -54,6 +63,25 @@ def add_entries(entries: Entries, path: Path = PARAMS_FILE) -> None:
 def _lines(added: Mapping[str, Any]) -> list[str]:
     text: str = yaml.safe_dump(dict(added), sort_keys=False, allow_unicode=True, default_flow_style=None, width=10_000)
     return [f"  {line}" for line in text.splitlines()]
+
+
+def _without(text: str, section: str, name: str) -> str:
+    """The text without an entry: its line and the deeper lines below it; comments above it and behind it stay."""
+    lines = text.splitlines(keepends=True)
+    heads = [i for i, line in enumerate(lines) if line[:1].isalpha()]
+    at = next((i for i in heads if lines[i].split(":")[0].strip() == section), len(lines))
+    end = next((i for i in heads if i > at), len(lines))
+    key = re.compile(rf"( +)(['\"]?){re.escape(name)}\2\s*:")
+    first = next((i for i in range(at + 1, end) if key.match(lines[i])), None)
+    if first is None:
+        return text
+    depth, last = len(lines[first]) - len(lines[first].lstrip()), first
+    for i in range(first + 1, end):
+        if lines[i].strip():
+            if len(lines[i]) - len(lines[i].lstrip()) <= depth:
+                break
+            last = i
+    return "".join([*lines[:first], *lines[last + 1 :]])
 
 
 def _with_lines(text: str, section: str, added: list[str], end: str) -> str:

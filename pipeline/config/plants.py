@@ -89,12 +89,18 @@ def own_plants(path: Path = PARAMS_FILE) -> dict[str, Any]:
     return {name: read_section(SECTION, name, path) for name in sections(SECTION, path)}
 
 
-def check_name(name: str, path: Path = PARAMS_FILE) -> None:
-    """ParamsError unless a plant can have this name: well-formed, and neither a plant nor a case has it."""
+def check_name(name: str, path: Path = PARAMS_FILE, *, replace: bool = False) -> None:
+    """ParamsError unless a plant can have this name: well-formed, and neither a plant nor a case has it.
+
+    With ``replace`` an own plant may have it. A case that is no own plant is never replaced.
+    """
     if not NAME.match(name):
         raise ParamsError(
             f"the name {name!r} cannot be a plant's: a small letter, then small letters, digits and _ (64 at most)"
         )
-    for kind in (SECTION, "cases"):
-        if name in sections(kind, path):
-            raise ParamsError(f"{path}: {kind} has {name!r} already; choose another name, or remove that section")
+    if name in sections(SECTION, path):
+        if not replace:
+            raise ParamsError(f"{path}: {SECTION} has {name!r} already; choose another name, or give --replace")
+    elif name in sections("cases", path):
+        also = "; --replace replaces own plants alone" if replace else ""
+        raise ParamsError(f"{path}: cases has {name!r} already; choose another name{also}")

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from pipeline.metrics import Array
 MOST_PASSES = 20  # over the same time; more is disorder
 LEAST_OVERLAP = 5  # readings
 SENT_AGAIN = 0.9  # of the values of two passes that are equal: sent twice, and no ambiguous clock
+NO_CUTS = np.zeros(0, dtype=np.int64)
 SHARED = 0.4  # of the readings have the stamp of the one before: stamps are rounded
 
 
@@ -76,23 +78,29 @@ class Export:
     notes: tuple[str, ...] = ()
 
 
-def in_order(series: Series) -> Series:
+def in_order(series: Series, files: NDArray[np.int64] = NO_CUTS) -> Series:
     """The readings sorted by time; of equal times the last good one stays, the others are DUPLICATE.
 
     Two passes over the same time with other values are CLOCK, both of them: a clock was set back, or zones are mixed.
-    Readings that share rounded stamps in equal numbers are spread evenly over them.
+    What one pass holds and another one too was sent again: the first stays, the others are DUPLICATE. What is left and
+    shares rounded stamps in equal numbers is spread evenly over them. ``files`` are the readings, (m,), with which the
+    second and later files begin; where the times are in disorder, a file counts as a pass.
     """
     t = series.time_s
     back = np.flatnonzero(np.diff(t) < 0)
     if 0 < len(back) <= MOST_PASSES:  # more is disorder
         series.code[_ambiguous(t, series.value, back + 1) & series.good] = Reason.CLOCK
+    if back.size or files.size:
+        cuts = back + 1 if len(back) <= MOST_PASSES else files
+        series.code[_in_another_pass(t, series.value, cuts) & series.good] = Reason.DUPLICATE
     if back.size:
         order = np.argsort(t, kind="stable")
         series.time_s, series.value, series.code = t[order], series.value[order], series.code[order]
         t = series.time_s
     same = np.flatnonzero(np.diff(t) == 0)
-    if same.size > SHARED * len(t):
-        _spread(series)
+    once = series.code != Reason.DUPLICATE
+    if np.count_nonzero(np.diff(t[once]) == 0) > SHARED * np.count_nonzero(once):
+        _spread(series, once)
         t = series.time_s
         same = np.flatnonzero(np.diff(t) == 0)
     if same.size:
@@ -117,7 +125,7 @@ def _ambiguous(t: Array, values: Array, cuts: NDArray[np.int64]) -> NDArray[np.b
         if min(first.sum(), second.sum()) < LEAST_OVERLAP:
             continue
         _, i, j = np.intersect1d(t[one][first], t[other][second], return_indices=True)
-        if len(i) >= 0.5 * min(first.sum(), second.sum()):
+        if len(i) >= 0.5 * min(len(np.unique(t[one][first])), len(np.unique(t[other][second]))):
             same = values[one][first][i] == values[other][second][j]
             if np.mean(same) > SENT_AGAIN:
                 continue  # the same readings, sent again
@@ -126,9 +134,32 @@ def _ambiguous(t: Array, values: Array, cuts: NDArray[np.int64]) -> NDArray[np.b
     return where
 
 
-def _spread(series: Series) -> None:
-    """Readings in the order of the file, in groups of one stamp, over the time to the next stamp; equal groups only."""
-    t = series.time_s
+def _in_another_pass(t: Array, values: Array, cuts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Readings (n,) whose stamp and value an earlier pass holds too, as many of them as it holds."""
+    of_pass = np.zeros(len(t), dtype=np.int64)
+    of_pass[cuts] = 1
+    of_pass = np.cumsum(of_pass)
+    value = np.nan_to_num(values, nan=np.inf)
+    rank = _rank(t, value, of_pass)  # within a pass equal readings may stand side by side: their stamps are rounded
+    return _rank(t, value, rank) > 0
+
+
+def _rank(*keys: NDArray[Any]) -> NDArray[np.int64]:
+    """How many earlier rows (n,) have the same keys, each (n,)."""
+    order = np.lexsort(keys)  # stable
+    first = np.r_[True, np.any([k[order][1:] != k[order][:-1] for k in keys], axis=0)]
+    place = np.arange(len(order))
+    out = np.empty(len(order), dtype=np.int64)
+    out[order] = place - np.maximum.accumulate(np.where(first, place, 0))
+    return out
+
+
+def _spread(series: Series, which: NDArray[np.bool_]) -> None:
+    """``which`` readings (n,), in the order of the file, in groups of one stamp, over the time to the next stamp.
+
+    Equal groups only. The others keep their stamps.
+    """
+    t = series.time_s[which]
     stamps, counts = np.unique(t, return_counts=True)
     usual = int(np.median(counts))
     if usual < 2 or len(stamps) < 3 or np.mean(np.abs(counts[1:-1] - usual) <= 1) < 0.8:
@@ -137,7 +168,10 @@ def _spread(series: Series) -> None:
     rank = np.arange(len(t)) - np.repeat(np.cumsum(counts) - counts, counts)
     # The first group may begin anywhere within its step; it ends with it.
     rank[: counts[0]] += max(usual - counts[0], 0)
-    series.time_s = t + rank * (step / np.maximum(np.repeat(counts, counts), usual))
+    time_s = series.time_s.copy()
+    time_s[which] = t + rank * (step / np.maximum(np.repeat(counts, counts), usual))
+    order = np.argsort(time_s, kind="stable")
+    series.time_s, series.value, series.code = time_s[order], series.value[order], series.code[order]
     series.rounded_s = step
 
 
@@ -153,4 +187,6 @@ def joined(parts: list[Series]) -> Series:
     parts = sorted(parts, key=lambda p: float(p.time_s[0]) if len(p) else 0.0)
     texts = sum((p.texts for p in parts), Counter[str]())
     time_s, value = (np.concatenate([getattr(p, key) for p in parts]) for key in ("time_s", "value"))
-    return in_order(Series(parts[0].tag, time_s, value, np.concatenate([p.code for p in parts]), texts, names))
+    files = np.cumsum([len(p) for p in parts[:-1]])
+    code = np.concatenate([p.code for p in parts])
+    return in_order(Series(parts[0].tag, time_s, value, code, texts, names), files[files < len(time_s)])

@@ -22,6 +22,7 @@ from pipeline.historian.layout import Layout, layout_of
 from pipeline.historian.numbers import numbers
 from pipeline.historian.quality import good_quality
 from pipeline.historian.reason import Reason
+from pipeline.historian.sent_again import drop_repeated_rows
 from pipeline.records.record_file import split_column
 
 BLOCK_BYTES = 1 << 24
@@ -76,6 +77,7 @@ def read_export(
         source = opened(path)
         layout = layout_of(source.path, source.header, source.sample, time_column, time_format)
         found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
+        drop_repeated_rows(found)
         for name, series in found.items():
             parts.setdefault(name, []).append(series)
         pa.default_memory_pool().release_unused()

@@ -26,6 +26,7 @@ from pipeline.historian.remarks import of_grid, of_mode, of_models, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.static import explained
 from pipeline.historian.tags import Tag
+from pipeline.historian.unmoved import of_answers
 from pipeline.historian.wandering import of_levels
 from pipeline.metrics import Array
 from pipeline.records.record import Record
@@ -102,6 +103,8 @@ def screened(
         default=0,
     )
     findings += of_models(excerpt, models)
+    verdict = judged(excerpt, models, moved, len(record))
+    findings += of_answers([s.name for s in record.pv_signals], verdict)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
     )
@@ -125,7 +128,7 @@ def screened(
         tags=reports,
         modes={t.tag: _mode_rows(grid, own[t.tag]) for t in tags if t.role == "mode"},
         findings=merged(findings),
-        verdict=judged(excerpt, models, moved, len(record)),
+        verdict=verdict,
     )
     return Screened(record, grid, code, own, report)
 

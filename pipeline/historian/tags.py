@@ -19,6 +19,14 @@ SIGNAL_ROLES = ("pv", "mv", "dv")
 COLUMNS = ("tag", "role", "name", "unit", "low", "high", "step", "good_percent", "remark")
 OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
 UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
+RANGES = """low, high of an mv: the range that the controller may command, not the transmitter's span
+low, high of a pv or dv: the range in which a reading can be true"""
+EXPLAINED = f"""role: pv (to be controlled), mv (what the controller commands), dv (measured disturbance),
+  sp (set point of a loop), mode (of a loop); empty leaves a tag out
+name: of the signal in reports and in the controller
+{RANGES}
+step, good_percent, remark: the smallest difference of two readings, the share of good ones, what was seen; only to
+  read. docs/tag_table.md says more"""
 
 
 @dataclass(frozen=True, slots=True)

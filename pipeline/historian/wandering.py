@@ -13,6 +13,10 @@ LEVELS, MOST_LEVELS = 12, 2_000
 WANDERS = 0.015  # of the PV's span: standard deviation of the levels
 OF_NOISE = 3.0  # of what noise alone leaves in a mean
 EXPLAINED = 0.7  # of the levels' variance, by a ramp or a jump
+WANDERING = (
+    "loads that nobody measures, or an answer far from linear: the model is less exact, feedback corrects the rest; "
+    "make a tag that measures such a load dv, and where you know of none check the tag and its times"
+)
 SPLITS = 40  # places tried for a jump
 RATIO = 0.08  # by which the answer must change with the jump, to be another span
 
@@ -53,10 +57,7 @@ def _words(level: Array, curve: Array, z: Array, e: Array, first: NDArray[np.int
     left, s, jump, more = min(jumps)
     if min(ramp, left) > (1 - EXPLAINED) * none:
         size = 100 * float(np.ptp(level)) / span
-        return (
-            f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; loads that "
-            "nobody measures, or an answer far from linear"
-        )
+        return f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; {WANDERING}"
     if ramp < left + 0.05 * none:
         change = float(slope[-1])
         return (

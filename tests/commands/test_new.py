@@ -75,6 +75,9 @@ def test_without_roles_a_table_is_written_corrected_and_read(capsys: pytest.Capt
     write(Path("x.csv"), cells(clean()), header)
     assert main(["new", "tank", "x.csv"]) == 0
     assert files() == {"params.yaml", "x.csv", "tank-tags.csv"}
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("pv (", "mv (", "dv (", "sp (", "mode (", "name:", "step, good_percent"))
+    assert "the range that the controller may command, not the transmitter's span" in printed
     table = Path("tank-tags.csv")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [(r["tag"], r["role"], r["unit"]) for r in rows] == [
@@ -149,6 +152,53 @@ def test_guesses_tell_disturbances_from_the_rest_and_controlled_variables_come_f
     assert (roles["FI-7"], roles["PI-3"], roles["TIC-101.SP"]) == ("dv", "", "sp")
     assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 0
     assert [s.name for s in read_back("tank")[0].pv] == ["TIC-101.PV", "TI-9.PV"]
+
+
+def test_a_plant_is_replaced_on_request_and_kept_where_the_new_data_fail(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean(2500)))
+    assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    with Path("params.yaml").open("a") as file:
+        file.write("  # Another plant.\n  kettle: {period_s: 1} # kept\n")
+    text = Path("params.yaml").read_text()
+    Path("params.yaml").write_text(text.replace("name: predictive,", "name: predictive, mv_rate: 5,"))
+    first = {p: p.read_bytes() for p in (Path("params.yaml"), *Path("data/tank").iterdir())}
+    capsys.readouterr()
+    assert main(["new", "tank", "x.csv", *ROLES]) == 2
+    assert "--replace" in capsys.readouterr().err
+    swapped = ["--pv", "TIC-101.OP[%]", "--mv", "TIC-101.PV[degC]"]
+    assert main(["new", "tank", "x.csv", *swapped, "--replace"]) == 2
+    assert Path("data/tank-refused/step_test.csv").exists()
+    assert {p: p.read_bytes() for p in first} == first
+    assert main(["new", "tank", "x.csv", *ROLES[:-2], "--replace"]) == 0
+    assert "again if you want it: controllers.tank-predictive: mv_rate: 5" in capsys.readouterr().out
+    params, record = read_back("tank")
+    assert params.dv == ()
+    assert record.dv.shape[1] == 0
+    assert "  # Another plant.\n  kettle: {period_s: 1} # kept\n" in Path("params.yaml").read_text()
+    assert {p.name for p in Path("data").iterdir()} == {"tank", "tank-refused"}
+
+
+def test_a_replacement_that_params_yaml_does_not_take_leaves_the_plant() -> None:
+    write(Path("x.csv"), cells(clean(1500)))
+    assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    params = Path("params.yaml")
+    params.write_text(params.read_text().replace("  tank:\n    period_s", "  ? tank\n  : period_s"))
+    first = {p: p.read_bytes() for p in (params, *Path("data/tank").iterdir())}
+    assert main(["new", "tank", "x.csv", *ROLES[:-2], "--replace"]) == 2
+    assert {p: p.read_bytes() for p in (params, *Path("data/tank").iterdir())} == first
+
+
+def test_only_what_new_wrote_is_replaced(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean(200)))
+    assert main(["new", "batch_reactor", "x.csv", *ROLES, "--replace"]) == 2
+    assert "is a case of this project" in capsys.readouterr().err
+    assert main(["new", "taken", "x.csv", *ROLES, "--replace"]) == 2
+    assert "cases has 'taken' already" in capsys.readouterr().err
+    Path("data/tank").mkdir(parents=True)
+    Path("data/tank/raw.csv").write_text("mine")
+    assert main(["new", "tank", "x.csv", *ROLES, "--replace"]) == 2
+    assert "raw.csv, which `new` did not write" in capsys.readouterr().err
+    assert Path("data/tank/raw.csv").read_text() == "mine"
 
 
 BAD: dict[str, tuple[list[str], str]] = {

@@ -91,3 +91,38 @@ def test_nothing_is_written_where_an_entry_cannot_be_added(tmp_path: Path, text:
         add_entries({"plants": {"b": {}}, "cases": {"b": {"x": 1}}}, path)
     assert said in str(error.value)
     assert path.read_text() == text
+
+
+def test_entries_are_replaced_and_the_others_keep_every_byte(tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    comments = TEXT.replace("  a: {seeds: [1, 2]} # of a\n", "  # Above b.\n  b-x: 1\n  a: {seeds: [1, 2]} # of a\n")
+    path.write_text(comments, encoding="utf-8")
+    add_entries(NEW, path)
+    text = path.read_text(encoding="utf-8").replace("  b:\n    seeds: [3]\n", "  b: {seeds: [3]}\n")
+    path.write_text(text + "  # Of the next.\n  later: {x: 1} # its own\n", encoding="utf-8")
+    before = path.read_text(encoding="utf-8")
+    with pytest.raises(ParamsError, match="'b' already"):
+        add_entries(NEW, path)
+    assert path.read_text(encoding="utf-8") == before
+    newer = {**NEW, "cases": {"b": {"seeds": [4, 5]}}}
+    add_entries(newer, path, replace=True)
+    after = path.read_text(encoding="utf-8")
+    loaded = yaml.safe_load(before)
+    assert yaml.safe_load(after) == {**loaded, **{k: {**loaded[k], **newer[k]} for k in newer}}
+    own = (
+        "seeds: [3]",
+        "seeds: [4, 5]",
+        "title:",
+        "b-x:",
+        "b-pid:",
+        "  b:",
+        "law: pid",
+        "case: b",
+        "parts:",
+        "pv:",
+        "- {",
+    )
+    assert [line for line in after.splitlines() if not any(w in line for w in own)] == [
+        line for line in before.splitlines() if not any(w in line for w in own)
+    ]
+    assert "  # Of the next.\n  later: {x: 1} # its own\n" in after

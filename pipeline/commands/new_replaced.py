@@ -1,0 +1,35 @@
+"""``loopwright new --replace``: what an earlier `loopwright new` wrote for the plant, and what goes with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.cases import CASES
+from pipeline.commands.new_simulated import SIMULATOR
+from pipeline.config.params import read_section, sections
+from pipeline.errors import RecordError
+
+REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added
+OWN = {*REFUSED, "record.parquet", "first_test.json"}  # what is written for a plant, beside its simulator
+
+
+def check_replaceable(name: str, folder: Path) -> None:
+    """RecordError where --replace would take more away than an earlier `loopwright new` wrote."""
+    if name in CASES:
+        raise RecordError(f"{name} is a case of this project, which --replace never replaces; choose another name")
+    foreign = sorted(p.name for p in folder.glob("*") if p.name not in OWN and p.name.partition(".")[0] != SIMULATOR)
+    if foreign:
+        raise RecordError(f"{folder} holds {foreign[0]}, which `new` did not write; move it, then --replace works")
+
+
+def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Settings of a plant's controllers that the new ``entries`` lack, as ``NAME: key: value``; a person wrote them."""
+    if plant not in sections("plants"):
+        return []
+    found = []
+    for name, new in entries["controllers"].items():
+        old = read_section("controllers", name) if name in sections("controllers") else {}
+        found += [f"{name}: {key}: {value}" for key, value in old.items() if key not in new]
+    return found
