@@ -32,6 +32,7 @@ POWERS = {
     **dict.fromkeys(("penalty", "penalty_start", "penalty_low", "noise_variance"), (2, 0)),
     **dict.fromkeys(("band", "eps_high", "eps_low", "jacket_low", "jacket_high", "switch_penalty"), (1, 0)),
     "integral": (-1, 0),
+    **dict.fromkeys(("cv_low", "cv_high"), (1, 0)),
     "mv_rate": (0, 1),
 }
 
