@@ -9,11 +9,11 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.params import sections
+from pipeline.config.params import entries, sections, sections_of
 from pipeline.engine.lifeline import end_with_parent
 from pipeline.errors import ParamsError, PipelineError, nearest
 from pipeline.report.results import show_results
@@ -24,6 +24,7 @@ ARTIFACTS = Path("artifacts")
 MANY = 25  # stages that a person does not read line by line
 ABSENT = {"deleted", "not in cache"}  # DVC's words for a file that is not there, whether or not it ever was
 KINDS = {"records": "excite", "models": "fit", "controllers": "validate"}  # a section of params.yaml -> its stage
+STAGES = {"records": ("excite",), "models": ("fit",), "controllers": ("design", "validate")}  # in their order
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     print("\n".join(plan(changed)), flush=True)
     if options.dry:
         return 0
-    code = repro(*(["--keep-going"] if options.keep_going else []), *targets) if changed else 0
+    code = repro(targets, changed, keep_going=options.keep_going) if changed else 0
     if code == 0:
         # Somebody who asked for one case need not look for it in the table of all.
         asked = options.targets if targets and all(t.startswith("report@") for t in targets) else [None]
@@ -62,14 +63,22 @@ def run(options: argparse.Namespace) -> int:
     return code
 
 
-def repro(*arguments: str) -> int:
-    """Run ``dvc repro`` with the stages' libraries loaded once; its exit status.
+def repro(targets: Sequence[str], changed: Iterable[str], *, keep_going: bool = False) -> int:
+    """Run ``targets`` (none: everything), of which the stages ``changed``, by DVC; its exit status.
 
+    Cases share no output, so that those with changes run side by side. Stages find their libraries loaded once.
     The process that loads them imports nothing of the pipeline, so that every stage runs the sources
     as they are when it starts. It and all that it starts end with this process, whatever ends it.
     """
+    options = ["--keep-going"] if keep_going else []
+    chains = side_by_side(targets, changed)
+    if chains:
+        rest = [] if targets else ["--rest"]
+        work = ["-m", "pipeline.engine.lanes", *options, *rest, *(",".join(chain) for chain in chains)]
+    else:
+        work = ["-m", "dvc", "repro", *options, *targets]
     own = os.getpid()
-    command = [sys.executable, "-m", "pipeline.engine.warm", sys.executable, "-m", "dvc", "repro", *arguments]
+    command = [sys.executable, "-m", "pipeline.engine.warm", sys.executable, *work]
     with subprocess.Popen(command, preexec_fn=lambda: end_with_parent(own)) as process:
         signal.signal(signal.SIGTERM, lambda *_: process.terminate())
         while True:
@@ -77,6 +86,27 @@ def repro(*arguments: str) -> int:
                 return process.wait()
             except KeyboardInterrupt:
                 continue  # the terminal has interrupted all of them; wait until they have ended
+
+
+def side_by_side(targets: Sequence[str], changed: Iterable[str]) -> list[list[str]]:
+    """The stages of each case that must run, in their order; none where fewer than two cases must, or parts of one.
+
+    ``targets`` are the reports that are asked for, none: all cases. A case that reads another's record is no chain.
+    """
+    if not all(target.startswith("report@") for target in targets):
+        return []
+    asked = [target.partition("@")[2] for target in targets] or list(sections("cases"))
+    touched = set(changed)
+    chains = {case: chain for case in dict.fromkeys(asked) if touched.intersection(chain := chain_of(case))}
+    read = {(case, Path(data).parts) for case in chains for data in entries("models", case, "data")}
+    apart = all(parts[0] != "work" or parts[1] == case for case, parts in read)
+    return list(chains.values()) if apart and len(chains) > 1 else []
+
+
+def chain_of(case: str) -> list[str]:
+    """The stages of a case, each after those that it depends on."""
+    own = {kind: sections_of(kind, case) for kind in STAGES}
+    return [*(f"{s}@{name}" for kind, ss in STAGES.items() for s in ss for name in own[kind]), f"report@{case}"]
 
 
 def stages_of(name: str) -> list[str]:

@@ -60,8 +60,14 @@ def _tree(path: Path) -> dict[str, Any]:
 
 def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
     """The values of ``field`` in the entries that the section ``kind`` has for ``case``, in their order."""
-    own = {name: e for name, e in (_tree(path).get(kind) or {}).items() if e.get("case") == case}
-    return tuple(str(_entry(e, field, f"{path}: {kind}.{name}")) for name, e in own.items())
+    return tuple(
+        str(_entry(_tree(path)[kind][name], field, f"{path}: {kind}.{name}")) for name in sections_of(kind, case, path)
+    )
+
+
+def sections_of(kind: str, case: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
+    """Names of the sections of one kind that belong to ``case``, in their order."""
+    return tuple(str(name) for name, e in (_tree(path).get(kind) or {}).items() if e.get("case") == case)
 
 
 def _entry(tree: Mapping[str, Any], key: str, where: str) -> Any:

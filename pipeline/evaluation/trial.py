@@ -22,6 +22,7 @@ from serving.errors import LoopwrightError
 
 Metrics = dict[str, float]
 ROUNDS = 8  # of timing a step
+TIMED = 1_000  # samples of a round
 DRAW = 1_000  # added to the noise's seed for every further draw of it
 DEVELOPED = "development"  # stands for all development sequences among the names of tests
 DEVELOPMENT = 100_000  # added to the noise's seed over the development sequences
@@ -151,12 +152,13 @@ def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:
     """Time of one step along a loop under dv (n_dv,) [us], with all checks: the fastest of several rounds.
 
-    Other processes can slow down a round.
+    A round is the loop's first 1,000 samples. Other processes can slow it down.
     """
-    rounds = np.empty((ROUNDS, len(loop.sp) - 1))
+    n = min(len(loop.sp), TIMED + 1)
+    rounds = np.empty((ROUNDS, n - 1))
     for taken in rounds:
         state = controller.cold_state()
-        for k in range(1, len(loop.sp)):
+        for k in range(1, n):
             begun = time.perf_counter()
             sample = {"sp": loop.sp[k], "pv": loop.pv[k], "dv": dv, "mv_applied": loop.mv[k - 1]}
             state = controller.step(**sample, state=state).state

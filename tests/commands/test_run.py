@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.__main__ import main
 from pipeline.commands import run
-from pipeline.commands.run import plan, reasons, stages_of
+from pipeline.commands.run import chain_of, plan, reasons, side_by_side, stages_of
 from pipeline.errors import ParamsError
 
 ROOT = Path(__file__).parents[2]
@@ -61,3 +61,34 @@ def test_the_plan_names_every_stage_or_counts_many() -> None:
     assert "fit@a  models.a is modified" in few[1]
     many = plan({f"{kind}@{i}": ["new"] for kind in ("fit", "design") for i in range(20)})
     assert [line.split() for line in many[1:]] == [["fit", "20"], ["design", "20"]]
+
+
+def test_cases_with_changes_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    chain = chain_of("batch_reactor")
+    assert chain[0] == "excite@batch_reactor-batches"
+    assert chain[-1] == "report@batch_reactor"
+    kinds = [stage.partition("@")[0] for stage in chain]
+    assert kinds == sorted(kinds, key=["excite", "fit", "design", "validate", "report"].index)
+    assert not any("15s" in stage for stage in chain_of("ph_neutralization"))
+    found = side_by_side([], ["fit@batch_reactor-nnarx", "report@ph_neutralization", "overview"])
+    assert [chain[-1] for chain in found] == ["report@ph_neutralization", "report@batch_reactor"]
+    asked = ["report@batch_reactor", "report@reversible_cstr"]
+    assert len(side_by_side(asked, ["report@batch_reactor", "report@reversible_cstr"])) == 2
+
+
+def test_one_case_or_a_part_of_one_runs_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    assert side_by_side([], ["fit@batch_reactor-nnarx"]) == []
+    both = ["fit@batch_reactor-nnarx", "report@reversible_cstr"]
+    assert side_by_side(["report@reversible_cstr"], both) == []
+    assert side_by_side(["fit@batch_reactor-nnarx", "report@reversible_cstr"], both) == []
+
+
+def test_a_case_that_reads_the_record_of_another_is_no_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "params.yaml").read_text()
+    (tmp_path / "params.yaml").write_text(
+        text.replace("data: work/batch_reactor/records/batches", "data: work/reversible_cstr/records/aprbs", 1)
+    )
+    monkeypatch.chdir(tmp_path)
+    assert side_by_side([], ["report@batch_reactor", "report@reversible_cstr"]) == []

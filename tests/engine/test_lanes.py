@@ -1,0 +1,102 @@
+"""Chains of stages side by side: two at once, each in its order, with their failures."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from threading import Event
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+# In place of DVC: says what it was asked, then what the name of its last stage tells it to do.
+DVC = """
+import os, sys, time
+from pathlib import Path
+asked = [a for a in sys.argv[1:] if not a.startswith("-")][1:]
+with open("asked", "a") as file:
+    print(*sys.argv[1:], file=file)
+print("Stage 'code' didn't change, skipping", flush=True)
+print("ran", *asked, flush=True)
+last = asked[-1] if asked else ""
+if last.startswith("meets-"):
+    Path(last).touch()
+    other = Path("meets-b" if last == "meets-a" else "meets-a")
+    end = time.monotonic() + 30
+    while not other.exists():
+        if time.monotonic() > end:
+            sys.exit("alone")
+        time.sleep(0.01)
+if last == "waits":
+    Path("pid").write_text(str(os.getpid()))
+    time.sleep(60)
+sys.exit(3 if last.startswith("fails") else 0)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "dvc").mkdir()
+    (tmp_path / "dvc" / "__init__.py").touch()
+    (tmp_path / "dvc" / "__main__.py").write_text(DVC)
+    return tmp_path
+
+
+def begin(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    environment: Mapping[str, str] = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    pipe = subprocess.PIPE
+    command = [sys.executable, "-m", "pipeline.engine.lanes", *arguments]
+    return subprocess.Popen(command, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True)
+
+
+def run(folder: Path, *arguments: str) -> tuple[int, list[str], list[str]]:
+    process = begin(folder, *arguments)
+    out, _ = process.communicate(timeout=60)
+    asked = folder / "asked"
+    return process.returncode, out.splitlines(), asked.read_text().splitlines() if asked.exists() else []
+
+
+def test_two_chains_run_at_once_and_the_rest_after_them(folder: Path) -> None:
+    code, out, asked = run(folder, "--rest", "fit@a,meets-a", "fit@b,meets-b", "fit@c")
+    assert code == 0
+    assert asked[-1] == "--wait-for-lock repro"
+    assert sorted(asked[:2]) == [f"--wait-for-lock repro --single-item fit@{x} meets-{x}" for x in "ab"]
+    assert sorted(out) == ["ran", "ran fit@a meets-a", "ran fit@b meets-b", "ran fit@c"]
+
+
+def test_a_failure_begins_no_further_chain(folder: Path) -> None:
+    code, out, _ = run(folder, "--rest", "fails-a", "fails-b", "fit@c")
+    assert code == 3
+    assert "ran fit@c" not in out
+    assert "ran" not in out
+
+
+def test_the_others_go_on_where_they_may(folder: Path) -> None:
+    code, out, asked = run(folder, "--keep-going", "--rest", "fails-a", "fit@b", "fit@c")
+    assert code == 3
+    assert {"ran fit@b", "ran fit@c", "ran"} <= set(out)
+    assert all("--keep-going" in line for line in asked)
+
+
+def test_without_chains_it_says_how_it_is_used(folder: Path) -> None:
+    assert run(folder)[0] == 2
+    assert run(folder, "--force", "fit@a")[0] == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+def test_lanes_that_are_ended_end_what_runs(folder: Path) -> None:
+    process = begin(folder, "waits", "fit@b")
+    pid = folder / "pid"
+    for _ in range(1_500):
+        if pid.exists() and pid.read_text():
+            break
+        Event().wait(0.02)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=30)
+    assert process.returncode != 0
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), 0)
