@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -35,7 +37,7 @@ from pipeline.laws.predictive.predictive import Predictive
 from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
 from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import LOOPS, Outcome, Trials
-from pipeline.laws.predictive.tuning import TRAVEL, costs, searched
+from pipeline.laws.predictive.tuning import FORGETS, TRAVEL, costs, searched, tuned
 from pipeline.models.identified.identified import Identified
 from pipeline.models.static.mlp import MLP
 from serving import Controller
@@ -394,6 +396,58 @@ def test_the_search_takes_what_costs_least() -> None:
     assert tried[0].numbers == start
     assert tried[0].cost == pytest.approx(1.0)
     assert len({tuple(c.numbers.values()) for c in tried}) == len(tried)
+
+
+@pytest.mark.parametrize(
+    ("calm_from", "given", "found"), [(0.0, None, 0.1), (0.2, None, 0.25), (9.0, None, None), (9.0, 0.3, 0.3)]
+)
+def test_the_damping_is_the_least_that_the_loops_stand(
+    calm_from: float, given: float | None, found: float | None
+) -> None:
+    class Shaken(Bowl):
+        def growth(self, law: Any) -> float:
+            return 1.0 if law.damping >= calm_from else 1e6
+
+    def law_of(numbers: Any, damping: float | None) -> Any:
+        law: Any = Numbered(numbers)
+        law.damping = damping
+        return law
+
+    start = {"speed": 1.0, "caution": 1.0, "horizon": 20.0}
+    best = tuned(Shaken(), law_of, start, given)  # type: ignore[arg-type]
+    assert best.damping == found
+    assert list(best.numbers.values()) == pytest.approx(Bowl.best.tolist())
+
+
+def test_a_law_that_calms_at_its_last_numbers_alone_is_damped_more() -> None:
+    """The loops stand .1 at the first numbers, and .5 at those that the search chooses."""
+
+    class Shaken(Bowl):
+        def growth(self, law: Any) -> float:
+            return 1.0 if law.damping >= (0.1 if float(law.logs[0]) == 0 else 0.5) else 1e6
+
+    def law_of(numbers: Any, damping: float | None) -> Any:
+        law: Any = Numbered(numbers)
+        law.damping = damping
+        return law
+
+    start = {"speed": 1.0, "caution": 1.0, "horizon": 20.0}
+    assert tuned(Shaken(), law_of, start).damping == 0.5  # type: ignore[arg-type]
+
+
+def test_trials_see_a_difference_grow() -> None:
+    """The law forgets one; a law that turns over with every thousandth of the PV does not."""
+    model, signals = first_order(pole=0.9), made_signals()
+    trials = Trials.draw(model, signals, 12, seed=1)
+    assert trials.growth(law_of(model, horizon=12)) < FORGETS
+
+    class Sawtooth(torch.nn.Module):
+        n_state = 0
+
+        def forward(self, sp: Any, pv: Any, dv: Any, mv: Any, state: Any) -> Any:
+            return torch.remainder(1e3 * pv, 1.0), state, state
+
+    assert trials.growth(Sawtooth()) > FORGETS  # type: ignore[arg-type]
 
 
 def test_the_cost_weighs_relative_errors_and_travel() -> None:

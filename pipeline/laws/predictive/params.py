@@ -30,7 +30,7 @@ class PredictiveParams:
     ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's; q_d
     None: 3e-5 over the noise. ``loads`` act on the ``mvs`` or the ``outputs``.
     ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or
-    more; None: .5 of one MV, .25 of several.
+    more; None: .5 of one MV, .25 of several, and with a search the least that the loops stand.
     ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses speed, caution
     and horizon in closed loops over the model with wrong gains and loads, drawn by ``seed``. ``mv_rate`` [mv]:
     largest MV change a sample, which the plan knows; None: unlimited.

@@ -20,7 +20,7 @@ from pipeline.laws.predictive.set_points import SetPoints
 from pipeline.laws.predictive.settling import horizon_for, refuse_unstable
 from pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
 from pipeline.laws.predictive.trials import Trials
-from pipeline.laws.predictive.tuning import Candidate, searched
+from pipeline.laws.predictive.tuning import Candidate, tuned
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Named, Stage
@@ -180,26 +180,28 @@ class Predictive(ControlLaw):
         """
         horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held")
 
-        def law_of(n: Mapping[str, float], given: PredictiveParams = plain) -> Any:
-            changed: Any = replace(given, speed=n["speed"], caution=n["caution"], horizon=int(n["horizon"]))
+        def law_of(n: Mapping[str, float], damping: float | None, given: PredictiveParams = plain) -> Any:
+            speed, caution, horizon = n["speed"], n["caution"], int(n["horizon"])
+            changed = replace(given, speed=speed, caution=caution, horizon=horizon, damping=damping)
             return type(self)(self.signals, model, changed).eval()
 
         start = {n: float(getattr(params, n)) for n in ("speed", "caution")} | {"horizon": float(horizon)}
-        best, tried = searched(Trials.draw(model, self.signals, horizon, params.seed), law_of, start)
-        law: Self = law_of(best.numbers, params)
-        law.tried = tuple(tried)
+        found = tuned(Trials.draw(model, self.signals, horizon, params.seed), law_of, start, params.damping)
+        law: Self = law_of(found.numbers, found.damping, params)
+        law.tried = found.tried
         return law
 
     def analysis(self, plant: Simulator | None) -> Analysis:
         """The numbers that a search chose, and its cost at first and at last; empty without one."""
         if not self.tried:
             return Analysis()
-        best = min(self.tried, key=lambda c: c.cost)
-        figures = {**best.numbers, "cost": best.cost, "cost_given": self.tried[0].cost, "tried": len(self.tried)}
+        best, damping = min(self.tried, key=lambda c: c.cost), float(self.planner.damping)
+        first = self.tried[0].cost
+        figures = {**best.numbers, "damping": damping, "cost": best.cost, "cost_given": first, "tried": len(self.tried)}
         note = (
             f"{len(self.tried)} sets of numbers were tried in closed loops over the model with errors of gain, pace "
-            f"and dead time, with loads and noise; the cost fell from {self.tried[0].cost:.3g} to {best.cost:.3g}, "
-            "where 1 is the errors with the first numbers, and .1 a travel of 1 % of the MVs' range a sample."
+            f"and dead time, with loads and noise; the cost fell from {first:.3g} to {best.cost:.3g}, "
+            "where 1 is the errors with the first numbers, and .05 a travel of 1 % of the MVs' range a sample."
         )
         return Analysis(figures, notes=(note,))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -27,6 +28,7 @@ BIAS = 0.2  # of half an MV's range: the largest steps of a load at the MV
 LOAD = 0.6  # scaled, over the samples of the horizon: steps of a load at the output
 DRIFT = 0.15  # of BIAS and LOAD: a sample's share of a load that walks
 WALKS = (2, 5)  # loops whose loads walk; the loads of the others step
+NUDGE = 1e-9  # scaled
 AT_OUTPUT = (3, 4, 5)  # loops whose loads act on the outputs; those of the others on the MVs
 
 
@@ -97,32 +99,52 @@ class Trials:
     @torch.no_grad()
     def run(self, laws: ControlLaw, count: int) -> Outcome:
         """The loops of ``count`` laws side by side; infinite where a loop is not finite."""
-        model, (n, loops, n_cv) = self.model, self.sp.shape
-        low, high = (torch.tensor([getattr(s, end) for s in self.signals.mv]).double() for end in ("low", "high"))
-        middle, n_y = 0.5 * (low + high), model.n_y
-        mv, x = self.mv0.expand(count, -1, -1), self.x0.expand(count, -1, -1)
+        n_cv, span = self.sp.shape[-1], self._span
+        error = torch.zeros(count, self.sp.shape[1], dtype=torch.float64)
+        travel = error.clone()
+        for k, (y, before, mv) in enumerate(self._samples(laws, self.x0.expand(count, -1, -1))):
+            if k >= self.quiet:
+                error += ((y[..., :n_cv] - self.sp[k]).abs() / self.model.y_scale[:n_cv]).mean(dim=-1)
+                travel += ((mv - before).abs() / span).mean(dim=-1)
+        error, travel = (100 / (len(self.sp) - self.quiet) * t for t in (error / SPAN, travel))
+        error = torch.nan_to_num(error, nan=torch.inf)
+        moved = torch.stack([travel[:, :LOOPS].mean(dim=-1), travel[:, LOOPS:].mean(dim=-1)], dim=-1)
+        return Outcome(error[:, :LOOPS].numpy(), error[:, LOOPS:].numpy(), moved.numpy())
+
+    @torch.no_grad()
+    def growth(self, law: ControlLaw) -> float:
+        """The largest difference of an MV, over its range, that a far smaller one of the first states makes of it.
+
+        In units of that one. Some tens at most where the loop forgets; a loop that does not is thrown by rounding,
+        and by noise.
+        """
+        drawn = np.random.default_rng(0).normal(size=self.x0.shape)
+        x = torch.stack([self.x0, self.x0 + NUDGE * torch.from_numpy(drawn)])
+        found = [((mv[1] - mv[0]).abs() / self._span).max() for _, _, mv in self._samples(law, x)]
+        return float(torch.nan_to_num(torch.stack(found), nan=torch.inf).max()) / NUDGE
+
+    @property
+    def _span(self) -> Tensor:
+        """Range (n_mv,) of the MVs."""
+        return torch.tensor([s.high - s.low for s in self.signals.mv], dtype=torch.float64)
+
+    def _samples(self, laws: ControlLaw, x: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Of loops from the states x (count, 2 LOOPS, n_x), sample by sample: outputs, the MV before, and the MV."""
+        model, (n, loops, _), count = self.model, self.sp.shape, len(x)
+        middle, n_y = torch.tensor([s.middle for s in self.signals.mv]).double(), model.n_y
+        mv = self.mv0.expand(count, -1, -1)
         state = torch.zeros(count, loops, laws.n_state, dtype=torch.float64)
         more = torch.tensor([s.middle for s in self.signals.pv[n_y:]]).double().expand(count, loops, -1)
-        dv = model.v_center[len(low) :].expand(count, loops, -1)
-        error = torch.zeros(count, loops, dtype=torch.float64)
-        travel = torch.zeros(count, loops, dtype=torch.float64)
+        dv = model.v_center[len(middle) :].expand(count, loops, -1)
         for k in range(n):
-            y = model.measured(x)
-            if k >= self.quiet:
-                error += ((y[..., :n_cv] - self.sp[k]).abs() / model.y_scale[:n_cv]).mean(dim=-1)
-            before = mv
+            y, before = model.measured(x), mv
             wanted = self.sp[k].expand(count, -1, -1)
             mv, state, _ = laws(wanted, torch.cat([y + self.noise[k], more], dim=-1), dv, mv, state)
-            if k >= self.quiet:
-                travel += ((mv - before).abs() / (high - low)).mean(dim=-1)
+            yield y, before, mv
             late = mv + self.late * (before - mv)
             acting = middle + self.gain * (late - middle) + self.bias[k]
             x = x + self.pace * (model(torch.cat([x, acting, dv], dim=-1)) - x)
             x = torch.cat([x[..., :n_y] + self.load[k], x[..., n_y:]], dim=-1)
-        error, travel = (100 / (n - self.quiet) * t for t in (error / SPAN, travel))
-        error = torch.nan_to_num(error, nan=torch.inf)
-        moved = torch.stack([travel[:, :LOOPS].mean(dim=-1), travel[:, LOOPS:].mean(dim=-1)], dim=-1)
-        return Outcome(error[:, :LOOPS].numpy(), error[:, LOOPS:].numpy(), moved.numpy())
 
 
 def _courses(rng: np.random.Generator, horizon: int, hold: int, count: int) -> Array:

@@ -13,11 +13,13 @@ from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import Outcome
 from pipeline.plants.simulator import Array
 
-TRAVEL = 0.1  # of J: what a travel of 1 % of the MVs' range a sample costs
+TRAVEL = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
 NEAR = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
 COARSE = [(s, c) for s in (0.5, 1.0, 2.0) for c in (0.4, 1.0, 2.5)]  # factors of speed and caution
 FINE = [(s, c) for s in (0.7, 1.0, 1.4) for c in (0.6, 1.0, 1.6)]
 HORIZONS = (0.7, 1.3)
+DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
+FORGETS = 100.0  # growth of a small difference up to which a loop forgets it; most stay below 20
 
 Numbers = dict[str, float]
 """``speed``, ``caution`` and ``horizon``."""
@@ -37,11 +39,14 @@ class Tries(Protocol):
     def run(self, laws: ControlLaw, count: int) -> Outcome:
         """The loops of ``count`` laws."""
 
+    def growth(self, law: ControlLaw) -> float:
+        """How far a small difference grows in the loops of one law."""
+
 
 def costs(outcome: Outcome, given: Outcome) -> Array:
     """J (C,) of each law beside the ``given`` one's first, whose errors count 1.
 
-        J = (E_sp/E_sp0 + E_load/E_load0)/2 + .1 (T_sp + T_load)/2
+        J = (E_sp/E_sp0 + E_load/E_load0)/2 + .05 (T_sp + T_load)/2
 
     E is the mean error of the loops, T the MVs' travel [% of their range a sample]. Set points have by far the larger
     errors; so each part counts by what it gains. A worst loop does not count by itself, which made J jump.
@@ -82,6 +87,37 @@ def searched(
         tried_all([{"horizon": float(np.clip(round(at["horizon"] * factor), 8, 60))}])
     tried_all(grid(FINE))
     return best, tried
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """What a search found: the best numbers, the damping of the passes (None: no reason for any), all that it tried."""
+
+    numbers: Numbers
+    damping: float | None
+    tried: tuple[Candidate, ...]
+
+
+def tuned(
+    trials: Tries,
+    law_of: Callable[[Mapping[str, float], float | None], ControlLaw],
+    start: Numbers,
+    damping: float | None = None,
+) -> Tuned:
+    """The best numbers of the laws ``law_of(numbers, damping)``; without a ``damping`` the least that the loops stand.
+
+    That is the least with which a small difference does not grow in the loops. Where it grows with each, the model is
+    to blame and not the passes, and the law keeps its own.
+    """
+
+    def stood(numbers: Numbers, least: float) -> float | None:
+        offers = (d for d in DAMPINGS if d >= least)
+        return next((d for d in offers if trials.growth(law_of(numbers, d)) <= FORGETS), None)
+
+    first = stood(start, 0.0) if damping is None else damping
+    best, tried = searched(trials, lambda numbers: law_of(numbers, first), start)
+    last = stood(best.numbers, first) if damping is None and first is not None else first
+    return Tuned(best.numbers, last, tuple(tried))
 
 
 def _distance(numbers: Numbers, start: Numbers) -> float:
