@@ -23,6 +23,7 @@ from pipeline.pictures.drawing import (
     SIZE,
     axis_label,
     colour_of,
+    fit_labels,
     layer,
     legend_below,
     ratio_unit,
@@ -179,6 +180,7 @@ class LoopPanels:
         if self.hidden:
             handles, labels = [*handles, Patch(color="black", alpha=0.25, linewidth=0)], [*labels, FAST]
         legend_below(self.canvas, handles, labels)
+        fit_labels(self.canvas)
         return self.canvas
 
 
