@@ -1,4 +1,4 @@
-"""What ``loopwright new`` prints of a screening: findings, what the data say of the plant, the verdict, the next step."""
+"""What ``loopwright new`` prints of a screening: findings, what the data say of the plant, verdict, next step."""
 
 from __future__ import annotations
 
