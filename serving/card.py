@@ -8,7 +8,7 @@ from typing import Any
 from serving.controller import Controller
 from serving.manifest import Signal
 
-SHOWN = {"scenarios", "locked_up", "as_printed"}  # entries of the evidence that have a place of their own
+SHOWN = {"scenarios", "units", "locked_up", "as_printed"}  # entries of the evidence that have a place of their own
 
 
 def card(controller: Controller) -> str:
@@ -77,9 +77,11 @@ def _evidence(evidence: dict[str, Any]) -> list[str]:
     columns = list(dict.fromkeys(key for row in rows.values() for key, v in row.items() if isinstance(v, int | float)))
     if not columns:
         return _tree(evidence)
+    units = evidence.get("units")
+    named = {c: f"{c} [{units[c]}]" if isinstance(units, dict) and c in units else c for c in columns}
     first = max(len(name) for name in rows)
-    widths = [max(10, len(c)) for c in columns]
-    lines = ["  " + " " * first + "".join(f"  {c:>{w}}" for c, w in zip(columns, widths, strict=True))]
+    widths = [max(10, len(words)) for words in named.values()]
+    lines = ["  " + " " * first + "".join(f"  {w:>{n}}" for w, n in zip(named.values(), widths, strict=True))]
     for name, row in rows.items():
         cells = (f"{row[c]:.4g}" if isinstance(row.get(c), int | float) else "-" for c in columns)
         lines.append(f"  {name:<{first}}" + "".join(f"  {c:>{w}}" for c, w in zip(cells, widths, strict=True)))

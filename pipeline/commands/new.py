@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline.cases.own_plant import entries_of
 from pipeline.commands.new_fmu import table_from, write_table
+from pipeline.commands.new_printed import tell
 from pipeline.commands.new_replaced import REFUSED, check_replaceable, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
@@ -18,11 +19,11 @@ from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
 from pipeline.files import draft_folder_of, write_json, write_text
 from pipeline.historian.excerpt import evenly
-from pipeline.historian.findings import Screening, Verdict
+from pipeline.historian.findings import Screening
 from pipeline.historian.guessing import controlled_first, guesses
 from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
-from pipeline.historian.step_test import StepTest, planned
+from pipeline.historian.step_test import planned
 from pipeline.historian.tags import EXPLAINED, RANGES, ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
 from pipeline.plants.simulator_file import is_fmu
 from pipeline.records.record import Record
@@ -163,7 +164,7 @@ def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace
                 earlier.rename(folder)
             raise
     shutil.rmtree(earlier, ignore_errors=True)
-    _tell(name, folder, report, test, not usable)
+    tell(name, folder, report, test, not usable)
     for wish in lost:
         print(f"replaced, write it into params.yaml again if you want it: controllers.{wish}")
     if usable:
@@ -196,41 +197,6 @@ def entry(record: Record, report: Screening, folder: Path) -> dict[str, Any]:
         "data": (folder / "record.parquet").as_posix(),
         "source": [dict(f) for f in report.files],
     }
-
-
-def _tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:
-    kept = 100 * report.kept_rows / report.grid_rows
-    print(f"{name}: {report.file_rows} rows of {len(report.files)} file(s) -> {report.grid_rows} rows of "
-          f"{report.period_s:g} s, {report.kept_rows} kept ({kept:.1f} %) in {report.runs} run(s)")  # fmt: skip
-    for reason, rows in report.dropped_rows.items():
-        print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
-    for finding in report.findings:
-        print(f"  {finding.tag}: {finding.words}")
-    for line in sayings(report.verdict):
-        print(f"  {line}")
-    print(f"can these data carry a model: {report.verdict.carries}")
-    for reason in report.verdict.reasons:
-        print(f"  {reason}")
-    print(f"look at {folder}/screening.html: trends with every mask")
-    if added:
-        print(f"then: loopwright run {name}")
-    if test:
-        print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h")
-
-
-def sayings(verdict: Verdict) -> list[str]:
-    """What the data say of the plant, a line a pair, for a person to compare with what is known of it."""
-    lines = []
-    for i in verdict.inputs:
-        for pv, gain in i.gain.items():
-            first = i.first_answer_s.get(pv)
-            if not gain and first is None:
-                continue
-            words = [f"gain {gain:.3g}"] if gain else ["gain not clear"]
-            words += [f"first answer after {first:g} s"] if first is not None else []
-            words += [f"the slowest settles in {i.settling_s:g} s"] if i.settling_s and gain else []
-            lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
-    return lines
 
 
 def _with_unit(tag: Tag, units: dict[str, str]) -> Tag:

@@ -118,7 +118,7 @@ def _findings(plant: FileSimulator, test: FirstTest, plan: Plan) -> list[Finding
         words = "the start is no rest: the process variables move without a step, so settling and gains are rough"
         found.append(Finding("first_test", plant.name, words))
     for j, s in enumerate(plant.mv_signals):
-        kind = "gain" if test.settles else "slope a period"
+        kind = "gain in the first step test" if test.settles else "slope a period in the first step test"
         gains = ", ".join(f"{pv.name} {g[j]:.3g}" for pv, g in zip(plant.pv_signals, test.gain, strict=True))
         words = f"{kind}: {gains}; moved from {plan.low[j]:.4g} to {plan.high[j]:.4g} {s.unit}, held for "
         found.append(Finding("first_test", s.name, f"{words}{plan.mv_hold[0]} to {plan.mv_hold[1]} periods"))

@@ -199,6 +199,11 @@ class Case(ABC):
         return self.metrics[self.metric]
 
     @property
+    def unit(self) -> str:
+        """The unit of that metric; empty for a plain number."""
+        return self.criterion.unit_of(self.cv_unit)
+
+    @property
     def foreseen(self) -> bool:
         """Whether the bounds may use the future set points: of a recipe, or of a reference model."""
         return self.recipe or self.criterion.reference

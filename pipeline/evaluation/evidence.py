@@ -245,9 +245,9 @@ class Evidence:
             return "it has the lowest gate score of the laws that did not lock up"
         others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)
         beside = f" (others: {others})" if others else ""
-        short = self.case.criterion.short
-        return f"its {short} over the development sequences, which are not scored, is the lowest: " + (
-            f"{errors[self.best]:.3g}{beside}"
+        return (
+            f"its {self.case.criterion.short} over the development sequences, which are not scored, is the lowest: "
+            + (f"{errors[self.best]:.3g} {self.case.unit}".rstrip() + beside)
         )
 
     def loop(self, curve: Curve, scenario: str) -> Loop | None:

@@ -46,8 +46,8 @@ class OverSeeds:
 class Form:
     """One form of a law: the shipped one, or a variant.
 
-    ``setting`` holds the numbers, words and switches that params.yaml gives this form itself, ``info`` the names
-    of the trajectories' columns, ``tests`` the figures by test, those with noise under names of their own.
+    ``setting`` holds what params.yaml gives this form itself, ``info`` the names of the trajectories' columns,
+    ``tests`` the figures by test, those with noise under names of their own.
     """
 
     setting: Mapping[str, Any]
@@ -144,8 +144,8 @@ class LawEvidence:
 
     def form_of(self, setting: Mapping[str, Any]) -> str | None:
         """Name of the form whose numbers, words and switches are the shipped ones but for ``setting``; BASE first."""
-        shipped = self.metrics.forms[BASE].setting
-        forms = {name: {**shipped, **form.setting} for name, form in self.metrics.forms.items()}
+        shipped = _naming(self.metrics.forms[BASE].setting)
+        forms = {name: {**shipped, **_naming(form.setting)} for name, form in self.metrics.forms.items()}
         return next((name for name, own in forms.items() if own == {**shipped, **setting}), None)
 
     def form(self, setting: Mapping[str, Any]) -> Form | None:
@@ -174,6 +174,11 @@ class LawEvidence:
     def replay(self) -> Loop:
         """Arrays of the replay over the plant's record by name; empty where there was none."""
         return arrays(self.trajectories.with_name("replay.npz"))
+
+
+def _naming(setting: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers, words and switches of a setting, which tell forms apart; a list or a mapping names no form."""
+    return {key: value for key, value in setting.items() if isinstance(value, (int, float, str))}
 
 
 def arrays(path: Path, start: str = "") -> Loop:

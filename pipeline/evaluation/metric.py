@@ -24,12 +24,17 @@ NO_UNIT = frozenset({"", "-", "1"})
 """Units of a signal that is a plain number."""
 
 
+def with_unit(words: str, unit: str) -> str:
+    """``words [unit]``; ``unit`` is empty for a plain number."""
+    return f"{words} [{unit}]" if unit else words
+
+
 @dataclass(frozen=True, slots=True)
 class Floor:
     """The error that measurement noise can hide in a test; a smaller error counts as perfect.
 
     ``error`` computes it from the noise's standard deviation [CV] and the number of samples. ``text``
-    describes it, with ``{noise}`` for the deviation.
+    describes it, with ``{noise}`` for the deviation and ``{unit}`` for a space and its unit.
     """
 
     error: Callable[[float, float], float]
@@ -60,15 +65,15 @@ class Metric:
 
     def unit_of(self, cv: str) -> str:
         """The unit where the controlled variable has the unit ``cv``; empty for a plain number."""
-        cv = cv.replace("deg", "°")
         if cv in NO_UNIT:  # only the rest of the unit remains
-            return self.unit.replace("{cv}²", "").replace("{cv}", "").strip()
-        return self.unit.replace("{cv}²", f"({cv})²" if {" ", "/"} & set(cv) else f"{cv}²").replace("{cv}", cv)
+            own = self.unit.replace("{cv}²", "").replace("{cv}", "").strip()
+        else:
+            own = self.unit.replace("{cv}²", f"({cv})²" if {" ", "/"} & set(cv) else f"{cv}²").replace("{cv}", cv)
+        return "" if own in NO_UNIT else own.replace("deg", "°")
 
     def label(self, cv: str) -> str:
         """Short words and unit, for the head of a table: IAE [mol/l min]."""
-        unit = self.unit_of(cv)
-        return f"{self.short} [{unit}]" if unit else self.short
+        return with_unit(self.short, self.unit_of(cv))
 
 
 def _deviation(noise: float, samples: float) -> float:
@@ -84,7 +89,7 @@ def _detectable(noise: float, samples: float) -> float:
     return float(noise * (2 / samples) ** 0.25)
 
 
-_ABSOLUTE = Floor(_deviation, "{noise:.4g} (the measurement noise)")
+_ABSOLUTE = Floor(_deviation, "{noise:.4g}{unit} (the measurement noise)")
 _SUM = Floor(_sum_of_squares, "the SSE of the measurement noise alone ({noise:g} squared times the samples)")
 _MEAN_SQUARE = Floor(
     _detectable, "the smallest error that the samples can show in their noise ({noise:g} times (2/samples)^(1/4))"

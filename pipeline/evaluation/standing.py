@@ -39,6 +39,7 @@ class Standing:
     title: str
     metric: str  # as it stands in a table
     metric_long: str
+    unit: str  # of the metric
     test: str
     test_title: str
     bound: float | None  # of the perfect-model NMPC
@@ -71,6 +72,7 @@ class Standing:
             title=validation.titles.case,
             metric=validation.titles.metric_short,
             metric_long=validation.titles.metric,
+            unit=validation.titles.unit,
             test=test,
             test_title=validation.titles.scenarios.get(bare, bare) + (" with noise" if test != bare else ""),
             bound=bound,

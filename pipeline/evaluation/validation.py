@@ -82,7 +82,7 @@ class GateRecord:
 
 @dataclass(frozen=True, slots=True)
 class Titles:
-    """Words for a person: of the case, of its metric, of its own figures, of laws and tests."""
+    """Words for a person: of the case, of its metric and its unit, of its own figures, of laws and tests."""
 
     case: str
     metric: str
@@ -90,6 +90,7 @@ class Titles:
     figures: Mapping[str, str]
     laws: Mapping[str, str]
     scenarios: Mapping[str, str]
+    unit: str = ""  # of the metric
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Canvas
 from matplotlib.legend import Legend
 from matplotlib.path import Path as Outline
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 
 from pipeline.evaluation.evidence import Evidence
@@ -50,6 +51,9 @@ FRONT, STEP_BACK = 1.3, 0.5  # line widths in points: of the curve in front, and
 PLAIN_DECADES, TICKED_DECADES = 1.0, 3.0  # an axis that spans less is linear, or has ticks at 1, 2 and 5
 PLAIN_TICKS = 1e-3, 1e5  # numbers on a logarithmic axis that are written out
 LEGEND_GAP = 0.03  # of the axes' height, between a legend and the curves
+LONGEST_BASE = 2  # letters of a symbol before its index
+LABEL_GAP = 6.0  # dots by which a label may be longer than its panel
+LEAST_FONT, LEAST_LETTERS = 7.0, 8  # points, and what a shortened label keeps
 LONGEST_IN_S, LONGEST_IN_MIN = 3000.0, 30_000.0  # [s] of a picture whose axis counts seconds, minutes
 
 
@@ -84,12 +88,10 @@ def time_axis(time_s: Array) -> tuple[Array, str]:
 
 
 def symbol(name: str) -> str:
-    """``C_A`` as a formula; a tag with other signs, such as TIC-101.PV, as it is."""
-    if not name.replace("_", "").isalnum():
-        return name.replace("$", r"\$")
+    """``C_A`` as a formula; a tag, such as TIC-101.PV or reactor_temperature, as it is."""
     base, _, index = name.partition("_")
-    if len(base) > 1 and not index:
-        return name
+    if not (base + index).isalnum() or len(base) > (LONGEST_BASE if index else 1):
+        return name.replace("$", r"\$")
     return f"${base}_{{{index}}}$" if index else f"${base}$"
 
 
@@ -109,6 +111,11 @@ def ratio_unit(top: str, bottom: str) -> str:
         return top
     below = f"({bottom})" if "/" in bottom else bottom
     return f"{'1' if top in NO_UNIT else top}/{below}"
+
+
+def gain_unit(output: Signal, given: Signal, rate: bool) -> str:
+    """Unit of the gain of an output; of one that integrates it is a rate."""
+    return f"{ratio_unit(output.unit, given.unit)} a period".strip() if rate else ratio_unit(output.unit, given.unit)
 
 
 def layer(rank: int) -> dict[str, Any]:
@@ -157,6 +164,41 @@ def legend_below(
             break
         legend.remove()
     return legend
+
+
+def fit_labels(canvas: Canvas, titles: Iterable[Text] = ()) -> None:
+    """Make the axes' labels and these panels' titles as short as their panels, so that no two run into each other.
+
+    A label beside a panel breaks before its unit; then the letters become smaller; at last the middle is left out.
+    """
+    canvas.draw_without_rendering()
+    for axes in canvas.axes:
+        _fit(axes.yaxis.label, axes, upright=True)
+        _fit(axes.xaxis.label, axes)
+    for title in titles:
+        if title.axes is not None:
+            _fit(title, title.axes)
+
+
+def _fit(text: Any, axes: Any, upright: bool = False) -> None:
+    side = "height" if upright else "width"
+    room = getattr(axes.get_window_extent(), side) + LABEL_GAP
+
+    def excess() -> float:
+        return float(getattr(text.get_window_extent(), side)) / room
+
+    if upright and excess() > 1 and "\n" not in text.get_text():
+        text.set_text(text.get_text().replace(" [", "\n["))
+    if excess() > 1:
+        text.set_fontsize(max(LEAST_FONT, text.get_fontsize() / excess()))
+    words = text.get_text()
+    if "$" in words:  # a formula cannot be cut
+        return
+    name, end, unit = words.partition("\n")
+    for kept in range(len(name) - 1, LEAST_LETTERS - 1, -1):
+        if excess() <= 1:
+            return
+        text.set_text(f"{name[: kept // 2]}…{name[len(name) - (kept - kept // 2) :]}{end}{unit}")
 
 
 def covers(legend: Legend, axes: Axes) -> bool:

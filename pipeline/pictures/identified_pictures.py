@@ -16,8 +16,9 @@ from pipeline.pictures.drawing import (
     PALETTE,
     SIZE,
     axis_label,
+    fit_labels,
+    gain_unit,
     legend_below,
-    ratio_unit,
     signal_label,
     symbol,
     time_axis,
@@ -27,19 +28,26 @@ from pipeline.simulation.rests import local_gains
 from serving.manifest import Signal
 
 LAW, OTHER = PALETTE[1], "#8fb8d6"
-PANEL, WIDEST, LOWEST = (2.9, 1.9), 11.0, 3.2  # inches
-QUANTILES = (0.05, 0.95)  # of a record's MV: over them the gains are taken
+PANEL, WIDEST, LOWEST = (2.9, 1.9), 13.0, 3.2  # inches
+SMALL = 8.0  # points of the numbers at the axes of a grid of panels
+QUANTILES = (0.1, 0.9)  # of a record's MV: over them the gains are taken, as in the report's table
 PLACES = 7
 LAGS = 40
+HISTOGRAM_TICKS, PLAIN = 4, (-2, 4)  # intervals at most; powers of ten between which numbers are written out
 SURE = 2.58  # standard deviations of a white residual's correlation that 99 % stay within
 SHOWN = 800  # samples of a free run
+IN_TABLE = "gain at the middle ± standard deviation, as in the table"
 SIGNS = {"+": "rises with", "-": "falls with", "uncertain": "may rise or fall with"}
 
 
 def _grid(rows: int, columns: int, **shared: Any) -> tuple[Canvas, list[list[Axes]]]:
     width = float(np.clip(columns * PANEL[0], SIZE[0], WIDEST))
     canvas = Canvas(figsize=(width, max(rows * PANEL[1] + 1.0, LOWEST)), layout="constrained")
-    return canvas, [list(row) for row in canvas.subplots(rows, columns, squeeze=False, **shared)]
+    panels = [list(row) for row in canvas.subplots(rows, columns, squeeze=False, **shared)]
+    if columns > 1:
+        for axes in (a for row in panels for a in row):
+            axes.tick_params(labelsize=SMALL)
+    return canvas, panels
 
 
 def step_responses_picture(evidence: Evidence) -> Canvas:
@@ -51,6 +59,7 @@ def step_responses_picture(evidence: Evidence) -> Canvas:
     plant = evidence.case.plant_class
     inputs, cvs = (*plant.mv_signals, *plant.dv_signals), [s for s in plant.sp_signals if s.name in responses]
     canvas, panels = _grid(len(cvs), len(inputs), sharex=True)
+    titles = []
     for row, cv in zip(panels, cvs, strict=True):
         for axes, signal in zip(row, inputs, strict=True):
             found = responses[cv.name][signal.name]
@@ -65,24 +74,29 @@ def step_responses_picture(evidence: Evidence) -> Canvas:
                 axes.axvline(time[-1] * waits / (plant.period_s * found["periods"][-1]), color=PALETTE[0],
                              linewidth=0.9, linestyle=":", label="dead time")  # fmt: skip
             if row is panels[0]:
-                axes.set_title(f"step of {_of(signal)}", fontsize=9.5)
+                titles.append(axes.set_title(f"{symbol(signal.name)}\nstep by {_one(signal)}", fontsize=9.5))
             if row is panels[-1]:
                 axes.set_xlabel(words)
             axes.margins(x=0.01)
         row[0].set_ylabel(signal_label(cv))
     _legend(canvas, panels)
+    fit_labels(canvas, titles)
     return canvas
 
 
 def gains_picture(evidence: Evidence) -> Canvas:
-    """Local gain of each controlled variable over the visited range of each MV: the law's model and the others."""
+    """Local gain of each controlled variable over the visited range of each MV, of the law's model and the others.
+
+    The gain of the report's table stands with its spread where it belongs, at the median of the MV.
+    """
     if evidence.case.replayed is None or not isinstance(evidence.case.plant, IdentifiedPlant):
         raise NotMeasuredError
     plant, record = evidence.case.plant, evidence.case.replayed[0]
-    signs: Mapping[str, Any] = identified_part(evidence.models).get("gains") or {}
+    table: Mapping[str, Any] = identified_part(evidence.models).get("gains") or {}
     others = list({id(t.plant): t.plant for tests in evidence.tests.values() for t in tests if t.plant}.values())
     middle, (low, high) = np.median(record.mv, axis=0), np.quantile(record.mv, QUANTILES, axis=0)
-    canvas, panels = _grid(len(plant.sp_signals), len(plant.mv_signals))
+    canvas, panels = _grid(len(plant.sp_signals), len(plant.mv_signals), sharex="col")
+    titles = []
     for j, mv in enumerate(plant.mv_signals):
         places = np.linspace(low[j], high[j], PLACES)
         found = [local_gains(p, j, places, middle, len(plant.sp_signals)) for p in (*others, plant)]
@@ -93,12 +107,18 @@ def gains_picture(evidence: Evidence) -> Canvas:
                 look: dict[str, Any] = {"color": LAW if own else OTHER, "linewidth": 1.7 if own else 1.0}
                 axes.plot(places, gain[:, i], label="law's model" if own else "models of the tests", **look)
             axes.axhline(0.0, color="#888888", linewidth=0.7)
-            axes.set_xlabel(signal_label(mv))
-            unit = ratio_unit(cv.unit, mv.unit) + (" a period" if rate else "")
-            axes.set_ylabel(axis_label(f"d {symbol(cv.name)} / d {symbol(mv.name)}", unit), fontsize=8.5)
-            sign = (signs.get(cv.name) or {}).get(mv.name, {}).get("sign")
-            axes.set_title(f"{symbol(cv.name)} {SIGNS.get(sign, 'answers to')} {symbol(mv.name)}", fontsize=9.5)
+            of = (table.get(cv.name) or {}).get(mv.name) or {}
+            if of and bool(of.get("rate")) == rate:
+                mark: dict[str, Any] = {"fmt": "o", "color": PALETTE[0], "markersize": 4, "capsize": 3, "zorder": 5}
+                axes.errorbar(middle[j], of["gain"], yerr=of["spread"], label=IN_TABLE, **mark)
+            if i == len(panels) - 1:
+                axes.set_xlabel(signal_label(mv))
+            words = axis_label("gain", gain_unit(cv, mv, rate))
+            axes.set_ylabel(words if j else f"{symbol(cv.name)}\n{words}", fontsize=8.5)
+            title = f"{SIGNS.get(of.get('sign', ''), 'answers to')} {symbol(mv.name)}"
+            titles.append(axes.set_title(title, fontsize=9.0))
     _legend(canvas, panels)
+    fit_labels(canvas, titles)
     return canvas
 
 
@@ -115,6 +135,7 @@ def free_run_picture(evidence: Evidence) -> Canvas:
     for i, cv in enumerate(cvs):
         _free_run_of(panels[2 * i : 2 * i + 2], arrays["time_s"], measured[:, i], run[:, i], cv)
     legend_below(canvas, *panels[0][0].get_legend_handles_labels())
+    fit_labels(canvas)
     return canvas
 
 
@@ -143,10 +164,12 @@ def _free_run_of(panels: Any, time_s: Array, measured: Array, run: Array, cv: Si
         spread.hist(known, bins=30, color=LAW, alpha=0.6)
         spread.set_xlabel(axis_label("residual", cv.unit), fontsize=8.5)
         spread.set_yticks([])
+        spread.locator_params(axis="x", nbins=HISTOGRAM_TICKS)
+        spread.ticklabel_format(axis="x", style="sci", scilimits=PLAIN)
 
 
-def _of(signal: Signal) -> str:
-    return f"{symbol(signal.name)} by 1 {signal.unit.replace('deg', '°')}".strip()
+def _one(signal: Signal) -> str:
+    return f"1 {signal.unit.replace('deg', '°')}".strip()
 
 
 def _legend(canvas: Canvas, panels: Sequence[Sequence[Axes]]) -> None:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from pipeline.evaluation.case import Case, Curve, Figure
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.law_evidence import BASE, Array, Loop
-from pipeline.evaluation.metric import Metric
 from pipeline.pictures.drawing import (
     REFERENCE,
     SET_POINT,
@@ -24,6 +23,7 @@ from pipeline.pictures.drawing import (
     SIZE,
     axis_label,
     colour_of,
+    fit_labels,
     layer,
     legend_below,
     ratio_unit,
@@ -180,6 +180,7 @@ class LoopPanels:
         if self.hidden:
             handles, labels = [*handles, Patch(color="black", alpha=0.25, linewidth=0)], [*labels, FAST]
         legend_below(self.canvas, handles, labels)
+        fit_labels(self.canvas)
         return self.canvas
 
 
@@ -360,39 +361,42 @@ def info_label(case: Case, name: str) -> str:
 
 def overview_picture(evidence: Evidence, law: str) -> Canvas:
     """A law beside the baseline on the first sequence of the test that weighs most, with the figures over all."""
-    scenario, metric, baseline = evidence.main_test, evidence.case.criterion, evidence.case.baseline
+    scenario, case, baseline = evidence.main_test, evidence.case, evidence.case.baseline
     own = evidence.loop(Curve(law), scenario)
     if own is None:
         raise NotMeasuredError
     error, times = evidence.figure(law, scenario), evidence.ratio(law, scenario)
     beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
-    late, late_s = evidence.figure(law, scenario, metric.late), evidence.late_s(scenario)
-    rest = "" if late is None or not late_s else f"; {number(late)} from {late_s:g} s on"
-    title = f"{evidence.laws[law].title}\n{metric.short} {_error(error, metric)}{beside}{rest}"
+    late, late_s = evidence.figure(law, scenario, case.criterion.late), evidence.late_s(scenario)
+    rest = "" if late is None or not late_s else f"; {number(late)} {case.unit}".rstrip() + f" from {late_s:g} s on"
+    title = f"{evidence.laws[law].title}\n{_error(error, case)}{beside}{rest}"
     drawn = {law_name(law): (own, colour_of(law, evidence.laws, baseline))}
     other = evidence.loop(Curve(baseline), scenario) if law != baseline else None
     if other is not None:
         error = evidence.figure(baseline, scenario)
-        label = f"{law_name(baseline)}, {metric.short} {_error(error, metric)}"
+        label = f"{law_name(baseline)}, {_error(error, case)}"
         drawn[label] = other, colour_of(baseline, evidence.laws, baseline)
     return _picture(evidence, scenario, title, drawn)
 
 
 def disturbance_picture(evidence: Evidence, scenario: str) -> Canvas:
     """The first sequence of a test that moves a measured disturbance, under the best law and the baseline."""
-    laws, metric = dict.fromkeys((evidence.best or "", evidence.case.baseline)), evidence.case.criterion
+    laws = dict.fromkeys((evidence.best or "", evidence.case.baseline))
     drawn = {}
     for law in laws:
         loop = evidence.loop(Curve(law), scenario)
         if loop is not None:
-            label = f"{law_name(law)}, {metric.short} {_error(evidence.figure(law, scenario), metric)}"
+            label = f"{law_name(law)}, {_error(evidence.figure(law, scenario), evidence.case)}"
             drawn[label] = loop, colour_of(law, evidence.laws, evidence.case.baseline)
     if not drawn:
         raise NotMeasuredError
     return _picture(evidence, scenario, evidence.scenarios[scenario], drawn)
 
 
-def _error(value: float | None, metric: Metric) -> str:
+def _error(value: float | None, case: Case) -> str:
+    """A figure in the case's metric: MAE 0.0123 mol/l."""
+    metric = case.criterion
     if value is None:
-        return "–"
-    return f"{value:.4f}" if not metric.squared and 0.01 <= value < 1.0 else number(value, 4)
+        return f"{metric.short} –"
+    words = f"{value:.4f}" if not metric.squared and 0.01 <= value < 1.0 else number(value, 4)
+    return f"{metric.short} {words} {case.unit}".rstrip()

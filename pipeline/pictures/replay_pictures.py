@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.pictures.drawing import SET_POINT, SIZE, colour_of, legend_below, signal_label, time_axis
+from pipeline.pictures.drawing import SET_POINT, SIZE, colour_of, fit_labels, legend_below, signal_label, time_axis
 from pipeline.pictures.words import law_name
 
 DONE = "#56b4e9"  # neither the baseline's grey nor the first law's colour
@@ -41,4 +41,5 @@ def replay_picture(evidence: Evidence, law: str) -> Canvas:
     canvas.align_ylabels(panels)
     found = [axes.get_legend_handles_labels() for axes in (panels[0], panels[-1])]
     legend_below(canvas, [h for row, _ in found for h in row], [text for _, row in found for text in row], most=2)
+    fit_labels(canvas)
     return canvas

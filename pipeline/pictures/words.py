@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from typing import Any
 
 from pipeline.evaluation.case import Curve, Setting
 from pipeline.evaluation.evidence import Evidence
@@ -37,6 +39,11 @@ def setting_text(setting: Setting) -> str:
         key if value is True else f"{key}={value}" if isinstance(value, str) else f"{key}={value:g}"
         for key, value in setting.items()
     )
+
+
+def given_text(settings: Mapping[str, Any]) -> str:
+    """``tuning = search, cv_high = [80, null]``: settings as params.yaml has them, each of them."""
+    return ", ".join(f"{k} = {v if isinstance(v, str) else json.dumps(v)}" for k, v in settings.items())
 
 
 def scenario_name(scenario: str, recipe: bool, own: Mapping[str, str] | None = None) -> str:

@@ -25,7 +25,11 @@ from pipeline.simulation.scenario import NOISE_SUFFIX
 MODEL_PICTURES: tuple[tuple[str, Draw, str], ...] = (
     ("free_run", free_run_picture, "The free run over rows that the fit never saw, and its residual"),
     ("step_responses", step_responses_picture, "Step responses, with the band of all fits that are as good"),
-    ("gains", gains_picture, "Local gains over the visited range of each MV"),
+    (
+        "gains",
+        gains_picture,
+        "Gains over each MV, from 10 to 90 % of its values in the record; the other MVs at their medians",
+    ),
 )
 """Of identified models."""
 

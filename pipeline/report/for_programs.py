@@ -37,6 +37,7 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
             figures={metric.name: metric.label(case.cv_unit) for metric in case.own_metrics},
             laws={name: law.title for name, law in evidence.laws.items()},
             scenarios=evidence.scenarios,
+            unit=case.unit,
         ),
         requirements=judged.acceptance,
         claims=judged.statements,

@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.model_evidence import identified_part
-from pipeline.pictures.drawing import axis_label, ratio_unit
+from pipeline.pictures.drawing import axis_label, gain_unit
 from pipeline.pictures.numbers import figure, number
 
 MOST_TRIED = 12  # candidates in the table, the best first
@@ -34,7 +34,7 @@ VARIABLES = (
     "Residual with itself",
     "with inputs",
 )
-ANSWERS = ("Variable", "Input", "Gain", "Sign", "Over the range", "Dead time [s]")
+ANSWERS = ("Variable", "Input", "Gain at the middle", "Sign", "Gain over the range", "Dead time [s]")
 TRIED = ("Start", "States", "Dead times", "Hidden units", "Held-out error", "Spread", "Chosen")
 
 
@@ -94,7 +94,8 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
                     signal.name,
                     given.name,
                     axis_label(
-                        f"{number(found['gain'])} ± {number(found['spread'], 2)}", ratio_unit(signal.unit, given.unit)
+                        f"{number(found['gain'])} ± {number(found['spread'], 2)}",
+                        gain_unit(signal, given, bool(found.get("rate"))),
                     ),
                     SIGNS.get(found["sign"], found["sign"]),
                     f"{number(found['low'])} … {number(found['high'])}, {varies}",

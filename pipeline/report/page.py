@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import BASE, lock_up_text
-from pipeline.evaluation.metric import NO_UNIT
+from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
 from pipeline.evaluation.validation import FILE
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
-from pipeline.pictures.drawing import CasePicture, axis_label
+from pipeline.pictures.drawing import CasePicture
 from pipeline.pictures.numbers import number, ratio
 from pipeline.pictures.words import law_name, scenario_name
 from pipeline.report.figures import draw_all, main_words
 from pipeline.report.for_programs import validation
 from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
+from pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
-from pipeline.simulation.scenario import NOISE_SUFFIX
 
 MOST_HEADLINES = 5
 
@@ -57,13 +56,13 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "evidence": evidence,
         "metric": case.criterion,
         "noise": f"true output, noisy measurement{draws}",
-        "floor": case.criterion.floor.text.format(noise=evidence.noise) if case.criterion.floor else "",
+        "floor": _floor(evidence),
         "best": best,
         "seeds": "" if best is None else _seeds(best.seeds),
         "headline": headline(evidence),
         "pictures": of_kind("figure_"),
         "own_pictures": {k: v for k, v in pictures.items() if k in own},
-        "loops": of_kind("closed_loop_"),
+        "further_pictures": _loops(evidence, of_kind("closed_loop_")),
         "sweeps": of_kind("sweep_") | of_kind("candidates_"),
         # A search over models has no offline optimum: its column would stand empty.
         "offline": evidence.grounds is None,
@@ -73,7 +72,6 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "identified": model_section(evidence),
         "identified_heads": (VARIABLES, ANSWERS, TRIED),
         "identified_pictures": of_kind("model_"),
-        "main_test": main_words(evidence)[0],
         "tables": judged.tables,
         "rule": RULE,
         "acceptance": judged.acceptance,
@@ -82,10 +80,10 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
         "withheld": evidence.withheld,
         "gate_of": f"{case.baseline}'s" if evidence.simulated else "NMPC's",
-        "laws": [_law(evidence, law) for law in evidence.laws],
-        "scenarios": _rows(evidence),
-        "further": _further(evidence),
-        "analyses": _analyses(evidence),
+        "laws": [law_row(evidence, law) for law in evidence.laws],
+        "scenarios": scenario_rows(evidence),
+        "further": further_figures(evidence),
+        "analyses": analyses(evidence),
         "bound_notes": _bound_notes(evidence),
         "bounded": any(evidence.bound(name) is not None for name in evidence.scenarios),
         "models": models,
@@ -94,6 +92,21 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "step_ms": evidence.bound(evidence.main_test, "step_ms_p50"),
         "registry": REGISTRY_URL,
     }
+
+
+def _floor(evidence: Evidence) -> str:
+    """The error that noise can hide, in words; empty where the case's metric has no floor."""
+    floor = evidence.case.criterion.floor
+    return "" if floor is None else floor.text.format(noise=evidence.noise, unit=f" {evidence.case.unit}".rstrip())
+
+
+def _loops(evidence: Evidence, pictures: Mapping[str, str]) -> list[tuple[str, dict[str, str]]]:
+    """Pictures of closed loops below their headings; the best law's on the main test stands at the top of the page."""
+    moved = {name: words for name, words in pictures.items() if name.startswith("closed_loop_test_")}
+    others = {k: v for k, v in pictures.items() if k not in moved and k != f"closed_loop_{evidence.best}.png"}
+    law = "Each law" if evidence.best is None else "The other laws"
+    found = [(f"{law} on {main_words(evidence)[0]}", others), ("Tests that move measured disturbances", moved)]
+    return [(title, shown) for title, shown in found if shown]
 
 
 def _bound_notes(evidence: Evidence) -> list[str]:
@@ -138,8 +151,10 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     for need in (n for n in needs if n.metric == case.criterion.late):
         late = evidence.figure(best, need.scenario, need.metric)
         if late is not None:
-            words = f"{case.metrics[need.metric].short} on {name_of(need.scenario)}"
-            rows.append((number(late), f"{words}; at most {number(need.high)} is asked"))
+            metric = case.metrics[need.metric]
+            unit = metric.unit_of(case.cv_unit)
+            words = f"{metric.short} on {name_of(need.scenario)}; at most {number(need.high)} is asked"
+            rows.append((f"{number(late)} {unit}".rstrip(), words))
     rows = rows[:MOST_HEADLINES]
     if evidence.grounds is not None:
         rows += [
@@ -147,8 +162,8 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
             for name, fit in evidence.grounds.fit.items()
         ]
     late_s = evidence.late_s(evidence.main_test)
-    metric = case.criterion.late if late_s else case.metric
-    own, other = (evidence.figure(law, evidence.main_test, metric) for law in (best, case.baseline))
+    compared = case.criterion.late if late_s else case.metric
+    own, other = (evidence.figure(law, evidence.main_test, compared) for law in (best, case.baseline))
     if own and other and own < other:
         where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
         lower = f"lower {case.criterion.long} than the {law_name(case.baseline)} on {where}"
@@ -165,96 +180,4 @@ def _locked(evidence: Evidence, law: str) -> dict[str, str]:
         "loops": "one closed loop" if own.lock_ups == 1 else f"{own.lock_ups} closed loops",
         "tests": lock_up_text(own.locked_up),
         "why": ". It is shipped as printed, to reproduce the paper" if own.as_printed else ". It is not shipped",
-    }
-
-
-def _law(evidence: Evidence, law: str) -> dict[str, Any]:
-    measured = evidence.laws[law]
-    return {
-        "name": law,
-        "title": measured.title,
-        "setting": ", ".join(f"{k} = {v}" for k, v in measured.metrics.forms[BASE].setting.items()),
-        "score": evidence.score(law),
-        "lock_ups": measured.lock_ups,
-        "seeds": measured.seeds,
-        "step_us": measured.step_us,
-    }
-
-
-def _rows(evidence: Evidence) -> list[dict[str, Any]]:
-    """The big table: each test in the case's metric, its late part if it has one, and at the end the MV's travel."""
-    case = evidence.case
-    rows = []
-    for name, title in evidence.scenarios.items():
-        rows.append(_row(evidence, name, title, case.metric))
-        if late_s := evidence.late_s(name):
-            rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", case.criterion.late))
-    mv, *others = case.plant_class.mv_signals
-    together = case.cv_unit if len(case.plant_class.sp_signals) > 1 else ""  # with several CVs all are shares of ranges
-    unit = axis_label(", all MVs together", together) if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
-    travel = _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")
-    return [*rows, travel | {"winner": None}]
-
-
-def _further(evidence: Evidence) -> list[dict[str, Any]]:
-    """The figures of ``own_metrics`` in each test: each law's median, without and with noise."""
-    case, tables = evidence.case, []
-    for name, title in evidence.scenarios.items():
-        rows = [
-            (metric.label(case.cv_unit), _row(evidence, name, title, metric.name)["cells"])
-            for metric in case.own_metrics
-            if metric.name != case.metric
-        ]
-        rows = [(metric, cells) for metric, cells in rows if any(c["value"] is not None for c in cells.values())]
-        if rows:
-            tables.append({"name": name, "title": title, "rows": rows})
-    return tables
-
-
-def _analyses(evidence: Evidence) -> list[dict[str, Any]]:
-    """The analysis of each law that has one: its figures, a column for every form, and its notes."""
-    tables = []
-    for name, law in evidence.laws.items():
-        forms = {"as shipped" if form == BASE else form: analysis for form, analysis in law.analyses.items()}
-        if not forms:
-            continue
-        notes = dict.fromkeys(note for analysis in forms.values() for note in analysis.notes)
-        of = {note: [form for form, analysis in forms.items() if note in analysis.notes] for note in notes}
-        metrics = dict.fromkeys(metric for analysis in forms.values() for metric in analysis.figures)
-        tables.append(
-            {
-                "law": name,
-                "title": law.title,
-                "forms": list(forms),
-                "rows": [
-                    (evidence.case.label(m), [analysis.figures.get(m) for analysis in forms.values()]) for m in metrics
-                ],
-                # A note that all forms share names no form.
-                "notes": [(note, "" if len(own) == len(forms) else ", ".join(own)) for note, own in of.items()],
-            }
-        )
-    return tables
-
-
-def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, Any]:
-    """A row of the big table: each law's figure, range, figure with noise, and ratio to the bound."""
-    cells = {
-        law: {
-            "value": evidence.figure(law, name, metric),
-            "low": evidence.figure(law, name, metric, None, "min"),
-            "high": evidence.figure(law, name, metric, None, "max"),
-            "noise": evidence.figure(law, name + NOISE_SUFFIX, metric),
-            "ratio": evidence.ratio(law, name) if metric == evidence.case.metric else None,
-        }
-        for law in evidence.laws
-    }
-    medians = {law: c["value"] for law, c in cells.items() if c["value"] is not None}
-    return {
-        "name": name,
-        "title": title,
-        "cells": cells,
-        "winner": min(medians, key=lambda law: medians[law] or 0.0, default=None),
-        "nmpc": evidence.bound(name, metric),
-        "nmpc_noise": evidence.bound(name + NOISE_SUFFIX, metric),
-        "offline": evidence.bound(name, metric, "offline"),
     }

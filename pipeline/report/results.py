@@ -8,9 +8,11 @@ from pathlib import Path
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.errors import PipelineError
+from pipeline.evaluation.metric import with_unit
 from pipeline.evaluation.standing import LawStanding, Standing, tally
 from pipeline.evaluation.validation import FILE, Validation
 from pipeline.pictures.numbers import ratio
@@ -74,7 +76,7 @@ def overview(standings: Iterable[Standing]) -> Table:
 
 def _about(standing: Standing) -> list[str]:
     """The first column of a case, a line a row."""
-    lines = [f"[bold]{standing.case}[/bold]", f"{standing.metric}, {standing.test}"]
+    lines = [f"[bold]{standing.case}[/bold]", f"{escape(with_unit(standing.metric, standing.unit))}, {standing.test}"]
     if standing.grounds is not None:
         fits = [fit for fit in standing.grounds.fit.values() if fit is not None]
         lines += ["on models of your data", f"their fit {min(fits):.3g} %" if fits else "which do not run free"]
@@ -106,7 +108,8 @@ def _tests(standing: Standing) -> Table:
     scenarios, metric, weights = validation.scenarios, validation.metric, validation.gate.weights
     names = [name for name in scenarios if not name.endswith(NOISE_SUFFIX) or name in weights]
     table = Table(title_justify="left", box=box.SIMPLE)
-    table.title = f"{standing.case}: {standing.metric_long}, median over data seeds"
+    figure = escape(with_unit(standing.metric_long, standing.unit))  # rich would take a unit in brackets for markup
+    table.title = f"{standing.case}: {figure}, median over data seeds"
     table.add_column("test", no_wrap=True)
     for name in ("perfect_NMPC", *(law.law for law in standing.laws)):
         # Six names side by side fit a line only if each breaks at its underscores.

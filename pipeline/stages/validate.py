@@ -150,8 +150,7 @@ def _metrics(
         rows = [t for t in trials if t.form == name]
         analysis = parse(Analysis, analyses[name], f"analysis of {name}") if analyses.get(name) else None
         tests = {test: _over_seeds({t.seed: t.metrics[test] for t in rows}) for test in rows[0].metrics}
-        plain = {key: value for key, value in settings.items() if isinstance(value, (int, float, str))}
-        return Form(plain, rows[0].info, tests, analysis)
+        return Form(settings, rows[0].info, tests, analysis)
 
     return LawMetrics(
         name=params.name,
@@ -190,7 +189,9 @@ def _evidence(case: Case, base: list[Trial], shipped: Trial, grounds: Grounds | 
         for name, row in shipped.metrics.items()
     }
     of = {} if grounds is None else {"plant": case.stand_in, "on": grounds.to_dict()}
-    return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "scenarios": figures}
+    names = dict.fromkeys(name for row in figures.values() for name in row)
+    units = {n: unit for n in names if (unit := case.metrics[n.removesuffix("_median")].unit_of(case.cv_unit))}
+    return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "units": units, "scenarios": figures}
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from html import escape
 
 from pipeline.evaluation.law_evidence import Analysis
-from pipeline.evaluation.metric import ratio_to_bound
+from pipeline.evaluation.metric import ratio_to_bound, with_unit
 from pipeline.evaluation.validation import Validation
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.tracking.gate import Gate, Rank
@@ -89,7 +89,7 @@ def _verdict(gate: Gate) -> str:
 def _table(validation: Validation, shown: Gate) -> str:
     law = shown.law
     scenarios, metric, titles = validation.scenarios, validation.metric, validation.titles
-    heads = [f"Scenario ({titles.metric})", "this law", "range over seeds", "with noise"]
+    heads = [f"Scenario ({with_unit(titles.metric, titles.unit)})", "this law", "range over seeds", "with noise"]
     heads += [shown.baseline_name, "NMPC", "ratio"]
     rows = []
     for name, laws in scenarios.items():

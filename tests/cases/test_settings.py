@@ -46,10 +46,7 @@ def test_every_form_that_a_case_asks_for_is_run(case: Case) -> None:
     for name in sections("controllers"):
         params = ControllerParams.read(name)
         if params.case == case.name:
-            forms = {
-                form: Form({k: v for k, v in own.items() if isinstance(v, (int, float, str))}, (), {})
-                for form, own in {BASE: params.settings, **params.variants}.items()
-            }
+            forms = {form: Form(own, (), {}) for form, own in {BASE: params.settings, **params.variants}.items()}
             laws[params.name] = LawEvidence(LawMetrics(params.name, "", case.metric, (0,), 0, forms), Path())
     places = [vars(module) for module in modules(case)]
     wanted = [row for place in (*places, case.requirements, case.tables, case.figures) for row in asked(place)]

@@ -73,7 +73,7 @@ def test_a_case_is_compared_by_a_metric_with_a_floor_and_travels_to_workers(case
     floor = case.criterion.floor
     assert floor is not None
     assert floor.error(0.1, 200) > 0
-    assert floor.text.format(noise=0.1)
+    assert floor.text.format(noise=0.1, unit=" K")
     assert pickle.loads(pickle.dumps(case)).criterion == case.criterion
 
 
@@ -93,6 +93,8 @@ def test_units_follow_the_controlled_variable() -> None:
     assert METRICS["sse"].label("mol/l") == "SSE [(mol/l)²]"
     assert METRICS["sse"].label("-") == "SSE"
     assert METRICS["ise"].label("-") == "ISE [s]"
+    assert Metric("mae_T", "MAE T", unit="degC").label("mol/l") == "MAE T [°C]"
+    assert Metric("mae_x", "MAE x", unit="-").label("mol/l") == "MAE x"
     assert METRICS["overshoot"].label("K") == "overshoot"
     with pytest.raises(FrozenInstanceError):
         METRICS["mae"].short = "x"  # type: ignore[misc]

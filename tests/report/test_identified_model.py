@@ -12,8 +12,8 @@ from own_cases import two_lags
 from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, ModelSection, model_section
 
 
-def gain(sign: str, varies: float | None) -> dict[str, Any]:
-    return {"gain": 0.5, "spread": 0.3, "sign": sign, "low": -0.1, "high": 0.9, "varies": varies}
+def gain(sign: str, varies: float | None, rate: bool = False) -> dict[str, Any]:
+    return {"gain": 0.5, "spread": 0.3, "rate": rate, "sign": sign, "low": -0.1, "high": 0.9, "varies": varies}
 
 
 def tried(error: float | None, chosen: bool) -> dict[str, Any]:
@@ -31,7 +31,7 @@ PART: dict[str, Any] = {
         "y1": {"fit_percent": None, "free_run_rmse": 9.0, "rmse_by_third": [9.0, 9.0, 9.0], "noise_sd": 0.05},
     },
     "residual": {"y0": {"autocorrelated": 0.5, "input_correlated": 0.02}},
-    "gains": {"y0": {"u0": gain("+", 1.4), "u1": gain("uncertain", None)}, "y1": {"u0": gain("-", 1.0)}},
+    "gains": {"y0": {"u0": gain("+", 1.4), "u1": gain("uncertain", None)}, "y1": {"u0": gain("-", 1.0, rate=True)}},
     "dead_times": {"u0": 3.0, "u1": 0.0},
     "candidates_tried": [*(tried(0.1 * k, False) for k in range(1, 20)), tried(5.0, True), tried(None, False)],
 }
@@ -64,6 +64,7 @@ def test_an_answer_says_its_sign_and_how_sure_that_is(section: ModelSection) -> 
     signs = {row[:2]: row[3] for row in section.answers}
     assert signs == {("y0", "u0"): "+", ("y0", "u1"): "uncertain", ("y1", "u0"): "−"}
     assert "turns its sign" in section.answers[1][4]
+    assert [row[2] for row in section.answers] == ["0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V a period]"]
     assert [row[5] for row in section.answers] == ["3", "0", "3"]
 
 

@@ -67,6 +67,7 @@ def a_case(name: str, metric: str, bound: float | None, errors: dict[str, float]
             "figures": {},
             "laws": {law: f"Law {law.title()}" for law in errors},
             "scenarios": {"steps": "Steps up"},
+            "unit": "mol/l" if name == "tank" else "",
         },
     }
 
@@ -135,6 +136,9 @@ def test_the_page_shows_every_law_and_links_to_what_exists(artifacts: Path) -> N
         for words in ("Law Beta", "1.50", "20 kB", "12,346", "Steps up with noise", "The reactor"):
             assert words in page, words
         assert "None" not in page
+        # The figure's unit, where it has one.
+        assert "rror in words (ERR) in mol/l: Steps up with noise" in page
+        assert "rror in words (ERR): Steps up with noise" in page
         assert page.count("figures/closed_loop_alpha.png") == 2
     assert "tank is &lt;stable&gt;" in html
     assert "2 of 4 requirements met" in text
@@ -177,8 +181,9 @@ def test_the_terminal_has_one_table_over_all_cases(artifacts: Path) -> None:
     assert ["alpha", "*", "0.0300", "0.0200", "1.50", "20", "us", "20", "kB"] in [row[-9:] for row in rows]
     assert ["pid", "2.0000", "-", "-", "20", "us", "-"] in [row[-7:] for row in rows]  # no bound, no file
     text = "\n".join(lines)
-    for words in ("ERR, steps_noise", "1 of 2 requirements", "1 of 2 claims reproduce", "1 of 2 figures reproduce"):
+    for words in ("1 of 2 requirements", "1 of 2 claims reproduce", "1 of 2 figures reproduce"):
         assert text.count(words) == 2, words
+    assert text.count(" ERR [mol/l], steps_noise ") == text.count(" ERR, steps_noise ") == 1
     assert f"overview   {artifacts / 'report.html'}" in text
     assert "registry   make registry" in text
 

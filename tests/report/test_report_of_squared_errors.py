@@ -295,7 +295,8 @@ def test_the_table_in_the_terminal_and_the_card_in_the_registry(written):
     assert ratio(own / bound) in row
     tree = Validation.read(out / "validation.json")
     card = version_description(tree, Gate.of(tree, "gauss_newton_pid"), "run", None)
-    assert "Scenario (sum of squared errors)" in card
+    unit = evidence.case.unit  # none for a pH
+    assert f"Scenario (sum of squared errors{unit and f' [{unit}]'})" in card
     assert f"{own / bound:.2f}" in card
     assert "e+" not in card
 

@@ -43,6 +43,10 @@ def test_card(pi_file: Path, capsys: Capture) -> None:
             {"scenarios": {"sp_a": {"mae": 1 / 3}, "ua": {"ise": 2}}, "seeds": 5},
             "  ua             -           2\n  seeds: 5",
         ),
+        (
+            {"scenarios": {"ua": {"mae": 0.5, "travel": 2}}, "units": {"mae": "mol/l"}},
+            "      mae [mol/l]      travel\n  ua          0.5           2\n",
+        ),
         ({"gate": {"passed": "yes"}}, "  gate\n    passed: yes"),
     ],
 )

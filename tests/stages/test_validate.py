@@ -106,7 +106,7 @@ def test_settings_of_variants_are_kept_as_data(made: Callable[..., None]) -> Non
     forms = LawMetrics.read(MEASURED).forms
     assert {name: form.setting for name, form in forms.items()} == {
         "base": {"ti_s": 3.0},
-        "slow": {"kc": 0.5, "tuning": "manual"},  # a list names no form
+        "slow": {"kc": 0.5, "tuning": "manual", "examined_cv": [0.1, 0.2]},
     }
     assert list(forms["slow"].tests) == ["step"]
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +12,15 @@ import pytest
 import yaml
 from identified_models import first_order, scaled_model
 from own_cases import case_of, section
+from rich.console import Console
 
 from pipeline.evaluation.law_evidence import LawEvidence, LawMetrics
+from pipeline.report.results import show_results
 from pipeline.stages.check import notes
 from pipeline.stages.design import design
 from pipeline.stages.report import report
 from pipeline.stages.validate import validate
+from serving import Controller
 
 POLES = (0.6, 0.55, 0.65)
 
@@ -68,11 +73,12 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     (case.models.parent / "metrics.json").write_text(json.dumps({"data": {"0": "x"}, "parts": {}}))
     tree = yaml.safe_load(Path("params.yaml").read_text())
     own = {"case": "it", "model": "identified"}
+    given = {"tuning": "manual", "kc": 0.2, "ti_s": 4.0, "development_seeds": [1], "mv_rate": None}
     tree |= {
         "cases": {"it": {"held_out_seeds": [9001, 9002]}},
         "models": {"it-identified": {**own, "data": "data/it/record.parquet", "parts": {}}},
         "controllers": {
-            "it-pid": {**own, "name": "pid", "law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 4.0},
+            "it-pid": {**own, "name": "pid", "law": "pid", **given},
             "it-one_step": {**own, "name": "one_step", "law": "gauss_newton_pid"},
         },
     }
@@ -87,6 +93,27 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     report("it")
     page = Path("artifacts/it/report.md").read_text()
     assert f"**`one_step` was not designed:** {why}" in page
+    # Each absolute error has its unit, in the page, the terminal's table and the file.
+    assert re.search(r"its MAE over .* is the lowest: \S+ m\.", page)
+    assert "Mean absolute error in m: the median" in page
+    assert re.search(r"counts as the floor: \S+ m \(the measurement noise\)", page)
+    terminal = io.StringIO()
+    show_results(Path("artifacts"), Console(file=terminal))
+    show_results(Path("artifacts"), Console(file=terminal), "it")
+    assert "MAE [m], held_out" in terminal.getvalue()
+    assert "it: mean absolute error [m]" in terminal.getvalue()
+    units = Controller("artifacts/it/pid.onnx").manifest.evidence["units"]
+    assert units["mae"] == units["mae_median"] == units["max_asse"] == "m"
+    assert "overshoot" not in units  # a plain number
+    # Every setting that was given is shown, a list too.
+    assert "| development_seeds = [1], kc = 0.2, mv_rate = null, ti_s = 4.0, tuning = manual |" in page
+    # The best law's picture stands at the top, and is shown once.
+    html = Path("artifacts/it/report.html").read_text()
+    for text in (page, html):
+        assert text.count("figures/closed_loop.png") == 1
+        assert "closed_loop_pid.png" not in text
+        assert text.count("figures/closed_loop_test_measured.png") == 1
+        assert "Each law on" not in text
     # The PID met the steps of the measured disturbance too, and the report shows them.
     assert "| A step of d0, and back, 2 draws |" in page
     assert Path("artifacts/it/figures/closed_loop_test_measured.png").stat().st_size > 0

@@ -16,6 +16,7 @@ from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from pipeline.models.identified.residual_tests import residual_figures
+from pipeline.models.identified.scaled_record import ScaledRecord
 from pipeline.models.identified.selection import Selection
 from pipeline.models.identified.stability import stability_figures
 from pipeline.models.identified.structure import Problem, Structure
@@ -106,8 +107,10 @@ class IdentifiedPart(Part):
         model = assembled(fitted.model, structure.delays, scales, problem.data, noise, n_mv, source.seed)
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
         bands = [*_bands(selection), *_as_likely(problem, structure, fitted.model, source.seed)]
+        # The gains belong to the middle of the whole record, also where only a part of its rows is fitted.
+        rows = ScaledRecord.of(source.data(self.model.kind), scales)
         runs, curves = free_run_figures(problem, selection.chosen, scales, [s.name for s in pvs])
-        responses, dead = response_figures(bands, structure.delays, problem.data, scales, pvs, inputs)
+        responses, dead = response_figures(bands, structure.delays, rows, scales, pvs, inputs)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
         visited = _visited(fitted.model, whole, structure.correction)
@@ -124,9 +127,9 @@ class IdentifiedPart(Part):
             "member": self.member,
             "outputs": runs,
             "structure": structure_figures(selection),
-            "gains": gain_figures(bands, problem.data, scales, pvs, inputs),
+            "gains": gain_figures(bands, rows, scales, pvs, inputs),
             "dead_times": dead,
-            "spectral_radius": gains(fitted.model, problem.data)[1],
+            "spectral_radius": gains(fitted.model, problem.data)[2],
             "stability": stability_figures(fitted.model, visited, [s.v for s in whole]),
             "warnings": warnings,
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.metrics import fit_percent
 from pipeline.models.identified.assembly import dead_periods, step_responses
@@ -116,25 +117,25 @@ def rests_of(model: Dynamics, data: ScaledRecord) -> tuple[Array, Array]:
     return np.where(still[:, None], x, start), v
 
 
-def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, float]:
-    """(local steady gains (n_v, quantiles, n_y), scaled; the largest spectral radius at these rests).
+def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_], float]:
+    """(local steady gains (n_v, quantiles, n_y), scaled; which of them are rates; the largest spectral radius there).
 
-    For an integrating output the slope of the response to a step, a period, stands in place of the gain.
+    For an integrating output the slope of the response to a step, a period, stands in place of the gain: a rate.
     """
     n_y, n_v = data.y.shape[1], data.v.shape[1]
     x, v = rests_of(model, data)
     gain, radius = steady_gain(model, x, v)
-    found = np.empty((n_v, len(QUANTILES), n_y))
+    found, rates = np.empty((n_v, len(QUANTILES), n_y)), np.zeros((n_v, len(QUANTILES), n_y), dtype=np.bool_)
     for j in range(n_v):
         for q in range(len(QUANTILES)):
             at = j * len(QUANTILES) + q
             if radius[at] > INTEGRATES or not np.all(np.isfinite(gain[at])):
                 response = step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), 300)[j, :, :n_y] / 1e-3
-                level = np.abs(response[-1] - response[-31]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
-                found[j, q] = np.where(level, (response[-1] - response[-31]) / 30, response[-1])
+                rates[j, q] = np.abs(response[-1] - response[-31]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
+                found[j, q] = np.where(rates[j, q], (response[-1] - response[-31]) / 30, response[-1])
             else:
                 found[j, q] = gain[at, :n_y, j]
-    return found, float(radius.max())
+    return found, rates, float(radius.max())
 
 
 def gain_figures(
@@ -142,10 +143,12 @@ def gain_figures(
 ) -> dict[str, Any]:
     """Of each PV and input: the steady gain [PV/input], its spread over the members, its sign, its range over the data.
 
-    ``sign`` is uncertain where the gain lies within ``SURE`` spreads of zero; ``varies`` is the ratio of the
+    ``gain`` is taken where all inputs are at the medians of the data; where ``rate`` is true it is in PV/input a
+    period. ``sign`` is uncertain where the gain lies within ``SURE`` spreads of zero; ``varies`` is the ratio of the
     largest to the smallest local gain, None where the gain changes its sign.
     """
-    local = np.array([gains(m, data)[0] for m in members])  # (members, n_v, quantiles, n_y)
+    found = [gains(m, data) for m in members]
+    local, rates = (np.array([of[k] for of in found]) for k in (0, 1))  # (members, n_v, quantiles, n_y)
     table: dict[str, Any] = {}
     for i, pv in enumerate(pvs):
         table[pv.name] = {}
@@ -159,6 +162,7 @@ def gain_figures(
             table[pv.name][signal.name] = {
                 "gain": gain,
                 "spread": spread,
+                "rate": bool(2 * np.count_nonzero(rates[:, j, len(QUANTILES) // 2, i]) > len(members)),
                 "sign": "uncertain" if abs(gain) <= SURE * spread else "+" if gain > 0 else "-",
                 "low": float(over.min()),
                 "high": float(over.max()),

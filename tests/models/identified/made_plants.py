@@ -60,10 +60,14 @@ def two_by_two(n: int = 2000, noise: float = 0.1, seed: int = 0, measured: bool 
     return Record.of(signals_of(2, 2, int(measured)), y, u, dv=d)
 
 
-def hammerstein(n: int = 2000, noise: float = 0.1, seed: int = 0) -> Record:
-    """A static curve before a second-order lag: the gain is .1 at the low end and 1 at the high one."""
+def hammerstein(n: int = 2000, noise: float = 0.1, seed: int = 0, quiet: int = 0, at: float = 25.0) -> Record:
+    """A static curve before a second-order lag: the gain is .1 at the low end and 1 at the high one.
+
+    The input rests ``at`` one value in the last ``quiet`` rows.
+    """
     rng = np.random.default_rng(seed)
     u = random_holds(rng, n, 20)
+    u[n - quiet :] = at
     x1 = x2 = curve(u[0])
     y = np.empty(n)
     for k in range(n):

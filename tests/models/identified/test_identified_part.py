@@ -18,6 +18,7 @@ from pipeline.models import MODELS, load_model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.identified_part import IdentifiedPart
 from pipeline.models.part import Learnt, Source
+from pipeline.simulation.rests import local_gains
 
 LINEAR = IdentifiedPart(orders=(2, 3), units=())
 SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.05)
@@ -69,6 +70,7 @@ def test_a_second_process_variable_is_an_output_where_all_measured_ones_are() ->
 def test_an_integrator_keeps_its_slope_and_its_poles_inside() -> None:
     learnt = LINEAR.learn(Source(made_plants.integrator(800), made_plants.signals_of(1, 1)))
     assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.05, rel=0.03)
+    assert learnt.metrics["gains"]["y0"]["u0"]["rate"] is True
     assert 0.995 < learnt.metrics["spectral_radius"] <= 1 + 1e-6
     assert noise_sd(learnt) == pytest.approx(0.1, rel=0.1)
     plant = plant_of(identified(learnt), made_plants.signals_of(1, 1))
@@ -128,6 +130,19 @@ def test_a_long_record_gives_its_liveliest_blocks() -> None:
     learnt = IdentifiedPart(orders=(2, 3), units=(), rows=600).learn(Source(record, made_plants.signals_of(1, 1)))
     assert learnt.metrics["n_train"] <= 600
     assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.02)
+
+
+def test_the_gain_of_a_long_record_is_that_at_its_middle() -> None:
+    """Only lively rows are fitted, but the picture of gains and a reader go by the medians of the whole record."""
+    record, signals = made_plants.hammerstein(2100, quiet=1400, at=25.0), made_plants.signals_of(1, 1)
+    learnt = replace(SMALL, rows=600).learn(Source(record, signals))
+    found = learnt.metrics["gains"]["y0"]["u0"]
+    assert found["gain"] == pytest.approx(0.1 + 0.009 * 25.0, rel=0.1)
+    assert found["rate"] is False
+    middle = np.median(record.mv, axis=0)
+    drawn, _ = local_gains(plant_of(identified(learnt), signals, mv=middle), 0, middle, middle, 1)
+    assert found["gain"] == pytest.approx(float(drawn[0, 0]), rel=0.05)
+    assert learnt.metrics["step_responses"]["y0"]["u0"]["middle"][-1] == pytest.approx(found["gain"], rel=0.4)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,51 @@
+"""What ``loopwright new`` prints of a screening: findings, what the data say of the plant, verdict, next step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pipeline.historian.findings import Screening, Verdict
+from pipeline.historian.step_test import StepTest
+from pipeline.pictures.drawing import axis_label, ratio_unit
+
+
+def tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:
+    """Print the rows kept, what was found, the verdict, and where to look next."""
+    kept = 100 * report.kept_rows / report.grid_rows
+    print(f"{name}: {report.file_rows} rows of {len(report.files)} file(s) -> {report.grid_rows} rows of "
+          f"{report.period_s:g} s, {report.kept_rows} kept ({kept:.1f} %) in {report.runs} run(s)")  # fmt: skip
+    for reason, rows in report.dropped_rows.items():
+        print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
+    for finding in report.findings:
+        print(f"  {finding.tag}: {finding.words}")
+    for line in sayings(report.verdict, {tag.name: tag.unit for tag in report.tags}):
+        print(f"  {line}")
+    print(f"can these data carry a model: {report.verdict.carries}")
+    for reason in report.verdict.reasons:
+        print(f"  {reason}")
+    print(f"look at {folder}/screening.html: trends with every mask")
+    if added:
+        print(f"then: loopwright run {name}")
+    if test:
+        print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h")
+
+
+def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:
+    """What the data say of the plant, a line a pair, for a person to compare with what is known of it.
+
+    ``units`` are those of the signals by name.
+    """
+    lines = []
+    for i in verdict.inputs:
+        for pv, gain in i.gain.items():
+            first = i.first_answer_s.get(pv)
+            if not gain and first is None:
+                continue
+            # The report has the gain at the middle of the record, by the models that are fitted later.
+            known = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
+            words = [known if gain else "gain not clear"]
+            words += [f"first answer after {first:g} s"] if first is not None else []
+            words += [f"the slowest settles in {i.settling_s:g} s"] if i.settling_s and gain else []
+            lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
+    return lines

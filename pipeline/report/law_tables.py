@@ -1,0 +1,106 @@
+"""The tables of a report on its laws: what each one is, its figures in every test, and its analysis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.law_evidence import BASE
+from pipeline.evaluation.metric import NO_UNIT
+from pipeline.pictures.drawing import axis_label
+from pipeline.pictures.words import given_text
+from pipeline.simulation.scenario import NOISE_SUFFIX
+
+
+def law_row(evidence: Evidence, law: str) -> dict[str, Any]:
+    """The row of a law in the table of laws: title, settings, score, lock-ups, data seeds, time of a step."""
+    measured = evidence.laws[law]
+    return {
+        "name": law,
+        "title": measured.title,
+        "setting": given_text(measured.metrics.forms[BASE].setting),
+        "score": evidence.score(law),
+        "lock_ups": measured.lock_ups,
+        "seeds": measured.seeds,
+        "step_us": measured.step_us,
+    }
+
+
+def scenario_rows(evidence: Evidence) -> list[dict[str, Any]]:
+    """The big table: each test in the case's metric, its late part if it has one, and at the end the MV's travel."""
+    case = evidence.case
+    rows = []
+    for name, title in evidence.scenarios.items():
+        rows.append(_row(evidence, name, title, case.metric))
+        if late_s := evidence.late_s(name):
+            rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", case.criterion.late))
+    mv, *others = case.plant_class.mv_signals
+    together = case.cv_unit if len(case.plant_class.sp_signals) > 1 else ""  # with several CVs all are shares of ranges
+    unit = axis_label(", all MVs together", together) if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
+    travel = _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")
+    return [*rows, travel | {"winner": None}]
+
+
+def further_figures(evidence: Evidence) -> list[dict[str, Any]]:
+    """The figures of ``own_metrics`` in each test: each law's median, without and with noise."""
+    case, tables = evidence.case, []
+    for name, title in evidence.scenarios.items():
+        rows = [
+            (metric.label(case.cv_unit), _row(evidence, name, title, metric.name)["cells"])
+            for metric in case.own_metrics
+            if metric.name != case.metric
+        ]
+        rows = [(metric, cells) for metric, cells in rows if any(c["value"] is not None for c in cells.values())]
+        if rows:
+            tables.append({"name": name, "title": title, "rows": rows})
+    return tables
+
+
+def analyses(evidence: Evidence) -> list[dict[str, Any]]:
+    """The analysis of each law that has one: its figures, a column for every form, and its notes."""
+    tables = []
+    for name, law in evidence.laws.items():
+        forms = {"as shipped" if form == BASE else form: analysis for form, analysis in law.analyses.items()}
+        if not forms:
+            continue
+        notes = dict.fromkeys(note for analysis in forms.values() for note in analysis.notes)
+        of = {note: [form for form, analysis in forms.items() if note in analysis.notes] for note in notes}
+        metrics = dict.fromkeys(metric for analysis in forms.values() for metric in analysis.figures)
+        tables.append(
+            {
+                "law": name,
+                "title": law.title,
+                "forms": list(forms),
+                "rows": [
+                    (evidence.case.label(m), [analysis.figures.get(m) for analysis in forms.values()]) for m in metrics
+                ],
+                # A note that all forms share names no form.
+                "notes": [(note, "" if len(own) == len(forms) else ", ".join(own)) for note, own in of.items()],
+            }
+        )
+    return tables
+
+
+def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, Any]:
+    """A row of the big table: each law's figure, range, figure with noise, and ratio to the bound."""
+    cells = {
+        law: {
+            "value": evidence.figure(law, name, metric),
+            # One data seed has no range.
+            "low": evidence.figure(law, name, metric, None, "min") if found.seeds > 1 else None,
+            "high": evidence.figure(law, name, metric, None, "max") if found.seeds > 1 else None,
+            "noise": evidence.figure(law, name + NOISE_SUFFIX, metric),
+            "ratio": evidence.ratio(law, name) if metric == evidence.case.metric else None,
+        }
+        for law, found in evidence.laws.items()
+    }
+    medians = {law: c["value"] for law, c in cells.items() if c["value"] is not None}
+    return {
+        "name": name,
+        "title": title,
+        "cells": cells,
+        "winner": min(medians, key=lambda law: medians[law] or 0.0, default=None),
+        "nmpc": evidence.bound(name, metric),
+        "nmpc_noise": evidence.bound(name + NOISE_SUFFIX, metric),
+        "offline": evidence.bound(name, metric, "offline"),
+    }
