@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_entries import entries_of
+from pipeline.commands.new_commands import check_start, commanded, mvs_of
 from pipeline.commands.new_fmu import table_from, write_table
 from pipeline.commands.new_replaced import REFUSED, check_replaceable, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
-from pipeline.commands.new_summary import commanded, refusal, tell
+from pipeline.commands.new_summary import refusal, tell
 from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
@@ -97,6 +98,8 @@ def _run(options: argparse.Namespace) -> int:
     if not options.files:
         raise RecordError("no file is named; give one or more exports, or --simulator FILE")
     tags, _ = _tags(options)
+    if not tags and (options.command or options.max_move):
+        raise RecordError("--command and --max-move are given and no mv is; name it with --mv, or give --tags")
     if not tags:
         return _table(name, options)
     units = units_of(options.files)
@@ -116,7 +119,7 @@ def _tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
     found, where = (read_tags(options.tags), str(options.tags)) if options.tags else (given, "the options")
     if found or options.tags:
         check_tags(found, where)
-    return limited(found, options.command, options.max_move), where
+    return limited(found, options.command, options.max_move) if found else found, where
 
 
 def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
@@ -130,7 +133,9 @@ def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
         if table is None:
             return _proposed(name, path)
     made = simulated(name, path, options.rows, options.period, table)
-    return _write(name, folder, made.found, options, named(tags), made)
+    commands = named(tags) or limited(mvs_of(made.plant), options.command, options.max_move)
+    check_start(made.plant, commands)
+    return _write(name, folder, made.found, options, commands, made)
 
 
 def _proposed(name: str, fmu: Path) -> int:
@@ -167,8 +172,7 @@ def _write(
 ) -> int:
     """All files at once, then the section; neither without the other. Where both fail, a replaced plant stays."""
     report, verdict = found.report, found.report.verdict
-    begins = None if made is None else made.plant.start[1]
-    unusable, lost = refusal(found, tags, options.anyway, begins), list[str]()
+    unusable, lost = refusal(found, tags, options.anyway), list[str]()
     if unusable and folder.exists() and not _refused(folder):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
     earlier = folder.with_name(f".{name}-replaced")

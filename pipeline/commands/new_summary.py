@@ -2,69 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.historian.findings import InputReport, Screening, Verdict
+from pipeline.commands.new_commands import unvisited
+from pipeline.historian.findings import Screening, Verdict
 from pipeline.historian.screening import Screened
 from pipeline.historian.step_test import StepTest
 from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
-from serving.manifest import Signal
-
-LEAST_SHARED = 0.05  # of the commanded or the visited range, the smaller one: what both must share
 
 
-def refusal(found: Screened, tags: Sequence[Tag], anyway: bool, begins: Array | None = None) -> str:
-    """Why the plant is not added; empty where it is. ``begins`` are the MVs (n_mv,) that a simulator starts with."""
+def refusal(found: Screened, tags: Sequence[Tag], anyway: bool) -> str:
+    """Why the plant is not added; empty where it is."""
     record, verdict = found.record, found.report.verdict
     for signal, values in zip(record.mv_signals, record.mv.T, strict=True):
         if float(values.max() - values.min()) <= 1e-9 * (signal.high - signal.low):
             return f"{signal.name} is {values[0]:g} {signal.unit} in every row; run the step test in step_test.csv"
-        if words := _beyond_the_record(signal, values, _commands(tags).get(signal.name, {})):
+        if words := unvisited(signal, values, tags):
             return words
-    for signal, value in zip(record.mv_signals, () if begins is None else begins, strict=False):
-        low, high = _ends(signal.low, signal.high, _commands(tags).get(signal.name, {}))
-        if not low <= value <= high:
-            return (
-                f"the simulator starts with {signal.name} = {value:g}, which may not be commanded: {low:g} to {high:g}"
-            )
     if verdict.rows < verdict.parameters:
         return f"{verdict.reasons[0]}; with fewer rows than parameters --anyway does not help"
     if verdict.carries == "no" and not anyway:
         return f"{verdict.reasons[0]}; run the step test in step_test.csv, or give --anyway"
     return ""
-
-
-def commanded(inputs: Sequence[InputReport], tags: Sequence[Tag]) -> list[InputReport]:
-    """The inputs, the MVs with the ranges that may be commanded: a step test stays within them."""
-    found = []
-    for i in inputs:
-        low, high = _ends(i.low, i.high, _commands(tags).get(i.name, {}))
-        found.append(replace(i, low=low, high=high))
-    return found
-
-
-def _commands(tags: Sequence[Tag]) -> dict[str, dict[str, float]]:
-    return {t.name: t.commands for t in tags}
-
-
-def _ends(low: float, high: float, commands: Mapping[str, float]) -> tuple[float, float]:
-    return commands.get("command_low", low), commands.get("command_high", high)
-
-
-def _beyond_the_record(signal: Signal, values: Array, commands: Mapping[str, float]) -> str:
-    """Why an MV cannot be commanded as wished: its record (n,) never went there."""
-    low, high = _ends(signal.low, signal.high, commands)
-    least, most = float(values.min()), float(values.max())
-    if min(most, high) - max(least, low) >= LEAST_SHARED * min(most - least, high - low):
-        return ""
-    return (
-        f"{signal.name} may be commanded from {low:g} to {high:g} {signal.unit}, but moved only from {least:g} to "
-        f"{most:g} in the record, so nothing is known of the plant there; widen command_low or command_high, or add a "
-        "record of that range"
-    )
 
 
 def tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:

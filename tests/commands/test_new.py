@@ -309,6 +309,7 @@ def test_only_what_new_wrote_is_replaced(capsys: pytest.CaptureFixture[str]) -> 
 BAD: dict[str, tuple[list[str], str]] = {
     "commands backwards": (["tank", "x.csv", *ROLES, "--command", "TIC-101.OP=60..30"], "command_low must be below"),
     "commands of a PV": (["tank", "x.csv", *ROLES, "--command", "TIC-101.PV=30..60"], "'TIC-101.PV' is no mv"),
+    "commands without roles": (["tank", "x.csv", "--command", "TIC-101.OP=30..60"], "name it with --mv"),
     "no range of commands": (["tank", "x.csv", *ROLES, "--command", "TIC-101.OP=30"], "write TAG=LOW..HIGH"),
     "no change": (["tank", "x.csv", *ROLES, "--max-move", "TIC-101.OP=0"], "give a change above 0"),
     "no number": (["tank", "x.csv", *ROLES, "--max-move", "TIC-101.OP=slow"], "'slow' is no finite number"),
