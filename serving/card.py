@@ -48,7 +48,9 @@ def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
     rows = []
     for s in signals:
         allowed = f"{s.low:g} .. {s.high:g}" if s.values is None else f"one of {', '.join(f'{v:g}' for v in s.values)}"
-        rows.append(f"  {s.name:<{width}}  {allowed}{'' if s.unit == '-' else f' {s.unit}'}")
+        unit = "" if s.unit == "-" else f" {s.unit}"
+        moves = "" if s.max_move is None else f", moves at most {s.max_move:g}{unit} a period"
+        rows.append(f"  {s.name:<{width}}  {allowed}{unit}{moves}")
     return ["", title, *rows]
 
 

@@ -26,7 +26,7 @@ class Signal:
     """A named quantity in engineering units, with the range in which it is meaningful.
 
     ``values`` lists the allowed values of a discrete signal (a valve that is open or shut);
-    None for a continuous one.
+    None for a continuous one. ``max_move`` is the largest change of an MV a period; None: no limit.
     """
 
     name: str
@@ -34,6 +34,7 @@ class Signal:
     low: float
     high: float
     values: tuple[float, ...] | None = None
+    max_move: float | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -48,6 +49,10 @@ class Signal:
                 f"signal {self.name!r} has the values {list(self.values)}; they must be one or more, each above the "
                 f"one before and within the range [{self.low:g}, {self.high:g}]"
             )
+        if self.max_move is not None and not (math.isfinite(self.max_move) and self.max_move > 0):
+            raise ArtifactError(
+                f"signal {self.name!r} has the max_move {self.max_move}; it must be above 0 and finite, or left out"
+            )
 
     @property
     def middle(self) -> float:
@@ -56,11 +61,9 @@ class Signal:
         return middle if self.values is None else min(self.values, key=lambda v: abs(v - middle))
 
     def to_dict(self) -> dict[str, Any]:
-        """The signal as JSON-ready values; ``values`` only where the signal is discrete."""
+        """The signal as JSON-ready values; ``values`` and ``max_move`` only where the signal has them."""
         row = asdict(self)
-        if self.values is None:
-            del row["values"]
-        return row
+        return {key: value for key, value in row.items() if value is not None}
 
     @classmethod
     def from_dict(cls, row: dict[str, Any]) -> Self:
@@ -68,13 +71,14 @@ class Signal:
         unknown = sorted(set(row) - {f.name for f in fields(cls)})
         if unknown:
             raise ValueError(f"a signal has unknown entries: {', '.join(unknown)}")
-        values = row.get("values")
+        values, max_move = row.get("values"), row.get("max_move")
         return cls(
             name=_name(row["name"]),
             unit=_name(row["unit"]),
             low=_number(row["low"]),
             high=_number(row["high"]),
             values=None if values is None else tuple(map(_number, _list(values))),
+            max_move=None if max_move is None else _number(max_move),
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,8 +12,8 @@ import numpy as np
 
 from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.own_model import DELAYS, OwnPlant, Untrained, errors_of
-from pipeline.cases.reach import LOAD, Reach
-from pipeline.config.plants import PlantParams, SignalParams
+from pipeline.cases.reach import LOAD, Reach, visited_mv
+from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.errors import PlantError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
@@ -27,7 +27,6 @@ from pipeline.simulation.scenario import Scenario
 from serving.manifest import Signal
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
-MEMBER_NUMBERS = (1, 2)
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
 LOAD_AT = 5  # sample at which a load or a step of a measured disturbance begins
 MEASURED = "measured"  # the test with steps of the measured disturbances
@@ -49,7 +48,8 @@ class OwnCase(Case):
     on_models: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 1
     unforeseen: ClassVar[bool] = True
-    signals: ClassVar[Signals]
+    signals: ClassVar[Signals]  # the MVs with the ranges that laws command
+    record_signals: ClassVar[Signals]  # the MVs with the ranges of their readings
     models: ClassVar[Path]
     data: ClassVar[Path]
 
@@ -74,8 +74,8 @@ class OwnCase(Case):
 
     @cached_property
     def _model(self) -> OwnPlant:
-        """The law's own model, begun at the median MVs."""
-        return self._member(self._law_file, np.median(self.record.mv, axis=0))
+        """The law's own model, begun at the median MVs that laws may command."""
+        return self._member(self._law_file, visited_mv(self.record, self.signals.mv)[1])
 
     @cached_property
     def members(self) -> tuple[OwnPlant, ...]:
@@ -99,8 +99,9 @@ class OwnCase(Case):
         return plant
 
     def _resting(self, plant: OwnPlant) -> OwnPlant:
-        """The plant, begun where it rests; one that settles does so already."""
-        return plant.begun_at(*self.reach.rest(plant)) if self.reach.integrates else plant
+        """The plant, begun where it rests within the record; most do so already."""
+        rest = self.reach.rest(plant)
+        return plant if rest is None else plant.begun_at(*rest)
 
     @cached_property
     def reach(self) -> Reach:
@@ -110,7 +111,7 @@ class OwnCase(Case):
     @cached_property
     def record(self) -> Record:
         """The record of the plant."""
-        return Record.read(self.data, self.signals)
+        return Record.read(self.data, self.record_signals)
 
     @cached_property
     def recorded(self) -> Mapping[str, tuple[float, float]]:
@@ -245,7 +246,8 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
     """The case of ``plants.<name>`` of params.yaml; ``base`` with ``further`` attributes is its class."""
     params = PlantParams.read(name)
     pv, mv, dv = (tuple(map(_signal, group)) for group in (params.pv, params.mv, params.dv))
-    signals = Signals(params.period_s, pv[: params.n_controlled], pv, dv, mv)
+    recorded = Signals(params.period_s, pv[: params.n_controlled], pv, dv, mv)
+    signals = replace(recorded, mv=tuple(_commanded(m, params.period_s) for m in params.mv))
     models, title = Path("work") / name / "models" / MODEL_SET / "seed0", name.replace("_", " ").capitalize()
     described = {f"{group}_signals": getattr(signals, group) for group in ("sp", "pv", "mv", "dv")}
     described |= {"name": name, "title": title, "period_s": signals.period_s, "needs": models}
@@ -253,6 +255,7 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "name": name,
         "title": title,
         "signals": signals,
+        "record_signals": recorded,
         "plant_class": type("OwnPlant", (Untrained,), described),
         "models": models,
         "data": params.data,
@@ -273,20 +276,11 @@ def _spans(signals: Sequence[Signal]) -> Array:
     return np.array([s.high - s.low for s in signals])
 
 
-def _signal(params: SignalParams) -> Signal:
+def _signal(params: SignalParams | MvParams) -> Signal:
     return Signal(params.name, params.unit, params.low, params.high)
 
 
-def entries_of(name: str, plant: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The entries of params.yaml for an own plant: its section, its tests, its models, and two controllers."""
-    parts = {LAW_PART: {"kind": LAW_PART}, **{f"plant{k}": {"kind": LAW_PART, "member": k} for k in MEMBER_NUMBERS}}
-    own = {"case": name, "model": MODEL_SET}
-    return {
-        "plants": {name: dict(plant)},
-        "cases": {name: {"held_out_seeds": [9001, 9002, 9003], "noise_seed": 1}},
-        "models": {f"{name}-{MODEL_SET}": {**own, "data": plant["data"], "parts": parts}},
-        "controllers": {
-            f"{name}-predictive": {**own, "name": "predictive", "law": "predictive", "tuning": "search"},
-            f"{name}-pid": {**own, "name": "pid", "law": "pid"},
-        },
-    }
+def _commanded(mv: MvParams, period_s: float) -> Signal:
+    """The MV as laws command it: its range, and its largest change a period."""
+    per_min = mv.max_move_per_min
+    return Signal(mv.name, mv.unit, *mv.command, max_move=None if per_min is None else per_min * period_s / 60)

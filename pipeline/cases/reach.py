@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.evaluation.case import Array
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 from pipeline.simulation.rests import RESTING, balanced, courses, inside, settled
+from serving.manifest import Signal
 
 VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
+LEAST_VISITED = 0.05  # of an MV's commanded range, where that cuts the visited one
 LEVELS = 6  # set points of a sequence
 SETTLED = 0.05  # of the largest answer
 LEAST_ANSWER = 0.2  # of a CV's largest answer to an MV: a smaller one says nothing about how long it takes
 MOVING = 0.05  # of the CV's visited range in the last quarter of RESTING: a CV that moves more does not settle
 TIMES, HOLD = 3, (30, 400)  # a set point lasts so many times as long as an answer; the fewest and most samples
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
+INWARD = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the way from the visited range's middle to its end: where a rest is tried
 LOAD = 0.25  # standard deviations of the record's CV
 BALANCED = 1e-6  # largest residual of a balance
 
@@ -30,7 +35,8 @@ class Reach:
 
     A CV that settles under constant MVs takes the set points of rests under MVs drawn over the visited range; MVs
     whose rests leave the visited range of a CV are drawn nearer to their medians. A CV that never settles (an
-    integrator) takes set points drawn over its own visited range, under MVs that balance it.
+    integrator) takes set points drawn over its own visited range, under MVs that balance it; and so do all CVs where
+    even the medians' rest leaves the visited range. No set point leaves it: one that no MV was found for is cut to it.
     """
 
     model: IdentifiedPlant
@@ -38,9 +44,8 @@ class Reach:
 
     @cached_property
     def mv(self) -> Array:
-        """Lowest, median and highest visited MVs, shape (3, n_mv)."""
-        low, high = VISITED_MV
-        return np.asarray(np.quantile(self.record.mv, (low, 0.5, high), axis=0))
+        """Lowest, median and highest visited MVs within the ranges of the model's, shape (3, n_mv)."""
+        return visited_mv(self.record, self.model.mv_signals)
 
     @cached_property
     def cv(self) -> Array:
@@ -97,35 +102,73 @@ class Reach:
         first = [int((size[j, :, i] >= way[j, i]).argmax()) for i, j in enumerate(way.argmax(axis=0))]
         return max(1, *first)
 
-    def rest(self, plant: IdentifiedPlant) -> tuple[Array, Array]:
-        """(state (n_x,), mv (n_mv,)) where a plant rests: its own start, or balanced at the CVs' medians."""
-        x, mv = plant.start
-        if not self.integrates:
-            return x, mv
-        levels = self.cv[1, list(self.integrates)]
-        at, acting, away = balanced(plant, x, mv, levels, self.integrates)
-        return (at, acting) if away < BALANCED else (x, mv)
+    def rest(self, plant: IdentifiedPlant) -> tuple[Array, Array] | None:
+        """(state (n_x,), mv (n_mv,)) where a plant rests, if its own start is none within the record.
+
+        Integrating CVs are balanced at their medians. Where the start leaves the visited range of another CV, all CVs
+        are, at the nearest visited values: a test that begins outside would ask a model what its record never showed.
+        None where the start serves, or no such rest is found.
+        """
+        (x, mv), found = plant.start, None
+        if self.integrates:
+            levels = self.cv[1, list(self.integrates)]
+            at, acting, away = balanced(plant, x, mv, levels, self.integrates)
+            found = (at, acting) if away < BALANCED else None
+        cvs = plant.measure(x if found is None else found[0])[: self.cv.shape[1]]
+        slack = BALANCED * (self.cv[2] - self.cv[0])
+        if inside(cvs[None], self.cv[0] - slack, self.cv[2] + slack)[0]:
+            return found
+        for share in INWARD:
+            levels = self.cv[1] + share * (np.clip(cvs, self.cv[0], self.cv[2]) - self.cv[1])
+            at, acting, away = balanced(plant, x, mv, levels, range(len(cvs)))
+            if away < BALANCED and self._can_command(acting):
+                return at, acting
+        return found
+
+    def _can_command(self, mv: Array) -> bool:
+        """Whether MVs (n_mv,) lie within the ranges of the model's."""
+        low, high = (np.array([getattr(s, end) for s in self.model.mv_signals]) for end in ("low", "high"))
+        return bool(inside(mv[None], low, high)[0])
 
     def set_points(self, plant: Simulator, seed: int, p: Array | None = None) -> Array:
         """Set points (LEVELS * hold, n_cv) that a plant can hold under its parameters p (n_p,), each held."""
         rng = np.random.default_rng(seed)
         draws = rng.uniform(self.mv[0], self.mv[2], (LEVELS, self.mv.shape[1]))
-        levels = self._balances(plant, draws, rng, p) if self.integrates else self._rests(plant, draws, p)
-        return np.repeat(levels, self.hold, axis=0)
+        if self.integrates:
+            levels = self._balances(plant, draws, rng, p)
+        else:
+            levels, good = self._rests(plant, draws, p)
+            wanted = rng.uniform(self.cv[0], self.cv[2], levels.shape)
+            for k in np.flatnonzero(~good):
+                levels[k] = self._held(plant, wanted[k], p)
+        return np.repeat(np.clip(levels, self.cv[0], self.cv[2]), self.hold, axis=0)
 
-    def _rests(self, plant: Simulator, draws: Array, p: Array | None) -> Array:
-        """CVs (LEVELS, n_cv) of rests within the visited range: of each draw the farthest from the medians."""
+    def _rests(self, plant: Simulator, draws: Array, p: Array | None) -> tuple[Array, NDArray[np.bool_]]:
+        """CVs (LEVELS, n_cv) of rests within the visited range, of each draw the farthest from the medians.
+
+        And which (LEVELS,) there are: of the others no rest on the way to the medians lies within.
+        """
         scaled = self.mv[1] + np.array(SCALES)[:, None, None] * (draws - self.mv[1])
         x = settled(plant, plant.start[0], scaled.reshape(-1, draws.shape[1]), p)
         cvs = plant.measured(x).reshape(*scaled.shape[:2], -1)[..., : self.cv.shape[1]]
         good = inside(cvs, self.cv[0], self.cv[2])
-        first = np.where(good.any(axis=0), good.argmax(axis=0), len(SCALES) - 1)
-        return np.asarray(cvs[first, np.arange(len(draws))])
+        return np.asarray(cvs[good.argmax(axis=0), np.arange(len(draws))]), np.asarray(good.any(axis=0))
+
+    def _held(self, plant: Simulator, wanted: Array, p: Array | None) -> Array:
+        """CVs (n_cv,) of a rest on the way from where the plant starts to ``wanted`` (n_cv,), as far as MVs reach."""
+        x, mv = plant.start
+        start = np.clip(plant.measure(x)[: len(wanted)], self.cv[0], self.cv[2])
+        for scale in SCALES:
+            level = start + scale * (wanted - start)
+            _, acting, away = balanced(plant, x, mv, level, range(len(wanted)), p)
+            if away < BALANCED and self._can_command(acting):
+                return np.asarray(level)
+        return start
 
     def _balances(self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None) -> Array:
         """CVs (LEVELS, n_cv) of rests: those that integrate at levels drawn over their visited range."""
         which, (start, mv0) = list(self.integrates), plant.start
-        low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
+        low, high = (np.array([getattr(s, end) for s in self.model.mv_signals]) for end in ("low", "high"))
         wanted = rng.uniform(self.cv[0, which], self.cv[2, which], (len(draws), len(which)))
         found = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1))
         for k, (draw, levels) in enumerate(zip(draws, wanted, strict=True)):
@@ -151,3 +194,22 @@ class Reach:
             courses(plant, x, mv[None], samples, plant.parameters({name: load}))[0, -1, cv] for load in (tried, 0.0)
         ]
         return tried * LOAD * size / abs(float(ends[0] - ends[1]))
+
+
+def visited_mv(record: Record, mvs: Sequence[Signal]) -> Array:
+    """Lowest, median and highest MVs (3, n_mv) of a record, within the ranges that ``mvs`` may be commanded over.
+
+    Where the median lies outside such a range or at its end, the middle of what was visited within takes its place:
+    a loop that begins at an end has no room on one side. Where next to nothing was visited within, the whole range
+    counts.
+    """
+    low, high = VISITED_MV
+    whole = np.asarray(np.quantile(record.mv, (low, 0.5, high), axis=0))
+    found = np.clip(whole, [s.low for s in mvs], [s.high for s in mvs])
+    span = np.array([s.high - s.low for s in mvs])
+    cut = np.any(found != whole, axis=0)
+    narrow = cut & (found[2] - found[0] < LEAST_VISITED * span)
+    found = np.where(narrow, [[s.low for s in mvs], [s.middle for s in mvs], [s.high for s in mvs]], found)
+    at_end = cut & ~((found[0] < found[1]) & (found[1] < found[2]))
+    found[1] = np.where(at_end, 0.5 * (found[0] + found[2]), found[1])
+    return found

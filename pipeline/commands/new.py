@@ -6,12 +6,16 @@ import argparse
 import math
 import shutil
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.cases.own_plant import entries_of
+from pipeline.cases.own_entries import entries_of
+from pipeline.commands.new_commands import check_start, commanded, mvs_of
 from pipeline.commands.new_fmu import table_from, write_table
 from pipeline.commands.new_printed import tell
+from pipeline.commands.new_refusal import refusal
 from pipeline.commands.new_replaced import REFUSED, check_replaceable, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
@@ -24,7 +28,19 @@ from pipeline.historian.guessing import controlled_first, guesses
 from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
 from pipeline.historian.step_test import planned
-from pipeline.historian.tags import EXPLAINED, RANGES, ROLES, Tag, check_tags, named, parse_tag, read_tags, write_tags
+from pipeline.historian.tags import (
+    EXPLAINED,
+    RANGES,
+    ROLES,
+    TableError,
+    Tag,
+    check_tags,
+    limited,
+    named,
+    parse_tag,
+    read_tags,
+    write_tags,
+)
 from pipeline.plants.simulator_file import is_fmu
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
@@ -47,6 +63,10 @@ def options(parser: argparse.ArgumentParser) -> None:
     for role in ROLES:
         form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"
         add(f"--{role}", metavar=form, action="append", default=[], help=f"{WORDS[role]}; may be given again")
+    add("--command", metavar="TAG=LOW..HIGH", action="append", default=[],
+        help="range that the controller may command an MV over, within the range of its readings")  # fmt: skip
+    add("--max-move", metavar="TAG=CHANGE", action="append", default=[],
+        help="largest change of an MV in a minute that the controller may make, in the MV's unit")  # fmt: skip
     add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
     add("--period", metavar="S", type=_positive, help="sampling period of the record (default: from the data)")
     add("--hold", metavar="S", type=_positive, help="longest time that a reading is held or drawn on over")
@@ -57,6 +77,15 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """0 where the plant was added or a table of tags written; 2 where the record cannot be used, after the report."""
+    try:
+        return _run(options)
+    except TableError as error:
+        for mistake in error.mistakes:
+            print(f"loopwright new: {mistake}", file=sys.stderr)
+        return 2
+
+
+def _run(options: argparse.Namespace) -> int:
     name: str = options.name
     replace: bool = options.replace
     folder = DATA / name
@@ -70,6 +99,8 @@ def run(options: argparse.Namespace) -> int:
     if not options.files:
         raise RecordError("no file is named; give one or more exports, or --simulator FILE")
     tags, _ = _tags(options)
+    if not tags and (options.command or options.max_move):
+        raise RecordError("--command and --max-move are given and no mv is; name it with --mv, or give --tags")
     if not tags:
         return _table(name, options)
     units = units_of(options.files)
@@ -78,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
     values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
     export = read_export(options.files, values, modes, options.time, options.time_format)
     found = screened(name, export, tags, options.period, options.hold, options.without_mode)
-    return _write(name, folder, found, options)
+    return _write(name, folder, found, options, tags)
 
 
 def _tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
@@ -89,7 +120,7 @@ def _tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
     found, where = (read_tags(options.tags), str(options.tags)) if options.tags else (given, "the options")
     if found or options.tags:
         check_tags(found, where)
-    return found, where
+    return limited(found, options.command, options.max_move) if found else found, where
 
 
 def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
@@ -103,7 +134,9 @@ def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
         if table is None:
             return _proposed(name, path)
     made = simulated(name, path, options.rows, options.period, table)
-    return _write(name, folder, made.found, options, made)
+    commands = named(tags) or limited(mvs_of(made.plant), options.command, options.max_move)
+    check_start(made.plant, commands)
+    return _write(name, folder, made.found, options, commands, made)
 
 
 def _proposed(name: str, fmu: Path) -> int:
@@ -130,19 +163,27 @@ def _table(name: str, options: argparse.Namespace) -> int:
     return 0
 
 
-def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace, made: Simulated | None = None) -> int:
+def _write(
+    name: str,
+    folder: Path,
+    found: Screened,
+    options: argparse.Namespace,
+    tags: Sequence[Tag],
+    made: Simulated | None = None,
+) -> int:
     """All files at once, then the section; neither without the other. Where both fail, a replaced plant stays."""
     report, verdict = found.report, found.report.verdict
-    usable, lost = _usable(found, options.anyway), list[str]()
-    if usable and folder.exists() and not _refused(folder):
+    unusable, lost = refusal(found, tags, options.anyway), list[str]()
+    if unusable and folder.exists() and not _refused(folder):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
     earlier = folder.with_name(f".{name}-replaced")
     shutil.rmtree(earlier, ignore_errors=True)
-    test = planned(verdict.inputs, found.record.mv[-1], report.period_s) if verdict.carries != "yes" else None
+    inputs = commanded(verdict.inputs, tags)
+    test = planned(inputs, found.record.mv[-1], report.period_s) if verdict.carries != "yes" else None
     with draft_folder_of(folder) as draft:
-        if not usable:
+        if not unusable:
             found.record.write(draft / "record.parquet")
-        plant = entry(found.record, report, folder)
+        plant = entry(found.record, report, folder, tags)
         found.record = evenly(found.record)  # pages need no more, and a long record is large
         write_json(draft / "screening.json", report.to_dict())
         if made:
@@ -152,7 +193,7 @@ def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace
         write_page(draft / "screening.html", found, test)
         if folder.exists():
             folder.rename(earlier)
-    if not usable:
+    if not unusable:
         simulator = {"simulator": (folder / copy_name(made.plant.path)).as_posix()} if made else {}
         entries = entries_of(name, plant | simulator)
         try:
@@ -164,23 +205,12 @@ def _write(name: str, folder: Path, found: Screened, options: argparse.Namespace
                 earlier.rename(folder)
             raise
     shutil.rmtree(earlier, ignore_errors=True)
-    tell(name, folder, report, test, not usable)
+    tell(name, folder, report, test, not unusable)
     for wish in lost:
         print(f"replaced, write it into params.yaml again if you want it: controllers.{wish}")
-    if usable:
-        print(f"loopwright new: {name} was not added to params.yaml: {usable}", file=sys.stderr)
-    return 2 if usable else 0
-
-
-def _usable(found: Screened, anyway: bool) -> str:
-    """Why the plant is not added; empty where it is."""
-    record, verdict = found.record, found.report.verdict
-    for signal, values in zip(record.mv_signals, record.mv.T, strict=True):
-        if float(values.max() - values.min()) <= 1e-9 * (signal.high - signal.low):
-            return f"{signal.name} is {values[0]:g} {signal.unit} in every row; run the step test in step_test.csv"
-    if verdict.carries == "no" and not anyway:
-        return f"{verdict.reasons[0]}; run the step test in step_test.csv, or give --anyway"
-    return ""
+    if unusable:
+        print(f"loopwright new: {name} was not added to params.yaml: {unusable}", file=sys.stderr)
+    return 2 if unusable else 0
 
 
 def _refused(folder: Path) -> bool:
@@ -188,19 +218,20 @@ def _refused(folder: Path) -> bool:
     return {p.name for p in folder.iterdir()} <= REFUSED and (folder / "screening.json").exists()
 
 
-def entry(record: Record, report: Screening, folder: Path) -> dict[str, Any]:
-    """``plants.<name>`` as params.yaml holds it."""
+def entry(record: Record, report: Screening, folder: Path, tags: Sequence[Tag] = ()) -> dict[str, Any]:
+    """``plants.<name>`` as params.yaml holds it; ``tags`` say what the controller may command."""
     groups = {"pv": record.pv_signals, "mv": record.mv_signals, "dv": record.dv_signals}
+    commands = {t.name: t.commands for t in tags}
     return {
         "period_s": record.period_s,
-        **{role: [s.to_dict() for s in signals] for role, signals in groups.items()},
+        **{role: [s.to_dict() | commands.get(s.name, {}) for s in signals] for role, signals in groups.items()},
         "data": (folder / "record.parquet").as_posix(),
         "source": [dict(f) for f in report.files],
     }
 
 
 def _with_unit(tag: Tag, units: dict[str, str]) -> Tag:
-    return Tag(tag.tag, tag.role, units.get(tag.tag, ""), tag.low, tag.high, tag.name)
+    return replace(tag, unit=units.get(tag.tag, ""))
 
 
 def _rows(text: str) -> int:

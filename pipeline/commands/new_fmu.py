@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import RecordError
@@ -70,7 +71,7 @@ def _remark(v: Variable) -> str:
 
 def _with_range(tag: Tag, v: Variable) -> Tag:
     low, high = (v.low if tag.low is None else tag.low), (v.high if tag.high is None else tag.high)
-    return Tag(tag.tag, tag.role, tag.unit or v.unit, low, high, tag.name)
+    return replace(tag, unit=tag.unit or v.unit, low=low, high=high)
 
 
 def _step(of: Description, period_s: float | None) -> float:

@@ -26,6 +26,9 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
         print(f"  {reason}")
     print(f"look at {folder}/screening.html: trends with every mask")
     if added:
+        if report.verdict.carries != "yes":
+            print(f"{name} was added in spite of this, and its models may be poor: look at their fit in the report, "
+                  f"or record more and give all files again with --replace")  # fmt: skip
         print(f"then: loopwright run {name}")
     if test:
         print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from pipeline.config.params import PARAMS_FILE, parse, read_section, sections
 from pipeline.errors import ParamsError
@@ -29,6 +30,79 @@ class SignalParams:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class MvParams:
+    """An MV: its name, unit, and the range that its readings lie in; and what a controller may do with it.
+
+    A controller commands it from ``command_low`` to ``command_high`` (None: ``low``, ``high``), and changes it by at
+    most ``max_move_per_min`` in a minute [unit of the MV] (None: no limit).
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    command_low: float | None = None
+    command_high: float | None = None
+    max_move_per_min: float | None = None
+
+    def __post_init__(self) -> None:
+        wrong = mistakes_of_mv(self)
+        if wrong:
+            raise ValueError(f"{self.name}: {'; '.join(wrong)}")
+
+    @property
+    def command(self) -> tuple[float, float]:
+        """The range that a controller commands."""
+        low, high = self.command_low, self.command_high
+        return (self.low if low is None else low), (self.high if high is None else high)
+
+
+class Commanded(Protocol):
+    """Numbers of an MV, None where they are not given."""
+
+    @property
+    def low(self) -> float | None:
+        """Lowest reading."""
+
+    @property
+    def high(self) -> float | None:
+        """Highest reading."""
+
+    @property
+    def command_low(self) -> float | None:
+        """Lowest command."""
+
+    @property
+    def command_high(self) -> float | None:
+        """Highest command."""
+
+    @property
+    def max_move_per_min(self) -> float | None:
+        """Largest change in a minute."""
+
+
+def mistakes_of_mv(mv: Commanded) -> list[str]:
+    """What cannot be in the numbers of an MV, a clause each."""
+    wrong = []
+    low, high = (-math.inf if mv.low is None else mv.low), (math.inf if mv.high is None else mv.high)
+    if not low < high:
+        wrong.append(f"the range is {low:g} to {high:g}; low must be below high")
+    for name in ("command_low", "command_high"):
+        value = getattr(mv, name)
+        if value is not None and low < high and not low <= value <= high:
+            wrong.append(f"{name} is {value:g}, outside low to high, {low:g} to {high:g}; choose one within")
+    first = low if mv.command_low is None else mv.command_low
+    last = high if mv.command_high is None else mv.command_high
+    if not wrong and not first < last:
+        wrong.append(f"the commands range from {first:g} to {last:g}; command_low must be below command_high")
+    if mv.max_move_per_min is not None and not 0 < mv.max_move_per_min < math.inf:
+        wrong.append(
+            f"max_move_per_min is {mv.max_move_per_min:g}; give a change above 0 in a minute, or leave it empty"
+        )
+    return wrong
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class RawFileParams:
     """A raw file that the record was made from."""
 
@@ -47,7 +121,7 @@ class PlantParams:
 
     period_s: float
     pv: tuple[SignalParams, ...]  # controlled variables first
-    mv: tuple[SignalParams, ...]
+    mv: tuple[MvParams, ...]
     dv: tuple[SignalParams, ...]
     data: Path
     source: tuple[RawFileParams, ...]
@@ -70,7 +144,8 @@ class PlantParams:
                 f"controlled is {self.controlled}; {len(self.pv)} PVs and {len(self.mv)} MVs allow 1 to {most}: "
                 "each controlled variable needs an MV of its own"
             )
-        names = [s.name for s in (*self.pv, *self.mv, *self.dv)]
+        signals: tuple[SignalParams | MvParams, ...] = (*self.pv, *self.mv, *self.dv)
+        names = [s.name for s in signals]
         twice = [n for n in names if names.count(n) > 1]
         if twice:
             raise ValueError(f"signal {twice[0]!r} is there twice; give each its own name")

@@ -18,6 +18,7 @@ from pipeline.evaluation.effort import Effort
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import rmse
 from pipeline.plants.equations import EquationPlant, equations
+from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario
@@ -170,6 +171,11 @@ class Case(ABC):
     def recorded(self) -> Mapping[str, tuple[float, float]]:
         """PV or MV -> its lowest and highest value in the plant's record; empty for a plant in equations."""
         return {}
+
+    @property
+    def record_signals(self) -> Signals:
+        """The signals of the plant's record: those of the plant, unless its MVs were moved farther than laws may."""
+        return self.plant.signals
 
     @property
     def replayed(self) -> tuple[Record, int] | None:

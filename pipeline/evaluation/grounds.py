@@ -35,6 +35,14 @@ class Grounds:
         loops = left if not self.loops else f"in closed loop {_far(self.loops, 'goes')}"
         return f"free-run fit over unseen rows: {fits}; {inside}; {loops}"
 
+    @property
+    def warning(self) -> str:
+        """One sentence where set points go beyond the record; empty where none does."""
+        if not self.set_points:
+            return ""
+        far = ", ".join(f"{name} by {value:.3g} % of its recorded range" for name, value in self.set_points.items())
+        return f"Set points of the tests go beyond the record, {far}: figures there rest on no data."
+
     def to_dict(self) -> dict[str, Any]:
         """For the manifest: the figures, and the sentence."""
         return {"words": self.words, **{key: dict(value) for key, value in asdict(self).items()}}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 from serving.errors import LoopwrightError
+from serving.manifest import Signal
 
 UNSEEN = 0.2  # share of the rows, the last ones: the choice of the model's structure held them out
 MOST = 2_000  # rows
@@ -39,13 +40,13 @@ class Replay:
     asked: Array  # (n, n_mv); NaN where the controller refused the row
     done: Array  # (n, n_mv) recorded
 
-    def figures(self, record: Record) -> dict[str, dict[str, float]]:
+    def figures(self, mvs: Sequence[Signal]) -> dict[str, dict[str, float]]:
         """Of each MV: distance of asked from done and its mean [% of range], correlation, share at an end [%].
 
-        The correlation is left out where either never moved.
+        ``mvs`` are the law's, with the ranges that it commands. The correlation is left out where either never moved.
         """
         found = {}
-        for i, signal in enumerate(record.mv_signals):
+        for i, signal in enumerate(mvs):
             known = np.isfinite(self.asked[:, i])
             asked, done, span = self.asked[known, i], self.done[known, i], signal.high - signal.low
             if not asked.size:

@@ -161,10 +161,11 @@ def _reasons(
     record: Record, inputs: list[InputReport], correlation: Mapping[str, float], parameters: int, moved_sp: int, n: int
 ) -> tuple[list[str], int]:
     found: list[tuple[int, str]] = []
-    if n < LEAST_ROWS_A_PARAMETER * parameters:
-        found.append((2, f"{n} rows for {parameters} parameters of a linear model: too few; record longer"))
-    elif n < ROWS_A_PARAMETER * parameters:
-        found.append((1, f"{n} rows for {parameters} parameters of a linear model are few"))
+    wanted = ROWS_A_PARAMETER * parameters
+    if n < wanted:
+        few = ": too few" if n < LEAST_ROWS_A_PARAMETER * parameters else " are few"
+        words = f"{n} rows for {parameters} parameters of a linear model{few}; record {wanted} or more"
+        found.append((1 + (n < LEAST_ROWS_A_PARAMETER * parameters), words))
     for i, values in zip((i for i in inputs if i.role == "mv"), record.mv.T, strict=True):
         span = float(np.ptp(values)) if n else 0.0
         if i.moves < FEW_MOVES:

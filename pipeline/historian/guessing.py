@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.historian.cells import sentinels, unit_slips, usual
 from pipeline.historian.character import quantum
-from pipeline.historian.excitation import FOLLOWS, follows
+from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, follows, moves_of
 from pipeline.historian.export import Export, Series
+from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.grid import proposed_period, resampled
 from pipeline.historian.linear import fitted
 from pipeline.historian.reason import Reason
 from pipeline.historian.tags import Guess, Tag
+from pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
     (r"(mode|md|auto)$", "mode"),
@@ -45,7 +48,40 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
         free = [g for g in found if not g.tag.role and g.good > 0 and g.step >= 0 and g.tag.low is not None]
         own = [g for g in free if g.tag.tag in loops] or free[:1]
         found = [replace(g, tag=replace(g.tag, role="pv")) if g in own else g for g in found]
-    return disturbances(found, export)
+    # A variable that looks like a PV and answers to nothing may drift as the PVs do: no guess makes it a cause of them.
+    taken = {g.tag.tag for g in found if g.tag.role == "pv"}
+    return disturbances(without_answers(found, export), export, taken)
+
+
+def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
+    """The guesses, PVs that answer to no MV without a role: no controller can hold them.
+
+    All keep it where no PV answers at all, or where some MV hardly moves in the readings that are looked at: then
+    they say nothing about what it moves.
+    """
+    pvs, mvs = ([g.tag.tag for g in found if g.tag.role == role and g.tag.low is not None] for role in ("pv", "mv"))
+    if not pvs or not mvs:
+        return list(found)
+    own = {name: _excerpt(export.series[name]) for name in (*pvs, *mvs)}
+    grid, _ = resampled([own[n] for n in pvs], [own[n] for n in mvs], proposed_period([own[pvs[0]]]))
+    u, run = [grid.value[m] for m in mvs], grid.piece
+    if min(len(moves_of(v[np.isfinite(v)], run[np.isfinite(v)])) for v in u) < FEW_MOVES:
+        return list(found)
+    still = [name for name in pvs if not _answers(grid.value[name], u, run)]
+    if len(still) == len(pvs):
+        return list(found)
+    words = "answers to no MV; role pv if one moves it all the same"
+    return [
+        replace(g, tag=replace(g.tag, role=""), remark=f"{g.remark}; {words}".strip("; ")) if g.tag.tag in still else g
+        for g in found
+    ]
+
+
+def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
+    """Whether y (n,) answers to one of the inputs u, (n,) each, by the quick model or by what follows their moves."""
+    model = fitted(y, list(u), run)
+    seen = model is not None and max(model.strength[i] for i in range(len(u))) > SEEN
+    return seen or any(first_answer(y, v, run) != NONE for v in u)
 
 
 def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:
@@ -59,10 +95,14 @@ def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:
     return tuple(sorted(tags, key=after)) if loops else tuple(tags)
 
 
-def disturbances(found: Sequence[Guess], export: Export) -> list[Guess]:
-    """The guesses, tags without a role that a PV answers to, and that do not answer to it, as measured disturbances."""
+def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] = ()) -> list[Guess]:
+    """The guesses, tags without a role that a PV answers to, and that do not answer to it, as measured disturbances.
+
+    Those ``taken`` are not tried.
+    """
     pvs, mvs = ([g.tag.tag for g in found if g.tag.role == role] for role in ("pv", "mv"))
     free = [g.tag.tag for g in found if not g.tag.role and g.good > LEAST_GOOD and g.tag.low is not None]
+    free = [tag for tag in free if tag not in taken]
     if not pvs or not mvs or not free:
         return list(found)
     names = dict.fromkeys((*pvs, *mvs, *free[:MOST_TRIED]))
@@ -114,6 +154,7 @@ def _guess(series: Series, unit: str) -> Guess:
     still = np.abs(np.diff(plain)) <= 0
     if np.ptp(plain) == 0:
         remarks.append("constant")
+        role = "" if role == "pv" else role
     elif still.mean() >= HELD_SHARE:
         remarks.append("moves in steps")
     if found:

@@ -106,9 +106,10 @@ def _signal(tag: Tag, values: Array) -> Signal:
     """The tag's signal.
 
     A range that was not given is what the values show: of a percentage 0 to 100, of another MV what was seen, of a
-    PV a tenth more.
+    PV a tenth more. It holds what the controller may command.
     """
-    low, high = float(values.min()), float(values.max())
+    commands = [v for v in (tag.command_low, tag.command_high) if v is not None]
+    low, high = min(float(values.min()), *commands, np.inf), max(float(values.max()), *commands, -np.inf)
     if tag.unit == "%" and low >= 0 and high <= 100:
         low, high = 0.0, 100.0
     elif tag.role != "mv":

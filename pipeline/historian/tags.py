@@ -10,17 +10,22 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pipeline.config.plants import mistakes_of_mv
 from pipeline.errors import RecordError, nearest
 from pipeline.files import write_text
 from serving.manifest import MAX_NAME, Signal
 
 ROLES = ("pv", "mv", "dv", "sp", "mode")
 SIGNAL_ROLES = ("pv", "mv", "dv")
-COLUMNS = ("tag", "role", "name", "unit", "low", "high", "step", "good_percent", "remark")
+COMMANDS = ("command_low", "command_high", "max_move_per_min")  # of an MV, for the controller
+NUMBERS = ("low", "high", *COMMANDS)
+COLUMNS = ("tag", "role", "name", "unit", *NUMBERS, "step", "good_percent", "remark")
 OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
 UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
-RANGES = """low, high of an mv: the range that the controller may command, not the transmitter's span
-low, high of a pv or dv: the range in which a reading can be true"""
+RANGES = """low, high: the range in which a reading can be true; of an mv it holds all that the valve did
+command_low, command_high of an mv: the range that the controller may command; empty is low, high
+max_move_per_min of an mv: the largest change that the controller may make in a minute, in the mv's unit; empty is
+  no limit"""
 EXPLAINED = f"""role: pv (to be controlled), mv (what the controller commands), dv (measured disturbance),
   sp (set point of a loop), mode (of a loop); empty leaves a tag out
 name: of the signal in reports and in the controller
@@ -29,9 +34,20 @@ step, good_percent, remark: the smallest difference of two readings, the share o
   read. docs/tag_table.md says more"""
 
 
+class TableError(RecordError):
+    """A corrected table has mistakes; ``mistakes`` are all of them, a line each."""
+
+    def __init__(self, mistakes: Sequence[str]) -> None:
+        super().__init__("; ".join(mistakes))
+        self.mistakes = tuple(mistakes)
+
+
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """A column of the export and what it is in the plant; the range is None where the data give it."""
+    """A column of the export and what it is in the plant; the range is None where the data give it.
+
+    ``command_low``, ``command_high`` and ``max_move_per_min`` as in MvParams.
+    """
 
     tag: str
     role: str  # pv, mv, dv, sp, mode; "" is not used
@@ -39,6 +55,15 @@ class Tag:
     low: float | None = None
     high: float | None = None
     name: str = ""  # of the signal; "" is the tag's own, made safe
+    command_low: float | None = None
+    command_high: float | None = None
+    max_move_per_min: float | None = None
+
+    @property
+    def commands(self) -> dict[str, float]:
+        """What of a controller's limits was given, by its name in params.yaml."""
+        given = {name: getattr(self, name) for name in COMMANDS}
+        return {name: value for name, value in given.items() if value is not None}
 
     def signal(self, low: float, high: float) -> Signal:
         """The signal of the tag; ``low`` and ``high`` count where the tag has none."""
@@ -87,8 +112,33 @@ def parse_tag(text: str, role: str) -> Tag:
         )
     low, high = (_number(match[key], f"--{role} {text}") if match[key] else None for key in ("low", "high"))
     tag = Tag(match["tag"].strip(), role, (match["unit"] or "").strip(), low, high)
-    _check_range(tag, f"--{role} {text}")
+    if wrong := _wrong(tag):
+        raise RecordError(f"--{role} {text}: {'; '.join(wrong)}")
     return tag
+
+
+def limited(tags: Sequence[Tag], commands: Iterable[str], moves: Iterable[str]) -> tuple[Tag, ...]:
+    """The tags with what options say of MVs: ``TAG=LOW..HIGH`` to command, ``TAG=CHANGE`` the largest in a minute.
+
+    RecordError for another form, for a tag that is no MV, and for numbers that cannot be.
+    """
+    found, options = {t.tag: t for t in tags}, []
+    for option, texts, form in (("command", commands, "LOW..HIGH"), ("max-move", moves, "CHANGE")):
+        options += [(f"--{option} {text}", form, text) for text in texts]
+    for where, form, text in options:
+        name, _, value = text.rpartition("=")
+        ends = value.split("..") if form == "LOW..HIGH" else [value]
+        if not name or len(ends) != 1 + (form == "LOW..HIGH"):
+            raise RecordError(f"{where}: write TAG={form}, as in TIC-101.OP={'15..85' if ends[1:] else '5'}")
+        mvs = [t.tag for t in tags if t.role == "mv"]
+        if name not in mvs:
+            raise RecordError(f"{where}: {name!r} is no mv{nearest(name, mvs)}")
+        keys = COMMANDS[:2] if form == "LOW..HIGH" else COMMANDS[2:]
+        numbers = {key: _number(end, where) for key, end in zip(keys, ends, strict=True)}
+        found[name] = replace(found[name], **numbers)  # type: ignore[arg-type]
+        if wrong := _wrong(found[name]):
+            raise RecordError(f"{where}: {'; '.join(wrong)}")
+    return tuple(found[t.tag] for t in tags)
 
 
 def check_tags(tags: Sequence[Tag], where: str) -> None:
@@ -111,14 +161,14 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
     rows.writerow(COLUMNS)
     for g in guesses:
         t = g.tag
-        low, high = ("" if v is None else f"{v:.6g}" for v in (t.low, t.high))
         good = f"{100 * g.good:.2f}"
-        rows.writerow([t.tag, t.role, safe_name(t.tag), t.unit, low, high, f"{g.step:.6g}", good, g.remark])
+        numbers = ["" if v is None else f"{v:.6g}" for v in (getattr(t, name) for name in NUMBERS)]
+        rows.writerow([t.tag, t.role, safe_name(t.tag), t.unit, *numbers, f"{g.step:.6g}", good, g.remark])
     write_text(path, out.getvalue())
 
 
 def read_tags(path: Path) -> tuple[Tag, ...]:
-    """The tags that have a role in a corrected table; RecordError names line and column of a mistake.
+    """The tags that have a role in a corrected table; RecordError names line and column of every mistake.
 
     A spreadsheet's semicolons and decimal commas are read too.
     """
@@ -134,7 +184,7 @@ def read_tags(path: Path) -> tuple[Tag, ...]:
     for column in ("tag", "role"):
         if column not in header:
             raise RecordError(f"{path}: column {column!r} is missing; the table has {', '.join(COLUMNS)}")
-    found = []
+    found, wrong = list[Tag](), list[str]()
     for line, row in enumerate(rows[1:], start=2):
         cells = dict(zip(header, (c.strip() for c in row), strict=False))
         role = cells.get("role", "").lower()
@@ -142,17 +192,28 @@ def read_tags(path: Path) -> tuple[Tag, ...]:
             continue
         where = f"{path}, line {line} ({cells['tag']})"
         if role not in ROLES:
-            raise RecordError(f"{where}: role {role!r}{nearest(role, ROLES)}; leave it empty for a tag without one")
-        low, high = (_number(cells[k], f"{where}, {k}") if cells.get(k) else None for k in ("low", "high"))
-        tag = Tag(cells["tag"], role, cells.get("unit", ""), low, high, cells.get("name", ""))
-        _check_range(tag, where)
+            wrong.append(f"{where}: role {role!r}{nearest(role, ROLES)}; leave it empty for a tag without one")
+            continue
+        numbers: dict[str, float] = {}
+        for key in NUMBERS:
+            try:
+                numbers |= {key: _number(cells[key], f"{where}, {key}")} if cells.get(key) else {}
+            except RecordError as error:
+                wrong.append(str(error))
+        tag = Tag(tag=cells["tag"], role=role, unit=cells.get("unit", ""), name=cells.get("name", ""), **numbers)
+        wrong += [f"{where}: {words}" for words in _wrong(tag)]
         found.append(tag)
+    if wrong:
+        raise TableError(wrong)
     return tuple(found)
 
 
-def _check_range(tag: Tag, where: str) -> None:
-    if tag.low is not None and tag.high is not None and not tag.low < tag.high:
-        raise RecordError(f"{where}: the range is {tag.low:g} to {tag.high:g}; low must be below high")
+def _wrong(tag: Tag) -> list[str]:
+    """What cannot be in the numbers of a tag, a clause each."""
+    if tag.role != "mv" and tag.commands:
+        verb, it = ("belong", "them") if tag.commands.keys() - {next(iter(tag.commands))} else ("belongs", "it")
+        return [f"{', '.join(tag.commands)} {verb} to an mv, which the controller commands; leave {it} empty"]
+    return mistakes_of_mv(tag)
 
 
 def _number(text: str, where: str) -> float:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from math import inf
 from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from pipeline.errors import LawError
+from pipeline.laws.rates import Rates, rates_of
 from pipeline.models.base import Model
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
@@ -91,7 +91,8 @@ class ControlLaw(nn.Module, ABC):
     engineering units; float64. A state of zeros means "no history": the law handles its own first
     step. ``mv_applied`` is the MV that the plant received over the last period. A law that needs
     its last MV uses this value, which gives anti-windup and bumpless transfer. The law limits its
-    MV to the signal's range and to ``rate`` per sample.
+    MV to the signal's range and to ``rate`` per sample: its own ``mv_rate``, or the signal's ``max_move`` where
+    that is less.
     """
 
     name: ClassVar[str]
@@ -112,18 +113,15 @@ class ControlLaw(nn.Module, ABC):
     info: tuple[str, ...]
     low: Tensor  # (n_mv,)
     high: Tensor  # (n_mv,)
-    rate: Tensor | None  # (n_mv,) largest change a sample; None where unlimited
+    rate: Tensor | None  # (n_mv,) largest change a sample, infinite without a limit; None where no MV has one
 
-    def __init__(self, signals: Signals, mv_rate: float | None = None) -> None:
+    def __init__(self, signals: Signals, mv_rate: Rates = None) -> None:
         super().__init__()
         self.signals = signals
         self.register_buffer("low", torch.tensor([s.low for s in signals.mv], dtype=torch.float64))
         self.register_buffer("high", torch.tensor([s.high for s in signals.mv], dtype=torch.float64))
-        if mv_rate is not None and not mv_rate > 0:
-            raise LawError(f"mv_rate is {mv_rate}; give the largest MV change a sample, above 0, or leave it out")
-        # An on-off valve has no positions between, so no rate.
-        rates = [inf if s.values else mv_rate for s in signals.mv]
-        self.register_buffer("rate", None if mv_rate is None else torch.tensor(rates, dtype=torch.float64))
+        rates = rates_of(signals, mv_rate)
+        self.register_buffer("rate", None if rates is None else torch.tensor(rates, dtype=torch.float64))
 
     @classmethod
     @abstractmethod

@@ -85,7 +85,9 @@ def _plant_key(plant: IdentifiedPlant) -> str:
     f = plant.arrays
     numbers = (f.a, f.b, f.c, f.w1, f.b1, f.w2, f.y_center, f.y_scale, f.v_center, f.v_scale, *plant.start)
     ranges = [[s.low, s.high] for s in (*plant.sp_signals, *plant.mv_signals)]
-    return digest([[f"{v:.9g}" for v in np.ravel(array)] for array in numbers] + [ranges, plant.period_s])
+    moves = [s.max_move for s in plant.mv_signals]
+    limits = [moves] if any(moves) else []
+    return digest([[f"{v:.9g}" for v in np.ravel(array)] for array in numbers] + [ranges, plant.period_s, *limits])
 
 
 def _key(test: Scenario) -> str:

@@ -74,8 +74,9 @@ class SampledHorizon:
 
         min  sum_k sum_i |r_i - y_i(k)| / span_i  +  w sum_k ((u(k) - u(k-1)) / span_u)^2,   k = 1..n
 
-    over u(0)..u(n-1) within the MVs' ranges. All states are variables and the state equation a constraint; the
-    absolute value enters through slacks. The weight w chooses among equal errors.
+    over u(0)..u(n-1) within the MVs' ranges, and |u(k) - u(k-1)| at most ``max_move`` of an MV that has one, u(-1)
+    being the MV that acts now. All states are variables and the state equation a constraint; the absolute value
+    enters through slacks. The weight w chooses among equal errors.
     """
 
     def __init__(self, plant: IdentifiedPlant, n: int) -> None:
@@ -91,6 +92,9 @@ class SampledHorizon:
         x, z, s = ca.vertsplit(table, [0, self._n_x, self._n_x + self._m, self._rows])
         p = ca.MX.sym("p", len(plant.parameter_names()))
         x0, delayed, sp = ca.MX.sym("x0", self._n_x), ca.MX.sym("d", plant.most_dead_time + 1), ca.MX.sym("r", n_cv)
+        held = [j for j, s in enumerate(plant.mv_signals) if s.max_move is not None]
+        most = np.array([plant.mv_signals[j].max_move for j in held], dtype=np.float64) / self._span[held]
+        last = ca.MX.sym("u", self._m if held else 0)  # in shares of the range
         starts, dv = ca.horzcat(x0, x[:, :-1]), ca.MX.sym("dv", len(plant.dv_signals))
         every = [ca.repmat(value, 1, n) for value in (p, delayed, dv)]
         gap = x - transition(plant).map(n)(starts, self._low + self._span * z, *every)
@@ -98,8 +102,9 @@ class SampledHorizon:
         error = (ca.repmat(sp, 1, n) - y) / self._cv_span
         moves = z[:, 1:] - z[:, :-1]
         cost = ca.sum1(ca.vec(s)) + MOVE_WEIGHT[False] * ca.sumsqr(moves)
-        bound = ca.vertcat(ca.vec(gap), ca.vec(s - error), ca.vec(s + error))
-        problem: Any = {"x": w, "p": ca.vertcat(x0, sp, p, delayed, dv), "f": cost, "g": bound}
+        change = ca.horzcat(z[held, 0] - last[held], moves[held, :]) if held else ca.MX(0, n)
+        bound = ca.vertcat(ca.vec(gap), ca.vec(s - error), ca.vec(s + error), ca.vec(change))
+        problem: Any = {"x": w, "p": ca.vertcat(x0, sp, p, delayed, dv, last), "f": cost, "g": bound}
         options: Any = {
             "expand": True,
             "print_time": False,
@@ -118,8 +123,12 @@ class SampledHorizon:
         low, high = np.full((self._rows, n), -np.inf), np.full((self._rows, n), np.inf)
         low[self._n_x :] = 0.0
         high[self._n_x : self._n_x + self._m] = 1.0
-        free = np.concatenate([np.zeros(self._n_x * n), np.full(2 * n_cv * n, np.inf)])
-        self._bounds = {"lbx": low.ravel("F"), "ubx": high.ravel("F"), "lbg": np.zeros(free.size), "ubg": free}
+        size, step = 2 * n_cv * n, np.tile(most, n)
+        of_g = {"lbg": np.concatenate([np.zeros(self._n_x * n + size), -step])}
+        of_g |= {"ubg": np.concatenate([np.zeros(self._n_x * n), np.full(size, np.inf), step])}
+        self._bounds = {"lbx": low.ravel("F"), "ubx": high.ravel("F"), **of_g}
+        # Groups of constraints, in the order of ``bound``: rows of each in a sample.
+        self._groups, self._limited = (self._n_x, n_cv, n_cv, len(held)), bool(held)
 
     def solve(
         self, x0: Array, mv: Array, sp: Array, p: Array, dv: Array, before: SampledPlan | None = None, age: int = 0
@@ -127,18 +136,17 @@ class SampledHorizon:
         """The plan from a state x0 (n_x,) to set points sp (n_cv,) under parameters p (n_p,) and dv (n_dv,).
 
         It begins with the rest of the plan ``before`` after ``age`` samples, its last period repeated, else with
-        mv (n_mv,) held.
+        mv (n_mv,) held, the MV that acts now.
         """
-        arguments: dict[str, Any] = {"p": np.concatenate([x0, sp, p, shares(self.plant, p), dv]), **self._bounds}
+        last = (mv - self._low) / self._span if self._limited else np.zeros(0)
+        arguments: dict[str, Any] = {"p": np.concatenate([x0, sp, p, shares(self.plant, p), dv, last]), **self._bounds}
         if before is None:
             arguments["x0"] = self._held(x0, mv, sp, p, dv).ravel("F")
         else:
             at = np.minimum(np.arange(self.n) + age, self.n - 1)
             arguments["x0"] = self._table(before.values)[:, at].ravel("F")
-            # Of the constraints, those of the states come first, then two groups of slacks.
-            states, n_s = self._n_x * self.n, self._n_cv * self.n
             of_x, of_g = before.multipliers[0].ravel(), before.multipliers[1].ravel()
-            groups = (of_g[:states], of_g[states : states + n_s], of_g[states + n_s :])
+            groups = np.split(of_g, np.cumsum(self._groups)[:-1] * self.n)
             shifted = [group.reshape(-1, self.n, order="F")[:, at].ravel("F") for group in groups]
             arguments |= {"lam_x0": self._table(of_x)[:, at].ravel("F"), "lam_g0": np.concatenate(shifted)}
         result, stats = self._solver(**arguments), self._solver.stats()

@@ -60,6 +60,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "best": best,
         "seeds": "" if best is None else _seeds(best.seeds),
         "headline": headline(evidence),
+        "warning": "" if evidence.grounds is None else evidence.grounds.warning,
         "pictures": of_kind("figure_"),
         "own_pictures": {k: v for k, v in pictures.items() if k in own},
         "further_pictures": _loops(evidence, of_kind("closed_loop_")),

@@ -37,6 +37,9 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     if case is not None and case not in standings:
         raise PipelineError(f"{artifacts} holds no case {case!r}; it has {', '.join(standings)}")
     console.print(overview(standings.values()) if case is None else _tests(standings[case]))
+    for name, standing in standings.items():
+        if standing.grounds is not None and standing.grounds.warning and case in (None, name):
+            console.print(f"{name}: {standing.grounds.warning}", style="bold red", markup=False, soft_wrap=True)
     where = artifacts / (case or "<case>")
     if any(law.lock_ups for standing in standings.values() for law in standing.laws if case in (None, standing.case)):
         console.print(

@@ -106,7 +106,7 @@ def _source(data: Mapping[int, Path | None], case: Case, seed: int) -> Source:
 @lru_cache(maxsize=1)
 def _record(path: Path | None, case: Case) -> Record | None:
     """The record of a file; the last one is kept, because a seed's parts follow each other."""
-    return None if path is None else Record.read(path, case.plant.signals)
+    return None if path is None else Record.read(path, case.record_signals)
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def _replayed(case: Case, models: Mapping[str, Any], file: Path, path: Path) -> 
     structure = identified_part({"": models}).get("structure") or {}
     found = replay(Controller(file), record, case.plant.signals, ahead, same_row=bool(structure.get("same_row")))
     np.savez_compressed(path, **cast(dict[str, Any], found.arrays()))
-    return found.figures(record)
+    return found.figures(case.plant.signals.mv)
 
 
 def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:

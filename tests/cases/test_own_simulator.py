@@ -86,6 +86,26 @@ def test_laws_are_tuned_on_models_and_tested_on_the_simulator(heater: SimulatedC
     assert {t.plant.period_s for t in tests["held_out"] if t.plant} == {30.0}
 
 
+def test_the_controller_s_range_is_not_the_experiment_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
+    new = ["new", "heater", "--simulator", str(EXAMPLE), "--rows", "600"]
+    assert main([*new, "--command", "valve=70..90"]) == 2
+    error = capsys.readouterr().err
+    assert "the simulator starts with valve = " in error
+    assert "70 to 90 may be commanded" in error
+    assert not Path("data").exists()
+    assert main([*new, "--command", "valve=30..60", "--max-move", "valve=4"]) == 0
+    case = all_cases()["heater"]
+    assert isinstance(case, SimulatedCase)
+    (valve,) = case.plant.mv_signals
+    assert (valve.low, valve.high, valve.max_move) == (30.0, 60.0, pytest.approx(4 * case.plant.period_s / 60))
+    assert case.record.mv.min() < 30 < 60 < case.record.mv.max()
+    assert [(s.low, s.high) for s in case.simulator.mv_signals] == [(0.0, 100.0)]
+
+
 def test_a_load_moves_the_simulator_as_far_as_it_would_the_models(heater: SimulatedCase) -> None:
     for test in heater.scenarios()["load"]:
         assert test.plant is not None

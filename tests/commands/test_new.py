@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dirty_plant import TAGS, cells, clean, write
+from dirty_plant import TAGS, Clean, cells, clean, write
 
 from pipeline.__main__ import main
+from pipeline.cases import all_cases
 from pipeline.config.plants import PlantParams
 from pipeline.files import sha256
 from pipeline.plants.signals import Signals
@@ -78,7 +79,7 @@ def test_without_roles_a_table_is_written_corrected_and_read(capsys: pytest.Capt
     assert files() == {"params.yaml", "x.csv", "tank-tags.csv"}
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("pv (", "mv (", "dv (", "sp (", "mode (", "name:", "step, good_percent"))
-    assert "the range that the controller may command, not the transmitter's span" in printed
+    assert "command_low, command_high of an mv: the range that the controller may command" in printed
     table = Path("tank-tags.csv")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [(r["tag"], r["role"], r["unit"]) for r in rows] == [
@@ -91,6 +92,107 @@ def test_without_roles_a_table_is_written_corrected_and_read(capsys: pytest.Capt
     params, _ = read_back("tank")
     assert [s.name for s in (*params.pv, *params.mv, *params.dv)] == ["TIC-101.PV", "TIC-101.OP", "Flow"]
     assert params.mv[0].high == 100.0
+
+
+def test_a_pv_that_never_moves_is_guessed_to_be_none() -> None:
+    rows = [[*row, "25.0", "55"] for row in cells(clean(1500))]
+    write(Path("x.csv"), rows, ("timestamp", "TIC-101.PV", "TIC-101.OP", "FI-7", "TI-8.PV", "TIC-101.SP"))
+    assert main(["new", "tank", "x.csv"]) == 0
+    found = {r["tag"]: (r["role"], r["remark"]) for r in csv.DictReader(Path("tank-tags.csv").read_text().splitlines())}
+    assert found["TI-8.PV"] == ("", "constant")
+    assert found["TIC-101.SP"] == ("sp", "constant")
+
+
+LIMITS = ["--command", "TIC-101.OP=30..60", "--max-move", "TIC-101.OP=12"]
+
+
+def test_what_the_controller_may_command_is_written_and_every_row_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    """By options and by the table alike; the valve went from 20 to 80 %."""
+    write(Path("x.csv"), cells(clean()))
+    assert main(["new", "tank", "x.csv", *ROLES, *LIMITS]) == 0
+    params, record = read_back("tank")
+    valve = params.mv[0]
+    assert (valve.low, valve.high, valve.command, valve.max_move_per_min) == (0.0, 100.0, (30.0, 60.0), 12.0)
+    assert record.mv.min() < 25 < 75 < record.mv.max()
+    case = all_cases()["tank"]
+    assert [(s.low, s.high, s.max_move) for s in case.plant.mv_signals] == [(30.0, 60.0, pytest.approx(1.2))]  # in 6 s
+    assert [(s.low, s.high) for s in case.record_signals.mv] == [(0.0, 100.0)]
+    assert main(["new", "kettle", "x.csv"]) == 0
+    table = Path("kettle-tags.csv")
+    lines = list(csv.DictReader(table.read_text().splitlines()))
+    assert list(lines[0])[4:9] == ["low", "high", "command_low", "command_high", "max_move_per_min"]
+    valve_line = {**lines[1], "command_low": "30", "command_high": "60", "max_move_per_min": "12"}
+    with table.open("w") as file:
+        rows = csv.DictWriter(file, lines[0], lineterminator="\n")
+        rows.writeheader()
+        rows.writerows([lines[0], valve_line, lines[2]])
+    assert main(["new", "kettle", "x.csv", "--tags", "kettle-tags.csv"]) == 0
+    assert read_back("kettle")[0].mv[0].command == (30.0, 60.0)
+    assert read_back("kettle")[0].mv[0].max_move_per_min == 12.0
+
+
+def test_every_mistake_of_the_table_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean()))
+    Path("t.csv").write_text(
+        "tag,role,low,high,command_low,command_high,max_move_per_min\n"
+        "TIC-101.PV,pv,0,120,5,,\n"
+        "TIC-101.OP,mv,0,100,-5,fast,0\n"
+        "FI-7,dw,,,,,\n"
+    )
+    before = files()
+    assert main(["new", "tank", "x.csv", "--tags", "t.csv"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    wanted = (
+        ("line 2 (TIC-101.PV)", "command_low belongs to an mv"),
+        ("line 3 (TIC-101.OP), command_high", "'fast' is no finite number"),
+        ("line 3 (TIC-101.OP)", "command_low is -5, outside low to high, 0 to 100"),
+        ("line 3 (TIC-101.OP)", "max_move_per_min is 0; give a change above 0"),
+        ("line 4 (FI-7)", "role 'dw'"),
+    )
+    assert len(lines) == len(wanted)
+    for line, (where, says) in zip(lines, wanted, strict=True):
+        assert line.startswith(f"loopwright new: t.csv, {where}")
+        assert says in line
+    assert files() == before
+
+
+def test_a_range_that_the_record_never_visited_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean()))
+    assert main(["new", "tank", "x.csv", *ROLES, "--command", "TIC-101.OP=85..100"]) == 2
+    assert "may be commanded from 85 to 100 %, but moved only from 20" in capsys.readouterr().err
+    assert not Path("data/tank/record.parquet").exists()
+
+
+def test_a_step_test_stays_where_the_controller_may_command() -> None:
+    write(Path("x.csv"), cells(clean(300)))
+    assert main(["new", "tank", "x.csv", *ROLES, *LIMITS, "--anyway"]) == 0
+    rows = csv.DictReader(Path("data/tank/step_test.csv").read_text().splitlines())
+    values = [float(r["TIC-101.OP [%]"]) for r in rows]
+    assert 30 <= min(values) < max(values) <= 60
+
+
+def test_few_rows_are_said_where_the_plant_is_added_and_too_few_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean(300)))
+    assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    said = capsys.readouterr().out
+    assert "300 rows for 18 parameters of a linear model are few; record 360 or more" in said
+    assert "tank was added in spite of this, and its models may be poor" in said
+    write(Path("y.csv"), cells(quick(60)))
+    assert main(["new", "kettle", "y.csv", *ROLES]) == 2
+    assert "60 rows for 18 parameters of a linear model: too few; record 360 or more" in capsys.readouterr().err
+
+
+def test_fewer_rows_than_parameters_are_refused_whatever_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    more = [[*row, f"{k % 5}", f"{k % 7}"] for k, row in enumerate(cells(quick(24)))]
+    write(Path("x.csv"), more, ("timestamp", *(t.tag for t in TAGS), "FI-8", "FI-9"))
+    assert main(["new", "tank", "x.csv", *ROLES, "--dv", "FI-8", "--dv", "FI-9", "--anyway"]) == 2
+    assert "--anyway does not help" in capsys.readouterr().err
+
+
+def quick(n: int) -> Clean:
+    """So few rows that the valve must be moved often to be seen moving."""
+    data = clean(n)
+    return data.with_(mv=30.0 + 30.0 * (np.arange(n) // 4 % 2))
 
 
 def test_a_constant_mv_gets_a_step_test_and_no_section(capsys: pytest.CaptureFixture[str]) -> None:
@@ -140,7 +242,7 @@ def test_the_verdict_is_on_the_page_and_in_json(capsys: pytest.CaptureFixture[st
 
 
 def test_guesses_tell_disturbances_from_the_rest_and_controlled_variables_come_first() -> None:
-    """A flow that the PV answers to is a disturbance, noise is none; a PV whose loop has a set point is the first."""
+    """A flow that the PV answers to is a disturbance, noise is none, nor a PV; one with a set point is the first."""
     data = clean(2500)
     random = np.random.default_rng(1)
     rows = [
@@ -150,8 +252,11 @@ def test_guesses_tell_disturbances_from_the_rest_and_controlled_variables_come_f
     header = ("timestamp", "TI-9.PV", "TIC-101.PV", "TIC-101.OP", "FI-7", "TIC-101.SP", "PI-3")
     write(Path("x.csv"), rows, header)
     assert main(["new", "tank", "x.csv"]) == 0
-    roles = {r["tag"]: r["role"] for r in csv.DictReader(Path("tank-tags.csv").read_text().splitlines())}
-    assert (roles["FI-7"], roles["PI-3"], roles["TIC-101.SP"]) == ("dv", "", "sp")
+    table = Path("tank-tags.csv")
+    rows = {r["tag"]: r for r in csv.DictReader(table.read_text().splitlines())}
+    assert [rows[tag]["role"] for tag in ("FI-7", "PI-3", "TIC-101.SP", "TI-9.PV")] == ["dv", "", "sp", ""]
+    assert "answers to no MV" in rows["TI-9.PV"]["remark"]
+    table.write_text(table.read_text().replace("TI-9.PV,,", "TI-9.PV,pv,"))
     assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 0
     assert [s.name for s in read_back("tank")[0].pv] == ["TIC-101.PV", "TI-9.PV"]
 
@@ -204,6 +309,12 @@ def test_only_what_new_wrote_is_replaced(capsys: pytest.CaptureFixture[str]) -> 
 
 
 BAD: dict[str, tuple[list[str], str]] = {
+    "commands backwards": (["tank", "x.csv", *ROLES, "--command", "TIC-101.OP=60..30"], "command_low must be below"),
+    "commands of a PV": (["tank", "x.csv", *ROLES, "--command", "TIC-101.PV=30..60"], "'TIC-101.PV' is no mv"),
+    "commands without roles": (["tank", "x.csv", "--command", "TIC-101.OP=30..60"], "name it with --mv"),
+    "no range of commands": (["tank", "x.csv", *ROLES, "--command", "TIC-101.OP=30"], "write TAG=LOW..HIGH"),
+    "no change": (["tank", "x.csv", *ROLES, "--max-move", "TIC-101.OP=0"], "give a change above 0"),
+    "no number": (["tank", "x.csv", *ROLES, "--max-move", "TIC-101.OP=slow"], "'slow' is no finite number"),
     "no file": (["tank", "none.csv", *ROLES], "none.csv: no such file"),
     "a folder": (["tank", ".", *ROLES], "is a folder"),
     "a name that a case has": (["taken", "x.csv", *ROLES], "cases has 'taken' already"),

@@ -40,6 +40,12 @@ def test_the_sentence_says_the_fit_and_how_far_the_tests_leave_the_data(grounds:
     assert said in grounds.words
 
 
+def test_set_points_beyond_the_record_are_a_warning_of_their_own() -> None:
+    assert Grounds({"T": 90.0}, {}, {"V": 25.0}).warning == ""
+    said = Grounds({"T": 90.0}, {"T": 61.5, "L": 2.0}, {}).warning
+    assert said.startswith("Set points of the tests go beyond the record, T by 61.5 % of its recorded range, L by 2 %")
+
+
 def test_they_come_from_the_models_figures_and_from_the_loops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     case = two_lags()

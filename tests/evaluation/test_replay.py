@@ -73,19 +73,19 @@ def test_a_gap_begins_afresh_and_no_set_point_looks_across_it() -> None:
 def test_a_refused_row_is_a_gap_and_counts() -> None:
     found = replay(Law(refuses=8.5), record(), SIGNALS, ahead=5)
     assert np.flatnonzero(np.isnan(found.asked[:, 0])).tolist() == [5]
-    assert found.figures(record())["u"]["refused"] == pytest.approx(5.0)
+    assert found.figures(record().mv_signals)["u"]["refused"] == pytest.approx(5.0)
 
 
 def test_the_figures_count_in_shares_of_the_range() -> None:
     data = record()
     found = replay(Law(), data, SIGNALS, ahead=5)
-    row = found.figures(data)["u"]
+    row = found.figures(data.mv_signals)["u"]
     asked, done = found.asked[:, 0], found.done[:, 0]
     assert row["distance"] == pytest.approx(50 * np.abs(asked - done).mean())
     assert row["more"] == pytest.approx(50 * (asked - done).mean())
     assert row["correlation"] == pytest.approx(np.corrcoef(asked, done)[0, 1])
     assert row["at_end"] == row["refused"] == 0
-    assert replay(Law(more=5.0), data, SIGNALS, ahead=5).figures(data)["u"]["at_end"] == 100
+    assert replay(Law(more=5.0), data, SIGNALS, ahead=5).figures(data.mv_signals)["u"]["at_end"] == 100
 
 
 @dataclass

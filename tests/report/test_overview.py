@@ -201,6 +201,17 @@ def test_a_lock_up_stands_beside_the_laws_name(artifacts: Path) -> None:
     assert ["lock-ups", "0", "0", "9"] in [line.split() for line in shown(artifacts, "tank")]
 
 
+def test_set_points_beyond_the_record_are_said_aloud(artifacts: Path) -> None:
+    path = artifacts / "tank" / "validation.json"
+    tree = json.loads(path.read_text())
+    for far, said in (({}, False), ({"T[1]": 61.5}, True)):
+        path.write_text(json.dumps(tree | {"grounds": {"fit": {"T[1]": 93.0}, "set_points": far, "loops": {}}}))
+        for case, wanted in ((None, said), ("tank", said), ("reactor", False)):
+            lines = [line for line in shown(artifacts, case) if "beyond the record" in line]
+            words = "tank: Set points of the tests go beyond the record, T[1] by 61.5 % of its recorded range"
+            assert [line.startswith(words) for line in lines] == [True] * wanted
+
+
 def test_one_case_is_shown_in_all_of_its_tests(artifacts: Path) -> None:
     text = "\n".join(shown(artifacts, "tank"))
     assert "steps_noise / NMPC" in text

@@ -20,8 +20,11 @@ from pipeline.cases import CASES
 from pipeline.errors import ReportError
 from pipeline.evaluation.case import Curve, PaperFigure, Requirement
 from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.verdicts import PLAIN, close
 from pipeline.optimal import bounds
+from pipeline.report.page import context
+from pipeline.report.templating import render
 from pipeline.report.verdicts import acceptance, judge, requirement, table_row
 from pipeline.stages.report import report
 
@@ -80,6 +83,16 @@ def test_pages_refer_only_to_what_exists(out):
     assert len(tables) > 8
     for table in tables:
         assert len({row.count("|") - row.count("\\|") for row in table.splitlines()}) == 1, table
+
+
+@pytest.mark.parametrize("far", [{}, {"T": 61.5}])
+def test_set_points_beyond_the_record_stand_at_the_head(root: Path, far: dict[str, float]) -> None:
+    evidence = load(root)
+    vars(evidence)["grounds"] = Grounds({"T": 90.0}, far, {})  # as the property keeps it
+    content = context(evidence, judge(evidence, PLAIN), {}, ())
+    for name in ("report.html.j2", "report.md.j2"):
+        head = render(name, content).partition("Requirements")[0]
+        assert ("Set points of the tests go beyond the record, T by 61.5 %" in head) == bool(far)
 
 
 def test_the_same_evidence_gives_the_same_files(root, out, tmp_path):

@@ -343,6 +343,8 @@ def test_a_manifest_that_does_not_fit_its_graph_is_refused(
         ({"sp": [{"name": "level", "unit": "m", "low": False, "high": 1}]}, "False stands where a number belongs"),
         ({"mv": [{"name": "v", "unit": "%", "low": 0, "high": 1, "values": "01"}]}, "stands where a list belongs"),
         ({"mv": [{"name": "v", "unit": "%", "low": 0, "high": 1, "values": [0, True]}]}, "True stands where a number"),
+        ({"mv": [{"name": "v", "unit": "%", "low": 0, "high": 1, "max_move": "1"}]}, "'1' stands where a number"),
+        ({"mv": [{"name": "v", "unit": "%", "low": 0, "high": 1, "max_move": 0}]}, "max_move 0.0; it must be above 0"),
     ],
 )
 def test_a_manifest_of_wrong_types_or_sizes_is_refused(

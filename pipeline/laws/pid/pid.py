@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
 from pipeline.laws.pid.tuned import by_simulation, linearization, tuned
+from pipeline.laws.rates import Rates, rates_of
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.base import Model
 from pipeline.plants.equations import equations
@@ -72,7 +73,7 @@ class PID(ControlLaw):
         of a plant that is known by simulation alone, 30 to 400). ``sampling``: share of a
         period that ``itae`` counts as dead time; 0.5 is the textbook value, 1 is more cautious.
         ``examined_cv`` [pv]: range of the stability analysis; None: no analysis. ``mv_rate`` [mv]:
-        largest MV change per sample; None: unlimited.
+        largest MV change per sample, one number or one for each MV; None: that of the plant.
         """
 
         tuning: Literal["optimized", "imc", "simc", "itae", "manual"] = "optimized"
@@ -90,7 +91,7 @@ class PID(ControlLaw):
         development_hold: int | None = None
         sampling: float = 0.5
         examined_cv: tuple[float, float] | None = None
-        mv_rate: float | None = None
+        mv_rate: Rates = None
 
         def __post_init__(self) -> None:
             self.given()
@@ -118,7 +119,7 @@ class PID(ControlLaw):
         self,
         signals: Signals,
         settings: PidSettings | Loops | list[PidSettings] | list[Loops],
-        mv_rate: float | None = None,
+        mv_rate: Rates = None,
         pairs: Pairs = ONE_LOOP,
     ) -> None:
         """The law with ``settings`` of its loop, or of each of ``pairs`` (CV, MV), which are in the order of the MVs.
@@ -166,6 +167,7 @@ class PID(ControlLaw):
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
+        rates_of(plant.signals, params.mv_rate)
         if by_simulation(params, plant):
             pairings(StepResponses.near_start(plant).share)
         elif params.tuning == "optimized":

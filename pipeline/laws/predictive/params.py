@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.errors import LawError
 from pipeline.laws.predictive.loads import Where
+from pipeline.laws.rates import Rates
 from pipeline.models.identified.identified import Identified
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
@@ -33,7 +34,7 @@ class PredictiveParams:
     more; None: .5 of one MV, .25 of several, and with a search the least that the loops stand.
     ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses speed, caution
     and horizon in closed loops over the model with wrong gains and loads, drawn by ``seed``. ``mv_rate`` [mv]:
-    largest MV change a sample, which the plan knows; None: unlimited.
+    largest MV change a sample, which the plan knows, one number or one for each MV; None: that of the plant.
     ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has none; None: no limits. A set point
     beyond a limit counts as one at the limit. ``preview`` of the set points: ``held``, as they are now; ``ramp``, a
     known recipe, whose slope goes on.
@@ -54,7 +55,7 @@ class PredictiveParams:
     sweeps: int = 4
     tuning: Literal["given", "search"] = "given"
     seed: int = 0
-    mv_rate: float | None = None
+    mv_rate: Rates = None
     cv_low: Limits = None
     cv_high: Limits = None
     preview: Literal["held", "ramp"] = "held"

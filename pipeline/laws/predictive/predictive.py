@@ -21,6 +21,7 @@ from pipeline.laws.predictive.settling import horizon_for, refuse_unstable
 from pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
 from pipeline.laws.predictive.trials import Trials
 from pipeline.laws.predictive.tuning import Candidate, tuned
+from pipeline.laws.rates import rates_of
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Named, Stage
@@ -207,8 +208,9 @@ class Predictive(ControlLaw):
 
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
-        """Raise LawError for a plant with discrete MVs, or for weights or limits that do not fit its set points."""
+        """Raise LawError for a plant with discrete MVs, or for weights, limits or rates that do not fit its signals."""
         refuse_discrete(plant.signals)
+        rates_of(plant.signals, params.mv_rate)
         weights_of(plant.signals, params)
         limits_of(plant.signals, params)
 

@@ -1,0 +1,55 @@
+"""What a controller may command, beside what a record or a simulator shows of its MVs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from pipeline.errors import RecordError
+from pipeline.historian.findings import InputReport
+from pipeline.historian.tags import Tag
+from pipeline.metrics import Array
+from pipeline.plants.simulator import Simulator
+from serving.manifest import Signal
+
+LEAST_SHARED = 0.05  # of the commanded or the visited range, the smaller one: what both must share
+
+
+def mvs_of(plant: Simulator) -> tuple[Tag, ...]:
+    """The MVs of a simulator that states its signals itself."""
+    return tuple(Tag(s.name, "mv", s.unit, s.low, s.high, s.name) for s in plant.mv_signals)
+
+
+def commanded(inputs: Sequence[InputReport], tags: Sequence[Tag]) -> list[InputReport]:
+    """The inputs, the MVs with the ranges that may be commanded: a step test stays within them."""
+    ends = [_ends(i.name, i.low, i.high, tags) for i in inputs]
+    return [replace(i, low=low, high=high) for i, (low, high) in zip(inputs, ends, strict=True)]
+
+
+def unvisited(signal: Signal, values: Array, tags: Sequence[Tag]) -> str:
+    """Why an MV cannot be commanded as wished: its record (n,) hardly went there; empty where it can."""
+    low, high = _ends(signal.name, signal.low, signal.high, tags)
+    least, most = float(values.min()), float(values.max())
+    if min(most, high) - max(least, low) >= LEAST_SHARED * min(most - least, high - low):
+        return ""
+    return (
+        f"{signal.name} may be commanded from {low:g} to {high:g} {signal.unit}, but moved only from {least:g} to "
+        f"{most:g} in the record, so nothing is known of the plant there; widen command_low or command_high, or add a "
+        "record of that range"
+    )
+
+
+def check_start(plant: Simulator, tags: Sequence[Tag]) -> None:
+    """RecordError where tests on a simulator would begin at an MV that may not be commanded."""
+    for signal, value in zip(plant.mv_signals, plant.start[1], strict=True):
+        low, high = _ends(signal.name, signal.low, signal.high, tags)
+        if not low <= value <= high:
+            raise RecordError(
+                f"the simulator starts with {signal.name} = {value:g} {signal.unit}, and {low:g} to {high:g} may be "
+                "commanded; widen that range, or let the simulator start within"
+            )
+
+
+def _ends(name: str, low: float, high: float, tags: Sequence[Tag]) -> tuple[float, float]:
+    commands = next((t.commands for t in tags if t.name == name), {})
+    return commands.get("command_low", low), commands.get("command_high", high)
