@@ -18,7 +18,7 @@ from pipeline.cases import all_cases
 from pipeline.config.params import ControllerParams, choose, parse
 from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
-from pipeline.errors import LawError
+from pipeline.errors import ExportError, LawError
 from pipeline.evaluation.law_evidence import BASE
 from pipeline.export.gate import export
 from pipeline.files import digest, read_json, write_json
@@ -42,19 +42,30 @@ def design(name: str) -> None:
         raise LawError(f"{where}: {models} holds no models; run the fit stage of that model set first")
     folder = design_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
-    try:
-        require_fit(law, case.plant)
-    except LawError as error:  # the other controllers of the plant go on
-        print(f"design {name}: {error}", file=sys.stderr)
-        folder.mkdir(parents=True)
-        write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "withheld": str(error)})
-        return
     data = read_json(models / "metrics.json").get("data", {})
     provenance = {"params_sha256": digest(forms), "commit": _commit(), "versions": _versions()}
     work = [(form, seed) for form in forms for seed in seeds]
     arguments = (params, read, models, case.plant, provenance, data)
-    rows = parallel_map(partial(_export, *arguments), work, f"design {name}")
+    suits = False
+    try:
+        require_fit(law, case.plant)
+        suits = True
+        rows = parallel_map(partial(_export, *arguments), work, f"design {name}")
+    except (LawError, ExportError) as error:
+        if suits and not case.on_models:
+            raise  # who wrote equations and a law down wants to know
+        why = f"law {params.law!r} is withheld: {error}" if suits else str(error)
+        _withhold(folder, law, why)  # the other controllers of the plant go on
+        print(f"design {name}: {why}", file=sys.stderr)
+        return
     write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "controllers": rows})
+
+
+def _withhold(folder: Path, law: type[ControlLaw], why: str) -> None:
+    """Leave the reason for which a law has no controllers, and nothing else."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    write_json(folder / "metrics.json", {"law": law.name, "title": law.title, "withheld": why})
 
 
 def _export(

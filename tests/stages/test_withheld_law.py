@@ -58,6 +58,30 @@ def test_no_file_is_shipped_and_the_reason_stays(metrics: LawMetrics) -> None:
     assert LawEvidence(metrics, Path("trajectories.npz")).withheld
 
 
+def test_a_law_that_cannot_be_designed_leaves_the_reason_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two MVs that do the same cannot hold two controlled variables, and no pair of loops can be tuned."""
+    monkeypatch.chdir(tmp_path)
+    mv = np.repeat(np.random.default_rng(0).uniform(-0.6, 0.6, (40, 2)), 10, axis=0)
+    y = np.zeros((400, 2))
+    for k in range(399):
+        y[k + 1] = 0.6 * y[k] + 0.4 * mv[k].sum()
+    a, b = 0.6 * np.eye(2), np.full((2, 2), 0.4)
+    twins = [scaled_model(2, 2, 0, 2, a=a, b=b, rest=np.eye(2, 5)) for _ in POLES]
+    case = case_of(section(2, 2), twins, y, mv)
+    (case.models.parent / "metrics.json").write_text(json.dumps({"data": {"0": "x"}, "parts": {}}))
+    tree = yaml.safe_load(Path("params.yaml").read_text())
+    tree["cases"] = {"it": {"held_out_seeds": [9001, 9002]}}
+    tree["controllers"] = {"it-pid": {"case": "it", "name": "pid", "law": "pid", "model": "identified"}}
+    Path("params.yaml").write_text(yaml.safe_dump(tree))
+    design("it-pid")
+    validate("it-pid")
+    why = json.loads(Path("artifacts/it/pid.json").read_text())["withheld"]
+    assert why.startswith("law 'pid' is withheld: the MVs do not hold the controlled variables independently")
+    assert not Path("artifacts/it/pid.onnx").exists()
+
+
 def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
