@@ -205,7 +205,7 @@ class OwnCase(Case):
                     self._resting_at(p),
                     p,
                     None,
-                    {f"load_{cv.name}": (1 - 2 * i) * reach.load(p, j)},
+                    {f"load_{cv.name}": reach.load(p, j, upwards=i == 0)},
                 )
                 for j, cv in enumerate(cvs)
                 for _, p, i in pairs

@@ -26,6 +26,7 @@ TIMES, HOLD = 3, (30, 400)  # a set point lasts so many times as long as an answ
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
 INWARD = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the way from the visited range's middle to its end: where a rest is tried
 LOAD = 0.25  # standard deviations of the record's CV
+ROOM = 0.05  # of an MV's range, at each end: what holding a load must leave to act with
 BALANCED = 1e-6  # largest residual of a balance
 
 
@@ -125,10 +126,10 @@ class Reach:
                 return at, acting
         return found
 
-    def _can_command(self, mv: Array) -> bool:
-        """Whether MVs (n_mv,) lie within the ranges of the model's."""
+    def _can_command(self, mv: Array, room: float = 0.0) -> bool:
+        """Whether MVs (n_mv,) lie within the ranges of the model's, less a share ``room`` at both ends."""
         low, high = (np.array([getattr(s, end) for s in self.model.mv_signals]) for end in ("low", "high"))
-        return bool(inside(mv[None], low, high)[0])
+        return bool(inside(mv[None], low + room * (high - low), high - room * (high - low))[0])
 
     def set_points(self, plant: Simulator, seed: int, p: Array | None = None) -> Array:
         """Set points (LEVELS * hold, n_cv) that a plant can hold under its parameters p (n_p,), each held."""
@@ -182,10 +183,11 @@ class Reach:
                     break
         return found
 
-    def load(self, plant: IdentifiedPlant, cv: int) -> float:
+    def load(self, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float:
         """The load [CV a period] that moves a CV by ``LOAD`` within a hold, if no controller acts.
 
         An integrating CV moves as far in a third of a hold: there a load is a rate, and three times that is no rest.
+        Where MVs within their ranges cannot hold the CVs against it, it is as much smaller as they need.
         """
         (x, mv), name = plant.start, f"load_{plant.pv_signals[cv].name}"
         size = float(self.record.pv[:, cv].std())
@@ -193,7 +195,14 @@ class Reach:
         ends = [
             courses(plant, x, mv[None], samples, plant.parameters({name: load}))[0, -1, cv] for load in (tried, 0.0)
         ]
-        return tried * LOAD * size / abs(float(ends[0] - ends[1]))
+        wanted = (1 if upwards else -1) * tried * LOAD * size / abs(float(ends[0] - ends[1]))
+        cvs = plant.measure(x)[: self.cv.shape[1]]
+        for scale in SCALES:
+            p = plant.parameters({name: scale * wanted})
+            _, acting, away = balanced(plant, x, mv, cvs, range(len(cvs)), p)
+            if away < BALANCED and self._can_command(acting, ROOM):
+                return scale * wanted
+        return SCALES[-1] * wanted
 
 
 def visited_mv(record: Record, mvs: Sequence[Signal]) -> Array:

@@ -27,6 +27,7 @@ from pipeline.laws.predictive.observer import (
     FULL,
     OUTLIER,
     RISE,
+    SWINGS,
     Estimate,
     Noises,
     Observer,
@@ -180,11 +181,11 @@ def test_the_filter_is_the_textbook_s_on_a_linear_model(seed: int, where: Where)
         y, v = 0.02 * rng.normal(size=2) + (k > 15), rng.normal(size=2)
         mean, p = f @ mean + b @ v + c, f @ p @ f.T + q
         error = y - h @ mean
-        scaled = error / np.sqrt(np.diag(h @ p @ h.T + r))
+        scaled = np.clip(error / np.sqrt(np.diag(h @ p @ h.T + r)), -OUTLIER, OUTLIER)
         drift = drift + FORGETTING * (scaled - drift)
-        bounded = np.clip(scaled * np.abs(scaled), -OUTLIER, OUTLIER)
+        bounded = scaled * np.abs(scaled)
         square, signed = square + CALMING * (np.abs(bounded) - square), signed + CALMING * (bounded - signed)
-        calm = np.maximum(square - np.abs(signed), 1)
+        calm = np.maximum(1 + SWINGS * (square - np.abs(signed) - 1), 1)
         boost = np.clip(drift**2 * (2 - FORGETTING) / (RISE * FORGETTING) / calm - 1, 0, FULL) / FULL
         for i in range(2):
             for x in begun[..., i]:

@@ -22,9 +22,10 @@ LOAD_CHANGE = 3e-5  # scaled
 FIRST_LOAD = 0.05  # scaled, a period: standard deviation of a load before anything was seen of it
 FORGETTING = 0.5  # of the mean innovation
 CALMING = 0.1  # share of the last innovation in the mean squares
-OUTLIER = 100.0  # largest square that counts
+OUTLIER = 10.0  # largest innovation that counts, in the mean and in the squares: one alone would outgrow the other
 RISE = 7.0  # times its variance in pure noise: the square of the mean innovation at which the boost begins
 FULL = 4.0  # further such rises until it is full
+SWINGS = 4.0  # weight of innovations of both signs beyond those of noise
 BOOST = 1_000.0  # times its normal variance a load may move in a period then
 
 
@@ -64,11 +65,11 @@ class Observer(nn.Module):
     and a load at an MV all its lags and dead times. The filter is the extended Kalman filter, whose correction takes
     the outputs one after another.
 
-    A load that steps would be followed slowly. So the innovations e, by their standard deviation s, have a mean, and
-    their squares two, without and with their signs:
+    A load that steps would be followed slowly. So the innovations e, by their standard deviation s and within -10..10,
+    have a mean, and their squares two, without and with their signs:
 
         m <- m + a (e/s - m),   p <- p + c (e^2/s^2 - p),   q <- q + c (sign(e) e^2/s^2 - q)
-        b = clip(m^2 (2 - a)/(7 a max(p - |q|, 1)) - 1, 0, 4)/4
+        b = clip(m^2 (2 - a)/(7 a max(1 + 4 (p - |q| - 1), 1)) - 1, 0, 4)/4
 
     m^2 (2 - a)/a is 1 on average in pure noise, and the filter stays quiet. After a step of a load, the covariance of
     [x, d] grows by 1000 b q_d R g g', where g is what a unit of the load has made of them by the time that the outputs
@@ -94,6 +95,7 @@ class Observer(nn.Module):
     rise: Tensor  # (1,) (2 - a)/(7 a)
     fall: Tensor  # (1,) 1/4
     calming: Tensor  # (1,) c
+    swings: Tensor  # (1,) 4
     diagonal: Tensor  # (n_y,) where the outputs' variances stand in the flat covariance
 
     @torch.no_grad()
@@ -132,7 +134,12 @@ class Observer(nn.Module):
             self.register_buffer(name, values.contiguous())
         self.register_buffer("diagonal", torch.arange(self.n_y) * (n_a + 1))
         hold_numbers(
-            self, forgetting=FORGETTING, rise=(2 - FORGETTING) / (RISE * FORGETTING), fall=1 / FULL, calming=CALMING
+            self,
+            forgetting=FORGETTING,
+            rise=(2 - FORGETTING) / (RISE * FORGETTING),
+            fall=1 / FULL,
+            calming=CALMING,
+            swings=SWINGS,
         )
 
     def forward(self, y: Tensor, v: Tensor, past: Estimate) -> tuple[Estimate, Tensor]:
@@ -143,12 +150,13 @@ class Observer(nn.Module):
         mean, covariance = self.predicted(v, past)
         variance = covariance.flatten(-2).index_select(-1, self.diagonal).unsqueeze(-2)
         sd = torch.sqrt(variance + self.r)
-        innovation = (y - mean[..., : self.n_y]) / sd
+        innovation = torch.clamp((y - mean[..., : self.n_y]) / sd, -OUTLIER, OUTLIER)
         drift = past.drift + self.forgetting * (innovation - past.drift)
-        signed = torch.clamp(innovation * innovation.abs(), -OUTLIER, OUTLIER)
+        signed = innovation * innovation.abs()
         squares = past.squares + self.calming * (torch.cat([signed.abs(), signed], dim=-1) - past.squares)
         both = squares[..., : self.n_y] - squares[..., self.n_y :].abs()
-        boost = torch.clamp(self.rise * drift * drift / torch.clamp(both, min=1.0) - 1.0, 0.0, FULL)
+        calm = torch.clamp(1.0 + self.swings * (both - 1.0), min=1.0)
+        boost = torch.clamp(self.rise * drift * drift / calm - 1.0, 0.0, FULL)
         covariance = covariance + (boost @ self.place).reshape(covariance.shape)
         for o in range(self.n_y):
             row = covariance[..., o : o + 1, :]
