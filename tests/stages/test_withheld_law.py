@@ -125,6 +125,7 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     show_results(Path("artifacts"), Console(file=terminal))
     show_results(Path("artifacts"), Console(file=terminal), "it")
     assert "MAE [m], held_out" in terminal.getvalue()
+    assert f"it: one_step is not shipped: {why}" in terminal.getvalue()
     assert "it: mean absolute error [m]" in terminal.getvalue()
     units = Controller("artifacts/it/pid.onnx").manifest.evidence["units"]
     assert units["mae"] == units["mae_median"] == units["max_asse"] == "m"
