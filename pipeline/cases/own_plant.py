@@ -192,6 +192,7 @@ class OwnCase(Case):
         cvs = self.signals.sp
         loads = f"A load worth {LOAD:g} standard deviations of the record's {cvs[0].name if len(cvs) == 1 else 'CV'}"
         loads += "" if len(cvs) == 1 else ", each CV in turn"
+        loads += ", or as much as the MVs can hold"
         errors = errors_of(self._nominal)
         known = {i: [(s, p, p.parameters(errors[i])) for s, p, j in pairs if j == i] for i in (0, 1)}
         wrong = {s: reach.set_points(p, s, q) for rows in known.values() for s, p, q in rows}

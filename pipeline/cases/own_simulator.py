@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from pipeline.cases.own_plant import OwnCase, own_case
-from pipeline.cases.reach import LOAD
+from pipeline.cases.reach import LOAD, ROOM
 from pipeline.config.plants import PlantParams
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Array, Case
@@ -52,7 +52,8 @@ class SimulatedCase(OwnCase):
         for key, values in test.changes.items():
             cv = [s.name for s in self.simulator.pv_signals].index(key.removeprefix(LOADS))
             name, size = self._load_on_mv(cv)
-            changes[name] = size * np.sign(values)
+            upwards = bool(values.sum() > 0)
+            changes[name] = self._held(name, size if upwards else -size) * (values != 0)
         sp, dv = test.sp, test.dv
         if dv is not None:  # the same steps from where the simulator is
             dv = dv - dv[0] + self.simulator.dv_nominal
@@ -70,6 +71,13 @@ class SimulatedCase(OwnCase):
             answers[name] = abs(self._moved(self.simulator, name, tried, cv)) / tried
         name = max(answers, key=lambda key: answers[key])
         return name, wanted / max(answers[name], 1e-12)
+
+    def _held(self, name: str, load: float) -> float:
+        """The load on an MV, no larger than what the MV can take back within its range."""
+        i = list(self.simulator.parameter_names()).index(name)
+        signal, at = self.signals.mv[i], float(self.simulator.start[1][i])
+        room = ROOM * (signal.high - signal.low)
+        return float(np.clip(load, min(at - signal.high + room, 0.0), max(at - signal.low - room, 0.0)))
 
     def _moved(self, plant: Simulator, name: str, size: float, cv: int) -> float:
         """What a load changes of a CV over a hold, against the same hold without it."""

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_entries import entries_of
-from pipeline.commands.new_commands import check_start, commanded, mvs_of
+from pipeline.commands.new_commands import check_commands, check_start, commanded, mvs_of
 from pipeline.commands.new_fmu import table_from, write_table
 from pipeline.commands.new_printed import tell
 from pipeline.commands.new_refusal import refusal
-from pipeline.commands.new_replaced import REFUSED, check_replaceable, wishes_lost
+from pipeline.commands.new_replaced import REFUSED, check_replaceable, limits_kept, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
 from pipeline.config.plants import check_name
@@ -172,7 +172,10 @@ def _write(
     made: Simulated | None = None,
 ) -> int:
     """All files at once, then the section; neither without the other. Where both fail, a replaced plant stays."""
-    report, verdict = found.report, found.report.verdict
+    report, verdict, limits = found.report, found.report.verdict, list[str]()
+    if options.replace:
+        tags, limits = limits_kept(name, tags)
+    check_commands(found.record.mv_signals, tags)
     unusable, lost = refusal(found, tags, options.anyway), list[str]()
     if unusable and folder.exists() and not _refused(folder):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
@@ -206,6 +209,8 @@ def _write(
             raise
     shutil.rmtree(earlier, ignore_errors=True)
     tell(name, folder, report, test, not unusable)
+    for limit in limits:
+        print(f"kept of the plant that was replaced: {limit}; give another, or edit params.yaml")
     for wish in lost:
         print(f"replaced, write it into params.yaml again if you want it: controllers.{wish}")
     if unusable:

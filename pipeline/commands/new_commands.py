@@ -20,6 +20,17 @@ def mvs_of(plant: Simulator) -> tuple[Tag, ...]:
     return tuple(Tag(s.name, "mv", s.unit, s.low, s.high, s.name) for s in plant.mv_signals)
 
 
+def check_commands(signals: Sequence[Signal], tags: Sequence[Tag]) -> None:
+    """RecordError where an MV's range of commands leaves its own range, which a simulator may have stated itself."""
+    for s in signals:
+        low, high = _ends(s.name, s.low, s.high, tags)
+        if not s.low <= low < high <= s.high:
+            raise RecordError(
+                f"{s.name} may be commanded from {low:g} to {high:g} {s.unit}, outside its range, {s.low:g} to "
+                f"{s.high:g}; correct --command or command_low and command_high"
+            )
+
+
 def commanded(inputs: Sequence[InputReport], tags: Sequence[Tag]) -> list[InputReport]:
     """The inputs, the MVs with the ranges that may be commanded: a step test stays within them."""
     ends = [_ends(i.name, i.low, i.high, tags) for i in inputs]

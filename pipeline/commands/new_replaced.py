@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from pipeline.cases import CASES
 from pipeline.commands.new_simulated import SIMULATOR
 from pipeline.config.params import read_section, sections
 from pipeline.errors import RecordError
+from pipeline.historian.tags import COMMANDS, Tag
 
 REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added
 OWN = {*REFUSED, "record.parquet", "first_test.json"}  # what is written for a plant, beside its simulator
@@ -22,6 +24,23 @@ def check_replaceable(name: str, folder: Path) -> None:
     foreign = sorted(p.name for p in folder.glob("*") if p.name not in OWN and p.name.partition(".")[0] != SIMULATOR)
     if foreign:
         raise RecordError(f"{folder} holds {foreign[0]}, which `new` did not write; move it, then --replace works")
+
+
+def limits_kept(plant: str, tags: Sequence[Tag]) -> tuple[tuple[Tag, ...], list[str]]:
+    """The tags, MVs with the limits of commands that params.yaml has of them, and these limits in words.
+
+    A limit that a person gives anew prevails. Without this, a new record would let the next controller command all.
+    """
+    if plant not in sections("plants"):
+        return tuple(tags), []
+    old = {str(mv["name"]): mv for mv in read_section("plants", plant).get("mv", ())}
+    kept, words = [], []
+    for tag in tags:
+        earlier = {key: old.get(tag.name, {}).get(key) for key in COMMANDS if tag.role == "mv"}
+        taken = {key: value for key, value in earlier.items() if value is not None and getattr(tag, key) is None}
+        kept.append(replace(tag, **taken))
+        words += [f"{tag.name}: {key}: {value:g}" for key, value in taken.items()]
+    return tuple(kept), words
 
 
 def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -71,10 +71,11 @@ def repro(targets: Sequence[str], changed: Iterable[str], *, keep_going: bool = 
     as they are when it starts. It and all that it starts end with this process, whatever ends it.
     """
     options = ["--keep-going"] if keep_going else []
-    chains = side_by_side(targets, changed)
+    # What depends on a stage that failed must not run, and DVC knows that of its whole graph alone.
+    chains = [] if keep_going else side_by_side(targets, changed)
     if chains:
         rest = [] if targets else ["--rest"]
-        work = ["-m", "pipeline.engine.lanes", *options, *rest, *(",".join(chain) for chain in chains)]
+        work = ["-m", "pipeline.engine.lanes", *rest, *(",".join(chain) for chain in chains)]
     else:
         work = ["-m", "dvc", "repro", *options, *targets]
     own = os.getpid()

@@ -1,16 +1,17 @@
-"""``python -m pipeline.engine.lanes [--keep-going] [--rest] STAGE,STAGE,... ...``: chains of stages side by side.
+"""``python -m pipeline.engine.lanes [--rest] STAGE,STAGE,... ...``: chains of stages side by side.
 
 DVC runs one stage after another, and in each there is a while in which a core has nothing to do: imports, a single
 data seed, DVC's own files. Chains that share no output fill it. Each lane takes the next chain and has a ``dvc repro``
-of its own run its stages in their order; the stages that they depend on, outside the chain, must be up to date. With
-``--rest`` one more ``dvc repro`` then runs whatever is left. A chain that fails ends the run once those beside it have
-ended; with ``--keep-going`` the others still run. Results are those of one lane.
+of its own run its stages in their order, up to the first that fails; the stages that they depend on, outside the chain,
+must be up to date. With ``--rest`` one more ``dvc repro`` then runs whatever is left. A chain that fails ends the run
+once those beside it have ended. Results are those of one lane.
 
 What the lanes write comes line by line to one output, without DVC's lines on stages that it skips.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import selectors
 import signal
@@ -21,44 +22,38 @@ from collections.abc import Sequence
 from pipeline.engine.lifeline import end_with_parent
 
 LANES = 2  # more fill no core further: every stage already starts a process a core
-KEEP_GOING, REST = "--keep-going", "--rest"
+REST = "--rest"
 SKIPPED = b"didn't change, skipping"
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the chains, then the rest if asked; the exit status of the first failure, or 0."""
-    options = [a for a in argv if a.startswith("-")]
-    chains = [a.split(",") for a in argv if a not in options]
-    if not chains or not {KEEP_GOING, REST}.issuperset(options):
+    chains = [a.split(",") for a in argv if a != REST]
+    if not chains or any(chain[0].startswith("-") for chain in chains):
         print(
-            f"usage: python -m pipeline.engine.lanes [{KEEP_GOING}] [{REST}] STAGE,STAGE,... ...: stages of dvc.yaml",
-            file=sys.stderr,
+            f"usage: python -m pipeline.engine.lanes [{REST}] STAGE,STAGE,... ...: stages of dvc.yaml", file=sys.stderr
         )
         return 2
-    keep_going = [KEEP_GOING] if KEEP_GOING in options else []
-    lanes = _Lanes([sys.executable, "-m", "dvc", "--wait-for-lock", "repro", *keep_going])
+    lanes = _Lanes([sys.executable, "-m", "dvc", "--wait-for-lock", "repro"])
     # Single items: a look at a stage that they share would lock it for the others.
-    code = lanes.run([["--single-item", *chain] for chain in chains], keep_going=bool(keep_going))
-    if REST not in options or (code and not keep_going):
-        return code
-    return lanes.run([[]], keep_going=False) or code
+    return lanes.run([["--single-item", *chain] for chain in chains]) or (lanes.run([[]]) if REST in argv else 0)
 
 
 class _Lanes:
     """``command`` with one list of arguments after another, a few at once."""
 
     def __init__(self, command: list[str]) -> None:
-        self.command, self.stopped = command, False
+        self.command, self.stopped = command, 0  # the signal that ended the run
         self.running = dict[subprocess.Popen[bytes], bytearray]()  # the line that each has begun
-        signal.signal(signal.SIGINT, lambda *_: self._stop(ask=False))  # the terminal itself interrupts all of them
-        signal.signal(signal.SIGTERM, lambda *_: self._stop(ask=True))
+        for asked in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(asked, lambda number, _: self._stop(number))
 
-    def run(self, work: list[list[str]], *, keep_going: bool) -> int:
+    def run(self, work: list[list[str]]) -> int:
         """Do all of ``work``; the exit status of the first failure, or 0."""
         left, first = list(work), 0
         with selectors.DefaultSelector() as waiting:
-            while self.running or (left and not self.stopped and (keep_going or not first)):
-                while left and len(self.running) < LANES and not self.stopped and (keep_going or not first):
+            while self.running or (left and not self.stopped and not first):
+                while left and len(self.running) < LANES and not self.stopped and not first:
                     process = self._begun(left.pop(0))
                     waiting.register(process.stdout, selectors.EVENT_READ, process)  # type: ignore[arg-type]
                 for key, _ in waiting.select():
@@ -67,7 +62,7 @@ class _Lanes:
                     waiting.unregister(key.fileobj)
                     code = self._ended(key.data)
                     first = first or code
-        return first or (128 + signal.SIGTERM if self.stopped else 0)
+        return first or (128 + self.stopped if self.stopped else 0)
 
     def _begun(self, arguments: list[str]) -> subprocess.Popen[bytes]:
         own = os.getpid()
@@ -77,6 +72,7 @@ class _Lanes:
             stderr=subprocess.STDOUT,
             bufsize=0,
             preexec_fn=lambda: end_with_parent(own),
+            start_new_session=True,  # so that its stages can be told with it
         )
         self.running[process] = bytearray()
         return process
@@ -101,10 +97,12 @@ class _Lanes:
         code = process.wait()
         return 128 - code if code < 0 else code  # of a signal, as a shell counts
 
-    def _stop(self, *, ask: bool) -> None:
-        self.stopped = True
-        for process in self.running if ask else ():
-            process.terminate()
+    def _stop(self, number: int) -> None:
+        """Tell all that runs: DVC alone would leave its stage, and with it our wait, to its end."""
+        self.stopped = number
+        for process in self.running:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
 
 
 if __name__ == "__main__":

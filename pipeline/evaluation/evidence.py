@@ -69,6 +69,11 @@ class Evidence:
         validation, models = work / "validation", work / "models"
         validated = sorted(p.parent.name for p in validation.glob("*/metrics.json"))
         names = validated if laws is None else [n for n in laws if n in validated]
+        reasons = {p.parent.name: str(read_mapping(p)["why"]) for p in sorted(validation.glob(f"*/{WITHHELD}"))}
+        withheld = {n: why for n, why in reasons.items() if laws is None or n in laws}
+        if not names and withheld:
+            raise ReportError(f"{case.name}: no law could be designed, so there is nothing to report: "
+                              + "; ".join(f"{n}: {why}" for n, why in withheld.items()))  # fmt: skip
         if not names:
             raise ReportError(f"{validation} holds no law's metrics.json; run `dvc repro`")
         evidence = {}
@@ -79,8 +84,6 @@ class Evidence:
             evidence[name] = LawEvidence(metrics, folder / "trajectories.npz", step_us)
         sets = {p.parent.name: p for p in sorted(models.glob("*/metrics.json"))}
         model_sets = {n: read_mapping(p) for n, p in sets.items() if models_of is None or n in models_of}
-        reasons = {p.parent.name: str(read_mapping(p)["why"]) for p in sorted(validation.glob(f"*/{WITHHELD}"))}
-        withheld = {n: why for n, why in reasons.items() if laws is None or n in laws}
         return cls(case, bounds, evidence, model_sets, models, own_data, withheld)
 
     @cached_property
@@ -238,7 +241,8 @@ class Evidence:
     @property
     def why_best(self) -> str:
         """Why the best law is the best, in words; empty without one."""
-        errors = {n: law.development for n, law in self.laws.items() if law.development is not None}
+        shown = {n: law for n, law in self.laws.items() if not self._withheld(n)}
+        errors = {n: law.development for n, law in shown.items() if law.development is not None}
         if self.best is None:
             return ""
         if not errors:

@@ -159,6 +159,11 @@ def test_the_period_is_the_step_where_the_fmu_takes_any(tmp_path: Path) -> None:
         (FMI_2, [*ROLES, "--tags", "t.csv"], "--tags and options of roles are both given"),
         (FMI_2, ["--mv", "air"], "the options: no process variable is named"),
         (FMI_2, ["--mv", "airflow", "--pv", "oxygen"], "it has no variable 'airflow'"),
+        (
+            FMI_2,
+            [*ROLES, *ROWS, "--command", "air=0..5000"],
+            "air may be commanded from 0 to 5000 %, outside its",
+        ),
         (CLEAR.replace(' stepSize="30"', ""), [], "proposes no step size; give the sampling period"),
         (
             CLEAR.replace('canHandleVariableCommunicationStepSize="true"', ""),

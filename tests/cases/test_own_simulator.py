@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,17 @@ def test_a_load_moves_the_simulator_as_far_as_it_would_the_models(heater: Simula
         rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
         moved = rest.pv[heater.hold, 0] - rest.pv[0, 0]
         assert abs(moved) == pytest.approx(LOAD * heater.record.pv[:, 0].std(), rel=0.1)  # the heater is nonlinear
+
+
+def test_a_load_is_no_larger_than_the_valve_can_take_back(heater: SimulatedCase) -> None:
+    at = float(heater.simulator.start[1][0])
+    (valve,) = heater.signals.mv
+    near = replace(valve, low=at - 4.0, high=at + 2.0)
+    narrow = type("Narrow", (type(heater),), {"signals": replace(heater.signals, mv=(near,))})(heater.held_out_seeds)
+    loads = [test.changes["load_valve"] for test in narrow.scenarios()["load"]]
+    assert all(load.any() for load in loads)
+    needed = at - np.concatenate(loads)
+    assert near.low + 0.3 - 1e-9 <= needed.min() < needed.max() <= near.high - 0.3 + 1e-9
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from dirty_plant import TAGS, Clean, cells, clean, write
 
 from pipeline.__main__ import main
@@ -283,6 +284,20 @@ def test_a_plant_is_replaced_on_request_and_kept_where_the_new_data_fail(capsys:
     assert record.dv.shape[1] == 0
     assert "  # Another plant.\n  kettle: {period_s: 1} # kept\n" in Path("params.yaml").read_text()
     assert {p.name for p in Path("data").iterdir()} == {"tank", "tank-refused"}
+
+
+def test_a_replacement_keeps_the_limits_of_the_controller(capsys: pytest.CaptureFixture[str]) -> None:
+    """A new export must not free what the controller may not command; a limit that is given anew prevails."""
+    write(Path("x.csv"), cells(clean(2500)))
+    new = ["new", "tank", "x.csv", *ROLES]
+    assert main([*new, "--command", "TIC-101.OP=20..70", "--max-move", "TIC-101.OP=6"]) == 0
+    capsys.readouterr()
+    assert main([*new, "--replace", "--max-move", "TIC-101.OP=9"]) == 0
+    (mv,) = yaml.safe_load(Path("params.yaml").read_text())["plants"]["tank"]["mv"]
+    assert (mv["command_low"], mv["command_high"], mv["max_move_per_min"]) == (20.0, 70.0, 9.0)
+    said = capsys.readouterr().out
+    assert "kept of the plant that was replaced: TIC-101.OP: command_low: 20; give another" in said
+    assert "max_move_per_min" not in said
 
 
 def test_a_replacement_that_params_yaml_does_not_take_leaves_the_plant() -> None:
