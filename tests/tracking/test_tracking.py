@@ -431,6 +431,25 @@ def test_a_case_has_one_champion_and_every_controller_says_where_it_stands(root,
         assert "champion_by" not in client.get_model_version(inverse, "1").tags
 
 
+def test_a_law_that_the_newest_run_withholds_is_no_champion_any_more(root, capsys):
+    pid, inverse = f"{CASE}-pid", f"{CASE}-inverse_dob"
+    publish(root)
+    folder = root / "artifacts" / CASE
+    (folder / "inverse_dob.onnx").unlink()
+    made_up.write_json(folder / "inverse_dob.json", {"withheld": "it locked up"})
+    publish(root)
+    assert f"{inverse} version 1: no longer the best version" in capsys.readouterr().err
+    with store() as client:
+        assert inverse not in holders(client, "best")
+        assert holders(client, "champion") == {pid: 1}
+        assert "it locked up" in versions(client, inverse)[0].tags["verdict"]
+    # a person's own choice stays
+    assert main(["promote", inverse, "1", "--alias", "best"]) == 0
+    publish(root)
+    with store() as client:
+        assert holders(client, "best")[inverse] == 1
+
+
 def test_a_store_whose_folder_was_moved_or_copied_still_gives_its_files(root, monkeypatch, capsys):
     publish(root)
     copy, moved = root.parent / "a copy", root.parent / "moved"
