@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_entries import entries_of
-from pipeline.commands.new_commands import check_commands, check_start, commanded, mvs_of
+from pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
 from pipeline.commands.new_fmu import table_from, write_table
 from pipeline.commands.new_printed import tell
 from pipeline.commands.new_refusal import refusal
@@ -209,6 +209,8 @@ def _write(
             raise
     shutil.rmtree(earlier, ignore_errors=True)
     tell(name, folder, report, test, not unusable)
+    for line in confirmed(found.record.mv_signals, tags):
+        print(line)
     for limit in limits:
         print(f"kept of the plant that was replaced: {limit}; give another, or edit params.yaml")
     for wish in lost:

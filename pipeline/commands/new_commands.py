@@ -37,6 +37,19 @@ def commanded(inputs: Sequence[InputReport], tags: Sequence[Tag]) -> list[InputR
     return [replace(i, low=low, high=high) for i, (low, high) in zip(inputs, ends, strict=True)]
 
 
+def confirmed(signals: Sequence[Signal], tags: Sequence[Tag]) -> list[str]:
+    """What the controller may command, a line for each MV of which a person said it."""
+    lines = []
+    for s in signals:
+        limits = next((t.commands for t in tags if t.name == s.name), {})
+        if limits:
+            low, high = _ends(s.name, s.low, s.high, tags)
+            fastest = limits.get("max_move_per_min")
+            pace = "" if fastest is None else f", at most {fastest:g} {s.unit} in a minute"
+            lines.append(f"{s.name}: the controller may command {low:g} to {high:g} {s.unit}{pace}")
+    return lines
+
+
 def unvisited(signal: Signal, values: Array, tags: Sequence[Tag]) -> str:
     """Why an MV cannot be commanded as wished: its record (n,) hardly went there; empty where it can."""
     low, high = _ends(signal.name, signal.low, signal.high, tags)

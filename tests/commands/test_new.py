@@ -291,13 +291,15 @@ def test_a_replacement_keeps_the_limits_of_the_controller(capsys: pytest.Capture
     write(Path("x.csv"), cells(clean(2500)))
     new = ["new", "tank", "x.csv", *ROLES]
     assert main([*new, "--command", "TIC-101.OP=20..70", "--max-move", "TIC-101.OP=6"]) == 0
-    capsys.readouterr()
+    said = capsys.readouterr().out
+    assert "TIC-101.OP: the controller may command 20 to 70 %, at most 6 % in a minute" in said
     assert main([*new, "--replace", "--max-move", "TIC-101.OP=9"]) == 0
     (mv,) = yaml.safe_load(Path("params.yaml").read_text())["plants"]["tank"]["mv"]
     assert (mv["command_low"], mv["command_high"], mv["max_move_per_min"]) == (20.0, 70.0, 9.0)
     said = capsys.readouterr().out
     assert "kept of the plant that was replaced: TIC-101.OP: command_low: 20; give another" in said
     assert "max_move_per_min" not in said
+    assert "20 to 70 %, at most 9 % in a minute" in said
 
 
 def test_a_replacement_that_params_yaml_does_not_take_leaves_the_plant() -> None:
