@@ -6,12 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 from identified_models import scaled_model
 
 from pipeline.cases.own_plant import OwnCase, own_case
+from pipeline.laws import ControlLaw
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
+from pipeline.simulation.scenario import Scenario
+from pipeline.simulation.simulate import Trajectory, simulate_closed
 from serving.manifest import Signal
 
 GAINS = np.array([[2.0, -0.8], [0.6, 1.5]])
@@ -68,3 +72,18 @@ def filled_level() -> OwnCase:
     rest = np.array([[1.0, 0, 0], [0, 1.0, 0]])
     models = [scaled_model(1, 1, 0, 2, a=a, b=b * s, c=c, rest=rest) for s in (1.0, 0.9, 1.1)]
     return case_of(section(1, 1), models, y, mv)
+
+
+def loop_of(law: ControlLaw, test: Scenario) -> Trajectory:
+    """A law in closed loop over the plant of a test without measured disturbances."""
+    state = torch.zeros(law.n_state, dtype=torch.float64)
+    none = torch.zeros(0, dtype=torch.float64)
+
+    @torch.no_grad()
+    def step(sp: np.ndarray, pv: np.ndarray, mv: np.ndarray) -> tuple[np.ndarray, list[float]]:
+        nonlocal state
+        out, state, _ = law(*(torch.from_numpy(v) for v in (sp, pv)), none, torch.from_numpy(mv), state)
+        return out.numpy(), []
+
+    assert test.plant is not None
+    return simulate_closed(test.plant, step, test)

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cases.reach import BALANCED, SCALES, VISITED_MV
+from pipeline.cases.reach import ROOM, SCALES, VISITED_MV, held_at
 from pipeline.evaluation.case import Array
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.records.record import Record
-from pipeline.simulation.rests import balanced, inside
-
-ROOM = 0.05  # of an MV's range that a balance leaves at each end, for a controller to act in
 
 
 def course(nominal: Array, place: int, level: float, samples: int, at: int) -> Array:
@@ -39,7 +36,4 @@ def _holds(plant: IdentifiedPlant, place: int, level: float) -> bool:
     (x, mv), dv, n_cv = plant.start, plant.dv_nominal, len(plant.sp_signals)
     dv[place] = level
     other = IdentifiedPlant(plant.signals, plant.arrays, mv=mv, dv=dv, most_dead_time=plant.most_dead_time)
-    low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
-    _, needed, away = balanced(other, x, mv, plant.measure(x)[:n_cv], range(n_cv))
-    room = ROOM * (high - low)
-    return away < BALANCED and bool(inside(needed[None], low + room, high - room)[0])
+    return held_at(other, (x, mv), plant.measure(x)[:n_cv], plant.mv_signals, room=ROOM) is not None

@@ -26,7 +26,7 @@ TIMES, HOLD = 3, (30, 400)  # a set point lasts so many times as long as an answ
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
 INWARD = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the way from the visited range's middle to its end: where a rest is tried
 LOAD = 0.25  # standard deviations of the record's CV
-ROOM = 0.05  # of an MV's range, at each end: what holding a load must leave to act with
+ROOM = 0.05  # of an MV's range, at each end: what holding a disturbance leaves for a controller to act in
 BALANCED = 1e-6  # largest residual of a balance
 
 
@@ -121,15 +121,9 @@ class Reach:
             return found
         for share in INWARD:
             levels = self.cv[1] + share * (np.clip(cvs, self.cv[0], self.cv[2]) - self.cv[1])
-            at, acting, away = balanced(plant, x, mv, levels, range(len(cvs)))
-            if away < BALANCED and self._can_command(acting):
-                return at, acting
+            if (held := held_at(plant, (x, mv), levels, self.model.mv_signals)) is not None:
+                return held
         return found
-
-    def _can_command(self, mv: Array, room: float = 0.0) -> bool:
-        """Whether MVs (n_mv,) lie within the ranges of the model's, less a share ``room`` at both ends."""
-        low, high = (np.array([getattr(s, end) for s in self.model.mv_signals]) for end in ("low", "high"))
-        return bool(inside(mv[None], low + room * (high - low), high - room * (high - low))[0])
 
     def set_points(self, plant: Simulator, seed: int, p: Array | None = None) -> Array:
         """Set points (LEVELS * hold, n_cv) that a plant can hold under its parameters p (n_p,), each held."""
@@ -157,19 +151,14 @@ class Reach:
 
     def _held(self, plant: Simulator, wanted: Array, p: Array | None) -> Array:
         """CVs (n_cv,) of a rest on the way from where the plant starts to ``wanted`` (n_cv,), as far as MVs reach."""
-        x, mv = plant.start
-        start = np.clip(plant.measure(x)[: len(wanted)], self.cv[0], self.cv[2])
-        for scale in SCALES:
-            level = start + scale * (wanted - start)
-            _, acting, away = balanced(plant, x, mv, level, range(len(wanted)), p)
-            if away < BALANCED and self._can_command(acting):
-                return np.asarray(level)
-        return start
+        start = np.clip(plant.measure(plant.start[0])[: len(wanted)], self.cv[0], self.cv[2])
+        levels = [start + scale * (wanted - start) for scale in SCALES]
+        can = (at for at in levels if held_at(plant, plant.start, at, self.model.mv_signals, p) is not None)
+        return np.asarray(next(can, start))
 
     def _balances(self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None) -> Array:
         """CVs (LEVELS, n_cv) of rests: those that integrate at levels drawn over their visited range."""
         which, (start, mv0) = list(self.integrates), plant.start
-        low, high = (np.array([getattr(s, end) for s in self.model.mv_signals]) for end in ("low", "high"))
         wanted = rng.uniform(self.cv[0, which], self.cv[2, which], (len(draws), len(which)))
         found = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1))
         for k, (draw, levels) in enumerate(zip(draws, wanted, strict=True)):
@@ -177,8 +166,8 @@ class Reach:
             for scale in SCALES:
                 x, mv, away = balanced(plant, start, mv0 + scale * (draw - self.mv[1]), levels, which, p)
                 cvs = plant.measure(x)[: self.cv.shape[1]]
-                fits = inside(np.append(cvs, mv)[None], np.append(self.cv[0], low), np.append(self.cv[2], high))[0]
-                if away < BALANCED and fits:
+                visited = inside(cvs[None], self.cv[0], self.cv[2])[0]
+                if away < BALANCED and visited and can_command(self.model.mv_signals, mv):
                     found[k] = cvs
                     break
         return found
@@ -199,10 +188,31 @@ class Reach:
         cvs = plant.measure(x)[: self.cv.shape[1]]
         for scale in SCALES:
             p = plant.parameters({name: scale * wanted})
-            _, acting, away = balanced(plant, x, mv, cvs, range(len(cvs)), p)
-            if away < BALANCED and self._can_command(acting, ROOM):
+            if held_at(plant, (x, mv), cvs, self.model.mv_signals, p, ROOM) is not None:
                 return scale * wanted
         return SCALES[-1] * wanted
+
+
+def can_command(mvs: Sequence[Signal], values: Array, room: float = 0.0) -> bool:
+    """Whether MVs (n_mv,) lie within their ranges, less a share ``room`` at both ends."""
+    low, high = (np.array([getattr(s, end) for s in mvs]) for end in ("low", "high"))
+    return bool(inside(values[None], low + room * (high - low), high - room * (high - low))[0])
+
+
+def held_at(
+    plant: Simulator,
+    begin: tuple[Array, Array],
+    levels: Array,
+    mvs: Sequence[Signal],
+    p: Array | None = None,
+    room: float = 0.0,
+) -> tuple[Array, Array] | None:
+    """(state (n_x,), mv (n_mv,)) of a rest near ``begin`` with all CVs at ``levels`` (n_cv,), under MVs within ``mvs``.
+
+    ``room`` is the share of their ranges that they leave at both ends. None where there is no such rest.
+    """
+    x, acting, away = balanced(plant, *begin, levels, range(len(levels)), p)
+    return (x, acting) if away < BALANCED and can_command(mvs, acting, room) else None
 
 
 def visited_mv(record: Record, mvs: Sequence[Signal]) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from pipeline.config.plants import mistakes_of_mv
 from pipeline.errors import RecordError
 from pipeline.historian.findings import InputReport
 from pipeline.historian.tags import Tag
@@ -23,11 +24,11 @@ def mvs_of(plant: Simulator) -> tuple[Tag, ...]:
 def check_commands(signals: Sequence[Signal], tags: Sequence[Tag]) -> None:
     """RecordError where an MV's range of commands leaves its own range, which a simulator may have stated itself."""
     for s in signals:
-        low, high = _ends(s.name, s.low, s.high, tags)
-        if not s.low <= low < high <= s.high:
+        tag = next((t for t in tags if t.name == s.name), None)
+        if tag is not None and (wrong := mistakes_of_mv(replace(tag, low=s.low, high=s.high))):
+            low, high = _ends(s.name, s.low, s.high, tags)
             raise RecordError(
-                f"{s.name} may be commanded from {low:g} to {high:g} {s.unit}, outside its range, {s.low:g} to "
-                f"{s.high:g}; correct --command or command_low and command_high"
+                f"{s.name} may be commanded from {low:g} to {high:g} {s.unit}, outside its range: {'; '.join(wrong)}"
             )
 
 

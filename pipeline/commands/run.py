@@ -23,8 +23,8 @@ from pipeline.stages.code import code as list_files
 ARTIFACTS = Path("artifacts")
 MANY = 25  # stages that a person does not read line by line
 ABSENT = {"deleted", "not in cache"}  # DVC's words for a file that is not there, whether or not it ever was
-KINDS = {"records": "excite", "models": "fit", "controllers": "validate"}  # a section of params.yaml -> its stage
-STAGES = {"records": ("excite",), "models": ("fit",), "controllers": ("design", "validate")}  # in their order
+# A kind of section of params.yaml -> the stages of each, in their order; the last one is what its name asks for.
+STAGES = {"records": ("excite",), "models": ("fit",), "controllers": ("design", "validate")}
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -106,8 +106,8 @@ def side_by_side(targets: Sequence[str], changed: Iterable[str]) -> list[list[st
 
 def chain_of(case: str) -> list[str]:
     """The stages of a case, each after those that it depends on."""
-    own = {kind: sections_of(kind, case) for kind in STAGES}
-    return [*(f"{s}@{name}" for kind, ss in STAGES.items() for s in ss for name in own[kind]), f"report@{case}"]
+    own = [f"{s}@{name}" for kind, stages in STAGES.items() for s in stages for name in sections_of(kind, case)]
+    return [*own, f"report@{case}"]
 
 
 def stages_of(name: str) -> list[str]:
@@ -117,10 +117,10 @@ def stages_of(name: str) -> list[str]:
     """
     if name in sections("cases"):
         return [f"report@{name}"]
-    for kind, stage in KINDS.items():
+    for kind, stages in STAGES.items():
         if name in sections(kind):
-            return [f"{stage}@{name}"]
-    known = [name for kind in ("cases", *KINDS) for name in sections(kind)]
+            return [f"{stages[-1]}@{name}"]
+    known = [name for kind in ("cases", *STAGES) for name in sections(kind)]
     raise ParamsError(f"params.yaml has no case, controller, model or record {name!r}{nearest(name, known)}")
 
 

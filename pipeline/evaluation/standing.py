@@ -10,6 +10,7 @@ from typing import Self
 from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.validation import FILE, Statement, Validation
+from pipeline.files import read_json
 from pipeline.simulation import NOISE_SUFFIX
 
 
@@ -88,6 +89,12 @@ class Standing:
     def best(self) -> LawStanding | None:
         """The best law of the case."""
         return next((law for law in self.laws if law.best), None)
+
+
+def withheld_in(folder: Path) -> dict[str, str]:
+    """Law -> why its newest validation ships nothing, of those in ``folder`` = artifacts/<case>."""
+    reasons = {p.stem: read_json(p).get("withheld") for p in sorted(folder.glob("*.json")) if p.name != FILE}
+    return {law: str(why) for law, why in reasons.items() if why}
 
 
 def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:

@@ -211,7 +211,7 @@ def read_tags(path: Path) -> tuple[Tag, ...]:
 def _wrong(tag: Tag) -> list[str]:
     """What cannot be in the numbers of a tag, a clause each."""
     if tag.role != "mv" and tag.commands:
-        verb, it = ("belong", "them") if tag.commands.keys() - {next(iter(tag.commands))} else ("belongs", "it")
+        verb, it = ("belong", "them") if len(tag.commands) > 1 else ("belongs", "it")
         return [f"{', '.join(tag.commands)} {verb} to an mv, which the controller commands; leave {it} empty"]
     return mistakes_of_mv(tag)
 

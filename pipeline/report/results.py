@@ -13,9 +13,8 @@ from rich.table import Table
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.metric import with_unit
-from pipeline.evaluation.standing import LawStanding, Standing, tally
+from pipeline.evaluation.standing import LawStanding, Standing, tally, withheld_in
 from pipeline.evaluation.validation import FILE, Validation
-from pipeline.files import read_json
 from pipeline.pictures.numbers import ratio
 from pipeline.simulation import NOISE_SUFFIX
 
@@ -45,7 +44,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     for name, standing in standings.items():
         if case not in (None, name):
             continue
-        withheld = _withheld(standing)
+        withheld = withheld_in(standing.folder)
         for law, why in withheld.items():
             console.print(f"{name}: {law} is not shipped: {why}", style="red", markup=False, soft_wrap=True)
         shipped += [law for law in standing.laws if law.law not in withheld]
@@ -67,12 +66,6 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     console.print(f"try one    loopwright simulate {where / '<law>.onnx'}")
     console.print(f"read one   loopwright inspect {where / '<law>.onnx'}")
     console.print("registry   make registry, then /#/models in the browser")
-
-
-def _withheld(standing: Standing) -> dict[str, str]:
-    """Law -> why it is not shipped."""
-    reasons = {p.stem: read_json(p).get("withheld") for p in sorted(standing.folder.glob("*.json")) if p.name != FILE}
-    return {law: str(why) for law, why in reasons.items() if why}
 
 
 def overview(standings: Iterable[Standing]) -> Table:

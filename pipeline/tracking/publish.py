@@ -9,8 +9,9 @@ from typing import Any
 
 from mlflow import MlflowClient
 
+from pipeline.evaluation.standing import withheld_in
 from pipeline.evaluation.validation import FILE, Validation
-from pipeline.files import read_json, sha256
+from pipeline.files import sha256
 from pipeline.tracking.notes import experiment_note
 from pipeline.tracking.registry import describe, elect_champion, register, withdraw
 from pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
@@ -74,7 +75,7 @@ def _publish_case(
             made += is_new
             _say(line)
             digests[f"{case}-{law}"] = sha256(path)
-    for law, why in _withheld(root / "artifacts" / case).items():
+    for law, why in withheld_in(evidence.parent).items():
         if line := withdraw(client, f"{case}-{law}", why):
             _say(line)
     champion = elect_champion(client, case)
@@ -82,12 +83,6 @@ def _publish_case(
     describe_experiment(client, experiment, experiment_note(case, validation, champion))
     _say(f"{case}: {len(new)} new runs of {len(own)}, {made} new versions; champion: {champion or 'none'}")
     return digests
-
-
-def _withheld(folder: Path) -> dict[str, str]:
-    """Law -> why its newest validation ships nothing."""
-    reasons = {p.stem: read_json(p).get("withheld") for p in sorted(folder.glob("*.json")) if p.name != FILE}
-    return {law: str(why) for law, why in reasons.items() if why}
 
 
 def _add_picture(client: MlflowClient, run_id: str, picture: Path) -> str | None:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from identified_models import scaled_model
-from own_cases import GAINS, POLES, case_of, section, two_lags
+from own_cases import GAINS, POLES, case_of, loop_of, section, two_lags
 
 from pipeline.cases.own_plant import OwnCase, own_case
 from pipeline.cases.reach import visited_mv
@@ -21,7 +20,6 @@ from pipeline.models.base import load_model
 from pipeline.optimal.sampled import SampledHorizon, run_sampled
 from pipeline.records.record import Record
 from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import simulate_closed
 from serving.manifest import Signal
 
 LOW, HIGH, MOVE = -0.35, 0.15, 0.02  # of u0; the record visits -0.6 to 0.6
@@ -53,16 +51,7 @@ def designed(case: OwnCase, name: str) -> ControlLaw:
 
 def moves_of(law: ControlLaw, test: Scenario) -> np.ndarray:
     """All MVs (n + 1, n_mv) of a closed loop, the one before it first."""
-    state, none = torch.zeros(law.n_state, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-
-    @torch.no_grad()
-    def step(sp: np.ndarray, pv: np.ndarray, mv: np.ndarray) -> tuple[np.ndarray, list[float]]:
-        nonlocal state
-        out, state, _ = law(*(torch.from_numpy(v) for v in (sp, pv)), none, torch.from_numpy(mv), state)
-        return out.numpy(), []
-
-    assert test.plant is not None
-    return np.vstack([test.mv0, simulate_closed(test.plant, step, test).mv])
+    return np.vstack([test.mv0, loop_of(law, test).mv])
 
 
 def nmpc_moves(_: OwnCase, test: Scenario) -> np.ndarray:

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import yaml
-from own_cases import GAINS, POLES, RATE, filled_level, section, two_lags
+from own_cases import GAINS, POLES, RATE, filled_level, loop_of, section, two_lags
 
 from pipeline.cases.own_plant import PERCENT, OwnCase, own_case
 from pipeline.errors import ParamsError
@@ -16,7 +15,7 @@ from pipeline.evaluation.closed_loop import locked_up
 from pipeline.laws.predictive.predictive import Predictive
 from pipeline.models.base import load_model
 from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import Trajectory, simulate_closed
+from pipeline.simulation.simulate import Trajectory
 from pipeline.simulation.timetable import parse_event, timetable
 
 
@@ -36,17 +35,7 @@ def closed(case: OwnCase, test: Scenario) -> Trajectory:
     model = load_model(case.models / "identified.npz")
     settings = Predictive.Params(tuning="given", horizon=15, moves=4)
     law = Predictive.design(settings, {"identified": model}, case.plant.signals, case.plant).eval()
-    state = torch.zeros(law.n_state, dtype=torch.float64)
-    none = torch.zeros(0, dtype=torch.float64)
-
-    @torch.no_grad()
-    def step(sp: np.ndarray, pv: np.ndarray, mv: np.ndarray) -> tuple[np.ndarray, list[float]]:
-        nonlocal state
-        out, state, _ = law(*(torch.from_numpy(v) for v in (sp, pv)), none, torch.from_numpy(mv), state)
-        return out.numpy(), []
-
-    assert test.plant is not None
-    return simulate_closed(test.plant, step, test)
+    return loop_of(law, test)
 
 
 def test_all_variables_that_have_an_mv_are_controlled(two: OwnCase) -> None:

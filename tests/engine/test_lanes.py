@@ -6,11 +6,11 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from threading import Event
 
 import pytest
+from processes import lives, within
 
 ROOT = Path(__file__).parents[2]
 # In place of DVC: says what it was asked, then what the name of its last stage tells it to do.
@@ -60,23 +60,6 @@ def run(folder: Path, *arguments: str) -> tuple[int, list[str], list[str]]:
     out, _ = process.communicate(timeout=60)
     asked = folder / "asked"
     return process.returncode, out.splitlines(), asked.read_text().splitlines() if asked.exists() else []
-
-
-def lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    state = Path(f"/proc/{pid}/status")
-    return not (state.exists() and "\nState:\tZ" in state.read_text())
-
-
-def within(seconds: float, holds: Callable[[], bool]) -> bool:
-    for _ in range(int(seconds / 0.02)):
-        if holds():
-            return True
-        Event().wait(0.02)
-    return False
 
 
 def test_two_chains_run_at_once_and_the_rest_after_them(folder: Path) -> None:

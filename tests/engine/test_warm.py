@@ -8,11 +8,10 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from threading import Event
 
 import pytest
+from processes import lives, within
 
 SOURCES = Path(__file__).parents[2] / "pipeline"
 PROBE = """
@@ -59,21 +58,6 @@ def run(folder: Path, script: str) -> tuple[int, str, str]:
     process = begin(folder, script)
     out, err = process.communicate(timeout=60)
     return process.returncode, out, err
-
-
-def within(seconds: float, holds: Callable[[], bool]) -> bool:
-    for _ in range(int(seconds / 0.02)):
-        if holds():
-            return True
-        Event().wait(0.02)
-    return False
-
-
-def lives(pid: int) -> bool:
-    try:
-        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return False
 
 
 def test_a_stage_is_a_fork_of_the_warm_process(folder: Path) -> None:
