@@ -136,7 +136,9 @@ def fitted(record: Record, order: int, units: int, seed: int = 0) -> Identified:
     print(f"  free run, held out: linear {linear.held_out:.4f}, network {network.held_out:.4f} of a standard deviation")
     left = residuals(network.model, network.starts, train)
     assert left is not None
-    return assembled(network.model, [0] * data.v.shape[1], scales, data, noise_of(left), n_y, seed)
+    known = {"noise": noise_of(left), "colour": np.zeros(n_y), **dict.fromkeys(("pace_sd", "dead_sd"), np.zeros(1))}
+    known["gain_sd"] = np.zeros(n_y)
+    return assembled(network.model, [0] * data.v.shape[1], scales, data, known, n_y, seed)
 
 
 def courses(plant: Plant, seed: int) -> tuple[Array, Array]:

@@ -2,27 +2,67 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
+
+import numpy as np
 
 from pipeline.errors import PlantError
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.plants.spoilt import SpoiltPlant
 
-GAINS, SPEEDS, DELAYS = (0.8, 1.25), (1.25, 0.8), (1.0, 0.0)  # factors of gain and time constant; [periods]
+SURE = 2.0  # standard deviations of what the record leaves open, of each error
+# Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
+LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0
+MOST_GAIN, MOST_PACE, MOST_DEAD = 1.0, 0.8, 5.0  # twice the gain; beyond that a record tells nothing worth a test
+
+
+class Doubts(NamedTuple):
+    """Errors that a plant may have beside the model of its record, relative, of the dead time in periods.
+
+    Twice the standard deviations that the record leaves open, at least a quarter and a period.
+    """
+
+    gain: tuple[float, ...]  # of each MV
+    pace: float  # of the time constant
+    dead: float
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array]) -> Self:
+        """From ``gain_sd`` (n_mv,), ``pace_sd`` (1,) and ``dead_sd`` (1,) of an identified model."""
+        gain = np.clip(SURE * arrays["gain_sd"], LEAST_GAIN, MOST_GAIN)
+        pace = np.clip(SURE * float(arrays["pace_sd"][0]), LEAST_PACE, MOST_PACE)
+        dead = np.clip(SURE * float(arrays["dead_sd"][0]), LEAST_DEAD, MOST_DEAD)
+        return cls(tuple(map(float, gain)), float(pace), float(dead))
+
+    def __str__(self) -> str:
+        """In words."""
+        gains = sorted({round(1 + g, 2) for g in (min(self.gain), max(self.gain))})
+        return (
+            f"a gain {' to '.join(f'{g:g}' for g in gains)} times as high, {1 + self.pace:.3g} times as slow and "
+            f"{self.dead:.2g} periods later, or as much lower and faster"
+        )
 
 
 class OwnPlant(IdentifiedPlant):
-    """A model of an own plant, with the measurement noise of its record and the errors that it may have."""
+    """A model of an own plant, with the measurement noise of its record and the errors that the record leaves open."""
 
     noise: Array
+    colour: Array
+    doubts: Doubts
     rest: tuple[Array, Array] | None = None
 
     @property
     def noise_std(self) -> Array:
         """Standard deviation of the measurement noise, shape (n_pv,)."""
         return self.noise
+
+    @property
+    def noise_colour(self) -> Array:
+        """Colour of the measurement noise, shape (n_pv,)."""
+        return self.colour
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -34,7 +74,7 @@ class OwnPlant(IdentifiedPlant):
         other = type(self)(
             self.signals, self.arrays, name=self.name, mv=mv, dv=self.dv_nominal, most_dead_time=self.most_dead_time
         )
-        other.noise, other.rest = self.noise, (x, mv)
+        other.noise, other.colour, other.doubts, other.rest = self.noise, self.colour, self.doubts, (x, mv)
         return other
 
     def variations(self) -> tuple[Simulator, ...]:
@@ -42,12 +82,13 @@ class OwnPlant(IdentifiedPlant):
         return (self, *(SpoiltPlant(self, errors) for errors in errors_of(self)))
 
 
-def errors_of(plant: IdentifiedPlant) -> list[dict[str, float]]:
+def errors_of(plant: OwnPlant) -> list[dict[str, float]]:
     """Parameters of the spoilt plants: slow with a high gain and a longer dead time, fast with a low gain."""
-    gains = [dict.fromkeys((f"gain_{s.name}" for s in plant.mv_signals), gain) for gain in GAINS]
+    d = plant.doubts
+    high = {f"gain_{s.name}": 1 + error for s, error in zip(plant.mv_signals, d.gain, strict=True)}
     return [
-        {**gain, "time_constant": speed, "dead_time": delay}
-        for gain, speed, delay in zip(gains, SPEEDS, DELAYS, strict=True)
+        {**high, "time_constant": 1 + d.pace, "dead_time": d.dead},
+        {**{name: 1 / gain for name, gain in high.items()}, "time_constant": 1 / (1 + d.pace), "dead_time": 0.0},
     ]
 
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pipeline.cases.measured_steps import course, level_of
-from pipeline.cases.own_model import DELAYS, OwnPlant, Untrained, errors_of
+from pipeline.cases.own_model import Doubts, OwnPlant, Untrained, errors_of
 from pipeline.cases.reach import LOAD, Reach, visited_mv
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.errors import PlantError
@@ -92,11 +92,19 @@ class OwnCase(Case):
         """A model that begins at MVs (n_mv,)."""
         with np.load(path, allow_pickle=False) as file:
             arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
-            noise = np.asarray(file["noise"] * file["y_scale"])
+            colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
+            noise = np.asarray(file["noise"] * file["y_scale"]) / np.sqrt(1 - colour)
         dv = np.median(self.record.dv, axis=0)
-        plant = OwnPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=int(max(DELAYS)))
-        plant.noise = noise
+        most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
+        plant = OwnPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
+        plant.noise, plant.colour, plant.doubts = noise, colour, doubts
         return plant
+
+    @cached_property
+    def _doubts(self) -> Doubts:
+        """What the record leaves open, by the law's own model: with it tests go wrong on all models."""
+        with np.load(self._law_file, allow_pickle=False) as file:
+            return Doubts.of(file)
 
     def _resting(self, plant: OwnPlant) -> OwnPlant:
         """The plant, begun where it rests within the record; most do so already."""
@@ -188,7 +196,7 @@ class OwnCase(Case):
         members, reach = self.members, self.reach
         pairs = [(seed, members[i % len(members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
         held_out = "Set points, on models identified from the record"
-        spoilt = "Set points, on such models with errors of gain, speed and dead time"
+        spoilt = f"Set points, on such models with errors of gain, speed and dead time: {self._doubts}"
         cvs = self.signals.sp
         loads = f"A load worth {LOAD:g} standard deviations of the record's {cvs[0].name if len(cvs) == 1 else 'CV'}"
         loads += "" if len(cvs) == 1 else ", each CV in turn"

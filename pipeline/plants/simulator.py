@@ -76,6 +76,11 @@ class Simulator(ABC):
         """Standard deviation of the measurement noise that a tuning in closed loop counts with, shape (n_pv,)."""
         return np.zeros(len(self.pv_signals))
 
+    @property
+    def noise_colour(self) -> Array:
+        """Colour phi (n_pv,) of the measurement noise e(k) = phi e(k-1) + w(k): 0 of white noise."""
+        return np.zeros(len(self.pv_signals))
+
     def variations(self) -> tuple[Simulator, ...]:
         """The plants that a tuning must suit: this one, and what it may be where its equations are not certain."""
         return (self,)

@@ -31,6 +31,11 @@ class SpoiltPlant(Simulator):
         """Standard deviation of the measurement noise, shape (n_pv,)."""
         return self.plant.noise_std
 
+    @property
+    def noise_colour(self) -> Array:
+        """Colour of the measurement noise, shape (n_pv,)."""
+        return self.plant.noise_colour
+
     def parameter_names(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the plant's parameters."""
         return self.plant.parameter_names()

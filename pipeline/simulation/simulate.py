@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from pipeline.errors import PlantError
 from pipeline.plants.equations import EquationPlant
+from pipeline.plants.noise import coloured
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.simulation.scenario import Scenario
 
@@ -97,7 +98,8 @@ def simulate_closed(
 def noise_draws(plant: Simulator, n: int, noise: Sequence[float] | Array | None, rng: np.random.Generator) -> Array:
     """Measurement noise, shape (n, n_pv), Gaussian with one standard deviation a PV; zeros where there is none.
 
-    Raises PlantError unless there is one finite standard deviation >= 0 a PV.
+    Its colour is the plant's ``noise_colour``, which leaves the standard deviation as it is. Raises PlantError unless
+    there is one finite standard deviation >= 0 a PV.
     """
     names = [s.name for s in plant.pv_signals]
     if noise is None or not len(noise):
@@ -107,7 +109,7 @@ def noise_draws(plant: Simulator, n: int, noise: Sequence[float] | Array | None,
         raise PlantError(
             f"plant {plant.name!r}: noise is {list(noise)}; give one standard deviation >= 0 for each of {names}"
         )
-    return rng.standard_normal((n, len(names))) * std
+    return coloured(rng.standard_normal((n, len(names))), plant.noise_colour) * std
 
 
 def _checked(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pipeline.errors import PlantError
 from pipeline.plants.equations import EquationPlant
+from pipeline.plants.noise import coloured
 from pipeline.plants.simulator import Array, Simulator
 
 LawStep = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
@@ -128,10 +129,11 @@ class DevelopmentLoops:
         both in shares of their ranges.
         """
         n, s, n_cv = self.sp.shape
-        plant, noise, rng = self.plant, self.plant.noise_std, np.random.default_rng(0)
+        plant, sd = self.plant, self.plant.noise_std
+        noise = sd * coloured(np.random.default_rng(0).standard_normal((n, s, len(sd))), plant.noise_colour)
         spans = np.array([s.high - s.low for s in plant.sp_signals])
         weights = spans[0] / spans
-        price = TRAVEL * spans[0] / np.array([s.high - s.low for s in plant.mv_signals]) * bool(noise.any())
+        price = TRAVEL * spans[0] / np.array([s.high - s.low for s in plant.mv_signals]) * bool(sd.any())
         lanes = (candidates, s)
         x0, mv0 = np.tile(self.x0, (candidates, 1)), np.tile(self.mv0, (candidates, 1, 1))
         loops, error = BatchLoops(plant, step, n_state, lanes, x0, mv0), np.zeros(lanes)
@@ -140,8 +142,7 @@ class DevelopmentLoops:
             late = k % self.hold if time_weighted else 1
             error += late * np.abs(self.sp[k] - pv[..., :n_cv]) @ weights
             before = loops.mv
-            noisy = pv + noise * rng.standard_normal((s, len(noise))) if noise.any() else pv
-            loops.step(torch.from_numpy(self.sp[k]).expand(*lanes, n_cv), noisy, self._load(k))
+            loops.step(torch.from_numpy(self.sp[k]).expand(*lanes, n_cv), pv + noise[k], self._load(k))
             if price.any():
                 error += (loops.mv - before).abs().numpy() @ price
         total = error.mean(axis=1) / n

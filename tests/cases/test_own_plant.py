@@ -10,13 +10,13 @@ import pytest
 import yaml
 
 from pipeline.cases import CASES, all_cases
-from pipeline.cases.own_model import GAINS
+from pipeline.cases.own_model import LEAST_GAIN, Doubts
 from pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
 from pipeline.cases.reach import LOAD
 from pipeline.errors import ParamsError, PlantError
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
-from pipeline.simulation.simulate import simulate_closed
+from pipeline.simulation.simulate import noise_draws, simulate_closed
 from serving.manifest import Signal
 
 TEMPERATURE = {"name": "TIC-101.PV", "unit": "degC", "low": 20.0, "high": 90.0}
@@ -45,6 +45,7 @@ def model(pole: float) -> dict[str, np.ndarray]:
         "v_center": np.array([50.0]),
         "v_scale": np.array([50.0]),
         "noise": np.array([0.01]),
+        **{name: np.zeros(1) for name in ("colour", "gain_sd", "pace_sd", "dead_sd")},
         "rest": np.array([[1.0, 0.0, 0.0]]),
     }
 
@@ -102,7 +103,8 @@ def test_a_set_point_is_held_three_times_as_long_as_the_model_needs(heater: OwnC
 
 def test_spoilt_plants_have_errors_and_carry_a_load(heater: OwnCase) -> None:
     tests = heater.scenarios()
-    assert {float(t.changes["gain_TIC-101.OP"][0]) for t in tests["spoilt"]} == set(GAINS)
+    high = 1 + LEAST_GAIN
+    assert {float(t.changes["gain_TIC-101.OP"][0]) for t in tests["spoilt"]} == {high, 1 / high}
     for test in tests["load"]:
         assert test.plant is not None
         rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
@@ -112,8 +114,35 @@ def test_spoilt_plants_have_errors_and_carry_a_load(heater: OwnCase) -> None:
     assert len({np.sign(test.changes["load_TIC-101.PV"][-1]) for test in tests["load"]}) == 2
 
 
+def test_errors_of_spoilt_plants_grow_with_what_the_record_leaves_open(heater: OwnCase) -> None:
+    path = heater.models / "identified.npz"
+    np.savez(path, **model(0.9) | {"gain_sd": np.array([0.2]), "pace_sd": np.array([0.3]), "dead_sd": np.array([1.2])})
+    case = own_case("heater")
+    assert isinstance(case, OwnCase)
+    assert case.plant.parameters({"dead_time": 2.4}).tolist() == [1.0, 1.0, 2.4, 0.0]
+    slow, fast = (dict(t.changes) for t in case.scenarios()["spoilt"][:2])
+    assert [float(values[0]) for values in slow.values()] == pytest.approx([1.4, 1.6, 2.4])
+    assert [float(values[0]) for values in fast.values()] == pytest.approx([1 / 1.4, 1 / 1.6, 0.0])
+    assert "a gain 1.4 times as high, 1.6 times as slow and 2.4 periods later" in case.scenarios()["spoilt"][0].title
+
+
+@pytest.mark.parametrize(("sd", "error"), [(0.0, 0.25), (0.2, 0.4), (9.0, 1.0)])
+def test_an_error_is_neither_below_a_quarter_nor_beyond_a_factor_of_two(sd: float, error: float) -> None:
+    certain = {"pace_sd": np.zeros(1), "dead_sd": np.zeros(1)}
+    assert Doubts.of({"gain_sd": np.array([sd]), **certain}).gain == (pytest.approx(error),)
+
+
 def test_noise_is_that_of_the_model(heater: OwnCase) -> None:
     assert heater.noise_std == pytest.approx([0.2])
+
+
+def test_coloured_noise_is_larger_than_its_changes_tell(heater: OwnCase) -> None:
+    np.savez(heater.models / "identified.npz", **model(0.9) | {"colour": np.array([0.75])})
+    case = own_case("heater")
+    assert case.noise_std == pytest.approx([0.4])
+    noise = noise_draws(case.plant, 4000, case.noise_std, np.random.default_rng(1))
+    assert noise.std() == pytest.approx(0.4, rel=0.1)
+    assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(0.75, abs=0.05)
 
 
 def test_before_training_the_signals_are_known_and_the_rest_is_asked_for(heater: OwnCase) -> None:

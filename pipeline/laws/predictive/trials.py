@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.laws.base import ControlLaw
 from pipeline.models.identified.identified import Identified
+from pipeline.plants.noise import coloured
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
 
@@ -21,9 +22,12 @@ SETTLE = 300  # samples to come to rest
 STILL = 0.25  # share of a movement in the last third of SETTLE from which on it does not end; a level's is 1/3
 SPAN = 4.0  # scaled: a record's outputs lie within two standard deviations
 REACH = 0.8  # of the MVs' range -1..1: where the set points are rests
-GAINS = (1.0, 1.1, 0.9, 1.1, 0.9, 1.0)  # the plant's over the model's, by loop; of several MVs each by its own sign
-PACES = (1.0, 1.0, 0.93, 0.93, 1.07, 1.0)  # the plant's speed over the model's
-LATE = (0.0, 0.3, 0.0, 0.0, 0.0, 0.3)  # samples by which the plant answers later than its model
+GAINS = (0, 1, -1, 1, -1, 0)  # by loop: the plant's gain is higher or lower; of several MVs each by its own sign
+PACES = (0, 0, -1, -1, 1, 0)  # the plant is slower or faster
+LATE = (0, 1, 0, 0, 0, 1)  # the plant answers later
+GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors: a plant does not stay as its record found it
+SURE = 2.0  # standard deviations of what the record leaves open, of each error
+MOST = 1.0  # of each error; of the dead time in samples
 BIAS = 0.2  # of half an MV's range: the largest steps of a load at the MV
 LOAD = 0.6  # scaled, over the samples of the horizon: steps of a load at the output
 DRIFT = 0.15  # of BIAS and LOAD: a sample's share of a load that walks
@@ -50,7 +54,8 @@ class Trials:
     with the model f, the gains g, the middle m of the MVs' range and the pace p. The loads are biases of the MVs and
     loads at the outputs, in steps and in random walks; the noise is the model's estimate. Every set point is a rest
     of the loop's own plant, so that all are within reach. An output that never comes to rest, as a level, has set
-    points within its record's range.
+    points within its record's range. Errors are twice what the record leaves open, and no less than ``GAIN``, ``PACE``
+    and ``DEAD``.
     """
 
     model: Identified
@@ -75,7 +80,7 @@ class Trials:
         low, high = (np.array([getattr(s, end) for s in signals.mv]) for end in ("low", "high"))
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         signs = rng.choice([-1.0, 1.0], (loops, n_mv)) if n_mv > 1 else np.ones((loops, 1))
-        gain, pace, late = np.tile(GAINS, 2)[:, None] ** signs, np.tile(PACES, 2)[:, None], np.tile(LATE, 2)[:, None]
+        gain, pace, late = _errors(model, signs)
         # Every set point is a rest under MVs that act; a plant with another gain is given others for them.
         acting = middle + half * rng.uniform(-REACH, REACH, (HOLDS + 1, loops, n_mv))
         acting[:, LOOPS:] = middle + 0.6 * (acting[:1, LOOPS:] - middle)
@@ -92,7 +97,9 @@ class Trials:
                 load[:, LOOPS + i, :n_cv] = LOAD / horizon * course[:, i, :n_cv]
             else:
                 bias[:, LOOPS + i] = BIAS * half * course[:, i, :n_mv]
-        noise = (model.noise * model.y_scale).numpy() * rng.normal(size=(n, loops, model.n_y))
+        colour = model.colour.numpy()
+        sd = (model.noise * model.y_scale).numpy() / np.sqrt(1 - colour)
+        noise = sd * coloured(rng.normal(size=(n, loops, model.n_y)), colour)
         drawn = (torch.as_tensor(t) for t in (mv0, gain, pace, late, sp, bias, load, noise))
         return cls(model, signals, horizon, x0, *drawn)
 
@@ -145,6 +152,19 @@ class Trials:
             acting = middle + self.gain * (late - middle) + self.bias[k]
             x = x + self.pace * (model(torch.cat([x, acting, dv], dim=-1)) - x)
             x = torch.cat([x[..., :n_y] + self.load[k], x[..., n_y:]], dim=-1)
+
+
+def _errors(model: Identified, signs: Array) -> tuple[Array, Array, Array]:
+    """Gains (2 LOOPS, n_mv) and paces (2 LOOPS, 1) over the model's, and how much later (2 LOOPS, 1) plants answer.
+
+    ``signs`` (2 LOOPS, n_mv) say which MVs' gains are wrong the other way round.
+    """
+    gain, pace, dead = (
+        np.clip(SURE * sd.numpy(), least, MOST)
+        for sd, least in ((model.gain_sd, GAIN), (model.pace_sd, PACE), (model.dead_sd, DEAD))
+    )
+    turned = np.tile(GAINS, 2)[:, None] * signs
+    return (1 + gain) ** turned, (1 + pace) ** np.tile(PACES, 2)[:, None], dead * np.tile(LATE, 2)[:, None]
 
 
 def _courses(rng: np.random.Generator, horizon: int, hold: int, count: int) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -44,9 +44,19 @@ def noise_of(residuals: Sequence[Array]) -> Array:
 
 
 def assembled(
-    model: Dynamics, delays: Sequence[int], scales: Scales, data: ScaledRecord, noise: Array, n_mv: int, seed: int
+    model: Dynamics,
+    delays: Sequence[int],
+    scales: Scales,
+    data: ScaledRecord,
+    known: Mapping[str, Array],
+    n_mv: int,
+    seed: int,
 ) -> Identified:
-    """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,); ``noise`` (n_y,) is scaled."""
+    """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,).
+
+    ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour`` and what the record leaves open: ``gain_sd``,
+    ``pace_sd``, ``dead_sd``.
+    """
     whole, n_y, n_v = remembering(model, delays), data.y.shape[1], data.v.shape[1]
     table, covariance = rest_map(model, data.y, data.v, seed)
     n, total = model.n_x, whole.n_x
@@ -57,7 +67,7 @@ def assembled(
     arrays = {
         **{name: getattr(whole, name) for name in ("a", "b", "c", "w1", "b1", "w2")},
         **{name: getattr(scales, name) for name in ("y_center", "y_scale", "v_center", "v_scale")},
-        "noise": noise,
+        **known,
         "rest": rest,
         "rest_cov": rest_cov,
         "dead": dead_periods(model, data)[:n_mv] + np.asarray(delays[:n_mv], dtype=np.float64),

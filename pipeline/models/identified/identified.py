@@ -23,9 +23,11 @@ class Identified(Model):
     ``forward`` maps [x scaled, v in engineering units] (..., n_x + n_v) to the next x (..., n_x), scaled;
     ``measured`` gives y in engineering units.
 
-    ``noise`` is the scaled standard deviation of the measurement noise. ``rest`` gives the state of a rest from
-    [y scaled, v scaled, 1], ``rest_cov`` the covariance of its error. ``dead`` holds, for each MV, the fewest whole
-    periods that pass before any output answers (0: the next sample does).
+    ``noise`` is the scaled standard deviation of the measurement noise, were it white; its ``colour`` is phi of
+    e(k) = phi e(k-1) + w(k), with which its own standard deviation is 1/sqrt(1 - phi) times as large. ``gain_sd`` of
+    each MV and ``pace_sd`` of the time constant are relative, ``dead_sd`` counts periods: what the record leaves open.
+    ``rest`` gives the state of a rest from [y scaled, v scaled, 1], ``rest_cov`` the covariance of its error. ``dead``
+    holds, for each MV, the fewest whole periods that pass before any output answers (0: the next sample does).
 
     Raises ModelError for numbers of signals, states or units that cannot be.
     """
@@ -42,6 +44,10 @@ class Identified(Model):
     v_center: Tensor  # (n_v,) [unit of the input]
     v_scale: Tensor  # (n_v,) [unit of the input]
     noise: Tensor  # (n_y,) scaled
+    colour: Tensor  # (n_y,)
+    gain_sd: Tensor  # (n_mv,)
+    pace_sd: Tensor  # (1,)
+    dead_sd: Tensor  # (1,) [periods]
     rest: Tensor  # (n_x, n_y + n_v + 1)
     rest_cov: Tensor  # (n_x, n_x)
     dead: Tensor  # (n_mv,) [periods]
@@ -58,6 +64,7 @@ class Identified(Model):
         self.reserve(w1=(n_hidden, n_x + n_v), b1=(n_hidden,), w2=(n_x, n_hidden))
         self.reserve(y_center=(n_y,), y_scale=(n_y,), v_center=(n_v,), v_scale=(n_v,))
         self.reserve(noise=(n_y,), rest=(n_x, n_y + n_v + 1), rest_cov=(n_x, n_x), dead=(n_mv,))
+        self.reserve(colour=(n_y,), gain_sd=(n_mv,), pace_sd=(1,), dead_sd=(1,))
 
     @property
     def n_v(self) -> int:

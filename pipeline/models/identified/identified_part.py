@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.models.base import Model
 from pipeline.models.identified.assembly import assembled, noise_of
 from pipeline.models.identified.candidates import on_all_rows, within_limits
+from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.network_search import UNITS
@@ -23,9 +24,11 @@ from pipeline.models.identified.structure import Problem, Structure
 from pipeline.models.identified.structure_search import StructureSearch
 from pipeline.models.identified.uncertainty import drawn
 from pipeline.models.identified.verdict import (
+    dead_times,
     free_run_figures,
     gain_figures,
     gains,
+    response_curves,
     response_figures,
     structure_figures,
 )
@@ -104,15 +107,20 @@ class IdentifiedPart(Part):
         structure = selection.chosen.structure
         fitted = within_limits(problem, structure, _member(problem, selection, self.member))
         noise, found, whole = _residuals(problem, structure, fitted.model)
-        model = assembled(fitted.model, structure.delays, scales, problem.data, noise, n_mv, source.seed)
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
         bands = [*_bands(selection), *_as_likely(problem, structure, fitted.model, source.seed)]
         # The gains belong to the middle of the whole record, also where only a part of its rows is fitted.
         rows = ScaledRecord.of(source.data(self.model.kind), scales)
-        runs, curves = free_run_figures(problem, selection.chosen, scales, [s.name for s in pvs])
-        responses, dead = response_figures(bands, structure.delays, rows, scales, pvs, inputs)
+        runs, predictions = free_run_figures(problem, selection.chosen, scales, [s.name for s in pvs])
+        curves = response_curves(bands, rows)
+        doubt, colour = doubt_of(curves, n_mv), colour_of(found)
+        open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
+        known = {"noise": noise, "colour": colour, **open_to}
+        model = assembled(fitted.model, structure.delays, scales, problem.data, known, n_mv, source.seed)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
+        for name, phi in zip(runs, colour, strict=True):
+            runs[name]["noise_colour"] = float(phi)
         visited = _visited(fitted.model, whole, structure.correction)
         warnings = [
             f"{name}: {runs[name]['outside_training']:.0%} of the held-out rows leave the range of the training rows; "
@@ -128,16 +136,17 @@ class IdentifiedPart(Part):
             "outputs": runs,
             "structure": structure_figures(selection),
             "gains": gain_figures(bands, rows, scales, pvs, inputs),
-            "dead_times": dead,
+            "dead_times": dead_times(bands, structure.delays, rows, inputs),
+            "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model, problem.data)[2],
             "stability": stability_figures(fitted.model, visited, [s.v for s in whole]),
             "warnings": warnings,
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
-            "step_responses": responses,
+            "step_responses": response_figures(curves, structure.delays, rows, scales, pvs, inputs),
             "candidates_tried": _table(selection),
         }
-        time_s: Array = source.signals.period_s * np.arange(len(curves["measured"]), dtype=np.float64)
-        return Learnt(model, metrics, predictions={"time_s": time_s, **curves})
+        time_s: Array = source.signals.period_s * np.arange(len(predictions["measured"]), dtype=np.float64)
+        return Learnt(model, metrics, predictions={"time_s": time_s, **predictions})
 
 
 def _member(problem: Problem, selection: Selection, member: int) -> Fitted:

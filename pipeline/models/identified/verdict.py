@@ -30,6 +30,9 @@ POINTS = 60
 LONGEST = 960
 """Points of a step response, and the most periods that it spans."""
 
+STEP = 0.3
+"""Size of a step, in standard deviations of the input in the data."""
+
 
 def structure_figures(selection: Selection) -> dict[str, Any]:
     """The chosen structure, the errors of both classes, and the verdict in words."""
@@ -171,43 +174,55 @@ def gain_figures(
     return table
 
 
+def response_curves(members: Sequence[Dynamics], data: ScaledRecord) -> Array:
+    """Changes (members, n_v, length, n_y) of the outputs by a step of each input, scaled, until they settle.
+
+    A step of input j is ``STEP`` times its standard deviation in the data, from the rest under the medians.
+    """
+    middle, size, n_y = np.median(data.v, axis=0), STEP * data.v.std(axis=0), data.y.shape[1]
+    length, rests = 2 * POINTS, [_middle_rest(m, data) for m in members]
+    while True:
+        runs = [step_responses(m, x, middle, size, length)[..., :n_y] for m, x in zip(members, rests, strict=True)]
+        found = np.array(runs)
+        late = np.abs(found[:, :, -1] - found[:, :, -length // 5]).max()
+        if length >= LONGEST or late < 0.02 * np.abs(found).max():
+            return found
+        length *= 2
+
+
 def response_figures(
-    members: Sequence[Dynamics],
+    curves: Array,
     delays: Sequence[int],
     data: ScaledRecord,
     scales: Scales,
     pvs: Sequence[Signal],
     inputs: Sequence[Signal],
-) -> tuple[dict[str, Any], dict[str, float]]:
-    """(step responses of each PV to a unit step of each input, dead time of each input in periods).
+) -> dict[str, Any]:
+    """Step responses of each PV to a unit step of each input, from ``response_curves`` (members, n_v, length, n_y).
 
     A response holds ``periods``, and over the members the ``middle``, ``low`` and ``high`` in PV/input.
     """
-    n_y = len(pvs)
-    middle = np.median(data.v, axis=0)
-    size = 0.3 * data.v.std(axis=0)
-    length, rests = 2 * POINTS, [_middle_rest(m, data) for m in members]
-    while True:
-        found = np.array(
-            [step_responses(m, x, middle, size, length)[..., :n_y] for m, x in zip(members, rests, strict=True)]
-        )
-        late = np.abs(found[:, :, -1] - found[:, :, -length // 5]).max()
-        if length >= LONGEST or late < 0.02 * np.abs(found).max():
-            break
-        length *= 2
+    size, length = STEP * data.v.std(axis=0), curves.shape[2]
     every = max(length // POINTS, 1)
     table: dict[str, Any] = {pv.name: {} for pv in pvs}
     for j, signal in enumerate(inputs):
         for i, pv in enumerate(pvs):
-            curves = found[:, j, ::every, i] * scales.y_scale[i] / (scales.v_scale[j] * size[j])
+            found = curves[:, j, ::every, i] * scales.y_scale[i] / (scales.v_scale[j] * size[j])
             table[pv.name][signal.name] = {
                 "periods": [int(k) + 1 + int(delays[j]) for k in range(0, length, every)],
-                "middle": np.median(curves, axis=0).tolist(),
-                "low": curves.min(axis=0).tolist(),
-                "high": curves.max(axis=0).tolist(),
+                "middle": np.median(found, axis=0).tolist(),
+                "low": found.min(axis=0).tolist(),
+                "high": found.max(axis=0).tolist(),
             }
+    return table
+
+
+def dead_times(
+    members: Sequence[Dynamics], delays: Sequence[int], data: ScaledRecord, inputs: Sequence[Signal]
+) -> dict[str, float]:
+    """Dead time of each input [periods], the median over the members."""
     dead = np.median([dead_periods(m, data) for m in members], axis=0) + np.asarray(delays)
-    return table, {signal.name: float(d) for signal, d in zip(inputs, dead, strict=True)}
+    return {signal.name: float(d) for signal, d in zip(inputs, dead, strict=True)}
 
 
 def _middle_rest(model: Dynamics, data: ScaledRecord) -> Array:

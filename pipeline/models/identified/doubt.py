@@ -1,0 +1,70 @@
+"""What a record leaves open of its model: gain, speed and dead time, and the colour of the measurement noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.plants.simulator import Array
+
+RISES = (0.1, 0.63)
+"""Shares of its last value between which the time of a step response is its time constant; the first ends dead time."""
+
+MOST_COLOUR = 0.95
+"""Of the noise: what is slower is a disturbance."""
+
+
+class Doubt(NamedTuple):
+    """Standard deviations over models that are as likely as the fitted one."""
+
+    gain: Array  # (n_mv,) relative, of the answer that each MV moves most
+    pace: Array  # (1,) relative, of the time constant
+    dead: Array  # (1,) of the dead time [periods]
+
+
+def doubt_of(curves: Array, n_mv: int) -> Doubt:
+    """From the models' scaled step responses (members, n_v, length, n_y), the MVs' first.
+
+    Of each MV the output counts that it moves most. Speed and dead time are those of the MV that is least certain,
+    as all inputs of a plant share its dynamics.
+    """
+    gain, pace, dead = np.zeros(n_mv), np.zeros(n_mv), np.zeros(n_mv)
+    for j in range(n_mv):
+        strongest = int(np.abs(np.median(curves[:, j, -1], axis=0)).argmax())
+        found = curves[:, j, :, strongest]  # (members, length)
+        middle = float(np.median(found[:, -1]))
+        if len(found) < 2 or middle == 0.0:
+            continue
+        gain[j] = found[:, -1].std(ddof=1) / abs(middle)
+        rises = np.array([[_reached(one, share) for share in RISES] for one in found])
+        taken = rises[:, 1] - rises[:, 0]
+        pace[j], dead[j] = taken.std(ddof=1) / max(float(np.median(taken)), 1.0), rises[:, 0].std(ddof=1)
+    return Doubt(gain, np.array([pace.max()]), np.array([dead.max()]))
+
+
+def _reached(curve: Array, share: float) -> float:
+    """The time [periods, from the step] at which a response (length,) reaches a share of its last value."""
+    way = np.concatenate([[0.0], curve / curve[-1] if curve[-1] else curve])
+    after = int((way >= share).argmax())
+    if after == 0:
+        return float(len(curve))
+    return after - (way[after] - share) / (way[after] - way[after - 1])
+
+
+def colour_of(residuals: Sequence[Array]) -> Array:
+    """Colour phi (n_y,) of the measurement noise e from free-run residuals (n, n_y) of each stretch.
+
+        e(k) = phi e(k-1) + w(k),   corr(e(k) - e(k-1), e(k-1) - e(k-2)) = -(1 - phi)/2
+
+    The differences hide what a model misses slowly. Their standard deviation is that of the noise times
+    sqrt(2 (1 - phi)); phi is no larger than the residual's own standard deviation allows.
+    """
+    changes = [np.diff(r, axis=0) for r in residuals]
+    power = np.sum([(c**2).sum(axis=0) for c in changes], axis=0)
+    lagged = np.sum([(c[1:] * c[:-1]).sum(axis=0) for c in changes], axis=0)
+    white = np.concatenate(changes).var(axis=0) / 2
+    most = 1 - white / np.maximum(np.concatenate(list(residuals)).var(axis=0), 1e-300)
+    found = np.where(power > 0, 1 + 2 * lagged / np.maximum(power, 1e-300), 0.0)
+    return np.clip(found, 0.0, np.clip(most, 0.0, MOST_COLOUR))

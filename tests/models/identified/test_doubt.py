@@ -1,0 +1,51 @@
+"""What a record leaves open: errors of gain, speed and dead time, and the colour of the noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.models.identified.doubt import MOST_COLOUR, colour_of, doubt_of
+from pipeline.plants.noise import coloured
+
+
+def answer(gain: float, pole: float, dead: int, length: int = 200) -> np.ndarray:
+    """Step response (length,) of a lag."""
+    k = np.maximum(np.arange(1, length + 1) - dead, 0)
+    return gain * (1 - pole**k)
+
+
+def test_spreads_of_gain_speed_and_dead_time_are_told_apart() -> None:
+    gains, taus, deads = [1.8, 2.0, 2.2], [18.0, 20.0, 22.0], [2, 3, 4]
+    members = [answer(g, np.exp(-1 / t), d) for g, t, d in zip(gains, taus, deads, strict=True)]
+    found = doubt_of(np.array(members)[:, None, :, None], 1)
+    assert found.gain == pytest.approx([0.1], rel=0.02)
+    assert found.pace == pytest.approx([0.1], rel=0.05)
+    assert found.dead == pytest.approx([1.0 + 0.1 * 20 * 0.105], rel=0.1)  # a tenth of the answer comes later, too
+
+
+def test_the_output_counts_that_an_mv_moves_most() -> None:
+    strong = [answer(g, 0.9, 0) for g in (2.0, 2.1)]
+    weak = [answer(g, 0.9, 0) for g in (0.01, -0.01)]  # its gain is anybody's guess
+    found = doubt_of(np.stack([strong, weak], axis=-1)[:, None], 1)
+    assert found.gain == pytest.approx([0.0345], rel=0.01)
+
+
+def test_a_single_model_and_an_mv_without_effect_leave_nothing_open() -> None:
+    assert doubt_of(answer(1.0, 0.9, 0)[None, None, :, None], 1).gain == [0.0]
+    still = doubt_of(np.zeros((3, 1, 50, 1)), 1)
+    assert (still.gain, still.pace, still.dead) == ([0.0], [0.0], [0.0])
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.5, 0.8])
+def test_the_colour_of_noise_is_found_under_slow_errors_of_the_model(phi: float) -> None:
+    rng, n = np.random.default_rng(3), 20_000
+    noise = coloured(rng.standard_normal((n, 1)), np.array([phi]))
+    slow = 0.5 * np.sin(2 * np.pi * np.arange(n) / 2000)[:, None]
+    assert colour_of([noise + slow]) == pytest.approx([phi], abs=0.03)
+
+
+def test_drift_is_no_colour_beyond_what_the_residual_holds() -> None:
+    walk = np.cumsum(np.random.default_rng(0).standard_normal((5000, 1)), axis=0)
+    assert 0.9 < colour_of([walk])[0] <= MOST_COLOUR
+    assert colour_of([np.zeros((50, 2))]).tolist() == [0.0, 0.0]
