@@ -30,6 +30,7 @@ class Analysis:
 
     figures: Row = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    table: tuple[Row, ...] = ()  # of a search: a row for each trial
 
 
 @dataclass(frozen=True, slots=True)

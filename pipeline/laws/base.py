@@ -26,12 +26,14 @@ class Analysis:
     """Results of a law that need no closed-loop test, such as a proof of stability or a training history.
 
     ``figures`` go to the report, the manifest and the registry. ``arrays`` are for pictures.
-    ``notes`` are sentences below the figures in the report.
+    ``notes`` are sentences below the figures in the report. ``table`` has a row for each trial of a search, figures by
+    column.
     """
 
     figures: Mapping[str, float] = field(default_factory=dict)
     arrays: Mapping[str, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    table: tuple[Mapping[str, float], ...] = ()
 
 
 def hold_numbers(module: nn.Module, **numbers: Any) -> None:

@@ -57,12 +57,13 @@ def further_figures(evidence: Evidence) -> list[dict[str, Any]]:
 
 
 def analyses(evidence: Evidence) -> list[dict[str, Any]]:
-    """The analysis of each law that has one: its figures, a column for every form, and its notes."""
+    """The analysis of each law that has one: its figures by form, its notes, and what its search tried."""
     tables = []
     for name, law in evidence.laws.items():
         forms = {"as shipped" if form == BASE else form: analysis for form, analysis in law.analyses.items()}
         if not forms:
             continue
+        shipped = next(iter(forms.values()))
         notes = dict.fromkeys(note for analysis in forms.values() for note in analysis.notes)
         of = {note: [form for form, analysis in forms.items() if note in analysis.notes] for note in notes}
         metrics = dict.fromkeys(metric for analysis in forms.values() for metric in analysis.figures)
@@ -74,6 +75,8 @@ def analyses(evidence: Evidence) -> list[dict[str, Any]]:
                 "rows": [
                     (evidence.case.label(m), [analysis.figures.get(m) for analysis in forms.values()]) for m in metrics
                 ],
+                "tried": [list(row.values()) for row in shipped.table],
+                "columns": [evidence.case.label(name) for row in shipped.table[:1] for name in row],
                 # A note that all forms share names no form.
                 "notes": [(note, "" if len(own) == len(forms) else ", ".join(own)) for note, own in of.items()],
             }

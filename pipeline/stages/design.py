@@ -93,8 +93,14 @@ def _analysed(law: ControlLaw, plant: Simulator, path: Path) -> dict[str, Any]:
     if analysis.arrays:
         arrays: dict[str, Any] = {name: np.asarray(array) for name, array in analysis.arrays.items()}
         np.savez_compressed(path, **arrays)
-    words = {"figures": {k: float(v) for k, v in analysis.figures.items()}, "notes": list(analysis.notes)}
+    words: dict[str, Any] = {"figures": _floats(analysis.figures), "notes": list(analysis.notes)}
+    if analysis.table:
+        words["table"] = [_floats(row) for row in analysis.table]
     return {"analysis": words} if any(words.values()) else {}
+
+
+def _floats(figures: Mapping[str, float]) -> dict[str, float]:
+    return {name: float(value) for name, value in figures.items()}
 
 
 def _closed_loop(plant: Simulator) -> Callable[[Array], Array]:

@@ -38,7 +38,7 @@ from pipeline.laws.predictive.predictive import Predictive
 from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
 from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import LOOPS, Outcome, Trials
-from pipeline.laws.predictive.tuning import FORGETS, TRAVEL, costs, searched, tuned
+from pipeline.laws.predictive.tuning import FORGETS, TRAVEL, judged, searched, tuned
 from pipeline.models.identified.identified import Identified
 from pipeline.models.static.mlp import MLP
 from serving import Controller
@@ -383,15 +383,15 @@ class Numbered(torch.nn.Module):
 class Bowl:
     """Trials whose errors are known: the squares of the numbers' logarithms from their best values."""
 
-    best = row(2.0, 0.4, 26.0)
+    best = row(2.0, 0.4, 0.3, 26.0)
 
     def run(self, laws: Numbered, count: int) -> Outcome:
-        error = 1 + (laws.logs.reshape(count, 3) - self.best.log()).square().sum(dim=-1, keepdim=True).numpy()
+        error = 1 + (laws.logs.reshape(count, 4) - self.best.log()).square().sum(dim=-1, keepdim=True).numpy()
         return Outcome(error.repeat(LOOPS, axis=1), error.repeat(LOOPS, axis=1), np.zeros((count, 2)))
 
 
 def test_the_search_takes_what_costs_least() -> None:
-    start = {"speed": 1.0, "caution": 1.0, "horizon": 20.0}
+    start = {"speed": 1.0, "caution": 1.0, "jumps": 1.0, "horizon": 20.0}
     best, tried = searched(Bowl(), Numbered, start)  # type: ignore[arg-type]
     assert list(best.numbers.values()) == pytest.approx(Bowl.best.tolist())
     assert tried[0].numbers == start
@@ -414,7 +414,7 @@ def test_the_damping_is_the_least_that_the_loops_stand(
         law.damping = damping
         return law
 
-    start = {"speed": 1.0, "caution": 1.0, "horizon": 20.0}
+    start = {"speed": 1.0, "caution": 1.0, "jumps": 1.0, "horizon": 20.0}
     best = tuned(Shaken(), law_of, start, given)  # type: ignore[arg-type]
     assert best.damping == found
     assert list(best.numbers.values()) == pytest.approx(Bowl.best.tolist())
@@ -432,7 +432,7 @@ def test_a_law_that_calms_at_its_last_numbers_alone_is_damped_more() -> None:
         law.damping = damping
         return law
 
-    start = {"speed": 1.0, "caution": 1.0, "horizon": 20.0}
+    start = {"speed": 1.0, "caution": 1.0, "jumps": 1.0, "horizon": 20.0}
     assert tuned(Shaken(), law_of, start).damping == 0.5  # type: ignore[arg-type]
 
 
@@ -455,9 +455,10 @@ def test_the_cost_weighs_relative_errors_and_travel() -> None:
     even = np.full((2, LOOPS), 2.0)
     uneven = np.array([[2.0] * LOOPS, [2.0] * (LOOPS - 1) + [8.0]])
     given = Outcome(even[:1], even[:1], np.zeros((1, 2)))
-    found = costs(Outcome(even, uneven, np.array([[0.0, 0.0], [2.0, 4.0]])), given)
-    assert found[0] == 1.0
-    assert found[1] == pytest.approx(0.5 + 0.5 * 3.0 / 2.0 + 3 * TRAVEL)
+    found = judged(Outcome(even, uneven, np.array([[0.0, 0.0], [2.0, 4.0]])), given, [{"speed": 1.0}, {"speed": 2.0}])
+    assert found[0].cost == 1.0
+    assert found[1].cost == pytest.approx(0.5 + 0.5 * 3.0 / 2.0 + 3 * TRAVEL)
+    assert found[1].row() == {"speed": 2.0, "set_points": 1.0, "loads": 1.5, "travel": 3.0, "cost": found[1].cost}
 
 
 def test_laws_side_by_side_are_the_laws() -> None:
@@ -514,13 +515,46 @@ def test_a_searched_law_costs_no_more_than_the_given_one() -> None:
     figures = law.analysis(None).figures
     assert figures["cost"] <= figures["cost_given"]
     assert figures["horizon"] == law.moves.horizon
+    table = law.analysis(None).table
+    assert len(table) == figures["tried"]
+    assert [row["cost"] for row in table] == sorted(row["cost"] for row in table)
+    assert table[0]["jumps"] == figures["jumps"]
+    assert {row["jumps"] for row in table} > {1.0}
     assert not law_of(first_order()).analysis(None).figures
+
+
+def test_plants_of_the_trials_err_as_far_as_the_record_leaves_open_and_no_less_than_plants_change() -> None:
+    model, signals = first_order(), made_signals()
+    certain = Trials.draw(model, signals, 12, seed=0)
+    assert certain.gain[:3, 0].tolist() == pytest.approx([1.0, 1.25, 0.8])
+    assert certain.pace[:3, 0].tolist() == pytest.approx([1.0, 1 / 1.15, 1.15])
+    assert certain.late[:3, 0].tolist() == [0.0, 0.5, 0.0]
+    for name, sd in (("gain_sd", 0.2), ("pace_sd", 0.3)):
+        getattr(model, name)[:] = sd
+    open_to = Trials.draw(model, signals, 12, seed=0)
+    assert open_to.gain[1, 0] == pytest.approx(1.4)
+    assert open_to.pace[2, 0] == pytest.approx(1.6)
+
+
+def test_noise_of_the_trials_has_the_colour_and_the_strength_of_the_model_s() -> None:
+    model = first_order()
+    model.noise[:], model.colour[:] = 0.02, 0.75
+    noise = Trials.draw(model, made_signals(), 60, seed=0).noise[..., 0].numpy()
+    assert noise.std() == pytest.approx(0.04, rel=0.05)
+    assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(0.75, abs=0.1)
+
+
+def test_a_share_of_the_jumps_leaves_as_much_of_the_observer_s_boost() -> None:
+    model = first_order()
+    loads = loads_of(model, "mvs", 12)
+    whole, third = (Observer(model, loads, Noises(0.01, 2e-4, jumps)).place for jumps in (1.0, 0.3))
+    np.testing.assert_allclose(third, 0.3 * whole)
 
 
 # ---------------------------------------------------------------------- refusals
 @pytest.mark.parametrize(
     ("name", "value"),
-    [(n, v) for n in ("speed", "caution", "move_weight", "eps", "q_x", "q_d") for v in (0.0, -1.0, float("nan"))]
+    [(n, v) for n in ("speed", "caution", "jumps", "move_weight", "q_x", "q_d") for v in (0.0, -1.0, float("nan"))]
     + [("damping", -0.1), ("horizon", 7), ("moves", 0), ("passes", 0), ("sweeps", 0)],
 )
 def test_numbers_that_make_no_plan_are_refused(name: str, value: float) -> None:

@@ -35,6 +35,7 @@ class Noises:
 
     outputs: float
     loads: Tensor | float  # (n_y,), as each output sees it, or one for all
+    jumps: float = 1.0  # share of BOOST that a load moves by then
 
 
 def load_variance(model: Identified) -> Tensor:
@@ -72,9 +73,10 @@ class Observer(nn.Module):
         b = clip(m^2 (2 - a)/(7 a max(1 + 4 (p - |q| - 1), 1)) - 1, 0, 4)/4
 
     m^2 (2 - a)/a is 1 on average in pure noise, and the filter stays quiet. After a step of a load, the covariance of
-    [x, d] grows by 1000 b q_d R g g', where g is what a unit of the load has made of them by the time that the outputs
-    show it (``Loads.begun``): state and load then follow together. Innovations of both signs, p - |q|, are no load
-    but an error of the model: a loop that swings would be kept swinging by a filter that follows it.
+    [x, d] grows by 1000 j b q_d R g g', where j is the share ``jumps``, and g is what a unit of the load has made of
+    them by the time that the outputs show it (``Loads.begun``): state and load then follow together. Innovations of
+    both signs, p - |q|, are no load but an error of the model: a loop that swings would be kept swinging by a filter
+    that follows it.
 
     Source: the extended Kalman filter of Jazwinski, Stochastic Processes and Filtering Theory, section 8.3; loads
     as integrated noise after Pannocchia and Rawlings, AIChE Journal 49 (2003) 426; a jump of the state and the load
@@ -124,7 +126,7 @@ class Observer(nn.Module):
                 dim=-1,
             )
             grown = since.T @ since / len(since)  # (n_a, n_a)
-            place += BOOST / FULL * (noises.loads * r * loads.share[:, i])[:, None, None] * grown
+            place += noises.jumps * BOOST / FULL * (noises.loads * r * loads.share[:, i])[:, None, None] * grown
         by_y = torch.cat([torch.eye(self.n_y, dtype=torch.float64), model.rest[self.n_y :, : self.n_y]])
         first = torch.zeros(n_a, n_a, dtype=torch.float64)
         first[self.n_y : n_x, self.n_y : n_x] = model.rest_cov[self.n_y :, self.n_y :]

@@ -29,11 +29,12 @@ class PredictiveParams:
     ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
     by their size. ``weights`` > 0 of the CVs in units of their standard deviation; None: all 1. ``q_x`` and
     ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's; q_d
-    None: 3e-5 over the noise. ``loads`` act on the ``mvs`` or the ``outputs``.
+    None: 3e-5 over the noise. ``jumps`` > 0: share of the observer's jump after a step of a load; less calms loops
+    over a plant that is not the model. ``loads`` act on the ``mvs`` or the ``outputs``.
     ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or
     more; None: .5 of one MV, .25 of several, and with a search the least that the loops stand.
-    ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses speed, caution
-    and horizon in closed loops over the model with wrong gains and loads, drawn by ``seed``. ``mv_rate`` [mv]:
+    ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses speed, caution,
+    horizon and jumps in closed loops over the model with errors and loads, drawn by ``seed``. ``mv_rate`` [mv]:
     largest MV change a sample, which the plan knows, one number or one for each MV; None: that of the plant.
     ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has none; None: no limits. A set point
     beyond a limit counts as one at the limit. ``preview`` of the set points: ``held``, as they are now; ``ramp``, a
@@ -49,6 +50,7 @@ class PredictiveParams:
     weights: tuple[float, ...] | None = None
     q_x: float = 0.01
     q_d: float | None = None
+    jumps: float = 1.0
     loads: Where = "mvs"
     damping: float | None = None
     passes: int = 2
@@ -61,7 +63,7 @@ class PredictiveParams:
     preview: Literal["held", "ramp"] = "held"
 
     def __post_init__(self) -> None:
-        for name in ("speed", "caution", "move_weight", "eps", "q_x", "q_d"):
+        for name in ("speed", "caution", "jumps", "move_weight", "eps", "q_x", "q_d"):
             given = getattr(self, name)
             if given is not None and not 0 < given < np.inf:
                 raise ValueError(f"{name} is {given}; it must be above 0, and finite")

@@ -22,10 +22,12 @@ SETTLE = 300  # samples to come to rest
 STILL = 0.25  # share of a movement in the last third of SETTLE from which on it does not end; a level's is 1/3
 SPAN = 4.0  # scaled: a record's outputs lie within two standard deviations
 REACH = 0.8  # of the MVs' range -1..1: where the set points are rests
-GAINS = (0, 1, -1, 1, -1, 0)  # by loop: the plant's gain is higher or lower; of several MVs each by its own sign
-PACES = (0, 0, -1, -1, 1, 0)  # the plant is slower or faster
-LATE = (0, 1, 0, 0, 0, 1)  # the plant answers later
-GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors: a plant does not stay as its record found it
+# By loop, with set points and with loads: as the model; slow, late and with a high gain (of several MVs each by its own
+# sign); fast with a low one. Errors that come together are worse than each alone.
+GAINS = (0, 1, -1, 1, -1, 0)
+PACES = (0, -1, 1, -1, 1, 0)
+LATE = (0, 1, 0, 1, 0, 0)
+GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors; larger ones of pace and dead time calm loops that need no calm
 SURE = 2.0  # standard deviations of what the record leaves open, of each error
 MOST = 1.0  # of each error; of the dead time in samples
 BIAS = 0.2  # of half an MV's range: the largest steps of a load at the MV

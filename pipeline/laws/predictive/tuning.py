@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -11,26 +11,33 @@ import numpy as np
 from pipeline.laws.base import ControlLaw
 from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import Outcome
-from pipeline.plants.simulator import Array
 
 TRAVEL = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
 NEAR = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
 COARSE = [(s, c) for s in (0.5, 1.0, 2.0) for c in (0.4, 1.0, 2.5)]  # factors of speed and caution
 FINE = [(s, c) for s in (0.7, 1.0, 1.4) for c in (0.6, 1.0, 1.6)]
 HORIZONS = (0.7, 1.3)
+JUMPS = (0.3, 0.1, 0.03)
 DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
 FORGETS = 100.0  # growth of a small difference up to which a loop forgets it; most stay below 20
 
 Numbers = dict[str, float]
-"""``speed``, ``caution`` and ``horizon``."""
+"""``speed``, ``caution``, ``jumps`` and ``horizon``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Numbers that were tried, and their cost J."""
+    """Numbers that were tried, their cost J, and what it is made of: errors over the first ones', and travel."""
 
     numbers: Numbers
     cost: float
+    set_points: float = 1.0
+    loads: float = 1.0
+    travel: float = 0.0  # [% of the MVs' range a sample]
+
+    def row(self) -> dict[str, float]:
+        """Its numbers, what they gave, and its cost, by name."""
+        return {**self.numbers, **{n: getattr(self, n) for n in ("set_points", "loads", "travel", "cost")}}
 
 
 class Tries(Protocol):
@@ -43,16 +50,18 @@ class Tries(Protocol):
         """How far a small difference grows in the loops of one law."""
 
 
-def costs(outcome: Outcome, given: Outcome) -> Array:
-    """J (C,) of each law beside the ``given`` one's first, whose errors count 1.
+def judged(outcome: Outcome, given: Outcome, numbers: Sequence[Numbers]) -> list[Candidate]:
+    """Each law with its ``numbers`` beside the ``given`` one's first, whose errors count 1.
 
         J = (E_sp/E_sp0 + E_load/E_load0)/2 + .05 (T_sp + T_load)/2
 
     E is the mean error of the loops, T the MVs' travel [% of their range a sample]. Set points have by far the larger
     errors; so each part counts by what it gains. A worst loop does not count by itself, which made J jump.
     """
-    parts = [getattr(outcome, n).mean(axis=-1) / getattr(given, n).mean() for n in ("set_points", "loads")]
-    return np.asarray(0.5 * sum(parts) + TRAVEL * outcome.travel.mean(axis=-1), dtype=np.float64)
+    sp, loads = (getattr(outcome, n).mean(axis=-1) / getattr(given, n).mean() for n in ("set_points", "loads"))
+    travel = outcome.travel.mean(axis=-1)
+    rows = zip(numbers, 0.5 * (sp + loads) + TRAVEL * travel, sp, loads, travel, strict=True)
+    return [Candidate(dict(n), *map(float, figures)) for n, *figures in rows]
 
 
 def searched(
@@ -60,12 +69,12 @@ def searched(
 ) -> tuple[Candidate, list[Candidate]]:
     """The best numbers by a search from ``start``, and all that were tried, the start first.
 
-    Speed and caution together on a coarse grid, then the horizon, then a finer grid. Numbers far from the start must
-    gain more: the loops' model is the law's own, and what they gain by little may be lost on the plant.
+    Speed and caution together on a coarse grid, then the horizon, then the jumps, then a finer grid. Numbers far from
+    the start must gain more: the loops' model is the law's own, and what they gain by little may be lost on the plant.
     """
     given = trials.run(side_by_side([law_of(start)]), 1)
-    best = Candidate(dict(start), float(costs(given, given)[0]))
-    tried = [best]
+    tried = judged(given, given, [start])
+    best = tried[0]
 
     def tried_all(changes: Sequence[Numbers]) -> None:
         nonlocal best
@@ -73,8 +82,8 @@ def searched(
         new = [n for n in new if not any(n == c.numbers for c in tried)]
         if new:
             outcome = trials.run(side_by_side([law_of(n) for n in new]), len(new))
-            found = costs(outcome, given) + NEAR * np.array([_distance(n, start) for n in new])
-            tried.extend(Candidate(n, float(j)) for n, j in zip(new, found, strict=True) if np.isfinite(j))
+            found = [replace(c, cost=c.cost + NEAR * _distance(c.numbers, start)) for c in judged(outcome, given, new)]
+            tried.extend(c for c in found if np.isfinite(c.cost))
         best = min(tried, key=lambda c: c.cost)
 
     def grid(factors: Sequence[tuple[float, float]]) -> list[Numbers]:
@@ -85,6 +94,7 @@ def searched(
     at = dict(best.numbers)
     for factor in HORIZONS:  # each its own simulation: a plan has another length
         tried_all([{"horizon": float(np.clip(round(at["horizon"] * factor), 8, 60))}])
+    tried_all([{"jumps": at["jumps"] * factor} for factor in JUMPS])
     tried_all(grid(FINE))
     return best, tried
 
