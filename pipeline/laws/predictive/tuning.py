@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from pipeline.engine.progress import steps
 from pipeline.laws.base import ControlLaw
 from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import Outcome
@@ -63,6 +64,7 @@ def searched(
     Speed and caution together on a coarse grid, then the horizon, then a finer grid. Numbers far from the start must
     gain more: the loops' model is the law's own, and what they gain by little may be lost on the plant.
     """
+    show = steps("tuning in closed loops on the model with errors", 1 + len(COARSE) + len(HORIZONS) + len(FINE))
     given = trials.run(side_by_side([law_of(start)]), 1)
     best = Candidate(dict(start), float(costs(given, given)[0]))
     tried = [best]
@@ -76,6 +78,7 @@ def searched(
             found = costs(outcome, given) + NEAR * np.array([_distance(n, start) for n in new])
             tried.extend(Candidate(n, float(j)) for n, j in zip(new, found, strict=True) if np.isfinite(j))
         best = min(tried, key=lambda c: c.cost)
+        show(len(tried))
 
     def grid(factors: Sequence[tuple[float, float]]) -> list[Numbers]:
         at = best.numbers
