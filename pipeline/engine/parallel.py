@@ -33,7 +33,7 @@ CONTEXT: Any = multiprocessing.get_context("fork" if sys.platform == "linux" els
 def parallel_map(
     function: Callable[[Item], Result], items: Iterable[Item], label: str, weights: Sequence[float] | None = None
 ) -> list[Result]:
-    """``[function(i) for i in items]`` over processes, in order; ``label`` is the stage, and what it does: its progress.
+    """``[function(i) for i in items]`` over processes, in order; ``label`` (``STAGE: WHAT``) names the progress.
 
     One process a core here, this one among them; the workers of a Dask cluster where
     ``DASK_SCHEDULER_ADDRESS`` names its scheduler (that needs the package ``distributed``). ``weights`` are about
