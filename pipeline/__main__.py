@@ -36,14 +36,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"loopwright: unknown command {name!r}{nearest(name, COMMANDS)}", file=sys.stderr)
         return 2
     try:
-        command = importlib.import_module(f"pipeline.commands.{name}")
-    except ModuleNotFoundError as error:  # installed for embedding alone
-        print(f"loopwright {name}: {error.name} is not installed; pip install '.[pipeline]' brings it", file=sys.stderr)
-        return 2
-    parser = Parser(prog=f"loopwright {name}", description=COMMANDS[name])
-    command.options(parser)
-    options = parser.parse_args(words[1:])
-    try:
+        try:
+            command = importlib.import_module(f"pipeline.commands.{name}")
+        except ModuleNotFoundError as error:  # installed for embedding alone
+            print(
+                f"loopwright {name}: {error.name} is not installed; pip install '.[pipeline]' brings it",
+                file=sys.stderr,
+            )
+            return 2
+        parser = Parser(prog=f"loopwright {name}", description=COMMANDS[name])
+        command.options(parser)
+        options = parser.parse_args(words[1:])
         status: int | None = command.run(options)
     except FAILURES as error:
         if isinstance(error, BrokenPipeError):  # `| head`: nobody reads on

@@ -34,14 +34,31 @@ SMALL: dict[str, Any] = {
 LONG = {"jacket_pulses"}  # experiments whose records determine no model when they are short
 TRAINER = {"kind": "lm", "iterations": 15}
 TRAINING = {"iterations": 3, "restarts": 1}  # of laws that learn in closed loop
+# Of a plant that `loopwright new` added, whose sections leave these to their defaults.
+OWN_MODEL = {key: SMALL[key] for key in ("minutes", "rows", "units", "orders")}
+# One without a search, the other searched over a few short loops.
+OWN_LAW = {"predictive": {"tuning": "given"}, "pid": {"development_seeds": [1], "development_hold": 80}}
 
 
 def reduced(tree: dict[str, Any]) -> dict[str, Any]:
     """The sections of params.yaml with the numbers of SMALL, and no more controllers than show every law and case."""
-    found = fewer(shrunk(tree))
+    found = fewer(with_small_own_plants(shrunk(tree)))
     for controller in found["controllers"].values():
         controller["as_printed"] = True  # too small to be good: a lock-up must not end the smoke run
     return found
+
+
+def with_small_own_plants(tree: dict[str, Any]) -> dict[str, Any]:
+    """The sections with short searches for the models and the numbers of the laws of own plants."""
+    own = set(tree.get("plants") or {})
+    for entry in tree["models"].values():
+        if entry["case"] in own:
+            for part in entry["parts"].values():
+                part |= OWN_MODEL
+    for entry in tree["controllers"].values():
+        if entry["case"] in own:
+            entry |= OWN_LAW.get(entry["law"], {})
+    return tree
 
 
 def shrunk(tree: Any) -> Any:
@@ -69,12 +86,16 @@ def _small(key: str, value: Any) -> Any:
 
 
 def fewer(tree: dict[str, Any]) -> dict[str, Any]:
-    """Each law in the first case that has it, the first law of each case, and the model sets and records of these."""
+    """Each law in the first case that has it, the first law of each case, and the model sets and records of these.
+
+    An own plant keeps its controllers.
+    """
     laws: set[str] = set()
     cases: set[str] = set()
     controllers, dropped = {}, set()
     for name, entry in tree["controllers"].items():
-        if entry["law"] in laws and entry["case"] in cases:
+        own = entry["case"] in (tree.get("plants") or {})
+        if entry["law"] in laws and entry["case"] in cases and not own:
             dropped.add((entry["case"], entry["model"]))
             continue
         laws.add(entry["law"])

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.params import entries, sections, sections_of
-from pipeline.engine.lifeline import end_with_parent
+from pipeline.engine.dvc import affected, ask, environment
+from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
 from pipeline.errors import ParamsError, PipelineError, nearest
 from pipeline.report.results import show_results
 from pipeline.stages.check import mistakes
@@ -22,6 +23,7 @@ from pipeline.stages.code import code as list_files
 
 ARTIFACTS = Path("artifacts")
 MANY = 25  # stages that a person does not read line by line
+STOPPED = {128 + number for number in (signal.SIGINT, signal.SIGTERM)}
 ABSENT = {"deleted", "not in cache"}  # DVC's words for a file that is not there, whether or not it ever was
 # A kind of section of params.yaml -> the stages of each, in their order; the last one is what its name asks for.
 STAGES = {"records": ("excite",), "models": ("fit",), "controllers": ("design", "validate")}
@@ -38,6 +40,17 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check params.yaml, say what runs, run it, and show the results."""
+    try:
+        code = _run(options)
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    if code in STOPPED:
+        again = " ".join(["loopwright run", *options.targets])
+        print(f"stopped; finished stages are kept, `{again}` goes on from there", file=sys.stderr)
+    return code
+
+
+def _run(options: argparse.Namespace) -> int:
     targets = [stage for name in options.targets for stage in stages_of(name)]
     wrong = mistakes()
     if wrong:
@@ -47,12 +60,20 @@ def run(options: argparse.Namespace) -> int:
     if options.dry:
         list_files()  # not by DVC, which would change dvc.lock
     else:
-        _dvc("repro", "--quiet", "code")
+        try:
+            ask("repro", "--quiet", "code", finish=True)
+        except PipelineError as error:
+            raise PipelineError(
+                f"the list of the files that each stage runs could not be made, so no stage ran ({error}); "
+                f"mend that and run again: results are kept. Python is {sys.executable}; `make setup` gives one with "
+                "all packages"
+            ) from None
     changed = status(targets)
-    print("\n".join(plan(changed)), flush=True)
+    expected = affected(changed, targets) if changed else []
+    print("\n".join(plan(changed, len(expected))), flush=True)
     if options.dry:
         return 0
-    code = repro(targets, changed, keep_going=options.keep_going) if changed else 0
+    code = repro(targets, changed, expected, keep_going=options.keep_going) if changed else 0
     if code == 0:
         # Somebody who asked for one case need not look for it in the table of all.
         asked = options.targets if targets and all(t.startswith("report@") for t in targets) else [None]
@@ -63,30 +84,44 @@ def run(options: argparse.Namespace) -> int:
     return code
 
 
-def repro(targets: Sequence[str], changed: Iterable[str], *, keep_going: bool = False) -> int:
+def repro(targets: Sequence[str], changed: Iterable[str], expected: Sequence[str], *, keep_going: bool = False) -> int:
     """Run ``targets`` (none: everything), of which the stages ``changed``, by DVC; its exit status.
 
-    Cases share no output, so that those with changes run side by side. Stages find their libraries loaded once.
-    The process that loads them imports nothing of the pipeline, so that every stage runs the sources
-    as they are when it starts. It and all that it starts end with this process, whatever ends it.
+    ``expected`` are those and what depends on them. Cases share no output, so that those with changes run side by
+    side. Stages find their libraries loaded once. The process that loads them imports nothing of the pipeline, so that
+    every stage runs the sources as they are when it starts. It and all that it starts end with this process, whatever
+    ends it, and after Ctrl-C; the status is then that of a shell, 130.
     """
-    options = ["--keep-going"] if keep_going else []
     # What depends on a stage that failed must not run, and DVC knows that of its whole graph alone.
     chains = [] if keep_going else side_by_side(targets, changed)
     if chains:
-        rest = [] if targets else ["--rest"]
-        work = ["-m", "pipeline.engine.lanes", *rest, *(",".join(chain) for chain in chains)]
+        work = [*([] if targets else ["--rest"]), *(",".join(chain) for chain in chains)]
     else:
-        work = ["-m", "dvc", "repro", *options, *targets]
-    own = os.getpid()
-    command = [sys.executable, "-m", "pipeline.engine.warm", sys.executable, *work]
-    with subprocess.Popen(command, preexec_fn=lambda: end_with_parent(own)) as process:
-        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
-        while True:
-            try:
-                return process.wait()
-            except KeyboardInterrupt:
-                continue  # the terminal has interrupted all of them; wait until they have ended
+        work = ["repro", *(["--keep-going"] if keep_going else []), *targets]
+    lanes = [sys.executable, "-m", "pipeline.engine.lanes", "--of", ",".join(expected), *work]
+    own, asked, running = os.getpid(), list[int](), list[subprocess.Popen[bytes]]()
+
+    def begin() -> None:
+        end_with_parent(own)
+        hear_no_interrupt()
+
+    def stop(number: int, _: object) -> None:
+        asked.append(number)
+        for process in running:
+            process.terminate()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        command = [sys.executable, "-m", "pipeline.engine.warm", *lanes]
+        with subprocess.Popen(command, env=environment(), preexec_fn=begin) as process:
+            running.append(process)
+            if asked:
+                process.terminate()
+            code = process.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 128 + asked[0] if asked and code else code
 
 
 def side_by_side(targets: Sequence[str], changed: Iterable[str]) -> list[list[str]]:
@@ -127,7 +162,7 @@ def stages_of(name: str) -> list[str]:
 def status(targets: Iterable[str]) -> Mapping[str, list[str]]:
     """Stage -> why it runs, of the stages whose own files or parameters have changed (``dvc status``)."""
     upstream = [] if not targets else ["--with-deps"]
-    tree = json.loads(_dvc("status", "--json", *upstream, *targets) or "{}")
+    tree = json.loads(ask("status", "--json", *upstream, *targets) or "{}")
     return {stage: reasons(entries) for stage, entries in tree.items() if stage != "code"}
 
 
@@ -148,24 +183,17 @@ def reasons(entries: Iterable[Mapping[str, Mapping[str, Any]] | str]) -> list[st
     return lines
 
 
-def plan(changed: Mapping[str, list[str]]) -> list[str]:
-    """Stages that will run and why, a line each; of many stages, a line for each kind."""
+def plan(changed: Mapping[str, list[str]], expected: int) -> list[str]:
+    """Stages that have changed and why, a line each; of many stages, a line for each kind.
+
+    ``expected`` counts them and what depends on them; a stage whose inputs come out the same does not run.
+    """
     if not changed:
         return ["nothing has changed; everything is up to date"]
-    head = f"{len(changed)} stages have changed; they run, and after them what depends on them:"
+    stages = "1 stage has" if len(changed) == 1 else f"{len(changed)} stages have"
+    head = f"{stages} changed; with what depends on that at most {expected} run. Changed:"
     if len(changed) > MANY:
         kinds = Counter(stage.partition("@")[0] for stage in changed)
         return [head, *(f"  {kind:10} {count:3}" for kind, count in kinds.items())]
     width = max(map(len, changed))
     return [head, *(f"  {stage:{width}}  {'; '.join(why)}" for stage, why in changed.items())]
-
-
-def _dvc(*arguments: str) -> str:
-    """Output of DVC; PipelineError with its last line where it failed."""
-    command = [sys.executable, "-m", "dvc", *arguments]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-    except subprocess.CalledProcessError as error:
-        lines = (error.stderr or error.stdout).strip().splitlines() or ["no output"]
-        raise PipelineError(f"dvc {arguments[0]} failed: {lines[-1]}") from error
-    return done.stdout

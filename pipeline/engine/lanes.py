@@ -1,4 +1,4 @@
-"""``python -m pipeline.engine.lanes [--rest] STAGE,STAGE,... ...``: chains of stages side by side.
+"""``python -m pipeline.engine.lanes [--of STAGE,...] [--rest] STAGE,STAGE,... ...``: chains of stages side by side.
 
 DVC runs one stage after another, and in each there is a while in which a core has nothing to do: imports, a single
 data seed, DVC's own files. Chains that share no output fill it. Each lane takes the next chain and has a ``dvc repro``
@@ -6,47 +6,73 @@ of its own run its stages in their order, up to the first that fails; the stages
 must be up to date. With ``--rest`` one more ``dvc repro`` then runs whatever is left. A chain that fails ends the run
 once those beside it have ended. Results are those of one lane.
 
-What the lanes write comes line by line to one output, without DVC's lines on stages that it skips.
+``python -m pipeline.engine.lanes [--of STAGE,...] repro ARGUMENT...`` is one ``dvc repro ARGUMENT...``.
+
+What the lanes write comes line by line to one output, with each stage announced by its number among those ``of``
+which the run may have to run. After SIGINT or SIGTERM no line comes any more, and no stage begins. DVC itself is not
+interrupted while it may be writing down a finished stage: the warm process ends the stage that runs and refuses the
+next, so that DVC ends by itself.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import selectors
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
+from pipeline.engine.announcements import Announcements, words_of
+from pipeline.engine.dvc import COMMAND, environment
 from pipeline.engine.lifeline import end_with_parent
+from pipeline.engine.start import VARIABLE
 
 LANES = 2  # more fill no core further: every stage already starts a process a core
-REST = "--rest"
-SKIPPED = b"didn't change, skipping"
+GRACE_S = 15.0  # in which DVC ends by itself
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the chains, then the rest if asked; the exit status of the first failure, or 0."""
-    chains = [a.split(",") for a in argv if a != REST]
-    if not chains or any(chain[0].startswith("-") for chain in chains):
-        print(
-            f"usage: python -m pipeline.engine.lanes [{REST}] STAGE,STAGE,... ...: stages of dvc.yaml", file=sys.stderr
-        )
-        return 2
-    lanes = _Lanes([sys.executable, "-m", "dvc", "--wait-for-lock", "repro"])
+    parser = argparse.ArgumentParser(prog="python -m pipeline.engine.lanes")
+    parser.add_argument("--of", metavar="STAGE,...", type=lambda names: names.split(","), default=[])
+    parser.add_argument("--rest", action="store_true", help="run whatever is left after the chains")
+    parser.add_argument("work", metavar="STAGE,...", nargs="+", help="chains, or repro and its arguments")
+    asked, further = parser.parse_known_args(argv)
+    lanes = _Lanes(Announcements(asked.of, words_of(Path("dvc.yaml"))))
+    if asked.work[0] == "repro":
+        return lanes.run([[*asked.work, *further]])
+    if further or not all(asked.work):
+        parser.error(f"{' '.join(further)}: give stages of dvc.yaml")
     # Single items: a look at a stage that they share would lock it for the others.
-    return lanes.run([["--single-item", *chain] for chain in chains]) or (lanes.run([[]]) if REST in argv else 0)
+    repro = ["--wait-for-lock", "repro"]
+    chains = [[*repro, "--single-item", *chain.split(",")] for chain in asked.work]
+    return lanes.run(chains) or (lanes.run([repro]) if asked.rest else 0)
+
+
+@dataclass
+class _Lane:
+    """What is known of one DVC process."""
+
+    line: bytearray = field(default_factory=bytearray)  # that it has begun to write
+    ran: bool = False  # whether a stage ran, so that it may be writing dvc.lock
 
 
 class _Lanes:
-    """``command`` with one list of arguments after another, a few at once."""
+    """DVC with one list of arguments after another, a few at once."""
 
-    def __init__(self, command: list[str]) -> None:
-        self.command, self.stopped = command, 0  # the signal that ended the run
-        self.running = dict[subprocess.Popen[bytes], bytearray]()  # the line that each has begun
+    def __init__(self, announcements: Announcements) -> None:
+        self.announcements = announcements
+        self.stopped, self.patience_ends = 0, float("inf")  # the signal that ended the run; when DVC is ended, too
+        self.running = dict[subprocess.Popen[bytes], _Lane]()
         for asked in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(asked, lambda number, _: self._stop(number))
+            if signal.getsignal(asked) != signal.SIG_IGN:
+                signal.signal(asked, lambda number, _: self._stop(number))
 
     def run(self, work: list[list[str]]) -> int:
         """Do all of ``work``; the exit status of the first failure, or 0."""
@@ -56,38 +82,47 @@ class _Lanes:
                 while left and len(self.running) < LANES and not self.stopped and not first:
                     process = self._begun(left.pop(0))
                     waiting.register(process.stdout, selectors.EVENT_READ, process)  # type: ignore[arg-type]
-                for key, _ in waiting.select():
+                if self.stopped and time.monotonic() > self.patience_ends:
+                    self._end(self.running)
+                for key, _ in waiting.select(0.5):
                     if self._passed_on(key.data):
                         continue
                     waiting.unregister(key.fileobj)
                     code = self._ended(key.data)
                     first = first or code
-        return first or (128 + self.stopped if self.stopped else 0)
+        return 128 + self.stopped if self.stopped else first
 
     def _begun(self, arguments: list[str]) -> subprocess.Popen[bytes]:
         own = os.getpid()
         process = subprocess.Popen(
-            [*self.command, *arguments],
+            [*COMMAND, *arguments],
+            env=environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             bufsize=0,
             preexec_fn=lambda: end_with_parent(own),
-            start_new_session=True,  # so that its stages can be told with it
+            start_new_session=True,  # so that its stages can be ended with it
         )
-        self.running[process] = bytearray()
+        self.running[process] = _Lane()
         return process
 
     def _passed_on(self, process: subprocess.Popen[bytes]) -> bool:
         """Write the lines that a process has completed; False at their end."""
         assert process.stdout is not None
         found = os.read(process.stdout.fileno(), 65_536)
-        begun = self.running[process]
-        begun += found
-        *lines, rest = bytes(begun).split(b"\n") if found else [bytes(begun), b""]
-        begun[:] = rest
+        lane = self.running[process]
+        lane.line += found
+        *lines, rest = bytes(lane.line).split(b"\n") if found else [bytes(lane.line), b""]
+        lane.line[:] = rest
         for line in lines:
-            if line.strip() and not line.rstrip().endswith(SKIPPED):
-                os.write(1, line + b"\n")
+            before = self.announcements.begun
+            words = self.announcements.of(line.decode(errors="replace"))
+            lane.ran |= self.announcements.begun > before
+            if self.stopped:
+                if b"failed to" in line:  # nothing more is written down: with --keep-going it would try the others
+                    self._end([process])
+            elif words is not None:
+                os.write(1, words.encode() + b"\n")
         return bool(found)
 
     def _ended(self, process: subprocess.Popen[bytes]) -> int:
@@ -98,11 +133,18 @@ class _Lanes:
         return 128 - code if code < 0 else code  # of a signal, as a shell counts
 
     def _stop(self, number: int) -> None:
-        """Tell all that runs: DVC alone would leave its stage, and with it our wait, to its end."""
-        self.stopped = number
-        for process in self.running:
+        """Begin no further stage, and have those that run end."""
+        if self.stopped:
+            return
+        self.stopped, self.patience_ends = number, time.monotonic() + GRACE_S
+        served = VARIABLE in os.environ  # by a process that ends the stages
+        self._end([process for process, lane in self.running.items() if not (served and lane.ran)])
+
+    @staticmethod
+    def _end(processes: Sequence[subprocess.Popen[bytes]] | dict[subprocess.Popen[bytes], _Lane]) -> None:
+        for process in processes:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, number)
+                os.killpg(process.pid, signal.SIGTERM)
 
 
 if __name__ == "__main__":

@@ -23,3 +23,8 @@ def end_with_parent(parent: int | None = None) -> None:
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
     if parent is not None and os.getppid() != parent:
         os.kill(os.getpid(), signal.SIGTERM)
+
+
+def hear_no_interrupt() -> None:
+    """Ignore Ctrl-C in this process and in whatever it starts: the one that started it ends them all, in order."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

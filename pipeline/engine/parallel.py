@@ -9,7 +9,7 @@ import sys
 import traceback
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
@@ -18,11 +18,10 @@ from typing import Any, TypeVar
 
 import cloudpickle
 import joblib
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 
 from pipeline.engine.lifeline import end_with_parent
+from pipeline.engine.progress import piece, progress_bar, within
 from pipeline.errors import PipelineError
 
 Item = TypeVar("Item")
@@ -31,22 +30,23 @@ Result = TypeVar("Result")
 CONTEXT: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
 
 
-def parallel_map(function: Callable[[Item], Result], items: Iterable[Item], label: str) -> list[Result]:
-    """``[function(i) for i in items]`` over processes, in order, with progress under ``label``.
+def parallel_map(
+    function: Callable[[Item], Result], items: Iterable[Item], label: str, weights: Sequence[float] | None = None
+) -> list[Result]:
+    """``[function(i) for i in items]`` over processes, in order; ``label`` (``STAGE: WHAT``) names the progress.
 
     One process a core here, this one among them; the workers of a Dask cluster where
-    ``DASK_SCHEDULER_ADDRESS`` names its scheduler (that needs the package ``distributed``).
+    ``DASK_SCHEDULER_ADDRESS`` names its scheduler (that needs the package ``distributed``). ``weights`` are about
+    what the items cost beside each other (None: all the same), for the progress alone.
 
     Raises whatever ``function`` raises, of the first item that fails, and PipelineError where a
     process dies.
     """
     work = list(items)
     address = os.environ.get("DASK_SCHEDULER_ADDRESS")
-    results = _on_cluster(address, function, work, label) if address else _here(function, work, label)
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        console.print(f"{label}: {len(work)} done")
-    return results
+    if address:
+        return _on_cluster(address, function, work, label)
+    return _here(function, work, label, [1.0] * len(work) if weights is None else list(weights))
 
 
 def _one_thread(function: Callable[[Item], Result], item: Item) -> Result:
@@ -56,7 +56,7 @@ def _one_thread(function: Callable[[Item], Result], item: Item) -> Result:
 
 
 # ---------------------------------------------------------------------- this machine
-def _here(function: Callable[[Item], Result], work: list[Item], label: str) -> list[Result]:
+def _here(function: Callable[[Item], Result], work: list[Item], label: str, weights: Sequence[float]) -> list[Result]:
     """Share the items out between this process and helpers on the other cores, one by one."""
     left = deque(range(len(work)))
     futures: list[Future[Result]] = [Future() for _ in work]
@@ -66,8 +66,17 @@ def _here(function: Callable[[Item], Result], work: list[Item], label: str) -> l
     helpers = [_Helper(function, label) for _ in range(min(len(work), cores) - 1)]
     finished = False
     try:
-        with progress_bar() as bar:
+        # The steps of a single item are what there is to show; those of several would be mixed up.
+        with progress_bar() as bar, within(label.partition(": ")[0] if len(work) == 1 and bar.disable else ""):
             task = bar.add_task(label, total=len(work))
+            whole = piece(label, sum(weights)) if bar.disable and work[1:] else None
+            ended_ones = set[int]()
+
+            def advance(i: int) -> None:
+                bar.advance(task)
+                ended_ones.add(i)
+                if whole is not None:
+                    whole.show(sum(weights[k] for k in tuple(ended_ones)), f"{len(ended_ones)} of {len(work)}")
 
             def take(run: Callable[[Item], Result]) -> None:
                 while True:
@@ -80,7 +89,7 @@ def _here(function: Callable[[Item], Result], work: list[Item], label: str) -> l
                     except Exception as error:
                         left.clear()
                         futures[i].set_exception(error)
-                    bar.advance(task)
+                    advance(i)
 
             for helper in helpers:
                 Thread(target=helper.help_along, args=(take,), daemon=True).start()
@@ -193,16 +202,3 @@ def _cluster(address: str) -> Any:
             "pip install '.[cluster]', or unset it to use this machine's cores"
         ) from None
     return Client(address)
-
-
-def progress_bar() -> Progress:
-    """A progress bar on stderr; silent where stderr is not a terminal."""
-    console = Console(stderr=True)
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    )

@@ -35,6 +35,7 @@ LIBRARIES = (
     *("onnx", "onnx_ir", "onnxruntime", "onnxscript.optimizer", "onnxscript.function_libs.torch_lib.ops"),
 )
 POLL_S = 0.5
+STOPPED = 130  # exit status of a stage that was ended with the whole run, as a shell counts Ctrl-C
 
 
 def main(argv: Sequence[str]) -> int:
@@ -47,15 +48,23 @@ def main(argv: Sequence[str]) -> int:
         )
         return 2
     if sys.platform != "linux":  # elsewhere the system's own libraries do not survive a fork
-        return subprocess.run(command, check=False).returncode
+        return _cold(command)
     with TemporaryDirectory(prefix="loopwright-") as folder, socket.socket(socket.AF_UNIX) as door:
         address = str(Path(folder) / "stages")
         try:
             door.bind(address)
         except OSError:  # a path that is too long for a socket
-            return subprocess.run(command, check=False).returncode
+            return _cold(command)
         door.listen()
         return _Server(door, command, address).run()
+
+
+def _cold(command: list[str]) -> int:
+    """Exit status of the command, whose stages start by themselves; SIGTERM is passed on."""
+    with subprocess.Popen(command) as process:
+        signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+        code = process.wait()
+    return 128 - code if code < 0 else code
 
 
 class _Server:
@@ -65,23 +74,27 @@ class _Server:
         self.door, self.stages = door, dict[int, socket.socket]()
         self.waiting = selectors.DefaultSelector()
         self.waiting.register(door, selectors.EVENT_READ)
-        # An ended process wakes the loop; Ctrl-C is for the command, which is asked by the terminal itself.
+        # An ended process wakes the loop. Ctrl-C is for the command, which is asked by the terminal itself; stages
+        # ignore it where this process was started so: then who started it ends them all, by SIGTERM.
         self.wake, self.wakened = socket.socketpair()
         self.wakened.setblocking(False)
         self.waiting.register(self.wake, selectors.EVENT_READ)
         signal.set_wakeup_fd(self.wakened.fileno(), warn_on_full_buffer=False)
         signal.signal(signal.SIGCHLD, lambda *_: None)
-        signal.signal(signal.SIGINT, lambda *_: None)
+        self.deaf = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+        if not self.deaf:
+            signal.signal(signal.SIGINT, lambda *_: None)
         environment = {**os.environ, VARIABLE: json.dumps([address, *served()])}
         own = os.getpid()
         self.command = subprocess.Popen(command, env=environment, preexec_fn=lambda: end_with_parent(own))
-        signal.signal(signal.SIGTERM, lambda *_: self.command.terminate())
+        self.stopped = False
+        signal.signal(signal.SIGTERM, lambda *_: self._stop())
 
     def run(self) -> int:
         """Serve until the command ends."""
         for name in LIBRARIES:  # while the command starts; stages that come meanwhile wait at the door
-            if self.command.poll() is not None:
-                break  # nothing was to be done
+            if self.command.poll() is not None or self.stopped:
+                break  # nothing is to be done
             with contextlib.suppress(Exception):
                 importlib.import_module(name)
         try:
@@ -93,12 +106,22 @@ class _Server:
                         self._begin()
                     else:
                         self._abandon(key.data)
+                if self.stopped:
+                    self._end_stages()
                 self._report()
         finally:
-            for pid in self.stages:
-                os.kill(pid, signal.SIGTERM)
+            self._end_stages()
         code = self.command.returncode
         return 128 - code if code < 0 else code  # of a command that a signal ended, as a shell counts
+
+    def _stop(self) -> None:
+        """Tell the command, which from now on says nothing of the stages that end, and refuse further ones."""
+        self.stopped = True
+        self.command.terminate()
+
+    def _end_stages(self) -> None:
+        for pid in self.stages:
+            os.kill(pid, signal.SIGTERM)
 
     def _begin(self) -> None:
         """Fork for the stage that asks at the door."""
@@ -110,6 +133,11 @@ class _Server:
                 request = json.loads(reader.readline())
         except (OSError, ValueError):
             line.close()
+            return
+        if self.stopped:
+            for file in files:
+                os.close(file)
+            _answer(line, STOPPED)
             return
         sys.stdout.flush()
         sys.stderr.flush()
@@ -129,7 +157,7 @@ class _Server:
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGINT, signal.SIG_IGN if self.deaf else signal.default_int_handler)
             self.waiting.close()
             for own in (self.door, self.wake, self.wakened, *self.stages.values()):
                 own.close()
@@ -145,7 +173,7 @@ class _Server:
             if isinstance(end.code, str):
                 print(end.code, file=sys.stderr)
         except KeyboardInterrupt:
-            code = 130
+            code = STOPPED
         except BaseException:
             traceback.print_exc()
         finally:
@@ -167,10 +195,15 @@ class _Server:
                 continue
             with contextlib.suppress(KeyError):
                 self.waiting.unregister(line)
-            with contextlib.suppress(OSError):
-                line.sendall(f"{os.waitstatus_to_exitcode(status)}\n".encode())
-            line.close()
+            _answer(line, STOPPED if self.stopped and status else os.waitstatus_to_exitcode(status))
             del self.stages[pid]
+
+
+def _answer(line: socket.socket, code: int) -> None:
+    """Tell who waits for a stage how it ended."""
+    with contextlib.suppress(OSError):
+        line.sendall(f"{code}\n".encode())
+    line.close()
 
 
 if __name__ == "__main__":

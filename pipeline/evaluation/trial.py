@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.engine.progress import steps
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import left_limits, locked_up
 from pipeline.evaluation.law_evidence import BASE
@@ -75,9 +76,9 @@ def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
     locked_up: dict[str, int] = {}
     reached: list[dict[str, tuple[float, float]]] = []
     noisy = (False, True) if form == BASE or case.development_noise else (False,)
-    for name, tests in case.scenarios().items():
-        if form != BASE and not case.variants_run(tests):
-            continue
+    scored = {name: tests for name, tests in case.scenarios().items() if form == BASE or case.variants_run(tests)}
+    show = steps("tests in closed loop", len(noisy) * len(scored))
+    for name, tests in scored.items():
         for noise in noisy:
             runs = [repeated(controller, case, test, noise, noise_seed + i) for i, test in enumerate(tests)]
             key = name + (NOISE_SUFFIX if noise else "")
@@ -87,6 +88,7 @@ def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
             reached += [reached_by([one.first for one in runs], case)] if case.on_models and not noise else []
             if len(tests) > 1 and not noise:
                 sequences[name] = {str(test.seed): one.metrics for test, one in zip(tests, runs, strict=True)}
+            show(len(metrics))
     development = [
         repeated(controller, case, test, case.development_noise, noise_seed + DEVELOPMENT + i)
         for i, test in enumerate(case.development() if form == BASE else ())

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from pipeline.engine import progress
 from pipeline.errors import ExportError
 from pipeline.export.controller_file import assembled, write_sidecar
 from pipeline.export.graph import example_inputs, law_graph
@@ -107,6 +108,7 @@ def parity_gate(
     mv = np.array([s.middle for s in signals.mv])
     ours = theirs = (mv, np.zeros(law.n_state), np.zeros(len(law.info)))
     pairs = []
+    show = progress.steps("the exported file beside the law, step by step", steps)
     for k in range(steps):
         sp, pv, dv = (step() for step in courses)
         if drive is not None:
@@ -118,6 +120,7 @@ def parity_gate(
             theirs = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=theirs[0], state=theirs[1])
         except LoopwrightError as error:
             raise ExportError(f"law {law.name!r} fails at step {k} of the parity loop: {error}") from error
+        show(k + 1)
         pairs.append((np.concatenate(ours), np.concatenate(theirs)))
     torch_side, onnx_side = (np.array(side) for side in zip(*pairs, strict=True))
     scale = np.maximum(np.abs(torch_side), np.abs(onnx_side)).max(axis=0)

@@ -246,13 +246,18 @@ def _cause(error: Exception) -> str:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Hold back what the exporter says of torchvision and of its own deprecated calls."""
+    """Hold back what the exporter says of torchvision and of its own deprecated calls.
+
+    And what it notes of the place in the sources of each operation: nobody reads it, and it is a third of the tracing.
+    """
     log = logging.getLogger("torch.onnx._internal.exporter._registration")
-    level = log.level
+    level, without_places = log.level, torch.fx.config.do_not_emit_stack_traces
     log.setLevel(logging.ERROR)
+    torch.fx.config.do_not_emit_stack_traces = True
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*", category=FutureWarning)
             yield
     finally:
         log.setLevel(level)
+        torch.fx.config.do_not_emit_stack_traces = without_places

@@ -32,7 +32,11 @@ def model_bounds(case: Case, kept: Path) -> Bounds:
     work = [item for item, key in keys.items() if key not in known]
     # Sequences of one model follow each other: a process builds the problem of a model once.
     work.sort(key=lambda item: _plant_key(_plant(tests[item[0]][item[1]])))
-    found = parallel_map(partial(_bound, case), work, f"bounds {case.name}") if work else []
+    found = (
+        parallel_map(partial(_bound, case), work, f"report {case.name}: the bound, control that knows the model (NMPC)")
+        if work
+        else []
+    )
     known |= {keys[item]: figures for item, figures in zip(work, found, strict=True)}
     used = {key: known[key] for key in keys.values()}
     if work or set(used) != set(_read(kept)):

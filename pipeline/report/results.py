@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pipeline.config.params import PARAMS_FILE, entries, sections
 from pipeline.errors import PipelineError
 from pipeline.evaluation.metric import with_unit
 from pipeline.evaluation.standing import LawStanding, Standing, tally, withheld_in
@@ -45,7 +46,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         if case not in (None, name):
             continue
         withheld = withheld_in(standing.folder)
+        given = _given(artifacts.parent / PARAMS_FILE, name)
         for law, why in withheld.items():
+            if given is not None and law not in given:
+                continue  # a file that a controller left which has been taken out since
             console.print(f"{name}: {law} is not shipped: {why}", style="red", markup=False, soft_wrap=True)
         shipped += [law for law in standing.laws if law.law not in withheld]
     if any(law.lock_ups for law in shipped):
@@ -66,6 +70,13 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     console.print(f"try one    loopwright simulate {where / '<law>.onnx'}")
     console.print(f"read one   loopwright inspect {where / '<law>.onnx'}")
     console.print("registry   make registry, then /#/models in the browser")
+
+
+def _given(params: Path, case: str) -> tuple[str, ...] | None:
+    """The controllers that the case has; None where artifacts lie by themselves, and nobody can say."""
+    if not params.is_file() or case not in sections("cases", params):
+        return None
+    return entries("controllers", case, "name", params)
 
 
 def overview(standings: Iterable[Standing]) -> Table:

@@ -50,7 +50,9 @@ def design(name: str) -> None:
     try:
         require_fit(law, case.plant)
         suits = True
-        rows = parallel_map(partial(_export, *arguments), work, f"design {name}")
+        rows = parallel_map(
+            partial(_export, *arguments), work, f"design {name}: controllers, tuned and written as ONNX files"
+        )
     except (LawError, ExportError) as error:
         if suits and not case.on_models:
             raise  # who wrote equations and a law down wants to know

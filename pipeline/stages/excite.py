@@ -27,7 +27,11 @@ def excite(name: str) -> None:
     excitation = parse(kind, params.excitation, where)
     folder = record_folder(params.case, params.record)
     shutil.rmtree(folder, ignore_errors=True)
-    rows = parallel_map(partial(_record, excitation, case.plant, folder), params.seeds, f"excite {name}")
+    rows = parallel_map(
+        partial(_record, excitation, case.plant, folder),
+        params.seeds,
+        f"excite {name}: experiments on the simulated plant",
+    )
     write_json(folder / "metrics.json", {"record": params.record, "per_seed": dict(rows)})
 
 

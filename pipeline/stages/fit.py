@@ -38,7 +38,9 @@ def fit(name: str) -> None:
     needed = groundworks(parts.values())
     shared = {seed: done(needed, _source(data, case, seed), label) for seed in data if needed}
     work = [(seed, part) for seed in data for part in parts]
-    learnt = parallel_map(partial(_learn, parts, data, case, shared, folder), work, label)
+    learnt = parallel_map(
+        partial(_learn, parts, data, case, shared, folder), work, f"{label}: the models, their errors and their bands"
+    )
     results = dict(zip(work, learnt, strict=True))
     digests = {str(seed): digest for (seed, _), (digest, _, _) in results.items()}
     metrics: dict[str, Any] = {"model": params.model, "data": digests, "parts": {}}

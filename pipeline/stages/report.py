@@ -35,8 +35,8 @@ def report(name: str) -> None:
     own_data = any(_is_own(Path(data), name) for data in entries("models", name, "data"))
     evidence = Evidence.load(case, bounds, WORK / name, TIMING / name, laws, models, own_data)
     claims, pictures = beside(case, "paper", "CLAIMS", PLAIN), beside(case, "pictures", "PICTURES", ())
-    for path in write_report(evidence, claims, pictures, ARTIFACTS / name):
-        print(path)
+    files = write_report(evidence, claims, pictures, ARTIFACTS / name)
+    print(f"report {name}: {len(files)} files in {ARTIFACTS / name}")
     verdicts = (ARTIFACTS / name / "validation.json").read_bytes()
     write_json(receipt_file(name), {"validation_sha256": hashlib.sha256(verdicts).hexdigest()})
 

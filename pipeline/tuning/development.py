@@ -45,7 +45,7 @@ class BatchLoops:
         """The PVs (*lanes, n_pv)."""
         return self.plant.measured(self.x).reshape(*self.lanes, -1)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def step(self, sp: Tensor, pv: Array, load: Array | None = None) -> None:
         """One period on, with set points (*lanes, n_sp) and PVs; ``load`` (*lanes, n_mv) [mv] acts with the MVs."""
         self.mv, self.state, _ = self.law(sp, torch.from_numpy(pv), self.dv, self.mv, self.state)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.engine.progress import steps
 from pipeline.errors import LawError
 from pipeline.plants.simulator import Array
 from pipeline.tuning.responses import FirstOrder
@@ -45,6 +46,7 @@ def searched(
     ``processes`` are those of the pairs. ``weight`` is the set-point weight, None: chosen too. ``base`` gives the
     tracking time. Raises LawError where every candidate's cost is infinite.
     """
+    show, rounds = steps("tuning in closed loops", 1 + 2 * len(processes)), 1
     weights = WEIGHTS if weight is None else (weight,)
 
     def common(speed: float, b: float) -> Loops:
@@ -54,6 +56,7 @@ def searched(
     best = _cheapest(cost, [common(s, b) for s in SPEEDS for b in weights], (np.inf, ()))
     if not np.isfinite(best[0]):
         raise LawError("no PID gave a finite closed loop; check the MV's range or tune by hand (`manual`)")
+    show(rounds)
     for gains, integrals in ((GAINS, INTEGRALS), (NEAR, NEAR)):
         for i in range(len(processes)):
             now = best[1][i]
@@ -65,6 +68,8 @@ def searched(
             if weight is None:
                 rows = [replace(best[1][i], set_point_weight=b) for b in FINE_WEIGHTS]
                 best = _cheapest(cost, _others(best[1], i, rows), best)
+            rounds += 1
+            show(rounds)
     return best
 
 

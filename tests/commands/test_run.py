@@ -9,7 +9,7 @@ import pytest
 from pipeline.__main__ import main
 from pipeline.commands import run
 from pipeline.commands.run import chain_of, plan, reasons, side_by_side, stages_of
-from pipeline.errors import ParamsError
+from pipeline.errors import ParamsError, PipelineError
 
 ROOT = Path(__file__).parents[2]
 
@@ -47,19 +47,46 @@ def test_a_dry_run_leaves_the_stages_to_a_run(
         return '{"code": ["changed command"]}'
 
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(run, "_dvc", dvc)
+    monkeypatch.setattr(run, "ask", dvc)
     monkeypatch.setattr(run, "list_files", lambda: None)
     assert main(["run", "--dry"]) == 0
     assert asked == [("status", "--json")]
     assert capsys.readouterr().out == "nothing has changed; everything is up to date\n"
 
 
+def test_a_first_step_that_fails_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def dvc(*_: str, **__: bool) -> str:
+        raise PipelineError("dvc repro failed: code: No module named 'grimp'")
+
+    monkeypatch.setattr(run, "mistakes", list)
+    monkeypatch.setattr(run, "ask", dvc)
+    assert main(["run"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "no stage ran (dvc repro failed: code: No module named 'grimp'); mend that and run again" in said
+
+
+def test_ctrl_c_before_the_stages_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> list[str]:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(run, "mistakes", interrupted)
+    assert main(["run", "batch_reactor"]) == 130
+    said = "stopped; finished stages are kept, `loopwright run batch_reactor` goes on from there\n"
+    assert capsys.readouterr() == ("", said)
+
+
 def test_the_plan_names_every_stage_or_counts_many() -> None:
-    assert plan({}) == ["nothing has changed; everything is up to date"]
-    few = plan({"fit@a": ["models.a is modified"]})
-    assert few[0].startswith("1 stages have changed")
+    assert plan({}, 0) == ["nothing has changed; everything is up to date"]
+    few = plan({"fit@a": ["models.a is modified"]}, 4)
+    assert few[0] == "1 stage has changed; with what depends on that at most 4 run. Changed:"
     assert "fit@a  models.a is modified" in few[1]
-    many = plan({f"{kind}@{i}": ["new"] for kind in ("fit", "design") for i in range(20)})
+    many = plan({f"{kind}@{i}": ["new"] for kind in ("fit", "design") for i in range(20)}, 50)
     assert [line.split() for line in many[1:]] == [["fit", "20"], ["design", "20"]]
 
 

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from processes import lives, within
 
+from pipeline.engine.start import VARIABLE
+
 ROOT = Path(__file__).parents[2]
 # In place of DVC: says what it was asked, then what the name of its last stage tells it to do.
 DVC = """
@@ -22,6 +24,7 @@ with open("asked", "a") as file:
     print(*sys.argv[1:], file=file)
 print("Stage 'code' didn't change, skipping", flush=True)
 print("ran", *asked, flush=True)
+print("Running stage 'fit@x':", flush=True)
 last = asked[-1] if asked else ""
 if last.startswith("meets-"):
     Path(last).touch()
@@ -36,6 +39,9 @@ if last == "waits":
     stage = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])  # holds the output open
     Path("pid").write_text(str(stage.pid))
     stage.wait()
+    print("ERROR: failed to reproduce 'fit@x'", flush=True)
+    while "--keep-going" in sys.argv:
+        time.sleep(0.01)
 sys.exit(3 if last.startswith("fails") else 0)
 """
 
@@ -67,7 +73,15 @@ def test_two_chains_run_at_once_and_the_rest_after_them(folder: Path) -> None:
     assert code == 0
     assert asked[-1] == "--wait-for-lock repro"
     assert sorted(asked[:2]) == [f"--wait-for-lock repro --single-item fit@{x} meets-{x}" for x in "ab"]
-    assert sorted(out) == ["ran", "ran fit@a meets-a", "ran fit@b meets-b", "ran fit@c"]
+    own = sorted(line for line in out if not line.startswith("stage"))
+    assert own == ["ran", "ran fit@a meets-a", "ran fit@b meets-b", "ran fit@c"]
+    assert [line for line in out if line.startswith("stage")] == [f"stage {k} of {k}: fit x" for k in (1, 2, 3, 4)]
+
+
+def test_one_repro_takes_its_own_options(folder: Path) -> None:
+    code, out, asked = run(folder, "--of", "fit@x,fit@y", "repro", "--keep-going", "fit@c")
+    assert (code, asked) == (0, ["repro --keep-going fit@c"])
+    assert out == ["ran fit@c", "stage 1 of 2: fit x"]
 
 
 def test_a_failure_begins_no_further_chain(folder: Path) -> None:
@@ -90,5 +104,22 @@ def test_lanes_that_are_ended_end_the_stages_that_run(folder: Path, asked: signa
     assert within(30, lambda: pid.exists() and bool(pid.read_text()))
     process.send_signal(asked)
     process.communicate(timeout=30)
-    assert process.returncode != 0
+    assert process.returncode == 128 + asked
     assert within(5, lambda: not lives(int(pid.read_text())))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+@pytest.mark.parametrize("further", [[], ["--keep-going"]])
+def test_dvc_ends_by_itself_where_its_stage_is_ended(
+    folder: Path, further: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal in the middle of writing dvc.lock would cost the finished stages; what it then says is of no use."""
+    monkeypatch.setenv(VARIABLE, "a process that ends the stages")
+    process = begin(folder, "repro", *further, "waits")
+    pid = folder / "pid"
+    assert within(30, lambda: pid.exists() and bool(pid.read_text()))
+    process.send_signal(signal.SIGTERM)
+    os.kill(int(pid.read_text()), signal.SIGTERM)  # as the warm process does
+    out, err = process.communicate(timeout=10)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert (out.splitlines(), err) == (["ran waits", "stage 1 of 1: fit x"], "")

@@ -8,10 +8,13 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from processes import lives, within
+
+from pipeline.engine.lifeline import hear_no_interrupt
 
 SOURCES = Path(__file__).parents[2] / "pipeline"
 PROBE = """
@@ -47,11 +50,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def begin(folder: Path, script: str) -> subprocess.Popen[str]:
+def begin(folder: Path, script: str, preexec_fn: Callable[[], None] | None = None) -> subprocess.Popen[str]:
     """A shell script under a warm process, in a session of its own, as a terminal has it."""
     command = [sys.executable, "-c", SERVER, "bash", "-c", script.replace("python", sys.executable)]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    return subprocess.Popen(
+        command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True, preexec_fn=preexec_fn
+    )
 
 
 def run(folder: Path, script: str) -> tuple[int, str, str]:
@@ -136,6 +141,26 @@ def test_ctrl_c_ends_everything(folder: Path) -> None:
     process.communicate(timeout=20)
     assert process.returncode != 0
     assert not lives(int((folder / "pid").read_text()))
+
+
+def test_a_run_that_is_ended_begins_no_stage(folder: Path) -> None:
+    """The command hears of it first; a stage that it starts all the same is refused, and none says a word."""
+    (folder / "pipeline" / "stages" / "probe.py").write_text(WAIT)
+    stage = "python -m pipeline.engine.start probe"
+    process = begin(folder, f"trap 'echo heard' TERM; {stage}; echo $?; {stage}; echo $?; trap - INT")
+    assert within(20, lambda: (folder / "pid").exists() and (folder / "pid").read_text() != "")
+    process.terminate()
+    out, err = process.communicate(timeout=20)
+    assert (out.splitlines(), err) == (["heard", "130", "130"], "")
+    assert not lives(int((folder / "pid").read_text()))
+
+
+def test_stages_of_a_command_that_hears_no_ctrl_c_hear_none(folder: Path) -> None:
+    hears = "import signal; print(signal.getsignal(signal.SIGINT) == signal.SIG_IGN)"
+    (folder / "pipeline" / "stages" / "probe.py").write_text(hears)
+    assert run(folder, "python -m pipeline.engine.start probe")[1] == "False\n"
+    process = begin(folder, "python -m pipeline.engine.start probe", preexec_fn=hear_no_interrupt)
+    assert process.communicate(timeout=20)[0] == "True\n"
 
 
 def test_a_socket_that_cannot_be_made_is_no_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,10 +9,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import yaml
+from processes import within
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from reduced import reduced
@@ -159,6 +161,44 @@ def test_a_run_killed_in_the_middle_loses_nothing(copy: Copy) -> None:
     assert not {s for s in ran if s.startswith("excite") or s.endswith(("-inverse", "-inc"))}
     assert "up to date" in copy.run("dvc", "status")
     assert (copy.path / "artifacts" / CASE / "inc.onnx").read_bytes() == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("whole_group", [True, False])  # Ctrl-C in a terminal; kill -INT
+def test_ctrl_c_leaves_one_line_and_no_process_and_a_run_goes_on(copy: Copy, whole_group: bool) -> None:
+    """Started by its full path, where ``python`` is none that has the packages."""
+    copy.edit(("controllers", PID, "lambda_s"), 3.0 + whole_group)
+    mark = f"{os.getpid()}-{whole_group}"
+    bare = {**ENVIRONMENT, "PATH": "/usr/bin:/bin", "MARK": mark}
+    command, pipe = [sys.executable, "-m", "pipeline", "run", CASE], subprocess.PIPE
+    process = subprocess.Popen(
+        command, cwd=copy.path, env=bare, text=True, stdout=pipe, stderr=subprocess.STDOUT, start_new_session=True
+    )
+    assert process.stdout is not None
+    said = []
+    for line in process.stdout:
+        said.append(line)
+        if line.startswith("stage 1 of 3: design"):
+            (os.killpg if whole_group else os.kill)(process.pid, signal.SIGINT)
+    assert process.wait() == 130, said
+    process.stdout.close()
+    assert said[-1] == f"stopped; finished stages are kept, `loopwright run {CASE}` goes on from there\n"
+    assert said[-2].startswith("stage 1 of 3: design")
+    assert within(10, lambda: not _marked(f"MARK={mark}".encode()))
+    if whole_group:  # the other one would show the same again
+        done = subprocess.run(command, cwd=copy.path, env=bare, text=True, capture_output=True)
+        assert done.returncode == 0, done.stderr
+        assert "stage 1 of 3: design" in done.stdout
+
+
+def _marked(variable: bytes) -> list[str]:
+    """Processes that have a variable in their environment."""
+    marked = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with suppress(OSError):
+            if variable in path.read_bytes().split(b"\0"):
+                marked.append(path.parent.name)
+    return marked
 
 
 def test_a_mistake_in_the_parameters_is_one_line(copy: Copy) -> None:

@@ -127,6 +127,11 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     assert "MAE [m], held_out" in terminal.getvalue()
     assert f"it: one_step is not shipped: {why}" in terminal.getvalue()
     assert "it: mean absolute error [m]" in terminal.getvalue()
+    # A controller that params.yaml no longer has is no news.
+    del tree["controllers"]["it-one_step"]
+    Path("params.yaml").write_text(yaml.safe_dump(tree))
+    show_results(Path("artifacts"), Console(file=(later := io.StringIO())))
+    assert "not shipped" not in later.getvalue()
     units = Controller("artifacts/it/pid.onnx").manifest.evidence["units"]
     assert units["mae"] == units["mae_median"] == units["max_asse"] == "m"
     assert "overshoot" not in units  # a plain number

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from pipeline.engine.progress import steps
 from pipeline.laws.base import ControlLaw
 from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import Outcome
@@ -72,6 +73,7 @@ def searched(
     Speed and caution together on a coarse grid, then the horizon, then the jumps, then a finer grid. Numbers far from
     the start must gain more: the loops' model is the law's own, and what they gain by little may be lost on the plant.
     """
+    show = steps("tuning in closed loops on the model with errors", 1 + len(COARSE) + len(HORIZONS) + len(FINE))
     given = trials.run(side_by_side([law_of(start)]), 1)
     tried = judged(given, given, [start])
     best = tried[0]
@@ -85,6 +87,7 @@ def searched(
             found = [replace(c, cost=c.cost + NEAR * _distance(c.numbers, start)) for c in judged(outcome, given, new)]
             tried.extend(c for c in found if np.isfinite(c.cost))
         best = min(tried, key=lambda c: c.cost)
+        show(len(tried))
 
     def grid(factors: Sequence[tuple[float, float]]) -> list[Numbers]:
         at = best.numbers

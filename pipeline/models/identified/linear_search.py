@@ -65,7 +65,7 @@ class LinearSearch:
                 structures.extend(Structure("lagged", order, (y_lags, v_lags), d) for d in options)
         offered = [replace(s, correction=correction) for s in self.rounds.affordable(structures, SHORT, 0.3)]
         tasks = [Task(s, 0, SHORT, start=self._start(s, 0)) for s in offered]
-        trials, reasons = self.rounds.trials(tasks, "linear models")
+        trials, reasons = self.rounds.trials(tasks, "linear models, first fits")
         finite = [t for t in trials if np.isfinite(t.error)]
         if not finite:
             why = reasons[0] if reasons else "every free run over held-out rows explodes"
@@ -88,7 +88,7 @@ class LinearSearch:
             for t in kept
             for k in folds
         ]
-        finished = self.rounds.trials(tasks, "linear models, both folds")[0] or kept
+        finished = self.rounds.trials(tasks, "the best linear models, fitted to the end")[0] or kept
         return smallest_first(finished)
 
     def in_the_same_row(self, trials: Sequence[Trial]) -> list[Trial]:
@@ -103,7 +103,7 @@ class LinearSearch:
             for s in structures
             for k in range(len(self.rounds.problem.folds))
         ]
-        return smallest_first(self.rounds.trials(tasks, "linear models, MVs in their own row")[0])
+        return smallest_first(self.rounds.trials(tasks, "linear models whose MV acts in its own row of the record")[0])
 
     def settling(self, trials: Sequence[Trial]) -> list[Trial]:
         """The best candidates again, begun with all poles within ``SETTLING``.
@@ -116,7 +116,7 @@ class LinearSearch:
             for t in trials[:2]
             for (k, _), f in t.fits.items()
         ]
-        return smallest_first(self.rounds.trials(tasks, "linear models, poles inside")[0])
+        return smallest_first(self.rounds.trials(tasks, "linear models again, begun without integrator")[0])
 
     def corrected(self, trials: Sequence[Trial], correction: float) -> list[Trial]:
         """The same candidates, trained with another correction of their runs."""
@@ -126,7 +126,9 @@ class LinearSearch:
             for t in trials
             for k in folds
         ]
-        return smallest_first(self.rounds.trials(tasks, "linear models, corrected")[0])
+        return smallest_first(
+            self.rounds.trials(tasks, "linear models again, with a slow correction of their error")[0]
+        )
 
     def _start(self, structure: Structure, fold: int) -> Start | None:
         shift = (structure.delays, structure.same_row, fold)

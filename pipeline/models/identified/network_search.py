@@ -50,14 +50,18 @@ class NetworkSearch:
         cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT) for s in offers)
         seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *QUICK_SEEDS))
         tasks = [self._task(s, 0, seed, SHORT) for s in offers for seed in range(seeds)]
-        quick = _ranked(self.rounds.trials(tasks, "networks")[0])
+        quick = _ranked(self.rounds.trials(tasks, "neural networks, first training")[0])
         second = [
             self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE, t)
             for t in quick[:SECOND]
             for ridge in RIDGES
             for k in self._folds
         ]
-        longer = self.rounds.trials(second, "networks, both folds")[0] if self.rounds.budget.left(0.5) > 0 else []
+        longer = (
+            self.rounds.trials(second, "the best networks, trained longer")[0]
+            if self.rounds.budget.left(0.5) > 0
+            else []
+        )
         ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.error) or quick
         return self.last_round(ranked[:LAST])
 
@@ -76,7 +80,7 @@ class NetworkSearch:
                 # The seeds beyond the fewest leave half of the budget to later rounds.
                 if left >= (0 if place < least else 0.5 * self.rounds.budget.left()) or not tasks:
                     tasks += [self._task(t.structure, k, seed, LONG, t) for k in self._folds]
-        return self.rounds.trials(tasks, "networks, all seeds")[0]
+        return self.rounds.trials(tasks, "the last networks, trained to the end from several starts")[0]
 
     def corrected(self, trial: Trial, correction: float) -> list[Trial]:
         """The candidate with another correction of its training runs, trained anew."""

@@ -27,14 +27,17 @@ class Rounds:
     def starts(self, structures: Sequence[Structure]) -> dict[tuple[Structure, int], Start | str]:
         """The starts under the shifts of some structures, on each fold."""
         tasks = [(s, fold) for s in structures for fold in range(len(self.problem.folds))]
-        found = parallel_map(partial(find_start, self.problem), tasks, f"{self.label}: impulse responses")
+        found = parallel_map(
+            partial(find_start, self.problem), tasks, f"{self.label}: impulse responses from the record"
+        )
         return dict(zip(tasks, found, strict=True))
 
     def fits(self, tasks: Sequence[Task], name: str) -> list[Fitted | str]:
         """The outcomes of some fits, in order. The dearest begin first, so that no core is left with one at the end."""
         costs = [self.budget.of(t.structure, t.iterations) for t in tasks]
         order = sorted(range(len(tasks)), key=lambda i: (-costs[i], i))
-        found = parallel_map(partial(fit, self.problem), [tasks[i] for i in order], f"{self.label}: {name}")
+        in_order, weights = [tasks[i] for i in order], [costs[i] for i in order]
+        found = parallel_map(partial(fit, self.problem), in_order, f"{self.label}: {name}", weights)
         outcomes: list[Fitted | str] = ["not fitted"] * len(tasks)
         for i, outcome in zip(order, found, strict=True):
             outcomes[i] = outcome
@@ -57,9 +60,8 @@ class Rounds:
     def judged_beyond_drift(self, trials: Sequence[Trial], rows: int) -> list[Trial]:
         """The trials with held-out errors that leave out a gain and a level of each ``rows`` rows."""
         tasks = [(t.structure, fold, fitted) for t in trials for (fold, _), fitted in t.fits.items()]
-        found = iter(
-            parallel_map(partial(judged_beyond_drift, self.problem, rows), tasks, f"{self.label}: judged again")
-        )
+        label = f"{self.label}: errors of the models over held-out rows, slow drift left out"
+        found = iter(parallel_map(partial(judged_beyond_drift, self.problem, rows), tasks, label))
         return [Trial(t.structure, {key: next(found) for key in t.fits}) for t in trials]
 
     def affordable(self, structures: Sequence[Structure], iterations: int, share: float) -> list[Structure]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.engine.parallel import progress_bar
+from pipeline.engine.progress import progress_bar
 from pipeline.errors import ModelError
 from pipeline.files import write_json
 from pipeline.metrics import per_region, r2, rmse

@@ -1,0 +1,103 @@
+"""How far a piece of work is: a bar on a terminal, elsewhere a line now and then.
+
+A run of several stages shows lines. They come when something ends, and at most one every ``EVERY_S`` seconds, so that
+a run of minutes stays readable; short work says nothing.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from threading import Lock
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+EVERY_S = 10.0
+KNOWN = 0.2  # share of a piece after which its speed says how long the rest takes
+SOON_S = 5.0  # time left that is not worth a word
+
+
+@dataclass
+class Lines:
+    """Lines of progress of this process."""
+
+    clock: Callable[[], float] = time.monotonic
+    last: float = field(init=False)  # when the last line was due; the start of the process before the first
+    lock: Lock = field(default_factory=Lock, init=False)
+
+    def __post_init__(self) -> None:
+        self.last = self.clock()
+
+    def show(self, text: str) -> None:
+        """Write a line unless one was written a short while ago."""
+        with self.lock:
+            now = self.clock()
+            if now - self.last < EVERY_S:
+                return
+            self.last = now
+        print(text, file=sys.stderr, flush=True)
+
+
+class Piece:
+    """A piece of work of ``total`` units, done at about the same speed, under ``label``."""
+
+    def __init__(self, label: str, total: float, lines: Lines) -> None:
+        self.label, self.total, self.lines = label, total, lines
+        self.begun = lines.clock()
+        lines.show(label)
+
+    def show(self, done: float, count: str = "") -> None:
+        """Say how much is done, and about how long the rest takes once that can be known."""
+        share = done / self.total if self.total > 0 else 1.0
+        left = (self.lines.clock() - self.begun) * (1 - share) / share if share >= KNOWN else 0.0
+        words = f"{self.label}: {count + ', ' if count else ''}{100 * share:.0f} % done"
+        self.lines.show(words + (f", about {_rounded(left)} left" if left >= SOON_S else ""))
+
+
+_LINES = Lines()
+_within = list[str]()  # the labels of the work that this process does; empty ones where others share it
+
+
+@contextmanager
+def within(label: str) -> Iterator[None]:
+    """Whatever ``steps`` shows inside belongs to ``label``; an empty label shows nothing."""
+    _within.append(label)
+    try:
+        yield
+    finally:
+        _within.pop()
+
+
+def piece(label: str, total: float) -> Piece:
+    """A piece of work of a stage, whose lines begin with ``label``."""
+    return Piece(label, total, _LINES)
+
+
+def steps(what: str, total: int) -> Callable[[int], None]:
+    """Shows how many of ``total`` steps of one item of work are done; nothing outside ``within``."""
+    if not _within or not _within[-1]:
+        return lambda done: None
+    own = piece(f"{_within[-1]}: {what}", total)
+    return own.show
+
+
+def progress_bar() -> Progress:
+    """A progress bar on stderr; silent where stderr is not a terminal."""
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+def _rounded(seconds: float) -> str:
+    """``35 s``, ``4 min``: no more digits than an estimate has."""
+    return f"{5 * max(round(seconds / 5), 1)} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,71 @@
+"""DVC as the program starts it: its Python, what it depends on, and why it failed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.engine import dvc
+from pipeline.errors import PipelineError
+
+ROOT = Path(__file__).parents[2]
+# DVC itself, which says what its shell finds as `python` and then fails.
+FAKE = "import sys; sys.stderr.write({!r}); sys.exit({})"
+DOT = """strict digraph {
+"fit@a-one";
+"fit@a-one" -> "design@a-pid";
+"design@a-pid" -> "validate@a-pid";
+"fit@a-one" -> "design@a-inc";
+"validate@a-pid" -> "report@a";
+"fit@b-one" -> "report@b";
+"report@a" -> "overview";
+}
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_python_is_this_python_even_behind_a_link(tmp_path: Path) -> None:
+    """An environment's python is a link to another folder's, which has none of its packages."""
+    link = tmp_path / "bin" / "python"
+    link.parent.mkdir()
+    link.symlink_to(sys.executable)
+    asked = "from pipeline.engine.dvc import environment; print(environment()['PATH'])"
+    bare = {**os.environ, "PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([link, "-c", asked], env=bare, capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == f"{link.parent}:/usr/bin:/bin\n"
+
+
+def test_the_rest_of_the_environment_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PATH")
+    monkeypatch.setenv("MARK", "1")
+    assert dvc.environment() == {**os.environ, "PATH": str(Path(sys.executable).parent)}
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        (
+            "code: No module named 'grimp'\n\nERROR: failed to reproduce 'code': failed to run: x, exited with 1\n",
+            "code: No module named 'grimp'",
+        ),
+        ("ERROR: Unable to acquire lock\n", "ERROR: Unable to acquire lock"),
+        ("", "no output"),
+    ],
+)
+def test_a_failure_is_the_line_that_says_why(said: str, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dvc, "COMMAND", (sys.executable, "-c", FAKE.format(said, 1)))
+    with pytest.raises(PipelineError) as error:
+        dvc.ask("repro", "code")
+    assert str(error.value) == f"dvc repro failed: {reason}"
+
+
+def test_what_depends_on_a_change_is_affected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dvc, "ask", lambda *_: DOT)
+    assert dvc.affected(["design@a-pid"]) == ["design@a-pid", "overview", "report@a", "validate@a-pid"]
+    assert dvc.affected(["fit@a-one", "fit@b-one"], ["design@a-inc", "report@b"]) == [
+        *("design@a-inc", "fit@a-one", "fit@b-one", "report@b"),
+    ]
