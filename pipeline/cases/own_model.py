@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar, Self
 
+import numpy as np
+
 from pipeline.errors import PlantError
 from pipeline.plants.identified import IdentifiedPlant
+from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.plants.spoilt import SpoiltPlant
 
@@ -49,6 +52,15 @@ def errors_of(plant: IdentifiedPlant) -> list[dict[str, float]]:
         {**gain, "time_constant": speed, "dead_time": delay}
         for gain, speed, delay in zip(gains, SPEEDS, DELAYS, strict=True)
     ]
+
+
+def suits(file: Path, signals: Signals) -> bool:
+    """Whether a trained model is there and has as many outputs and inputs as the plant has signals."""
+    if not file.exists():
+        return False
+    with np.load(file, allow_pickle=False) as arrays:
+        n_y, n_v = len(arrays["y_scale"]), len(arrays["v_scale"])
+    return n_y <= len(signals.pv) and n_v == len(signals.mv) + len(signals.dv)
 
 
 class Untrained(Simulator):

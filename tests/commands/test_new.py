@@ -17,10 +17,12 @@ from dirty_plant import TAGS, Clean, cells, clean, write
 
 from pipeline.__main__ import main
 from pipeline.cases import all_cases
+from pipeline.config.exports import screened_record
 from pipeline.config.plants import PlantParams
 from pipeline.files import sha256
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
+from pipeline.stages.screen import screen
 from serving.manifest import Signal
 
 ROOT = Path(__file__).parents[2]
@@ -39,6 +41,8 @@ def files() -> set[str]:
 
 
 def read_back(name: str) -> tuple[PlantParams, Record]:
+    """What params.yaml has of the plant, and the record that its stage makes of the files."""
+    screen(name)
     params = PlantParams.read(name)
     pv, dv, mv = (tuple(Signal(s.name, s.unit, s.low, s.high) for s in g) for g in (params.pv, params.dv, params.mv))
     return params, Record.read(params.data, Signals(params.period_s, pv, pv, dv, mv))
@@ -49,26 +53,27 @@ def test_an_export_becomes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
     path = write(Path("x.csv"), cells(data))
     assert main(["new", "tank", "x.csv", *ROLES]) == 0
     assert files() == {
-        "params.yaml", "x.csv", "data/tank/record.parquet", "data/tank/screening.json", "data/tank/screening.html",
+        "params.yaml", "x.csv", "data/tank/screening.json", "data/tank/screening.html",
     }  # fmt: skip
+    assert "can these data carry a model: yes" in capsys.readouterr().out
     params, record = read_back("tank")
     assert (params.period_s, params.pv[0].low, params.pv[0].high) == (6.0, 0.0, 120.0)
-    assert (params.source[0].file, params.source[0].sha256) == ("x.csv", sha256(path))
     np.testing.assert_allclose(record.pv[:, 0], data.pv)
     report = json.loads(Path("data/tank/screening.json").read_text())
     assert report["kept_rows"] == len(record)
+    assert report["files"] == [{"file": "x.csv", "sha256": sha256(path)}]
     page = Path("data/tank/screening.html").read_text()
     assert 'src="data:image/png' in page
     assert "http://" not in page
     assert "https://" not in page
-    assert "can these data carry a model: yes" in capsys.readouterr().out
 
 
 def test_the_same_export_gives_the_same_bytes() -> None:
     write(Path("x.csv"), cells(clean()))
     for name in ("plant_a", "plant_b"):
         assert main(["new", name, "x.csv", *ROLES]) == 0
-    assert sha256(Path("data/plant_a/record.parquet")) == sha256(Path("data/plant_b/record.parquet"))
+        screen(name)
+    assert sha256(screened_record("plant_a")) == sha256(screened_record("plant_b"))
     pages = [Path(f"data/{n}/screening.html").read_text().replace(n, "") for n in ("plant_a", "plant_b")]
     assert pages[0] == pages[1]
 
@@ -161,7 +166,7 @@ def test_a_range_that_the_record_never_visited_is_refused(capsys: pytest.Capture
     write(Path("x.csv"), cells(clean()))
     assert main(["new", "tank", "x.csv", *ROLES, "--command", "TIC-101.OP=85..100"]) == 2
     assert "may be commanded from 85 to 100 %, but moved only from 20" in capsys.readouterr().err
-    assert not Path("data/tank/record.parquet").exists()
+    assert "plants" not in yaml.safe_load(Path("params.yaml").read_text())
 
 
 def test_a_step_test_stays_where_the_controller_may_command() -> None:
@@ -225,7 +230,8 @@ def test_data_that_carry_no_model_are_refused_unless_asked_for(capsys: pytest.Ca
         assert Path("params.yaml").read_bytes() == before
         assert {p.name for p in Path("data/tank").iterdir()} == {"screening.json", "screening.html", "step_test.csv"}
     assert main(["new", "tank", "x.csv", *swapped, "--anyway"]) == 0
-    assert Path("data/tank/record.parquet").exists()
+    screen("tank")
+    assert screened_record("tank").exists()
     assert main(["new", "tank", "x.csv", *swapped, "--anyway"]) == 2  # a plant that was added is not overwritten
     assert "already" in capsys.readouterr().err
 
