@@ -16,7 +16,12 @@ def entries_of(name: str, plant: Mapping[str, Any], export: ExportParams | None 
 
     With ``export`` its files too, of which stage `screen` makes the record; without, ``plant`` says where that is.
     """
-    parts = {LAW_PART: {"kind": LAW_PART}, **{f"plant{k}": {"kind": LAW_PART, "member": k} for k in MEMBER_NUMBERS}}
+    from pipeline.models.identified.structure_search import MINUTES  # here, because torch takes seconds to load
+
+    # The default, written out: all members share one search, so that they must have the same number.
+    minutes = {"minutes": MINUTES * min(len(plant["pv"]), len(plant["mv"]))}
+    members = {f"plant{k}": {"kind": LAW_PART, "member": k, **minutes} for k in MEMBER_NUMBERS}
+    parts = {LAW_PART: {"kind": LAW_PART, **minutes}, **members}
     own = {"case": name, "model": MODEL_SET}
     data = screened_record(name).as_posix() if export else plant["data"]
     return {

@@ -14,12 +14,17 @@ import yaml
 from dirty_plant import cells, clean, write
 
 from pipeline.__main__ import main
+from pipeline.cases.own_entries import entries_of
 from pipeline.config.exports import ExportParams, screened_record
+from pipeline.config.params import ModelParams
 from pipeline.engine.command import run_stage
 from pipeline.evaluation.case import Case
 from pipeline.files import sha256
+from pipeline.models.identified.structure_search import MINUTES, StructureSearch
+from pipeline.models.part import groundworks
 from pipeline.stages.check import mistakes
 from pipeline.stages.code import listing
+from pipeline.stages.fit import parts_of
 from pipeline.stages.screen import screen
 from pipeline.tracking.stage_results import StageResult, datasets
 
@@ -71,6 +76,19 @@ def test_new_says_all_that_the_record_needs_and_no_more() -> None:
     own = ExportParams.read("kettle")
     assert (own.period_s, own.hold_s, own.time, own.anyway, own.without_mode) == (12, 60, "timestamp", True, ("MAN",))
     assert mistakes() == []
+
+
+def test_the_budget_of_the_search_is_written_and_is_its_default() -> None:
+    """Of two controlled variables twice as much: what is fitted is what no number gives."""
+    parts = yaml.safe_load(Path("params.yaml").read_text())["models"]["tank-identified"]["parts"]
+    assert {part["minutes"] for part in parts.values()} == {MINUTES}
+    signal = {"name": "a", "unit": "%", "low": 0.0, "high": 1.0}
+    two = entries_of("it", {"pv": [signal] * 3, "mv": [signal] * 2, "data": "x.parquet"})
+    assert two["models"]["it-identified"]["parts"]["plant2"]["minutes"] == 2 * MINUTES
+    read = parts_of(ModelParams.read("tank-identified"), "models.tank-identified")
+    (search,) = groundworks(read.values())  # one for all members
+    assert isinstance(search, StructureSearch)
+    assert search.minutes == MINUTES
 
 
 def test_the_stage_makes_the_record_that_new_judged(capsys: pytest.CaptureFixture[str]) -> None:
