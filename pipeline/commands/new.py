@@ -150,7 +150,8 @@ def _write(
     earlier = folder.with_name(f".{name}-replaced")
     shutil.rmtree(earlier, ignore_errors=True)
     inputs = commanded(verdict.inputs, tags)
-    test = planned(inputs, found.record.mv[-1], report.period_s) if verdict.carries != "yes" else None
+    fastest = {t.name: t.max_move_per_min for t in tags if t.max_move_per_min is not None}
+    test = planned(inputs, found.record.mv[-1], report.period_s, fastest) if verdict.carries != "yes" else None
     with draft_folder_of(folder) as draft:
         if made and not unusable:
             found.record.write(draft / "record.parquet")

@@ -177,6 +177,28 @@ def test_a_step_test_stays_where_the_controller_may_command() -> None:
     assert 30 <= min(values) < max(values) <= 60
 
 
+def test_a_step_test_is_no_faster_than_the_valve_may_move(capsys: pytest.CaptureFixture[str]) -> None:
+    """Steps of 5 % at 2 % in a minute are ramps of 2.5 minutes; the hold begins when a ramp has ended."""
+    write(Path("x.csv"), cells(clean(300)))
+    tables = []
+    for name, more in (("tank", []), ("kettle", ["--max-move", "TIC-101.OP=2"])):
+        assert main(["new", name, "x.csv", *ROLES, *more, "--anyway"]) == 0
+        tables.append(list(csv.DictReader(Path(f"data/{name}/step_test.csv").read_text().splitlines())))
+    free, slow = tables
+    assert "move evenly over [min]" not in free[0]
+    assert [r["TIC-101.OP [%]"] for r in free] == [r["TIC-101.OP [%]"] for r in slow]
+    assert [r["hold [min]"] for r in free] == [r["hold [min]"] for r in slow]
+    ramp, at, value = (
+        np.array([float(r[c]) for r in slow]) for c in ("move evenly over [min]", "at [s]", "TIC-101.OP [%]")
+    )
+    moves = np.abs(np.diff(value))
+    assert np.all(moves <= 2 * ramp[1:] + 0.2 + 1e-6)  # 0.2 % is what a period of 6 s allows
+    assert np.all(ramp[1:] <= moves / 2 + 0.1 + 1e-6)
+    assert ramp[1] == pytest.approx(moves[0] / 2, abs=0.1)
+    hold = np.array([float(r["hold [min]"]) for r in slow])
+    np.testing.assert_allclose(np.diff(at), 60 * (ramp + hold)[:-1], rtol=1e-3)
+
+
 def test_few_rows_are_said_where_the_plant_is_added_and_too_few_refused(capsys: pytest.CaptureFixture[str]) -> None:
     write(Path("x.csv"), cells(clean(300)))
     assert main(["new", "tank", "x.csv", *ROLES]) == 0
