@@ -22,7 +22,7 @@ $(STAMP): pyproject.toml constraints.txt tools/setup.sh
 	@PYTHON="$(PYTHON)" bash tools/setup.sh "$(VENV)"
 	@touch $@
 
-run: $(STAMP) ## run the whole pipeline: excite, fit, design, validate, report, publish
+run: $(STAMP) ## run the whole pipeline: screen, excite, fit, design, validate, report, publish
 	@loopwright run
 
 test: check ## formatting, lint, types, import rules, tests

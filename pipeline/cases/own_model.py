@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.errors import PlantError
 from pipeline.plants.identified import IdentifiedPlant
+from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.plants.spoilt import SpoiltPlant
 
@@ -90,6 +91,15 @@ def errors_of(plant: OwnPlant) -> list[dict[str, float]]:
         {**high, "time_constant": 1 + d.pace, "dead_time": d.dead},
         {**{name: 1 / gain for name, gain in high.items()}, "time_constant": 1 / (1 + d.pace), "dead_time": 0.0},
     ]
+
+
+def suits(file: Path, signals: Signals) -> bool:
+    """Whether a trained model is there and has as many outputs and inputs as the plant has signals."""
+    if not file.exists():
+        return False
+    with np.load(file, allow_pickle=False) as arrays:
+        n_y, n_v = len(arrays["y_scale"]), len(arrays["v_scale"])
+    return n_y <= len(signals.pv) and n_v == len(signals.mv) + len(signals.dv)
 
 
 class Untrained(Simulator):

@@ -11,10 +11,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pipeline.cases.measured_steps import course, level_of
-from pipeline.cases.own_model import Doubts, OwnPlant, Untrained, errors_of
+from pipeline.cases.own_model import Doubts, OwnPlant, Untrained, errors_of, suits
 from pipeline.cases.reach import LOAD, Reach, visited_mv
+from pipeline.config.exports import is_exported
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
-from pipeline.errors import PlantError
+from pipeline.errors import PlantError, RecordError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.metric import Metric
@@ -55,8 +56,18 @@ class OwnCase(Case):
 
     @property
     def ready(self) -> bool:
-        """Whether the models are trained."""
-        return self._law_file.exists()
+        """Whether models and record are there and of these signals; those of a plant that was edited since are not."""
+        return suits(self._law_file, self.signals) and self._recorded
+
+    @cached_property
+    def _recorded(self) -> bool:
+        if not is_exported(self.name):
+            return True  # a person's own record: whoever reads it says what is wrong
+        try:
+            _ = self.record
+        except (RecordError, OSError):
+            return False  # stage `screen` makes it anew
+        return True
 
     @property
     def _law_file(self) -> Path:

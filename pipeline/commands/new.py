@@ -7,43 +7,33 @@ import math
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_entries import entries_of
 from pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
+from pipeline.commands.new_exported import asked, given_tags, propose_tags
 from pipeline.commands.new_fmu import table_from, write_table
 from pipeline.commands.new_printed import tell
-from pipeline.commands.new_refusal import refusal
 from pipeline.commands.new_replaced import REFUSED, check_replaceable, limits_kept, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
+from pipeline.config.exports import ExportParams
+from pipeline.config.params import sections
 from pipeline.config.plants import check_name
 from pipeline.errors import PipelineError, RecordError
 from pipeline.files import draft_folder_of, write_json, write_text
 from pipeline.historian.excerpt import evenly
-from pipeline.historian.findings import Screening
-from pipeline.historian.guessing import controlled_first, guesses
-from pipeline.historian.reading import read_export, units_of
-from pipeline.historian.screening import Screened, screened
+from pipeline.historian.exported import screened_export, with_units
+from pipeline.historian.guessing import controlled_first
+from pipeline.historian.refusal import Refusal, refusal
+from pipeline.historian.screening import Screened
 from pipeline.historian.step_test import planned
-from pipeline.historian.tags import (
-    EXPLAINED,
-    RANGES,
-    ROLES,
-    TableError,
-    Tag,
-    check_tags,
-    limited,
-    named,
-    parse_tag,
-    read_tags,
-    write_tags,
-)
-from pipeline.plants.simulator_file import is_fmu
+from pipeline.historian.tags import RANGES, ROLES, TableError, Tag, limited, named
+from pipeline.plants.simulator_file import FileSimulator, is_fmu
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
+from pipeline.stages.paths import WORK
 
 DATA = Path("data")
 LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
@@ -98,34 +88,20 @@ def _run(options: argparse.Namespace) -> int:
         return _simulated(name, folder, options)
     if not options.files:
         raise RecordError("no file is named; give one or more exports, or --simulator FILE")
-    tags, _ = _tags(options)
-    if not tags and (options.command or options.max_move):
+    given, _ = given_tags(options)
+    if not given and (options.command or options.max_move):
         raise RecordError("--command and --max-move are given and no mv is; name it with --mv, or give --tags")
-    if not tags:
-        return _table(name, options)
-    units = units_of(options.files)
-    tags = named([t if t.unit or t.role == "mode" else _with_unit(t, units) for t in tags])
-    tags = controlled_first(tags)
-    values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
-    export = read_export(options.files, values, modes, options.time, options.time_format)
-    found = screened(name, export, tags, options.period, options.hold, options.without_mode)
-    return _write(name, folder, found, options, tags)
-
-
-def _tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
-    """The tags that a person gave, and where they stand."""
-    given = tuple(parse_tag(text, role) for role in ROLES for text in getattr(options, role))
-    if given and options.tags:
-        raise RecordError("--tags and options of roles are both given; give one of them")
-    found, where = (read_tags(options.tags), str(options.tags)) if options.tags else (given, "the options")
-    if found or options.tags:
-        check_tags(found, where)
-    return limited(found, options.command, options.max_move) if found else found, where
+    if not given:
+        propose_tags(name, options)
+        return 0
+    export = asked(options, given)
+    tags = with_units(controlled_first(named(given)), export)
+    return _write(name, folder, screened_export(export, tags), options, tags, export=export)
 
 
 def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
     path: Path = options.simulator
-    tags, where = _tags(options)
+    tags, where = given_tags(options)
     if options.files or (tags and not is_fmu(path)):
         raise RecordError("--simulator and an export or its tags are both given; give one of them")
     table = None
@@ -133,10 +109,11 @@ def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
         table = table_from(path, tags, where, options.period)
         if table is None:
             return _proposed(name, path)
-    made = simulated(name, path, options.rows, options.period, table)
-    commands = named(tags) or limited(mvs_of(made.plant), options.command, options.max_move)
-    check_start(made.plant, commands)
-    return _write(name, folder, made.found, options, commands, made)
+    plant = FileSimulator(path, name, table=table)
+    commands = named(tags) or limited(mvs_of(plant), options.command, options.max_move)
+    check_start(plant, commands)  # before the minutes of an experiment
+    made = simulated(plant, options.rows, options.period)
+    return _write(name, folder, made.found, options, commands, made=made)
 
 
 def _proposed(name: str, fmu: Path) -> int:
@@ -149,44 +126,36 @@ def _proposed(name: str, fmu: Path) -> int:
     return 0
 
 
-def _table(name: str, options: argparse.Namespace) -> int:
-    path = Path(f"{name}-tags.csv")
-    export = read_export(options.files, (), (), options.time, options.time_format)
-    rows = guesses(export, units_of(options.files))
-    write_tags(path, rows)
-    roles = {r: [g.tag.tag for g in rows if g.tag.role == r] for r in ROLES}
-    print(f"{path}: {len(rows)} tags with guessed roles; nothing else was written")
-    for role, tags in roles.items():
-        print(f"  {role:5} {', '.join(tags) or '-'}")
-    files = " ".join(map(str, options.files))
-    print(f"{EXPLAINED}\ncorrect the table, then:\n  loopwright new {name} {files} --tags {path}")
-    return 0
-
-
 def _write(
     name: str,
     folder: Path,
     found: Screened,
     options: argparse.Namespace,
     tags: Sequence[Tag],
+    *,
+    export: ExportParams | None = None,
     made: Simulated | None = None,
 ) -> int:
-    """All files at once, then the section; neither without the other. Where both fail, a replaced plant stays."""
+    """All files at once, then the section; neither without the other. Where both fail, a replaced plant stays.
+
+    The record of ``export`` is left to stage `screen`; that of the experiment on a simulator is written here.
+    """
     report, verdict, limits = found.report, found.report.verdict, list[str]()
     if options.replace:
         tags, limits = limits_kept(name, tags)
     check_commands(found.record.mv_signals, tags)
     unusable, lost = refusal(found, tags, options.anyway), list[str]()
-    if unusable and folder.exists() and not _refused(folder):
+    if unusable and folder.exists() and (name in sections("plants") or not _refused(folder)):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
     earlier = folder.with_name(f".{name}-replaced")
     shutil.rmtree(earlier, ignore_errors=True)
     inputs = commanded(verdict.inputs, tags)
-    test = planned(inputs, found.record.mv[-1], report.period_s) if verdict.carries != "yes" else None
+    fastest = {t.name: t.max_move_per_min for t in tags if t.max_move_per_min is not None}
+    test = planned(inputs, found.record.mv[-1], report.period_s, fastest) if verdict.carries != "yes" else None
     with draft_folder_of(folder) as draft:
-        if not unusable:
+        if made and not unusable:
             found.record.write(draft / "record.parquet")
-        plant = entry(found.record, report, folder, tags)
+        plant = signals_of(found.record, tags)
         found.record = evenly(found.record)  # pages need no more, and a long record is large
         write_json(draft / "screening.json", report.to_dict())
         if made:
@@ -197,26 +166,31 @@ def _write(
         if folder.exists():
             folder.rename(earlier)
     if not unusable:
-        simulator = {"simulator": (folder / copy_name(made.plant.path)).as_posix()} if made else {}
-        entries = entries_of(name, plant | simulator)
+        if made:
+            record, simulator = folder / "record.parquet", folder / copy_name(made.plant.path)
+            plant |= {"data": record.as_posix(), "source": [dict(f) for f in report.files]}
+            plant |= {"simulator": simulator.as_posix()}
+        entries = entries_of(name, plant, export)
         try:
             lost = wishes_lost(name, entries)
-            add_entries(entries, replace=options.replace)
+            add_entries(entries, replace=options.replace, remove=[("exports", name)] if options.replace else ())
         except PipelineError:
             shutil.rmtree(folder)
             if earlier.exists():
                 earlier.rename(folder)
             raise
     shutil.rmtree(earlier, ignore_errors=True)
+    if not unusable:
+        shutil.rmtree(WORK / name, ignore_errors=True)  # models of a plant that was replaced need not suit this one
     tell(name, folder, report, test, not unusable)
     for line in confirmed(found.record.mv_signals, tags):
         print(line)
     for limit in limits:
         print(f"kept of the plant that was replaced: {limit}; give another, or edit params.yaml")
     for wish in lost:
-        print(f"replaced, write it into params.yaml again if you want it: controllers.{wish}")
+        print(f"replaced, write it into params.yaml again if you want it: {wish}")
     if unusable:
-        print(f"loopwright new: {name} was not added to params.yaml: {unusable}", file=sys.stderr)
+        print(f"loopwright new: {name} was not added to params.yaml: {_words(unusable)}", file=sys.stderr)
     return 2 if unusable else 0
 
 
@@ -225,20 +199,19 @@ def _refused(folder: Path) -> bool:
     return {p.name for p in folder.iterdir()} <= REFUSED and (folder / "screening.json").exists()
 
 
-def entry(record: Record, report: Screening, folder: Path, tags: Sequence[Tag] = ()) -> dict[str, Any]:
-    """``plants.<name>`` as params.yaml holds it; ``tags`` say what the controller may command."""
+def _words(refused: Refusal) -> str:
+    helps = ["run the step test in step_test.csv"] * refused.step_test + ["give --anyway"] * refused.anyway
+    return "; ".join(filter(None, (refused.why, ", or ".join(helps))))
+
+
+def signals_of(record: Record, tags: Sequence[Tag] = ()) -> dict[str, Any]:
+    """Period and signals as ``plants.<name>`` of params.yaml holds them; ``tags`` say what may be commanded."""
     groups = {"pv": record.pv_signals, "mv": record.mv_signals, "dv": record.dv_signals}
     commands = {t.name: t.commands for t in tags}
     return {
         "period_s": record.period_s,
         **{role: [s.to_dict() | commands.get(s.name, {}) for s in signals] for role, signals in groups.items()},
-        "data": (folder / "record.parquet").as_posix(),
-        "source": [dict(f) for f in report.files],
     }
-
-
-def _with_unit(tag: Tag, units: dict[str, str]) -> Tag:
-    return replace(tag, unit=units.get(tag.tag, ""))
 
 
 def _rows(text: str) -> int:

@@ -12,9 +12,7 @@ from pipeline.pictures.drawing import axis_label, ratio_unit
 
 def tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:
     """Print the rows kept, what was found, the verdict, and where to look next."""
-    kept = 100 * report.kept_rows / report.grid_rows
-    print(f"{name}: {report.file_rows} rows of {len(report.files)} file(s) -> {report.grid_rows} rows of "
-          f"{report.period_s:g} s, {report.kept_rows} kept ({kept:.1f} %) in {report.runs} run(s)")  # fmt: skip
+    print(f"{name}: {report.summary}")
     for reason, rows in report.dropped_rows.items():
         print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
     for finding in report.findings:

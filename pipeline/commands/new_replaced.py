@@ -44,11 +44,15 @@ def limits_kept(plant: str, tags: Sequence[Tag]) -> tuple[tuple[Tag, ...], list[
 
 
 def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Settings of a plant's controllers that the new ``entries`` lack, as ``NAME: key: value``; a person wrote them."""
+    """Settings that a person may have written and the new ``entries`` lack, as ``SECTION.NAME: key: value``.
+
+    Of a plant's controllers, and of how its export files are read.
+    """
     if plant not in sections("plants"):
         return []
     found = []
-    for name, new in entries["controllers"].items():
-        old = read_section("controllers", name) if name in sections("controllers") else {}
-        found += [f"{name}: {key}: {value}" for key, value in old.items() if key not in new]
+    for section in ("controllers", "exports"):
+        for name, new in entries.get(section, {}).items():
+            old = read_section(section, name) if name in sections(section) else {}
+            found += [f"{section}.{name}: {key}: {value}" for key, value in old.items() if key not in new]
     return found

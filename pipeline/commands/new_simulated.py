@@ -33,25 +33,24 @@ class Simulated:
     found: Screened
 
 
-def simulated(name: str, path: Path, rows: int, period_s: float | None, table: FmuTable | None = None) -> Simulated:
-    """The whole experiment; ``table`` belongs to an FMU.
+def simulated(plant: FileSimulator, rows: int, period_s: float | None) -> Simulated:
+    """The whole experiment.
 
     Raises PlantError where the simulator fails, and RecordError for a period that it cannot have.
     """
-    plant = FileSimulator(path, name, table=table)
     test = first_test(plant)
     if period_s is None and plant.strides and not test.settles:
         plant, test = _longer(plant, test)
     every = plant.every * _every(plant, test, period_s)
     if every > plant.every:
-        plant = FileSimulator(path, name, every, table)
+        plant = FileSimulator(plant.path, plant.name, every, plant.table)
         test = first_test(plant)
     if plant.table and not test.at_rest:
         plant, test = _rested(plant, plant.table, test)
     plan = planned(plant, test, rows)
     record = excited(plant, plan, SEED)
-    files = [{"file": str(path), "sha256": sha256(path)}]
-    found = judged_record(name, record, files, _findings(plant, test, plan), "simulated")
+    files = [{"file": str(plant.path), "sha256": sha256(plant.path)}]
+    found = judged_record(plant.name, record, files, _findings(plant, test, plan), "simulated")
     return Simulated(plant, test, plan, found)
 
 

@@ -26,7 +26,7 @@ MANY = 25  # stages that a person does not read line by line
 STOPPED = {128 + number for number in (signal.SIGINT, signal.SIGTERM)}
 ABSENT = {"deleted", "not in cache"}  # DVC's words for a file that is not there, whether or not it ever was
 # A kind of section of params.yaml -> the stages of each, in their order; the last one is what its name asks for.
-STAGES = {"records": ("excite",), "models": ("fit",), "controllers": ("design", "validate")}
+STAGES = {"exports": ("screen",), "records": ("excite",), "models": ("fit",), "controllers": ("design", "validate")}
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -57,9 +57,9 @@ def _run(options: argparse.Namespace) -> int:
         rest = f"; params.yaml has {len(wrong)} mistakes, `loopwright check` lists them" if wrong[1:] else ""
         raise ParamsError(f"{wrong[0]}{rest}")
     # The list of files that each stage runs comes first: what has changed shows only after it.
-    if options.dry:
-        list_files()  # not by DVC, which would change dvc.lock
-    else:
+    # DVC alone would not make it anew for a data file that has grown, and in a dry run it would change dvc.lock.
+    list_files()
+    if not options.dry:
         try:
             ask("repro", "--quiet", "code", finish=True)
         except PipelineError as error:

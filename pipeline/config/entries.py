@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,13 @@ Entries = Mapping[str, Mapping[str, Any]]
 """Section -> name of the entry -> its values."""
 
 
-def add_entries(entries: Entries, path: Path = PARAMS_FILE, *, replace: bool = False) -> None:
+def add_entries(
+    entries: Entries, path: Path = PARAMS_FILE, *, replace: bool = False, remove: Iterable[tuple[str, str]] = ()
+) -> None:
     """Add entries to the ends of their sections, a section that is missing at the end of the file; all or nothing.
 
-    ``replace`` takes entries of the same names out first. Raises ParamsError where an entry of that name exists
-    without it, or where a section is not written as a block.
+    ``replace`` takes entries of the same names out first, ``remove`` further ones: (section, name), if they are there.
+    Raises ParamsError where an entry of that name exists without it, or where a section is not written as a block.
     """
     try:
         text = path.read_bytes().decode("utf-8")
@@ -32,19 +34,23 @@ def add_entries(entries: Entries, path: Path = PARAMS_FILE, *, replace: bool = F
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise ParamsError(f"{path} is not YAML in UTF-8: {' '.join(str(error).split())}") from None
     wanted, end = dict(before), "\r\n" if "\r\n" in text else "\n"
+    taken = [
+        (section, name) for section, added in entries.items() for name in added if name in (before.get(section) or ())
+    ]
+    if taken and not replace:
+        section, name = min(taken)
+        raise ParamsError(f"{path}: {section} has {name!r} already; remove it, or choose another name")
+    further = [(section, name) for section, name in remove if name in (before.get(section) or ())]
+    for section, name in dict.fromkeys([*taken, *further]):
+        left = _without(text, section, name)
+        if left == text:
+            raise ParamsError(f"{path}: {section}.{name} is not written as a block; remove it by hand")
+        text = left
+        wanted[section] = {key: value for key, value in wanted[section].items() if key != name}
+        if not wanted[section] and section not in entries:
+            text = re.sub(rf"^{re.escape(section)}:", f"{section}: {{}}", text, flags=re.MULTILINE)
     for section, added in entries.items():
-        there = wanted.get(section) or {}
-        taken = sorted(set(there) & set(added))
-        if taken and replace:
-            for name in taken:
-                left = _without(text, section, name)
-                if left == text:
-                    raise ParamsError(f"{path}: {section}.{name} is not written as a block; remove it by hand")
-                text = left
-            there = {key: value for key, value in there.items() if key not in added}
-        elif taken:
-            raise ParamsError(f"{path}: {section} has {taken[0]!r} already; remove it, or choose another name")
-        wanted[section] = {**there, **added}
+        wanted[section] = {**(wanted.get(section) or {}), **added}
         text = _with_lines(text, section, _lines(added), end)
     try:
         after = yaml.safe_load(text)

@@ -16,6 +16,7 @@ from pipeline.errors import ParamsError, PipelineError, nearest
 
 T = TypeVar("T")
 PARAMS_FILE = Path("params.yaml")
+OPTIONAL = {"exports", "plants"}  # sections that may be left out
 
 
 def read_section(kind: str, name: str, path: Path = PARAMS_FILE) -> dict[str, Any]:
@@ -27,12 +28,12 @@ def read_section(kind: str, name: str, path: Path = PARAMS_FILE) -> dict[str, An
 
 
 def sections(kind: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
-    """Names of all sections of one kind (cases, records, models, controllers, plants), in their order.
+    """Names of all sections of one kind (cases, exports, records, models, controllers, plants), in their order.
 
-    ``plants`` may be left out.
+    ``exports`` and ``plants`` may be left out.
     """
     tree = _tree(path)
-    if kind == "plants" and kind not in tree:
+    if kind in OPTIONAL and kind not in tree:
         return ()
     section = _entry(tree, kind, str(path))
     if not isinstance(section, dict):

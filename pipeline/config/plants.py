@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 from typing import Any, Protocol
 
+from pipeline.config.exports import is_exported, screened_record
 from pipeline.config.params import PARAMS_FILE, parse, read_section, sections
 from pipeline.errors import ParamsError
 
@@ -112,8 +113,9 @@ class RawFileParams:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PlantParams:
-    """``plants.<name>``: period, signals, the clean record, the raw files behind it, and a simulator if it has one.
+    """``plants.<name>``: period, signals, the clean record, and a simulator if it has one.
 
+    ``data`` is left out where ``exports.<name>`` has the files of the record; else ``source`` has them.
     ``controlled`` is the number of PVs that have a set point, the first ones of ``pv``. None: all of them, and where
     there are more PVs than MVs, as many as there are MVs. The controllers are tested on ``simulator``, the file of the
     plant's own simulator; None: on models of the record.
@@ -124,7 +126,7 @@ class PlantParams:
     mv: tuple[MvParams, ...]
     dv: tuple[SignalParams, ...]
     data: Path
-    source: tuple[RawFileParams, ...]
+    source: tuple[RawFileParams, ...] = ()
     simulator: Path | None = None
     controlled: int | None = None
 
@@ -156,7 +158,12 @@ class PlantParams:
         entries = own_plants(path)
         if name not in entries:
             raise ParamsError(f"{path}: {SECTION} has no {name!r}; known: {', '.join(entries) or 'none'}")
-        return parse(cls, entries[name], f"{SECTION}.{name}")
+        made = {"data": screened_record(name).as_posix()} if is_exported(name, path) else {}
+        if made and "data" in entries[name]:
+            raise ParamsError(
+                f"{path}: {SECTION}.{name} has `data`, and exports.{name} has the files of its record; remove one"
+            )
+        return parse(cls, entries[name] | made, f"{SECTION}.{name}")
 
 
 def own_plants(path: Path = PARAMS_FILE) -> dict[str, Any]:

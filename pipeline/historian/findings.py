@@ -94,6 +94,15 @@ class Screening:
     findings: tuple[Finding, ...]
     verdict: Verdict
 
+    @property
+    def summary(self) -> str:
+        """Rows read, made and kept, in one line."""
+        kept = 100 * self.kept_rows / self.grid_rows
+        return (
+            f"{self.file_rows} rows of {len(self.files)} file(s) -> {self.grid_rows} rows of {self.period_s:g} s, "
+            f"{self.kept_rows} kept ({kept:.1f} %) in {self.runs} run(s)"
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
         return asdict(self)

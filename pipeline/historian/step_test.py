@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -22,13 +23,17 @@ SEED = 0
 
 @dataclass(frozen=True, slots=True)
 class StepTest:
-    """Rows of (start [s], hold [s], value of each MV), and what they are for."""
+    """Rows of (start [s], hold [s], value of each MV), and what they are for.
+
+    Over the first ``ramp_s`` [s] of its hold an MV is moved evenly to its value; 0 is a step.
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     start_s: tuple[float, ...]
     hold_s: tuple[float, ...]
     values: tuple[tuple[float, ...], ...]
+    ramp_s: tuple[float, ...]
 
     @property
     def hours(self) -> float:
@@ -36,22 +41,31 @@ class StepTest:
         return (self.start_s[-1] + self.hold_s[-1]) / 3600.0
 
     def table(self) -> str:
-        """CSV: step, time after the start, hold [min], one column an MV."""
+        """CSV: step, time after the start, hold [min], one column an MV; of ramps their time [min] too."""
         out = io.StringIO()
         rows = csv.writer(out, lineterminator="\n")
         columns = [f"{n} [{u}]" for n, u in zip(self.names, self.units, strict=True)]
-        rows.writerow(["step", "at [h:mm:ss]", "at [s]", "hold [min]", *columns])
-        for i, (at, hold, values) in enumerate(zip(self.start_s, self.hold_s, self.values, strict=True), start=1):
+        ramps = ["move evenly over [min]"] if any(self.ramp_s) else []
+        rows.writerow(["step", "at [h:mm:ss]", "at [s]", *ramps, "hold [min]", *columns])
+        lines = zip(self.start_s, self.hold_s, self.ramp_s, self.values, strict=True)
+        for i, (at, hold, ramp, values) in enumerate(lines, start=1):
             clock = f"{int(at) // 3600}:{int(at) // 60 % 60:02}:{int(at) % 60:02}"
-            rows.writerow([i, clock, f"{at:g}", f"{hold / 60:.4g}", *(f"{v:.5g}" for v in values)])
+            minutes = [f"{time_s / 60:.4g}" for time_s in ([ramp] if ramps else []) + [hold - ramp]]
+            rows.writerow([i, clock, f"{at:g}", *minutes, *(f"{v:.5g}" for v in values)])
         return out.getvalue()
 
 
-def planned(inputs: Sequence[InputReport], now: Sequence[float], period_s: float) -> StepTest:
+def planned(
+    inputs: Sequence[InputReport],
+    now: Sequence[float],
+    period_s: float,
+    fastest: Mapping[str, float] = MappingProxyType({}),
+) -> StepTest:
     """Steps around the present values: first one MV at a time, then all at random, from a fixed seed.
 
     Amplitude: AMPLITUDE of the range, LARGEST where no answer was seen. Holds: HOLDS of the settling time that the
-    record shows, or of UNKNOWN_PERIODS periods.
+    record shows, or of UNKNOWN_PERIODS periods. ``fastest``: MV -> its largest change in a minute; a step beyond it
+    becomes a ramp, and its hold begins when the ramp has ended.
     """
     mvs = [i for i in inputs if i.role == "mv"]
     random = np.random.default_rng(SEED)
@@ -69,9 +83,17 @@ def planned(inputs: Sequence[InputReport], now: Sequence[float], period_s: float
         holds.append(float(random.choice(HOLDS)) * settling)
     values.append(tuple(middle))
     holds.append(settling)
-    hold_s = tuple(float(max(LEAST_PERIODS, round(h / period_s)) * period_s) for h in holds)
+    rates = np.array([fastest.get(i.name, np.inf) for i in mvs]) / 60.0
+    moves = np.abs(np.diff(np.array([tuple(now), *values]), axis=0))
+    one_period = moves <= rates * period_s * (1 + 1e-9)
+    needed = np.where(one_period, 0.0, moves / rates).max(axis=1)  # [s]
+    ramps = np.ceil(needed / period_s - 1e-9) * period_s
+    hold_s = tuple(
+        float(max(LEAST_PERIODS, round(h / period_s)) * period_s + r) for h, r in zip(holds, ramps, strict=True)
+    )
     start = tuple(float(t) for t in np.r_[0.0, np.cumsum(hold_s[:-1])])
-    return StepTest(tuple(i.name for i in mvs), tuple(i.unit for i in mvs), start, hold_s, tuple(values))
+    names, units = tuple(i.name for i in mvs), tuple(i.unit for i in mvs)
+    return StepTest(names, units, start, hold_s, tuple(values), tuple(map(float, ramps)))
 
 
 def _seen(report: InputReport) -> bool:

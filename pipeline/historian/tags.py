@@ -13,6 +13,7 @@ from pathlib import Path
 from pipeline.config.plants import mistakes_of_mv
 from pipeline.errors import RecordError, nearest
 from pipeline.files import write_text
+from pipeline.historian.findings import InputReport
 from serving.manifest import MAX_NAME, Signal
 
 ROLES = ("pv", "mv", "dv", "sp", "mode")
@@ -139,6 +140,12 @@ def limited(tags: Sequence[Tag], commands: Iterable[str], moves: Iterable[str]) 
         if wrong := _wrong(found[name]):
             raise RecordError(f"{where}: {'; '.join(wrong)}")
     return tuple(found[t.tag] for t in tags)
+
+
+def commanded_range(signal: Signal | InputReport, tags: Sequence[Tag]) -> tuple[float, float]:
+    """The range that the controller may command a signal over: as the tag of its name says, else its own."""
+    commands = next((t.commands for t in tags if t.name == signal.name), {})
+    return commands.get("command_low", signal.low), commands.get("command_high", signal.high)
 
 
 def check_tags(tags: Sequence[Tag], where: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.cases import all_cases
+from pipeline.config.exports import ExportParams, is_exported, screened_record
 from pipeline.config.params import (
     CaseParams,
     ControllerParams,
@@ -24,6 +25,9 @@ from pipeline.config.params import (
 from pipeline.config.plants import PlantParams, own_plants
 from pipeline.errors import LawError, ParamsError, PipelineError
 from pipeline.evaluation.case import Case
+from pipeline.historian.agreement import check_agreement
+from pipeline.historian.exported import signal_tags
+from pipeline.historian.tags import check_tags
 from pipeline.laws import LAWS
 from pipeline.laws.fitting import require_fit
 from pipeline.models.local.linearized import LinearizedPart
@@ -96,6 +100,18 @@ def _case(name: str) -> None:
         raise ParamsError(f"case {name!r} has no development sequences; without them no controller can be chosen")
 
 
+def _export(name: str) -> None:
+    params = ExportParams.read(name)
+    if name not in sections("plants"):
+        raise ParamsError(
+            f"exports.{name} has no section plants.{name}; `loopwright new {name} ...` writes both, or remove it"
+        )
+    plant = PlantParams.read(name)
+    tags = signal_tags(params.tags)
+    check_tags(tags, f"exports.{name}.tags")
+    check_agreement(params, plant, tags)
+
+
 def _record(name: str) -> None:
     params, where = RecordParams.read(name), f"records.{name}"
     _known_case(params.case, where)
@@ -113,6 +129,7 @@ def _model(name: str) -> None:
             except ParamsError as error:
                 raise ParamsError(f"{where}.parts.{name}: {error}") from None
     records = {record_folder(r.case, r.record) for r in map(RecordParams.read, sections("records"))}
+    records |= {screened_record(plant) for plant in sections("exports")}
     if params.data.is_relative_to(WORK) and params.data not in records:
         raise ParamsError(f"{where}.data is {params.data}, which no record makes; records are {_listed(records)}")
     if not params.data.is_relative_to(WORK) and not params.data.exists():
@@ -161,7 +178,7 @@ def _controller(name: str) -> None:
 
 def _plant(name: str) -> None:
     params = PlantParams.read(name)
-    if not params.data.is_file():
+    if not is_exported(name) and not params.data.is_file():
         raise ParamsError(f"plants.{name}.data is {params.data}, which is not there; `loopwright new` writes it")
 
 
@@ -177,6 +194,7 @@ def _listed(names: Any) -> str:
 
 CHECKS: dict[str, Callable[[str], None]] = {
     "cases": _case,
+    "exports": _export,
     "records": _record,
     "models": _model,
     "controllers": _controller,

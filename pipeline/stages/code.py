@@ -1,8 +1,9 @@
 """Stage code: ``python -m pipeline.stages.code`` lists the files that every other stage runs.
 
 work/code/<stage>-<case>.json (<stage>.json of a stage over all cases) holds the sha256 of each file
-of ``pipeline`` and ``serving`` that the stage imports, at whatever depth, and of a report the digest of
-what it reads of params.yaml. The stage depends on that
+of ``pipeline`` and ``serving`` that the stage imports, at whatever depth; of the data files that dvc.yaml cannot list
+(exports, simulators); and the digest of what a report, or a stage of an own plant, reads of params.yaml beside its
+section. The stage depends on that
 one file, so an edit runs again what it has a part in and nothing else. One file for each stage keeps
 dvc.lock short, which DVC reads and writes after every stage.
 """
@@ -18,13 +19,14 @@ from typing import Any
 import grimp
 
 from pipeline.cases import all_cases
+from pipeline.config.exports import ExportParams, is_exported
 from pipeline.config.params import entries, read_section, sections
 from pipeline.engine.command import run_stage
 from pipeline.files import digest, sha256, write_json
 from pipeline.stages.paths import WORK
 
 PACKAGES = ("pipeline", "serving")
-STAGES = ("excite", "fit", "design", "validate", "report")  # of one case each
+STAGES = ("screen", "excite", "fit", "design", "validate", "report")  # of one case each
 LAST = ("overview", "publish")
 # What carries a stage's work from place to place and has no part in its result.
 CARRIERS = (
@@ -49,34 +51,63 @@ APART = {
 BESIDE = {"excite": ("excitations",), "fit": ("models",), "report": ("paper", "pictures")}
 # Entries of params.yaml that a report goes by: section and field.
 LISTED = (("controllers", "name"), ("models", "model"), ("models", "data"))
+BEFORE_LAWS = ("screen", "excite", "fit")
 # Files that are read and not imported.
-TEMPLATES = "pipeline/report/templates/*"
+TEMPLATES = dict.fromkeys(("report", "overview"), "*") | {"screen": "screening*"}
+NO_FILE = "not there"  # in place of a digest; the stage says so
 
 
 def code() -> None:
     """Write work/code: one file for each stage of each case, one for each of those at the end."""
     for stage, case in (*((stage, "") for stage in LAST), *product(STAGES, all_cases())):
+        if stage == "screen" and not is_exported(case):
+            continue
         write_json(WORK / "code" / f"{stage}{case and '-' + case}.json", listing(Path.cwd(), stage, case))
 
 
 def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:
     """Path -> sha256 of every file that the stage runs or reads (for the case)."""
     files = {path_of(root, module) for module in modules(stage, case)}
-    if stage in {"report", "overview"}:
-        files |= set(root.glob(TEMPLATES))
-    if stage == "validate":
-        files |= {root / path for path in all_cases()[case].reads}
+    if stage in TEMPLATES:
+        files |= set((root / "pipeline/report/templates").glob(TEMPLATES[stage]))
     bounds = path_of(root, beside(case, "bounds")).with_suffix(".json") if stage == "report" else root
     if bounds.is_file():
         files.add(bounds)
     found = {p.relative_to(root).as_posix(): sha256(p) for p in sorted(files)}
-    return {**found, "params.yaml": digest(_read_of(case))} if stage == "report" else found
+    data = _data_of(stage, case)
+    found |= {p.as_posix(): sha256(root / p) if (root / p).is_file() else NO_FILE for p in data}
+    read = _read_of(stage, case)
+    return {**found, "params.yaml": digest(read)} if read else found
 
 
-def _read_of(case: str) -> list[Any]:
-    """What a report reads of params.yaml: the case, its plant, and which controllers and models it lists."""
-    own = [read_section(kind, case) for kind in ("cases", "plants") if case in sections(kind)]
-    return [*own, *(list(entries(kind, case, field)) for kind, field in LISTED)]
+def _data_of(stage: str, case: str) -> tuple[Path, ...]:
+    """Data files that dvc.yaml cannot list, because their number differs from plant to plant."""
+    if stage == "screen":
+        return ExportParams.read(case).files
+    return all_cases()[case].reads if stage == "validate" else ()
+
+
+def _read_of(stage: str, case: str) -> list[Any]:
+    """What a stage reads of params.yaml beside its own section.
+
+    Of an own plant its signals; a report the case too, and which controllers and models it lists.
+    """
+    if not case:
+        return []
+    own = [_plant_of(stage, case)] if case in sections("plants") else []
+    if stage != "report":
+        return own
+    case_and_plant = [*([read_section("cases", case)] if case in sections("cases") else []), *own]
+    return [*case_and_plant, *(list(entries(kind, case, field)) for kind, field in LISTED)]
+
+
+def _plant_of(stage: str, case: str) -> dict[str, Any]:
+    """``plants.<case>`` as far as the stage goes by it: how fast an MV may move changes neither record nor models."""
+    plant = read_section("plants", case)
+    if stage not in BEFORE_LAWS:
+        return plant
+    mvs = [{key: value for key, value in mv.items() if key != "max_move_per_min"} for mv in plant.get("mv", ())]
+    return {**plant, "mv": mvs}
 
 
 def modules(stage: str, case: str = "") -> set[str]:
@@ -84,7 +115,7 @@ def modules(stage: str, case: str = "") -> set[str]:
     imports = graph()
     reached: set[str] = set()
     todo = [f"pipeline.stages.{stage}"]
-    if case:
+    if case and stage != "screen":  # which knows no case, only its files
         own = [beside(case, name) for name in ("case", *BESIDE.get(stage, ()))]
         todo += [module for module in own if module in imports.modules]
     while todo:

@@ -28,6 +28,7 @@ Figures = dict[str, float]
 def headline(kind: str, metrics: Mapping[str, Any], validation: Validation | None) -> Figures:
     """The metrics of a run of stage ``kind``, from its own metrics.json and its case's validation.json."""
     figures = {
+        "screen": lambda: _of_record(metrics),
         "excite": lambda: _of_record(metrics),
         "fit": lambda: _of_models(metrics),
         "design": lambda: _of_files(metrics),

@@ -7,6 +7,8 @@ from pipeline.tracking.gate import Gate
 from pipeline.tracking.stage_results import StageResult, Times
 
 WHAT = {
+    "screen": "Read and screened the export files of the plant *{case}*, and made its record of them."
+    " The models learn from it. Open `screening.html` under Artifacts.",
     "excite": "Made the data set **{item}** of the case *{case}*: the simulated plant, excited, with measurement noise."
     " The models learn from it.",
     "fit": "Trained the model set **{item}** of the case *{case}*, once for each data seed."
@@ -25,6 +27,7 @@ BOUND = {
     " from the plant's record, none on the plant",
 }
 METRICS = {
+    "screen": "`rows` counts the rows of the record. `figures.json` names the files with their digests.",
     "excite": "`rows` counts the samples of all data seeds.",
     "fit": "The metrics are medians over the data seeds: `rmse` one step ahead, `free_run_rmse` when the model runs on"
     " its own output. `training/` and `sweep/` are curves.",

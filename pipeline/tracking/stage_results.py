@@ -160,7 +160,7 @@ def _md5(path: Path) -> str:
 def datasets(result: StageResult, results: Iterable[StageResult]) -> dict[str, str]:
     """Path -> content hash of the records that ``result`` descends from; none for a law from equations alone.
 
-    A record is an output of an excite stage, or a table (CSV, Parquet) that no stage made.
+    A record is an output of a stage `screen` or `excite`, or a table (CSV, Parquet) that no stage made.
     """
     makers = {PurePosixPath(out): r for r in results for out in r.outs}
     records: dict[str, str] = {}
@@ -170,7 +170,7 @@ def datasets(result: StageResult, results: Iterable[StageResult]) -> dict[str, s
         if stage.name in done:
             continue
         done.add(stage.name)
-        if stage.kind == "excite":
+        if stage.kind in {"screen", "excite"}:
             records |= stage.outs
             continue
         for path, md5 in stage.deps.items():

@@ -110,7 +110,7 @@ def test_a_short_step_for_a_fast_solver_becomes_a_period_that_suits_the_plant(
     table = table_from(path, (), "", None)
     assert table is not None
     assert table.step_s == 1.5
-    made = simulated("basin", path, 500, None, table)
+    made = simulated(FileSimulator(path, "basin", table=table), 500, None)
     assert made.test.settles
     assert WANTED / 1.2 < made.test.settling_periods <= SLOW
     assert made.test.settling_periods * made.plant.period_s == pytest.approx(1590, rel=0.05)
@@ -131,7 +131,7 @@ def test_an_fmu_that_begins_with_a_transient_is_given_time_to_rest(
     path = fmu(tmp_path, CLEAR)
     table = table_from(path, (), "", None)
     assert not first_test(FileSimulator(path, table=table)).at_rest
-    made = simulated("basin", path, 500, None, table)
+    made = simulated(FileSimulator(path, "basin", table=table), 500, None)
     assert made.test.at_rest
     assert made.plant.table is not None
     assert made.plant.table.rest_periods >= 2 * 50

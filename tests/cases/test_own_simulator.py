@@ -94,7 +94,9 @@ def test_the_controller_s_range_is_not_the_experiment_s(
     monkeypatch.chdir(tmp_path)
     Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
     new = ["new", "heater", "--simulator", str(EXAMPLE), "--rows", "600"]
-    assert main([*new, "--command", "valve=70..90"]) == 2
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.commands.new.simulated", lambda *_: pytest.fail("the experiment has begun"))
+        assert main([*new, "--command", "valve=70..90"]) == 2
     error = capsys.readouterr().err
     assert "the simulator starts with valve = " in error
     assert "70 to 90 may be commanded" in error

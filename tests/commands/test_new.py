@@ -17,10 +17,12 @@ from dirty_plant import TAGS, Clean, cells, clean, write
 
 from pipeline.__main__ import main
 from pipeline.cases import all_cases
+from pipeline.config.exports import screened_record
 from pipeline.config.plants import PlantParams
 from pipeline.files import sha256
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
+from pipeline.stages.screen import screen
 from serving.manifest import Signal
 
 ROOT = Path(__file__).parents[2]
@@ -39,6 +41,8 @@ def files() -> set[str]:
 
 
 def read_back(name: str) -> tuple[PlantParams, Record]:
+    """What params.yaml has of the plant, and the record that its stage makes of the files."""
+    screen(name)
     params = PlantParams.read(name)
     pv, dv, mv = (tuple(Signal(s.name, s.unit, s.low, s.high) for s in g) for g in (params.pv, params.dv, params.mv))
     return params, Record.read(params.data, Signals(params.period_s, pv, pv, dv, mv))
@@ -49,26 +53,27 @@ def test_an_export_becomes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
     path = write(Path("x.csv"), cells(data))
     assert main(["new", "tank", "x.csv", *ROLES]) == 0
     assert files() == {
-        "params.yaml", "x.csv", "data/tank/record.parquet", "data/tank/screening.json", "data/tank/screening.html",
+        "params.yaml", "x.csv", "data/tank/screening.json", "data/tank/screening.html",
     }  # fmt: skip
+    assert "can these data carry a model: yes" in capsys.readouterr().out
     params, record = read_back("tank")
     assert (params.period_s, params.pv[0].low, params.pv[0].high) == (6.0, 0.0, 120.0)
-    assert (params.source[0].file, params.source[0].sha256) == ("x.csv", sha256(path))
     np.testing.assert_allclose(record.pv[:, 0], data.pv)
     report = json.loads(Path("data/tank/screening.json").read_text())
     assert report["kept_rows"] == len(record)
+    assert report["files"] == [{"file": "x.csv", "sha256": sha256(path)}]
     page = Path("data/tank/screening.html").read_text()
     assert 'src="data:image/png' in page
     assert "http://" not in page
     assert "https://" not in page
-    assert "can these data carry a model: yes" in capsys.readouterr().out
 
 
 def test_the_same_export_gives_the_same_bytes() -> None:
     write(Path("x.csv"), cells(clean()))
     for name in ("plant_a", "plant_b"):
         assert main(["new", name, "x.csv", *ROLES]) == 0
-    assert sha256(Path("data/plant_a/record.parquet")) == sha256(Path("data/plant_b/record.parquet"))
+        screen(name)
+    assert sha256(screened_record("plant_a")) == sha256(screened_record("plant_b"))
     pages = [Path(f"data/{n}/screening.html").read_text().replace(n, "") for n in ("plant_a", "plant_b")]
     assert pages[0] == pages[1]
 
@@ -161,7 +166,7 @@ def test_a_range_that_the_record_never_visited_is_refused(capsys: pytest.Capture
     write(Path("x.csv"), cells(clean()))
     assert main(["new", "tank", "x.csv", *ROLES, "--command", "TIC-101.OP=85..100"]) == 2
     assert "may be commanded from 85 to 100 %, but moved only from 20" in capsys.readouterr().err
-    assert not Path("data/tank/record.parquet").exists()
+    assert "plants" not in yaml.safe_load(Path("params.yaml").read_text())
 
 
 def test_a_step_test_stays_where_the_controller_may_command() -> None:
@@ -170,6 +175,28 @@ def test_a_step_test_stays_where_the_controller_may_command() -> None:
     rows = csv.DictReader(Path("data/tank/step_test.csv").read_text().splitlines())
     values = [float(r["TIC-101.OP [%]"]) for r in rows]
     assert 30 <= min(values) < max(values) <= 60
+
+
+def test_a_step_test_is_no_faster_than_the_valve_may_move(capsys: pytest.CaptureFixture[str]) -> None:
+    """Steps of 5 % at 2 % in a minute are ramps of 2.5 minutes; the hold begins when a ramp has ended."""
+    write(Path("x.csv"), cells(clean(300)))
+    tables = []
+    for name, more in (("tank", []), ("kettle", ["--max-move", "TIC-101.OP=2"])):
+        assert main(["new", name, "x.csv", *ROLES, *more, "--anyway"]) == 0
+        tables.append(list(csv.DictReader(Path(f"data/{name}/step_test.csv").read_text().splitlines())))
+    free, slow = tables
+    assert "move evenly over [min]" not in free[0]
+    assert [r["TIC-101.OP [%]"] for r in free] == [r["TIC-101.OP [%]"] for r in slow]
+    assert [r["hold [min]"] for r in free] == [r["hold [min]"] for r in slow]
+    ramp, at, value = (
+        np.array([float(r[c]) for r in slow]) for c in ("move evenly over [min]", "at [s]", "TIC-101.OP [%]")
+    )
+    moves = np.abs(np.diff(value))
+    assert np.all(moves <= 2 * ramp[1:] + 0.2 + 1e-6)  # 0.2 % is what a period of 6 s allows
+    assert np.all(ramp[1:] <= moves / 2 + 0.1 + 1e-6)
+    assert ramp[1] == pytest.approx(moves[0] / 2, abs=0.1)
+    hold = np.array([float(r["hold [min]"]) for r in slow])
+    np.testing.assert_allclose(np.diff(at), 60 * (ramp + hold)[:-1], rtol=1e-3)
 
 
 def test_few_rows_are_said_where_the_plant_is_added_and_too_few_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -225,7 +252,8 @@ def test_data_that_carry_no_model_are_refused_unless_asked_for(capsys: pytest.Ca
         assert Path("params.yaml").read_bytes() == before
         assert {p.name for p in Path("data/tank").iterdir()} == {"screening.json", "screening.html", "step_test.csv"}
     assert main(["new", "tank", "x.csv", *swapped, "--anyway"]) == 0
-    assert Path("data/tank/record.parquet").exists()
+    screen("tank")
+    assert screened_record("tank").exists()
     assert main(["new", "tank", "x.csv", *swapped, "--anyway"]) == 2  # a plant that was added is not overwritten
     assert "already" in capsys.readouterr().err
 

@@ -80,9 +80,9 @@ def test_a_stage_has_the_files_that_it_runs(stage: str, case: str, path: str, ru
 def test_an_edit_shows_in_the_stages_that_run_it_alone(tmp_path: Path) -> None:
     for package in ("pipeline", "serving"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    before = {(s, c): listing(tmp_path, s, c) for s in STAGES for c in CASES}
+    before = {(s, c): listing(tmp_path, s, c) for s in STAGES if s != "screen" for c in CASES}
     assert before[("design", "batch_reactor")] == listing(ROOT, "design", "batch_reactor")
     with (tmp_path / "pipeline" / "cases" / "batch_reactor" / "plant.py").open("a") as file:
         file.write("# edited\n")
     edited = {key for key in before if listing(tmp_path, *key) != before[key]}
-    assert edited == {(stage, "batch_reactor") for stage in STAGES}
+    assert edited == {key for key in before if key[1] == "batch_reactor"}

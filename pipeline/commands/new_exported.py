@@ -1,0 +1,54 @@
+"""``loopwright new NAME FILE...``: what the command line or the table of tags said, as params.yaml holds it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.config.exports import ExportParams
+from pipeline.errors import RecordError
+from pipeline.historian.exported import exported
+from pipeline.historian.guessing import guesses
+from pipeline.historian.reading import read_export, units_of
+from pipeline.historian.tags import EXPLAINED, ROLES, Tag, check_tags, limited, parse_tag, read_tags, write_tags
+
+
+def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
+    """The tags that a person gave, and where they stand."""
+    given = tuple(parse_tag(text, role) for role in ROLES for text in getattr(options, role))
+    if given and options.tags:
+        raise RecordError("--tags and options of roles are both given; give one of them")
+    found, where = (read_tags(options.tags), str(options.tags)) if options.tags else (given, "the options")
+    if found or options.tags:
+        check_tags(found, where)
+    return limited(found, options.command, options.max_move) if found else found, where
+
+
+def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
+    """``exports.<name>``: all that was said of the files."""
+    return ExportParams(
+        case=options.name,
+        files=tuple(options.files),
+        tags=tuple(map(exported, tags)),
+        period_s=options.period,
+        hold_s=options.hold,
+        without_mode=tuple(options.without_mode),
+        time=options.time,
+        time_format=options.time_format,
+        anyway=options.anyway,
+    )
+
+
+def propose_tags(name: str, options: argparse.Namespace) -> None:
+    """Write the table of all tags with guessed roles, for a person to correct, and say so."""
+    path = Path(f"{name}-tags.csv")
+    export = read_export(options.files, (), (), options.time, options.time_format)
+    rows = guesses(export, units_of(options.files))
+    write_tags(path, rows)
+    roles = {r: [g.tag.tag for g in rows if g.tag.role == r] for r in ROLES}
+    print(f"{path}: {len(rows)} tags with guessed roles; nothing else was written")
+    for role, tags in roles.items():
+        print(f"  {role:5} {', '.join(tags) or '-'}")
+    files = " ".join(map(str, options.files))
+    print(f"{EXPLAINED}\ncorrect the table, then:\n  loopwright new {name} {files} --tags {path}")

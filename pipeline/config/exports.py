@@ -1,0 +1,87 @@
+"""``exports.<plant>`` of params.yaml: the files that a plant's record is made of; `loopwright new` adds them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline.config.params import PARAMS_FILE, parse, read_section, sections
+from pipeline.errors import ParamsError
+
+SECTION = "exports"
+SCREENED = "screened"  # the name of the record
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ExportedTag:
+    """A column of the files and its role; unit, range and name where a person gave them.
+
+    Else the unit is the files', the range is what the readings show, and the name is the tag's own, made safe.
+    """
+
+    tag: str
+    role: Literal["pv", "mv", "dv", "sp", "mode"]
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    name: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ExportParams:
+    """``exports.<plant>``: the export files of a plant, and how they are read.
+
+    ``period_s``, ``hold_s``: sampling period of the record and the longest time that a reading is held (None: from the
+    data). ``without_mode``: rows of these modes are left out. ``time``, ``time_format``: the column of times and its
+    form ("": found by name and content). ``anyway``: the record is used even where it cannot carry a model.
+    """
+
+    case: str
+    files: tuple[Path, ...]
+    tags: tuple[ExportedTag, ...]
+    period_s: float | None = None
+    hold_s: float | None = None
+    without_mode: tuple[str, ...] = ()
+    time: str = ""
+    time_format: str = ""
+    anyway: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.files:
+            raise ValueError("files is empty; name one or more exports")
+        for name in ("period_s", "hold_s"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"{name} is {value:g}; it must be a positive number of seconds")
+
+    @classmethod
+    def read(cls, plant: str, path: Path = PARAMS_FILE) -> ExportParams:
+        """The section of one plant; ParamsError where it is not there, wrong, or another plant's."""
+        params = parse(cls, read_section(SECTION, plant, path), f"{SECTION}.{plant}")
+        if params.case != plant:
+            raise ParamsError(f"{SECTION}.{plant} has `case: {params.case}`; write `case: {plant}`")
+        return params
+
+    def to_dict(self) -> dict[str, Any]:
+        """The section; what was not given is left out."""
+        files = [file.as_posix() for file in self.files]
+        tags = [_given(ExportedTag, tag) for tag in self.tags]
+        given = {k: list(v) if isinstance(v, tuple) else v for k, v in _given(ExportParams, self).items()}
+        return {**given, "files": files, "tags": tags}
+
+
+def screened_record(plant: str) -> Path:
+    """The record that stage `screen` makes of a plant's exports."""
+    return Path("work") / plant / "records" / SCREENED / "record.parquet"
+
+
+def is_exported(plant: str, path: Path = PARAMS_FILE) -> bool:
+    """Whether the record of a plant is made of export files by stage `screen`."""
+    return plant in sections(SECTION, path)
+
+
+def _given(cls: type, values: Any) -> dict[str, Any]:
+    """Field -> value, without those that have their default."""
+    return {f.name: v for f in dataclasses.fields(cls) if (v := getattr(values, f.name)) != f.default}

@@ -1,0 +1,89 @@
+"""An export that grows, under the real DVC: which stages are stale, and what the models learn from."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from dirty_plant import cells, clean, write
+
+from pipeline.__main__ import main
+from pipeline.config.exports import screened_record
+
+ROOT = Path(__file__).parents[2]
+ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]=300..700"]
+FIT = "fit@tank-identified"
+
+
+def told(*command: str) -> str:
+    """What a command prints in the present folder."""
+    environment = {**os.environ, "DVC_NO_ANALYTICS": "1", "PYTHONPATH": ""}
+    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
+    done = subprocess.run(
+        [sys.executable, "-m", *command], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@pytest.fixture
+def _repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for package in ("pipeline", "serving"):
+        shutil.copytree(ROOT / package, package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("dvc.yaml", ".gitignore"):
+        shutil.copy(ROOT / name, name)
+    subprocess.run(["git", "init", "--quiet"], check=True)
+    told("dvc", "init", "--quiet")
+    # Without the section of exports, as written before there was one.
+    Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
+
+
+def small() -> None:
+    """Linear models of first order, learnt in seconds."""
+    tree: dict[str, Any] = yaml.safe_load(Path("params.yaml").read_text())
+    part = {"kind": "identified", "orders": [1, 1], "units": [], "lagged": False, "minutes": 0.02, "rows": 400}
+    tree["models"]["tank-identified"]["parts"] = {
+        "identified": part,
+        "plant1": {**part, "member": 1},
+        "plant2": {**part, "member": 2},
+    }
+    tree["controllers"] = {}
+    Path("params.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
+
+
+def stale() -> set[str]:
+    """The stages that `loopwright run --dry tank-identified` lists."""
+    return {line.split()[0] for line in told("pipeline", "run", "--dry", "tank-identified").splitlines()[1:]}
+
+
+def data() -> tuple[int, bool]:
+    """Rows of the record, and whether the models were learnt from it."""
+    record = json.loads(screened_record("tank").with_name("metrics.json").read_text())["per_seed"]["0"]
+    learnt = json.loads(Path("work/tank/models/identified/metrics.json").read_text())["data"]["0"]
+    return record["rows"], record["digest"] == learnt
+
+
+@pytest.mark.usefixtures("_repository")
+def test_an_export_that_grows_makes_its_own_record_and_models_anew() -> None:
+    assert told("dvc", "stage", "list", "--name-only").split() == ["code", "overview", "publish"]
+    write(Path("x.csv"), cells(clean(600)))
+    assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    small()
+    assert stale() == {"screen@tank", FIT}
+    told("pipeline.engine.start", "code")
+    told("dvc", "repro", "--quiet", FIT)
+    assert data() == (600, True)
+    assert stale() == set()
+    write(Path("x.csv"), cells(clean(900)))
+    assert stale() == {"screen@tank"}  # and after it, as `run` says, what depends on it
+    told("dvc", "repro", "--quiet", FIT)
+    assert data() == (900, True)
+    assert stale() == set()
