@@ -40,11 +40,9 @@ class Doubts(NamedTuple):
 
     def __str__(self) -> str:
         """In words."""
-        gains = sorted({round(1 + g, 2) for g in (min(self.gain), max(self.gain))})
-        return (
-            f"a gain {' to '.join(f'{g:g}' for g in gains)} times as high, {1 + self.pace:.3g} times as slow and "
-            f"{self.dead:.2g} periods later, or as much lower and faster"
-        )
+        gain = " to ".join(f"{g:g}" for g in sorted({round(1 + g, 2) for g in (min(self.gain), max(self.gain))}))
+        late = f"{self.dead:.2g} period{'s' * (self.dead != 1)} later"
+        return f"gain {gain} times as high, {1 + self.pace:.3g} times as slow, {late}; or lower and faster by as much"
 
 
 class OwnPlant(IdentifiedPlant):

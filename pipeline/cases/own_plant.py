@@ -207,7 +207,7 @@ class OwnCase(Case):
         members, reach = self.members, self.reach
         pairs = [(seed, members[i % len(members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
         held_out = "Set points, on models identified from the record"
-        spoilt = f"Set points, on such models with errors of gain, speed and dead time: {self._doubts}"
+        spoilt = f"Set points, on such models gone wrong: {self._doubts}"
         cvs = self.signals.sp
         loads = f"A load worth {LOAD:g} standard deviations of the record's {cvs[0].name if len(cvs) == 1 else 'CV'}"
         loads += "" if len(cvs) == 1 else ", each CV in turn"

@@ -123,7 +123,7 @@ def test_errors_of_spoilt_plants_grow_with_what_the_record_leaves_open(heater: O
     slow, fast = (dict(t.changes) for t in case.scenarios()["spoilt"][:2])
     assert [float(values[0]) for values in slow.values()] == pytest.approx([1.4, 1.6, 2.4])
     assert [float(values[0]) for values in fast.values()] == pytest.approx([1 / 1.4, 1 / 1.6, 0.0])
-    assert "a gain 1.4 times as high, 1.6 times as slow and 2.4 periods later" in case.scenarios()["spoilt"][0].title
+    assert "gain 1.4 times as high, 1.6 times as slow, 2.4 periods later" in case.scenarios()["spoilt"][0].title
 
 
 @pytest.mark.parametrize(("sd", "error"), [(0.0, 0.25), (0.2, 0.4), (9.0, 1.0)])
