@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -29,6 +30,9 @@ from pipeline.plants.equations import EquationPlant
 from pipeline.plants.signals import Signals
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_batch
+
+# A job that a shell puts in the background hears no Ctrl-C, and no program that it starts would.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
 QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}

@@ -17,6 +17,7 @@ from pipeline.stages.design import design
 from pipeline.stages.fit import fit
 from pipeline.stages.overview import overview
 from pipeline.stages.report import report
+from pipeline.stages.screen import screen
 from pipeline.stages.validate import validate
 from serving import Controller
 from serving.card import card
@@ -43,6 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tree["controllers"]["tank-pid"] |= {"development_seeds": [1], "development_set_points": 3}
         Path("params.yaml").write_text(yaml.safe_dump(tree))
         assert mistakes() == []
+        screen("tank")
         fit("tank-identified")
         for name in ("tank-predictive", "tank-pid"):
             design(name)
