@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from pipeline.pictures.drawing import axis_label, gain_unit
 from pipeline.pictures.numbers import figure, number
 
 MOST_TRIED = 12  # candidates in the table, the best first
+COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
 
@@ -43,7 +44,10 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     part = identified_part(evidence.models)
     if not part:
         return None
-    return ModelSection(_verdicts(part), _variables(evidence, part), _answers(evidence, part), _tried(part))
+    mvs = [s.name for s in evidence.case.plant_class.mv_signals]
+    return ModelSection(
+        (*_verdicts(part), *_left_open(part, mvs)), _variables(evidence, part), _answers(evidence, part), _tried(part)
+    )
 
 
 def _verdicts(part: Mapping[str, Any]) -> tuple[str, ...]:
@@ -55,6 +59,19 @@ def _verdicts(part: Mapping[str, Any]) -> tuple[str, ...]:
         words.append(f"the largest pole at rests of the visited range is {radius:.4g}; at most 1 is stable")
     warnings = tuple(f"Warning: {text}." for text in part.get("warnings") or ())
     return (*(f"{text[:1].upper()}{text[1:]}." for text in words if text), *warnings)
+
+
+def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
+    """How far models as likely as this one differ, which is how far tests and tuning go wrong at least."""
+    found = part.get("open")
+    if not found:
+        return ()
+    gains = ", ".join(f"{100 * sd:.2g} % in the gain of {name}" for name, sd in zip(mvs, found["gain_sd"], strict=True))
+    pace, dead = 100 * found["pace_sd"][0], found["dead_sd"][0]
+    return (
+        f"Models as likely as this one differ by {gains}, by {pace:.2g} % in speed and by {dead:.2g} periods in dead "
+        "time (standard deviations).",
+    )
 
 
 def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
@@ -71,7 +88,7 @@ def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, 
                 "the run explodes" if fit is None else f"{fit:.3g} %",
                 figure(found.get("free_run_rmse")),
                 ", ".join(figure(third) for third in thirds),
-                figure(found.get("noise_sd")),
+                _noise(found),
                 _share(residual.get("autocorrelated")),
                 _share(residual.get("input_correlated")),
             )
@@ -121,6 +138,12 @@ def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
         )
         for row in (*best, *chosen)
     )
+
+
+def _noise(found: Mapping[str, Any]) -> str:
+    """Standard deviation, and the colour where the noise has one."""
+    sd, colour = found.get("noise_sd"), found.get("noise_colour") or 0.0
+    return figure(sd) + (f", colour {colour:.2f}" if colour >= COLOURED else "")
 
 
 def _share(value: float | None) -> str:
