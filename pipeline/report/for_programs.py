@@ -84,6 +84,8 @@ def _gate(evidence: Evidence) -> GateRecord:
             )
             for law, found in evidence.laws.items()
         },
+        relative_to=evidence.relative_to,
+        no_baseline=evidence.no_baseline,
     )
 
 
@@ -91,7 +93,7 @@ def gate_id(evidence: Evidence) -> str:
     """Digest of what the gate measures: scores of different ids may not be compared."""
     case, tests = evidence.case, evidence.tests
     what: dict[str, Any] = {
-        s: [w, evidence.bound(s), [t.digest() for t in tests.get(s.removesuffix(NOISE_SUFFIX), ())]]
+        s: [w, evidence.reference(s), [t.digest() for t in tests.get(s.removesuffix(NOISE_SUFFIX), ())]]
         for s, w in case.gate.items()
     }
     what["floor"] = evidence.noise

@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
-from pipeline.evaluation.validation import FILE
+from pipeline.evaluation.validation import FILE, reference_words
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
 from pipeline.pictures.drawing import CasePicture
@@ -80,7 +80,10 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "statements": judged.statements,
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
         "withheld": evidence.withheld,
-        "gate_of": f"{case.baseline}'s" if evidence.simulated else "NMPC's",
+        "gate_of": _gate_of(evidence),
+        "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),
+        "no_baseline": evidence.no_baseline.rstrip("."),
+        "baseline": law_name(case.baseline),
         "laws": [law_row(evidence, law) for law in evidence.laws],
         "scenarios": scenario_rows(evidence),
         "further": further_figures(evidence),
@@ -93,6 +96,14 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "step_ms": evidence.bound(evidence.main_test, "step_ms_p50"),
         "registry": REGISTRY_URL,
     }
+
+
+def _gate_of(evidence: Evidence) -> str:
+    """What the gate score divides errors by."""
+    if evidence.relative_to == "floor":
+        return "the error that noise can hide"
+    whose = "NMPC" if evidence.relative_to == "nmpc" else law_name(evidence.case.baseline)
+    return f"{whose}'s {evidence.case.criterion.short}"
 
 
 def _floor(evidence: Evidence) -> str:

@@ -59,6 +59,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     if case is None:
         if any(standing.hidden for standing in standings.values()):
             console.print("n          noise can hide more than the bound: the ratio is to the hidden error, at least 1")
+        if any(standing.times != "× NMPC" for standing in standings.values()):
+            console.print(
+                "×          where there is no bound, as on a simulator of your own, the ratio is to what it names"
+            )
         console.print("*          the best law of its case, chosen on development sequences that are not scored")
         console.print(f"overview   {artifacts / 'report.html'} (and .md)")
         console.print(f"a case     {where / 'report.html'}; its tests here: loopwright results CASE")
@@ -142,7 +146,7 @@ def _tests(standing: Standing) -> Table:
     for name in names:
         table.add_row(name, _figure(validation.bound(name)), *(_figure(ours(name, law.law)) for law in standing.laws))
     table.add_section()
-    table.add_row(f"{standing.test} / NMPC", "", *(_multiple(standing, law) for law in standing.laws))
+    table.add_row(f"{standing.test} / {standing.times[2:]}", "", *(_multiple(standing, law) for law in standing.laws))
     table.add_row("lock-ups", "", *(("-" if law.lock_ups is None else str(law.lock_ups)) for law in standing.laws))
     table.add_row("size", "", *map(_size, standing.laws))
     return table
@@ -153,9 +157,14 @@ def _size(law: LawStanding) -> str:
 
 
 def _multiple(standing: Standing, law: LawStanding) -> str:
-    """Two decimals, more within 1 % of the bound; ``n`` marks a bound below the error that noise can hide."""
+    """Two decimals, more within 1 % of the bound; what it is a multiple of, where there is no bound.
+
+    ``n`` marks a bound below the error that noise can hide.
+    """
     if law.ratio is None:
         return "-"
+    if standing.times != "× NMPC":
+        return f"{ratio(law.ratio)} {standing.times}"
     return f"{law.ratio:.2f}n" if standing.hidden else ratio(law.ratio)
 
 

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from own_cases import controllers_of_a_lag
+from rich.console import Console
 
+from pipeline.cases.own_plant import OwnCase
 from pipeline.errors import LawError, ModelError, ParamsError, PlantError, RecordError
+from pipeline.evaluation.validation import Validation
 from pipeline.laws.pid.pid import PID
+from pipeline.report.results import show_results
 from pipeline.stages.design import design
+from pipeline.stages.report import report
 from pipeline.stages.validate import validate
+from pipeline.tracking.gate import Gate
 
 GIVEN = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
 
@@ -65,3 +73,66 @@ def test_models_that_cannot_be_read_end_the_run(plant: None) -> None:
     Path("work/it/models/identified/seed0/plant1.npz").write_bytes(b"cut off")
     with pytest.raises(ModelError):
         design("it-pid")
+
+
+def designed_and_validated(*names: str) -> Validation:
+    for name in names:
+        design(f"it-{name}")
+        validate(f"it-{name}")
+    report("it")
+    return Validation.read(Path("artifacts/it/validation.json"))
+
+
+def pages() -> tuple[str, str]:
+    """The report as Markdown, and the terminal's table."""
+    show_results(Path("artifacts"), Console(file=(terminal := io.StringIO())))
+    return Path("artifacts/it/report.md").read_text(), terminal.getvalue()
+
+
+def test_a_pid_that_locks_up_need_not_be_beaten_and_the_report_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    controllers_of_a_lag({"pid": GIVEN | {"kc": -2.0}, "other": GIVEN})
+    found = designed_and_validated("pid", "other")
+    assert found.gate.no_baseline.startswith("it locked up or left its limits on ")
+    assert Gate.of(found, "other").refusal() is None
+    assert "locked up" in str(Gate.of(found, "pid").refusal())
+    assert f"**There is no PID to beat:** {found.gate.no_baseline}" in pages()[0]
+
+
+def test_without_a_pid_another_law_passes_and_with_one_it_must_win(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    controllers_of_a_lag({"pid": GIVEN, "other": GIVEN | {"kc": 0.05}})  # slower, so worse
+    found = designed_and_validated("pid", "other")
+    assert found.gate.no_baseline == ""
+    assert "does not beat the PID's" in str(Gate.of(found, "other").refusal())
+    assert "no PID to beat" not in pages()[0]
+    assert found.gate.relative_to == "nmpc"
+
+    # A simulator has no NMPC: the PID's error counts as 1.
+    monkeypatch.setattr(OwnCase, "stand_in", "simulator")
+    report("it")
+    found = Validation.read(Path("artifacts/it/validation.json"))
+    assert found.gate.relative_to == "baseline"
+    assert found.gate.laws["pid"].score == pytest.approx(1.0)
+    assert found.gate.laws["other"].score is not None
+    assert found.gate.laws["other"].score > 1
+    page, terminal = pages()
+    assert "MAE / PID's MAE over held_out" in page
+    assert "and 1 is the PID's error." in page
+    assert re.search(r"pid \* .* 1\.0+ × PID", terminal), terminal
+
+    # Nor a PID: what noise can hide counts as 1.
+    monkeypatch.chdir(tmp_path)
+    controllers_of_a_lag({"other": GIVEN})
+    report("it")
+    found = Validation.read(Path("artifacts/it/validation.json"))
+    assert found.gate.relative_to == "floor"
+    assert found.gate.no_baseline == "params.yaml has no controller 'pid' for this plant"
+    assert Gate.of(found, "other").refusal() is None
+    page, terminal = pages()
+    assert "MAE / the error that noise can hide over held_out" in page
+    assert "× noise floor" in terminal
