@@ -65,17 +65,14 @@ class Evidence:
         ``timing`` = timing/<case> holds the times of a step; a law without a file there was not timed.
 
         The names leave out old folders of laws and sets that params.yaml no longer lists.
-        Raises ReportError if no law was validated.
+        Raises ReportError if no law was validated, nor withheld: a report without laws still shows the model.
         """
         validation, models = work / "validation", work / "models"
         validated = sorted(p.parent.name for p in validation.glob("*/metrics.json"))
         names = validated if laws is None else [n for n in laws if n in validated]
         reasons = {p.parent.name: str(read_mapping(p)["why"]) for p in sorted(validation.glob(f"*/{WITHHELD}"))}
         withheld = {n: why for n, why in reasons.items() if laws is None or n in laws}
-        if not names and withheld:
-            raise ReportError(f"{case.name}: no law could be designed, so there is nothing to report: "
-                              + "; ".join(f"{n}: {why}" for n, why in withheld.items()))  # fmt: skip
-        if not names:
+        if not names and not withheld:
             raise ReportError(f"{validation} holds no law's metrics.json; run `dvc repro`")
         evidence = {}
         for name in names:

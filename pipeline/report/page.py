@@ -43,6 +43,7 @@ def write_report(evidence: Evidence, claims: Claims, own: Sequence[CasePicture],
 def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own: Collection[str]) -> dict[str, Any]:
     """Everything that the templates show."""
     case, best = evidence.case, evidence.laws.get(evidence.best or "")
+    shipped = [name for name, law in evidence.laws.items() if not (case.on_models and law.withheld)]
     models = [row for name, model in evidence.models.items() for row in model_rows(name, model)]
     # An identified model has a section of its own, with what these rows have no columns for.
     models = [row for row in models if row["kind"] != IDENTIFIED]
@@ -58,6 +59,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "noise": f"true output, noisy measurement{draws}",
         "floor": _floor(evidence),
         "best": best,
+        "nothing_shipped": bool(evidence.withheld or evidence.laws) and not shipped,
+        "shown_law": evidence.best or next(iter(shipped), None),
         "seeds": "" if best is None else _seeds(best.seeds),
         "headline": headline(evidence),
         "warning": "" if evidence.grounds is None else evidence.grounds.warning,

@@ -52,6 +52,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
                 continue  # a file that a controller left which has been taken out since
             console.print(f"{name}: {law} is not shipped: {why}", style="red", markup=False, soft_wrap=True)
         shipped += [law for law in standing.laws if law.law not in withheld]
+        if without_controller(artifacts, name):
+            page = standing.folder / "report.html"
+            line = f"{name}: no controller is shipped, for the reasons above; {page} shows the model"
+            console.print(line, style="bold red", markup=False, soft_wrap=True)
     if any(law.lock_ups for law in shipped):
         console.print(
             "!          number of closed loops that locked up; the law reproduces a paper: do not run it on a plant"
@@ -74,6 +78,12 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     console.print(f"try one    loopwright simulate {where / '<law>.onnx'}")
     console.print(f"read one   loopwright inspect {where / '<law>.onnx'}")
     console.print("registry   make registry, then /#/models in the browser")
+
+
+def without_controller(artifacts: Path, case: str) -> bool:
+    """Whether a case has a report and withholds every law, so that its folder in ``artifacts`` has no controller."""
+    folder = artifacts / case
+    return (folder / FILE).is_file() and bool(withheld_in(folder)) and not any(folder.glob("*.onnx"))
 
 
 def _given(params: Path, case: str) -> tuple[str, ...] | None:

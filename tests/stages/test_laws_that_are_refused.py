@@ -16,7 +16,7 @@ from pipeline.cases.own_plant import OwnCase
 from pipeline.errors import LawError, ModelError, ParamsError, PlantError, RecordError
 from pipeline.evaluation.validation import Validation
 from pipeline.laws.pid.pid import PID
-from pipeline.report.results import show_results
+from pipeline.report.results import show_results, without_controller
 from pipeline.stages.design import design
 from pipeline.stages.report import report
 from pipeline.stages.validate import validate
@@ -136,3 +136,30 @@ def test_without_a_pid_another_law_passes_and_with_one_it_must_win(
     page, terminal = pages()
     assert "MAE / the error that noise can hide over held_out" in page
     assert "× noise floor" in terminal
+
+
+def test_without_any_law_the_report_shows_the_model_and_the_reasons(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    controllers_of_a_lag({"pid": GIVEN, "other": GIVEN})
+
+    def refuses(*_: object) -> None:
+        raise PlantError("the valve is stuck")
+
+    monkeypatch.setattr(PID, "design", refuses)
+    found = designed_and_validated("pid", "other")
+    assert found.best is None
+    assert found.laws == {}
+    page, terminal = pages()
+    assert "**No controller is shipped:** every law was withheld" in page
+    for law in ("pid", "other"):
+        assert f"**`{law}` was not designed:** law 'pid' is withheld: the valve is stuck." in page
+        assert f"it: {law} is not shipped: law 'pid' is withheld: the valve is stuck" in terminal
+    assert "None.onnx" not in page
+    assert "every test ran" not in page
+    html = Path("artifacts/it/report.html").read_text()
+    assert "No controller is shipped" in html
+    assert '<a href="#laws">' not in html
+    assert "it: no controller is shipped" in terminal
+    assert without_controller(Path("artifacts"), "it")
