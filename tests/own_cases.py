@@ -90,11 +90,16 @@ def loop_of(law: ControlLaw, test: Scenario) -> Trajectory:
     return simulate_closed(test.plant, step, test)
 
 
-def controllers_of_a_lag(controllers: dict[str, dict[str, Any]], gain: float = 2.0) -> OwnCase:
-    """A lag in params.yaml, with a record, models that need no training, and these controllers of it."""
+def controllers_of_a_lag(
+    controllers: dict[str, dict[str, Any]], gain: float = 2.0, moved: tuple[float, float] = (-0.6, 0.6)
+) -> OwnCase:
+    """A lag in params.yaml, with a record, models that need no training, and these controllers of it.
+
+    The record's MV was ``moved`` between two values.
+    """
     poles = (0.6, 0.55, 0.65)
-    mv = np.repeat(np.random.default_rng(0).uniform(-0.6, 0.6, (40, 1)), 10, axis=0)
-    y = np.zeros((400, 1))
+    mv = np.repeat(np.random.default_rng(0).uniform(*moved, (40, 1)), 10, axis=0)
+    y = np.full((400, 1), gain * mv[0])
     for k in range(399):
         y[k + 1] = poles[0] * y[k] + (1 - poles[0]) * gain * mv[k]
     lags = [

@@ -118,7 +118,8 @@ class Evidence:
     @property
     def main_test(self) -> str:
         """The test that weighs most in the gate."""
-        return max(self.case.gate, key=lambda name: self.case.gate[name])
+        weights = self.case.weights
+        return max(weights, key=lambda name: weights[name])
 
     def late_from(self, scenario: str) -> int:
         """The first sample of the late figures, with noise or without; 0: the test has none."""
@@ -234,7 +235,7 @@ class Evidence:
 
     def score(self, law: str) -> float | None:
         """Gate score: weighted mean of ``gate_ratio`` over the gate's scenarios; lower is better."""
-        gate = self.case.gate
+        gate = self.case.weights
         ratios = {s: r for s in gate if (r := self.gate_ratio(law, s)) is not None}
         if not ratios or len(ratios) < len(gate):
             return None
