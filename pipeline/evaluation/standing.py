@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -97,6 +98,13 @@ def withheld_in(folder: Path) -> dict[str, str]:
     """Law -> why its newest validation ships nothing, of those in ``folder`` = artifacts/<case>."""
     reasons = {p.stem: read_json(p).get("withheld") for p in sorted(folder.glob("*.json")) if p.name != FILE}
     return {law: str(why) for law, why in reasons.items() if why}
+
+
+def because(why: str) -> str:
+    """A stored reason as the end of a sentence, ``because ...``: without the law's name, which stands before it."""
+    words = re.sub(r"^law '[^']+' is withheld: ", "", why)
+    words = re.sub(r"^controllers\.\S+ (.*?), so nothing is shipped", r"it \1", words)
+    return f"because {words.rstrip('. ')}."
 
 
 def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from typing import Any
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
+from pipeline.evaluation.standing import because
 from pipeline.evaluation.validation import FILE, reference_words
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
@@ -82,10 +83,10 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "met": sum(row.holds is True for row in judged.acceptance),
         "statements": judged.statements,
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
-        "withheld": evidence.withheld,
+        "withheld": {law: because(why) for law, why in evidence.withheld.items()},
         "gate_of": _gate_of(evidence),
         "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),
-        "no_baseline": evidence.no_baseline.rstrip("."),
+        "no_baseline": because(evidence.no_baseline) if evidence.no_baseline else "",
         "baseline": law_name(case.baseline),
         "laws": [law_row(evidence, law) for law in evidence.laws],
         "scenarios": scenario_rows(evidence),

@@ -14,7 +14,7 @@ from rich.table import Table
 from pipeline.config.params import PARAMS_FILE, entries, sections
 from pipeline.errors import PipelineError
 from pipeline.evaluation.metric import with_unit
-from pipeline.evaluation.standing import LawStanding, Standing, tally, withheld_in
+from pipeline.evaluation.standing import LawStanding, Standing, because, tally, withheld_in
 from pipeline.evaluation.validation import FILE, Validation
 from pipeline.pictures.numbers import ratio
 from pipeline.simulation import NOISE_SUFFIX
@@ -50,7 +50,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         for law, why in withheld.items():
             if given is not None and law not in given:
                 continue  # a file that a controller left which has been taken out since
-            console.print(f"{name}: {law} is not shipped: {why}", style="red", markup=False, soft_wrap=True)
+            console.print(f"{name}: {law} is not shipped, {because(why)}", style="red", markup=False, soft_wrap=True)
         shipped += [law for law in standing.laws if law.law not in withheld]
         if without_controller(artifacts, name):
             page = standing.folder / "report.html"

@@ -11,6 +11,7 @@ from html import escape
 
 from pipeline.evaluation.law_evidence import Analysis
 from pipeline.evaluation.metric import ratio_to_bound, with_unit
+from pipeline.evaluation.standing import because
 from pipeline.evaluation.validation import Validation
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.tracking.gate import Gate, Rank
@@ -92,7 +93,7 @@ def _no_baseline(gate: Gate) -> str:
     """A sentence, after a space, for a law that had no baseline to beat; else nothing."""
     if not gate.no_baseline or gate.law == gate.baseline_law:
         return ""
-    return f" There was no {gate.baseline_name} to beat: {gate.no_baseline.rstrip('.')}."
+    return f" There was no {gate.baseline_name} to beat, {because(gate.no_baseline)}"
 
 
 def _table(validation: Validation, shown: Gate) -> str:

@@ -253,9 +253,9 @@ def test_without_a_baseline_the_best_other_law_is_champion_and_its_page_says_why
         model, (version,) = client.get_registered_model(name), versions(client, name)
         assert version.description.startswith(
             "Gate score 1.100 (1 = perfect-model NMPC), no lock-up. "
-            "There was no PID to beat: its &lt;gains&gt; have no inverse.\n"
+            "There was no PID to beat, because its &lt;gains&gt; have no inverse.\n"
         )
-        assert "There was no PID to beat: its &lt;gains&gt; have no inverse." in model.description
+        assert "There was no PID to beat, because its &lt;gains&gt; have no inverse." in model.description
         assert version.tags["gate_no_baseline"] == "its <gains> have no inverse"
     # All else is still asked of it.
     validation = Validation.read(folder / "validation.json")
