@@ -7,6 +7,7 @@ LoopwrightError (serving)
     +-- RecordError       a record's file: missing column, wrong unit, NaN, time not uniform, too short
     +-- ModelError        training data or a stored model do not fit the model
     +-- LawError          a control law cannot be designed from what it was given
+    |   +-- WithheldError  nor for this plant of a person, whose other controllers go on
     +-- ExportError       a law cannot be written as one graph, or the graph differs from the law
     +-- NotMeasuredError  evaluation.evidence: a check or a picture needs a figure that was not measured
     +-- ReportError       a report lacks a stage's results, or cannot read them
@@ -43,6 +44,10 @@ class ModelError(PipelineError):
 
 class LawError(PipelineError):
     """A control law cannot be designed."""
+
+
+class WithheldError(LawError):
+    """A law does not suit a person's own plant; the plant's other controllers go on without it."""
 
 
 class ExportError(PipelineError):

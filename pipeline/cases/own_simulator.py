@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.cases.own_plant import OwnCase, own_case
+from pipeline.cases.own_plant import LOADED, OwnCase, own_case
 from pipeline.cases.reach import LOAD, ROOM
 from pipeline.config.plants import PlantParams
 from pipeline.errors import ParamsError
@@ -41,10 +41,12 @@ class SimulatedCase(OwnCase):
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         """The tests of ``OwnCase`` on the simulator, but for ``spoilt``."""
-        return {
+        found = {
             name: tuple(map(_on_models if name == APART else self._on_simulator, tests))
             for name, tests in super().scenarios().items()
         }
+        found[LOADED] = tuple(t for t in found.get(LOADED, ()) if any(v.any() for v in t.changes.values()))
+        return {name: tests for name, tests in found.items() if tests}
 
     def _on_simulator(self, test: Scenario) -> Scenario:
         x0, mv0 = self.simulator.start

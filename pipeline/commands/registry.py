@@ -27,7 +27,8 @@ def _list(args: argparse.Namespace) -> None:
             for version in versions(client, model.name):
                 aliases = " ".join(f"@{a}" for a in version.aliases)
                 score = version.tags.get("gate_score", "-")
-                print(f"{model.name:40} {version.version:>4}  gate {score:10} {aliases}")
+                over = version.tags.get("gate_relative_to", "")  # nothing: the NMPC, as for most cases
+                print(f"{model.name:40} {version.version:>4}  gate {f'{score} {over}':10} {aliases}")
         if not models:
             print("the registry is empty; run `dvc repro`, or `loopwright registry publish`")
 

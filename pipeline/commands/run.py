@@ -17,7 +17,7 @@ from pipeline.config.params import entries, sections, sections_of
 from pipeline.engine.dvc import affected, ask, environment
 from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
 from pipeline.errors import ParamsError, PipelineError, nearest
-from pipeline.report.results import show_results
+from pipeline.report.results import show_results, without_controller
 from pipeline.stages.check import mistakes
 from pipeline.stages.code import code as list_files
 
@@ -81,6 +81,8 @@ def _run(options: argparse.Namespace) -> int:
             show_results(ARTIFACTS, case=case)
         if targets and not any(t.startswith("report") for t in targets):
             print("the table is of the last report; `loopwright run CASE` makes the report of these results")
+        # Who asks for a case asks for its controllers; the table says why there is none.
+        code = int(any(case is not None and without_controller(ARTIFACTS, case) for case in asked))
     return code
 
 

@@ -143,6 +143,16 @@ class Case(ABC):
         return self.plant_class()
 
     @property
+    def weights(self) -> Mapping[str, float]:
+        """The weights of ``gate`` over the tests that the case has; those of a test that it lacks go to the others."""
+        return self.gate
+
+    @property
+    def lacking(self) -> tuple[str, ...]:
+        """Sentences for the report: tests that the plant does not allow, and why."""
+        return ()
+
+    @property
     def ready(self) -> bool:
         """Whether the plant can be simulated yet; a plant known by its record alone waits for its models."""
         return True

@@ -12,11 +12,12 @@ from typing import Any, Self
 from pipeline.errors import PipelineError, ReportError
 from pipeline.evaluation.case import Case, Curve
 from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays
+from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays, lock_up_text
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.model_evidence import model_figure
 from pipeline.evaluation.reached import grounds_of
 from pipeline.evaluation.typed_json import read_mapping
+from pipeline.evaluation.validation import RelativeTo
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]
@@ -64,17 +65,14 @@ class Evidence:
         ``timing`` = timing/<case> holds the times of a step; a law without a file there was not timed.
 
         The names leave out old folders of laws and sets that params.yaml no longer lists.
-        Raises ReportError if no law was validated.
+        Raises ReportError if no law was validated, nor withheld: a report without laws still shows the model.
         """
         validation, models = work / "validation", work / "models"
         validated = sorted(p.parent.name for p in validation.glob("*/metrics.json"))
         names = validated if laws is None else [n for n in laws if n in validated]
         reasons = {p.parent.name: str(read_mapping(p)["why"]) for p in sorted(validation.glob(f"*/{WITHHELD}"))}
         withheld = {n: why for n, why in reasons.items() if laws is None or n in laws}
-        if not names and withheld:
-            raise ReportError(f"{case.name}: no law could be designed, so there is nothing to report: "
-                              + "; ".join(f"{n}: {why}" for n, why in withheld.items()))  # fmt: skip
-        if not names:
+        if not names and not withheld:
             raise ReportError(f"{validation} holds no law's metrics.json; run `dvc repro`")
         evidence = {}
         for name in names:
@@ -120,7 +118,8 @@ class Evidence:
     @property
     def main_test(self) -> str:
         """The test that weighs most in the gate."""
-        return max(self.case.gate, key=lambda name: self.case.gate[name])
+        weights = self.case.weights
+        return max(weights, key=lambda name: weights[name])
 
     def late_from(self, scenario: str) -> int:
         """The first sample of the late figures, with noise or without; 0: the test has none."""
@@ -206,17 +205,37 @@ class Evidence:
         return self.case.on_models and self.case.stand_in == "simulator"
 
     def gate_ratio(self, law: str, scenario: str) -> float | None:
-        """Error over the NMPC's, both at least ``floor``; 1 is the bound, or an error that noise can hide.
+        """Error over ``reference``, both at least ``floor``; None where one of them was not measured."""
+        own, other = self.figure(law, scenario), self.reference(scenario)
+        return None if own is None or other is None else gate_ratio(own, other, self.floor(scenario))
 
-        A simulator has no NMPC; the baseline's error stands in its place in all tests.
-        """
-        bound = self.figure(self.case.baseline, scenario) if self.simulated else self.bound(scenario)
-        own = self.figure(law, scenario)
-        return None if own is None or bound is None else gate_ratio(own, bound, self.floor(scenario))
+    @property
+    def relative_to(self) -> RelativeTo:
+        """What gate scores are relative to: on a simulator, which has no NMPC, the baseline, or else the noise."""
+        if not self.simulated:
+            return "nmpc"
+        return "baseline" if self.case.baseline in self.laws else "floor"
+
+    def reference(self, scenario: str) -> float | None:
+        """The error that counts as 1 in the gate score."""
+        if self.relative_to == "floor":
+            return self.floor(scenario) or None
+        return self.bound(scenario) if self.relative_to == "nmpc" else self.figure(self.case.baseline, scenario)
+
+    @property
+    def no_baseline(self) -> str:
+        """Why an own plant has no baseline to beat, in words; empty where it has one, and for other cases."""
+        name = self.case.baseline
+        if not self.case.on_models:
+            return ""
+        if name not in self.laws:
+            return self.withheld.get(name, f"params.yaml has no controller {name!r} for this plant")
+        tests = lock_up_text(self.laws[name].metrics.locked_up)
+        return f"it locked up or left its limits on {tests}" if self._withheld(name) else ""
 
     def score(self, law: str) -> float | None:
-        """Gate score: weighted mean of ``gate_ratio`` over the gate's scenarios; lower is better, 1 the bound."""
-        gate = self.case.gate
+        """Gate score: weighted mean of ``gate_ratio`` over the gate's scenarios; lower is better."""
+        gate = self.case.weights
         ratios = {s: r for s in gate if (r := self.gate_ratio(law, s)) is not None}
         if not ratios or len(ratios) < len(gate):
             return None

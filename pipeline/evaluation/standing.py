@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -26,7 +27,7 @@ class LawStanding:
     high: float | None
     seeds: int | None
     lock_ups: int | None
-    ratio: float | None  # to the bound, or to the noise floor if the bound is less: ``Standing.hidden``
+    ratio: float | None  # ``Standing.times``, or to the noise floor if the bound is less: ``Standing.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
 
@@ -50,6 +51,7 @@ class Standing:
     claims: tuple[Statement, ...]
     reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
     grounds: Grounds | None = None  # what tests on models of the plant's record rest on
+    times: str = "× NMPC"  # what ratios are to
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -83,6 +85,7 @@ class Standing:
             claims=validation.claims,
             reproduced=(sum(judged), len(judged)),
             grounds=validation.grounds,
+            times=validation.gate.times,
         )
 
     @property
@@ -97,31 +100,47 @@ def withheld_in(folder: Path) -> dict[str, str]:
     return {law: str(why) for law, why in reasons.items() if why}
 
 
+def because(why: str) -> str:
+    """A stored reason as the end of a sentence, ``because ...``: without the law's name, which stands before it."""
+    words = re.sub(r"^law '[^']+' is withheld: ", "", why)
+    words = re.sub(r"^controllers\.\S+ (.*?), so nothing is shipped", r"it \1", words)
+    return f"because {words.rstrip('. ')}."
+
+
 def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:
     """How many hold, of those that were measured."""
     verdicts = [row.holds for row in rows if row.holds is not None]
     return sum(verdicts), len(verdicts)
 
 
+def _ratio(validation: Validation, own: float | None) -> float | None:
+    """An error on the main test over what the gate divides by; None where one of them is missing."""
+    test, gate = validation.main, validation.gate
+    bound, floor = validation.bound(test), validation.floor(test.removesuffix(NOISE_SUFFIX))
+    if gate.relative_to != "nmpc":
+        baseline = validation.scenarios.get(test, {}).get(gate.baseline, {}).get(validation.metric)
+        other = baseline if gate.relative_to == "baseline" else floor or None
+        return None if own is None or other is None else gate_ratio(own, other, floor)
+    if own is None or bound is None:
+        return None
+    # A bound below the noise floor: the ratio to the floor, at least 1.
+    return gate_ratio(own, bound, floor) if bound < floor else ratio_to_bound(own, bound, floor)
+
+
 def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
     test, metric, result = validation.main, validation.metric, validation.laws[law]
     row = validation.scenarios.get(test, {}).get(law, {})
-    own, bound, floor = row.get(metric), validation.bound(test), validation.floor(test.removesuffix(NOISE_SUFFIX))
     file = folder / f"{law}.onnx"
-    ratio = None
-    if own is not None and bound is not None:
-        # A bound below the noise floor: the ratio to the floor, at least 1.
-        ratio = gate_ratio(own, bound, floor) if bound < floor else ratio_to_bound(own, bound, floor)
     return LawStanding(
         law=law,
         title=validation.titles.laws.get(law, law),
         best=law == validation.best,
-        figure=own,
+        figure=row.get(metric),
         low=row.get(f"{metric}_min"),
         high=row.get(f"{metric}_max"),
         seeds=result.seeds,
         lock_ups=result.lock_ups,
-        ratio=ratio,
+        ratio=_ratio(validation, row.get(metric)),
         step_us=result.step_us,
         bytes=file.stat().st_size if file.exists() else None,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import Analysis, Row
@@ -13,6 +14,8 @@ from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 SCHEMA = 1
 """It changes with the meaning of an entry; a new entry with a default does not change it."""
 FILE = "validation.json"
+RelativeTo: TypeAlias = Literal["nmpc", "baseline", "floor"]
+"""What a gate score is relative to: the perfect-model NMPC; the baseline; or the error that noise can hide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +67,19 @@ class GateResult:
     ratios: Row
 
 
+def reference_words(relative_to: RelativeTo, baseline: str) -> str:
+    """What a gate score is a multiple of, in words; ``baseline`` is the name of the case's baseline."""
+    return {"nmpc": "the bound", "baseline": f"the {baseline}'s error", "floor": "the error that noise can hide"}[
+        relative_to
+    ]
+
+
 @dataclass(frozen=True, slots=True)
 class GateRecord:
     """The promotion gate: what it measures, and each law's result.
 
     ``floor`` is the standard deviation of the noise, ``floors`` the floor of each scenario in the case's metric.
+    ``relative_to`` says what scores divide errors by, ``no_baseline`` why there is no baseline to beat.
     """
 
     id: str
@@ -78,6 +89,18 @@ class GateRecord:
     floor: float
     floors: Row
     laws: Mapping[str, GateResult]
+    relative_to: RelativeTo = "nmpc"
+    no_baseline: str = ""
+
+    @property
+    def reference(self) -> str:
+        """What a score is a multiple of, in words."""
+        return reference_words(self.relative_to, self.baseline_name)
+
+    @property
+    def times(self) -> str:
+        """The same as short as a column's head: ``× NMPC``."""
+        return "× " + {"nmpc": "NMPC", "baseline": self.baseline_name, "floor": "noise floor"}[self.relative_to]
 
 
 @dataclass(frozen=True, slots=True)

@@ -144,6 +144,11 @@ class ControlLaw(nn.Module, ABC):
         return tuple(cls.parts)
 
     @classmethod
+    def check_settings(cls, params: Any, signals: Signals) -> None:
+        """Raise LawError for parameters that do not fit the plant's signals; no model is needed."""
+        rates_of(signals, getattr(params, "mv_rate", None))
+
+    @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError if ``design`` would refuse the plant. No training is run; ``models`` may lack parts."""
 

@@ -71,7 +71,7 @@ def _gate(evidence: Evidence) -> GateRecord:
     case = evidence.case
     return GateRecord(
         id=gate_id(evidence),
-        weights=case.gate,
+        weights=case.weights,
         baseline=case.baseline,
         baseline_name=law_name(case.baseline),
         floor=evidence.noise,
@@ -80,10 +80,12 @@ def _gate(evidence: Evidence) -> GateRecord:
             law: GateResult(
                 evidence.score(law),
                 found.lock_ups,
-                {s: r for s in case.gate if (r := evidence.gate_ratio(law, s)) is not None},
+                {s: r for s in case.weights if (r := evidence.gate_ratio(law, s)) is not None},
             )
             for law, found in evidence.laws.items()
         },
+        relative_to=evidence.relative_to,
+        no_baseline=evidence.no_baseline,
     )
 
 
@@ -91,8 +93,8 @@ def gate_id(evidence: Evidence) -> str:
     """Digest of what the gate measures: scores of different ids may not be compared."""
     case, tests = evidence.case, evidence.tests
     what: dict[str, Any] = {
-        s: [w, evidence.bound(s), [t.digest() for t in tests.get(s.removesuffix(NOISE_SUFFIX), ())]]
-        for s, w in case.gate.items()
+        s: [w, evidence.reference(s), [t.digest() for t in tests.get(s.removesuffix(NOISE_SUFFIX), ())]]
+        for s, w in case.weights.items()
     }
     what["floor"] = evidence.noise
     if case.metric != DEFAULT:

@@ -76,6 +76,8 @@ def _best(standing: Standing) -> str:
         return "No law qualifies as best controller."
     if best.ratio is None:
         return f"Best controller: {best.title}."
+    if standing.times != "× NMPC":
+        return f"Best controller: {best.title}, {ratio(best.ratio)} {standing.times} ({standing.metric})."
     if standing.hidden:
         return f"Best controller: {best.title}, {ratio(best.ratio)} × the {standing.metric} that noise can hide."
     return f"Best controller: {best.title}, {ratio(best.ratio)} × the perfect-model NMPC's {standing.metric}."

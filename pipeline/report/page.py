@@ -10,7 +10,8 @@ from typing import Any
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
-from pipeline.evaluation.validation import FILE
+from pipeline.evaluation.standing import because
+from pipeline.evaluation.validation import FILE, reference_words
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
 from pipeline.pictures.drawing import CasePicture
@@ -43,6 +44,7 @@ def write_report(evidence: Evidence, claims: Claims, own: Sequence[CasePicture],
 def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own: Collection[str]) -> dict[str, Any]:
     """Everything that the templates show."""
     case, best = evidence.case, evidence.laws.get(evidence.best or "")
+    shipped = [name for name, law in evidence.laws.items() if not (case.on_models and law.withheld)]
     models = [row for name, model in evidence.models.items() for row in model_rows(name, model)]
     # An identified model has a section of its own, with what these rows have no columns for.
     models = [row for row in models if row["kind"] != IDENTIFIED]
@@ -58,6 +60,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "noise": f"true output, noisy measurement{draws}",
         "floor": _floor(evidence),
         "best": best,
+        "nothing_shipped": bool(evidence.withheld or evidence.laws) and not shipped,
+        "shown_law": evidence.best or next(iter(shipped), None),
         "seeds": "" if best is None else _seeds(best.seeds),
         "headline": headline(evidence),
         "warning": "" if evidence.grounds is None else evidence.grounds.warning,
@@ -79,8 +83,11 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "met": sum(row.holds is True for row in judged.acceptance),
         "statements": judged.statements,
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
-        "withheld": evidence.withheld,
-        "gate_of": f"{case.baseline}'s" if evidence.simulated else "NMPC's",
+        "withheld": {law: because(why) for law, why in evidence.withheld.items()},
+        "gate_of": _gate_of(evidence),
+        "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),
+        "no_baseline": because(evidence.no_baseline) if evidence.no_baseline else "",
+        "baseline": law_name(case.baseline),
         "laws": [law_row(evidence, law) for law in evidence.laws],
         "scenarios": scenario_rows(evidence),
         "further": further_figures(evidence),
@@ -93,6 +100,14 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "step_ms": evidence.bound(evidence.main_test, "step_ms_p50"),
         "registry": REGISTRY_URL,
     }
+
+
+def _gate_of(evidence: Evidence) -> str:
+    """What the gate score divides errors by."""
+    if evidence.relative_to == "floor":
+        return "the error that noise can hide"
+    whose = "NMPC" if evidence.relative_to == "nmpc" else law_name(evidence.case.baseline)
+    return f"{whose}'s {evidence.case.criterion.short}"
 
 
 def _floor(evidence: Evidence) -> str:

@@ -14,7 +14,7 @@ from rich.table import Table
 from pipeline.config.params import PARAMS_FILE, entries, sections
 from pipeline.errors import PipelineError
 from pipeline.evaluation.metric import with_unit
-from pipeline.evaluation.standing import LawStanding, Standing, tally, withheld_in
+from pipeline.evaluation.standing import LawStanding, Standing, because, tally, withheld_in
 from pipeline.evaluation.validation import FILE, Validation
 from pipeline.pictures.numbers import ratio
 from pipeline.simulation import NOISE_SUFFIX
@@ -50,8 +50,12 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         for law, why in withheld.items():
             if given is not None and law not in given:
                 continue  # a file that a controller left which has been taken out since
-            console.print(f"{name}: {law} is not shipped: {why}", style="red", markup=False, soft_wrap=True)
+            console.print(f"{name}: {law} is not shipped, {because(why)}", style="red", markup=False, soft_wrap=True)
         shipped += [law for law in standing.laws if law.law not in withheld]
+        if without_controller(artifacts, name):
+            page = standing.folder / "report.html"
+            line = f"{name}: no controller is shipped, for the reasons above; {page} shows the model"
+            console.print(line, style="bold red", markup=False, soft_wrap=True)
     if any(law.lock_ups for law in shipped):
         console.print(
             "!          number of closed loops that locked up; the law reproduces a paper: do not run it on a plant"
@@ -59,6 +63,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     if case is None:
         if any(standing.hidden for standing in standings.values()):
             console.print("n          noise can hide more than the bound: the ratio is to the hidden error, at least 1")
+        if any(standing.times != "× NMPC" for standing in standings.values()):
+            console.print(
+                "×          where there is no bound, as on a simulator of your own, the ratio is to what it names"
+            )
         console.print("*          the best law of its case, chosen on development sequences that are not scored")
         console.print(f"overview   {artifacts / 'report.html'} (and .md)")
         console.print(f"a case     {where / 'report.html'}; its tests here: loopwright results CASE")
@@ -70,6 +78,12 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     console.print(f"try one    loopwright simulate {where / '<law>.onnx'}")
     console.print(f"read one   loopwright inspect {where / '<law>.onnx'}")
     console.print("registry   make registry, then /#/models in the browser")
+
+
+def without_controller(artifacts: Path, case: str) -> bool:
+    """Whether a case has a report and withholds every law, so that its folder in ``artifacts`` has no controller."""
+    folder = artifacts / case
+    return (folder / FILE).is_file() and bool(withheld_in(folder)) and not any(folder.glob("*.onnx"))
 
 
 def _given(params: Path, case: str) -> tuple[str, ...] | None:
@@ -142,7 +156,7 @@ def _tests(standing: Standing) -> Table:
     for name in names:
         table.add_row(name, _figure(validation.bound(name)), *(_figure(ours(name, law.law)) for law in standing.laws))
     table.add_section()
-    table.add_row(f"{standing.test} / NMPC", "", *(_multiple(standing, law) for law in standing.laws))
+    table.add_row(f"{standing.test} / {standing.times[2:]}", "", *(_multiple(standing, law) for law in standing.laws))
     table.add_row("lock-ups", "", *(("-" if law.lock_ups is None else str(law.lock_ups)) for law in standing.laws))
     table.add_row("size", "", *map(_size, standing.laws))
     return table
@@ -153,9 +167,14 @@ def _size(law: LawStanding) -> str:
 
 
 def _multiple(standing: Standing, law: LawStanding) -> str:
-    """Two decimals, more within 1 % of the bound; ``n`` marks a bound below the error that noise can hide."""
+    """Two decimals, more within 1 % of the bound; what it is a multiple of, where there is no bound.
+
+    ``n`` marks a bound below the error that noise can hide.
+    """
     if law.ratio is None:
         return "-"
+    if standing.times != "× NMPC":
+        return f"{ratio(law.ratio)} {standing.times}"
     return f"{law.ratio:.2f}n" if standing.hidden else ratio(law.ratio)
 
 

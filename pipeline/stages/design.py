@@ -16,9 +16,10 @@ import numpy as np
 
 from pipeline.cases import all_cases
 from pipeline.config.params import ControllerParams, choose, parse
-from pipeline.engine.command import run_stage
+from pipeline.engine.command import reason, run_stage
 from pipeline.engine.parallel import parallel_map
-from pipeline.errors import ExportError, LawError
+from pipeline.errors import LawError, PipelineError, WithheldError
+from pipeline.evaluation.case import Case
 from pipeline.evaluation.law_evidence import BASE
 from pipeline.export.gate import export
 from pipeline.files import digest, read_json, write_json
@@ -28,9 +29,15 @@ from pipeline.models import load_model
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder
 
+REFUSALS = (PipelineError, np.linalg.LinAlgError)
+"""What a law raises that a plant does not suit; any other error is a mistake in the program."""
+
 
 def design(name: str) -> None:
-    """Export ``controllers.<name>`` for each seed of its model set, its variants too."""
+    """Export ``controllers.<name>`` for each seed of its model set, its variants too.
+
+    On an own plant, a law that cannot be designed leaves the reason, and the other controllers go on.
+    """
     params = ControllerParams.read(name)
     where = f"controllers.{name}"
     case, law = choose(all_cases(), params.case, "case", where), choose(LAWS, params.law, "law", where)
@@ -46,21 +53,35 @@ def design(name: str) -> None:
     provenance = {"params_sha256": digest(forms), "commit": _commit(), "versions": _versions()}
     work = [(form, seed) for form in forms for seed in seeds]
     arguments = (params, read, models, case.plant, provenance, data)
-    suits = False
+    label = f"design {name}: controllers, tuned and written as ONNX files"
     try:
-        require_fit(law, case.plant)
-        suits = True
-        rows = parallel_map(
-            partial(_export, *arguments), work, f"design {name}: controllers, tuned and written as ONNX files"
-        )
-    except (LawError, ExportError) as error:
-        if suits and not case.on_models:
-            raise  # who wrote equations and a law down wants to know
-        why = f"law {params.law!r} is withheld: {error}" if suits else str(error)
-        _withhold(folder, law, why)  # the other controllers of the plant go on
-        print(f"design {name}: {why}", file=sys.stderr)
+        _require_fit(law, case)
+        rows = parallel_map(partial(_export, *arguments, withhold=case.on_models), work, label)
+    except WithheldError as error:
+        _withhold(folder, law, str(error))
+        print(f"design {name}: {error}", file=sys.stderr)
         return
     write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "controllers": rows})
+
+
+def _require_fit(law: type[ControlLaw], case: Case) -> None:
+    """Raise WithheldError where the law does not suit the case's plant."""
+    try:
+        require_fit(law, case.plant)
+    except LawError as error:
+        raise WithheldError(str(error)) from error
+    except REFUSALS as error:
+        if not case.on_models:
+            raise
+        raise WithheldError(_why(law.name, error)) from error
+
+
+def _why(law: str, error: Exception) -> str:
+    if isinstance(error, np.linalg.LinAlgError):
+        # The stage's own words for it are about plants in equations.
+        words = " ".join(str(error).split())
+        return f"law {law!r} is withheld: its equations have no single solution over the model of the plant ({words})"
+    return f"law {law!r} is withheld: {reason(error)}"
 
 
 def _withhold(folder: Path, law: type[ControlLaw], why: str) -> None:
@@ -78,15 +99,23 @@ def _export(
     provenance: Mapping[str, Any],
     data: Mapping[str, str],
     item: tuple[str, int],
+    *,
+    withhold: bool,
 ) -> dict[str, Any]:
+    """The row of one exported file; with ``withhold``, WithheldError for what the law cannot do with its models."""
     form, seed = item
     parts = {p.stem: load_model(p) for p in sorted((models / f"seed{seed}").glob("*.npz"))}
-    law = LAWS[params.law].design(forms[form], parts, plant.signals, plant).eval()
     path = controller_file(params.case, params.name, form, seed)
     origin = {**provenance, "data_seed": seed, "record_sha256": data.get(str(seed))}
-    export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
-    row = {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
-    return row | _analysed(law, plant, analysis_file(params.case, params.name, form, seed))
+    try:
+        law = LAWS[params.law].design(forms[form], parts, plant.signals, plant).eval()
+        export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
+        row = {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
+        return row | _analysed(law, plant, analysis_file(params.case, params.name, form, seed))
+    except REFUSALS as error:
+        if not withhold:
+            raise  # who wrote equations and a law down wants to know
+        raise WithheldError(_why(params.law, error)) from error
 
 
 def _analysed(law: ControlLaw, plant: Simulator, path: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from html import escape
 
 from pipeline.evaluation.law_evidence import Analysis
 from pipeline.evaluation.metric import ratio_to_bound, with_unit
+from pipeline.evaluation.standing import because
 from pipeline.evaluation.validation import Validation
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from pipeline.tracking.gate import Gate, Rank
@@ -40,19 +41,20 @@ def model_description(case: str, law: str, validation: Validation | None, champi
 
 def standing(name: str, law: str, validation: Validation | None, champion: str | None) -> tuple[str, str]:
     """Where a controller stands: in a few words for the list of models, and in a sentence or two without markup."""
-    rank, score = Rank.of_laws(validation).get(law), Gate.of(validation, law).score
+    gate = Gate.of(validation, law)
+    rank, score, none = Rank.of_laws(validation).get(law), gate.score, _no_baseline(gate)
     if rank is None or score is None:
         return "not compared yet", "Not compared yet: the report stage of its case has not run."
-    place, ratio = f"{rank.place} of {rank.of}", f"{score:.3f} times the bound"
+    place, ratio = f"{rank.place} of {rank.of}", f"{score:.3f} times {gate.reference}"
     if name == champion and rank.place == 1:
-        return f"champion, {place}", f"CHAMPION: the best of the {rank.of} controllers of its case, {ratio}."
+        return f"champion, {place}", f"CHAMPION: the best of the {rank.of} controllers of its case, {ratio}.{none}"
     if name == champion:
-        return f"champion, {place}", f"CHAMPION of its case, {ratio}; rank {place} in the newest comparison."
+        return f"champion, {place}", f"CHAMPION of its case, {ratio}; rank {place} in the newest comparison.{none}"
     best = f"The champion is {champion}." if champion else "The case has no champion."
     if rank.refusal:
         sentence = f"Rank {place}, {ratio}. It does not pass the gate: {rank.refusal}. {best}"
         return f"{place}, did not pass the gate", sentence
-    return place, f"Rank {place}, {ratio}. {best}"
+    return place, f"Rank {place}, {ratio}. {best}{none}"
 
 
 def version_description(validation: Validation | None, gate: Gate, run_id: str, picture: str | None) -> str:
@@ -77,13 +79,21 @@ def _verdict(gate: Gate) -> str:
     """The first line, without markup: lists of versions show it as it is."""
     if gate.score is None:
         return "No closed-loop evidence yet: the report stage of its case has not run.\n"
-    other = gate.baseline is not None and gate.law != gate.baseline_law
+    other = gate.baseline is not None and gate.law != gate.baseline_law and not gate.no_baseline
     beside = f", {gate.baseline_name} {gate.baseline:.3f}" if other else ""
-    score = f"Gate score {gate.score:.3f} (1 = perfect-model NMPC{beside})"
+    one = "perfect-model NMPC" if gate.reference == "the bound" else gate.reference
+    score = f"Gate score {gate.score:.3f} (1 = {one}{beside})"
     if not gate.lock_ups:
-        return f"{score}, no lock-up.\n"
+        return f"{score}, no lock-up.{escape(_no_baseline(gate), quote=False)}\n"
     where = f": {gate.locked_up}" if gate.locked_up else ""
     return f"LOCKED UP in {gate.lock_ups} closed loops{where}; do not run it on a plant. {score}.\n"
+
+
+def _no_baseline(gate: Gate) -> str:
+    """A sentence, after a space, for a law that had no baseline to beat; else nothing."""
+    if not gate.no_baseline or gate.law == gate.baseline_law:
+        return ""
+    return f" There was no {gate.baseline_name} to beat, {because(gate.no_baseline)}"
 
 
 def _table(validation: Validation, shown: Gate) -> str:

@@ -3,7 +3,9 @@
 The report stage writes into validation.json, for each law of a case, its gate score: the weighted
 mean over the gate's scenarios of its error over that of the perfect-model NMPC, in the case's metric
 (mean absolute or squared), both at least what the measurement noise would hide, so lower is better
-and 1 is the bound. ``Gate.id`` is a digest of scenarios, weights and bounds: scores of different ids
+and 1 is the bound. On a person's own simulator, which has no NMPC, the error of the case's baseline
+takes its place, and without one the error that noise can hide. ``Gate.id`` is a digest of scenarios,
+weights and the errors that are divided by: scores of different ids
 were measured on different tests and are never compared.
 
 Aliases:
@@ -14,6 +16,8 @@ Aliases:
     the best version of a controller that passed the gate. It moves only to a version that did not
     lock up in any run, whose score is below that of the case's baseline in the same validation, and
     below that of the present best version. The baseline has only its own former version to beat.
+    An own plant whose baseline was not designed or locked up has none to beat; ``Gate.no_baseline``
+    says why.
 ``champion``
     one in a case: the best version with the lowest score among the case's controllers, or the one
     that a person promoted.
@@ -42,6 +46,9 @@ class Gate:
     baseline_law: str = ""  # as the case names it
     baseline_name: str = ""
     locked_up: str = ""  # on which tests, of which data seeds
+    no_baseline: str = ""  # why an own plant has no baseline to beat
+    reference: str = "the bound"  # what the score is a multiple of
+    times: str = "× NMPC"  # the same, short
 
     @classmethod
     def of(cls, validation: Validation | None, law: str) -> Self:
@@ -62,6 +69,9 @@ class Gate:
             gate.baseline,
             gate.baseline_name,
             locked_up,
+            gate.no_baseline,
+            gate.reference,
+            gate.times,
         )
 
     def tags(self) -> dict[str, str]:
@@ -71,6 +81,8 @@ class Gate:
             "gate_score": self.score,
             "gate_baseline": self.baseline_law or None,
             "gate_baseline_score": self.baseline,
+            "gate_no_baseline": self.no_baseline or None,
+            "gate_relative_to": None if self.reference == "the bound" else self.times,
             "lock_ups": self.lock_ups,
             "locked_up": self.locked_up or None,
             **{f"gate_{scenario}": ratio for scenario, ratio in self.ratios.items()},
@@ -83,7 +95,7 @@ class Gate:
             return "its validation has no gate score"
         if self.lock_ups:
             return f"it locked up in {self.lock_ups} of its closed loops"
-        if self.law == self.baseline_law:
+        if self.law == self.baseline_law or self.no_baseline:
             return None
         if self.baseline is None:
             return f"no {self.baseline_name} was validated beside it"

@@ -39,10 +39,16 @@ def headline(kind: str, metrics: Mapping[str, Any], validation: Validation | Non
     return dict(list(finite.items())[:MOST])
 
 
+def ratio_name(validation: Validation | None) -> str:
+    """The name of the gate score among the metrics: ``ratio_to_bound``, or of what else it is a multiple."""
+    other = "nmpc" if validation is None else validation.gate.relative_to
+    return "ratio_to_" + {"nmpc": "bound", "baseline": "baseline", "floor": "noise_floor"}[other]
+
+
 def of_gate(law: str, validation: Validation | None) -> Figures:
-    """The case's score of a law: its error over the bound's. It is the report's, so it may change after a run."""
+    """The case's score of a law: its error over the bound's or what else is named. A later report may change it."""
     score = Gate.of(validation, law).score
-    return {"ratio_to_bound": float(score)} if _is_figure(score) else {}
+    return {ratio_name(validation): float(score)} if _is_figure(score) else {}
 
 
 def _of_record(tree: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,9 +108,10 @@ def _of_case(validation: Validation | None) -> dict[str, Any]:
         return {}
     laws = validation.gate.laws
     scores = [row.score for row in laws.values() if row.score is not None]
+    ratio = ratio_name(validation)
     shown: dict[str, Any] = {"laws": len(laws), "laws_that_locked_up": sum(bool(r.lock_ups) for r in laws.values())}
     if scores:
-        shown |= {"best_ratio_to_bound": min(scores), "median_ratio_to_bound": statistics.median(scores)}
+        shown |= {f"best_{ratio}": min(scores), f"median_{ratio}": statistics.median(scores)}
     shown |= _grounds(validation)
     for name, words in (("requirements", "met"), ("claims", "confirmed"), ("paper", "reproduced")):
         known = [row.holds for row in getattr(validation, name) if row.holds is not None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pipeline.evaluation.validation import Validation
 from pipeline.tracking.gate import Gate
+from pipeline.tracking.headline import ratio_name
 from pipeline.tracking.stage_results import StageResult, Times
 
 WHAT = {
@@ -32,19 +33,36 @@ METRICS = {
     "fit": "The metrics are medians over the data seeds: `rmse` one step ahead, `free_run_rmse` when the model runs on"
     " its own output. `training/` and `sweep/` are curves.",
     "design": "`bytes` is the largest file, `states` the length of the state vector.",
-    "validate": "`ratio_to_bound` is the figure that decides: the error divided by that of {bound};"
+    "validate": "`{ratio}` is the figure that decides: the error divided by that of {bound};"
     " lower is better. `{metric}/…` is the error on each test, the median over the data seeds."
     " `lock_ups` must be 0. `step_us` is the time of one step in microseconds.",
-    "report": "`best_ratio_to_bound` is that of the best law; 1 is the bound.",
+    "report": "`best_{ratio}` is that of the best law; 1 is {one}.",
 }
+
+
+def _bound(validation: Validation) -> str:
+    """What an error is divided by, in words."""
+    gate = validation.gate
+    if gate.relative_to == "nmpc":
+        return BOUND[validation.on_models]
+    tested = "every test ran on a simulator or on models of the plant, none on the plant"
+    if gate.relative_to == "baseline":
+        return f"the {gate.baseline_name}, and 1 is as good as it; {tested}"
+    return f"a loop whose error is what noise can hide, and 1 is as good as that; {tested}"
 
 
 def run_note(result: StageResult, case: str, validation: Validation | None, times: Times) -> str:
     """The description of a run: what the stage did, what came out, and what its metrics mean."""
     item = result.item
-    words = {"case": case, "item": item, "metric": "<metric>", "bound": BOUND[False]}
+    words = {"case": case, "item": item, "metric": "<metric>", "bound": BOUND[False], "one": "the bound"}
+    words["ratio"] = ratio_name(validation)
     if validation is not None:
-        words |= {"case": validation.titles.case, "metric": validation.metric, "bound": BOUND[validation.on_models]}
+        words |= {
+            "case": validation.titles.case,
+            "metric": validation.metric,
+            "bound": _bound(validation),
+            "one": validation.gate.reference,
+        }
         if result.kind in {"design", "validate"}:
             words["item"] = validation.titles.laws.get(item, item)
     # the page shows the first lines, the rest on a click
@@ -69,7 +87,7 @@ def _verdict(gate: Gate) -> str:
         return ""
     refusal = gate.refusal()
     passed = "It passes the gate." if refusal is None else f"It does not pass the gate: {refusal}."
-    return f"**{gate.score:.3f} times the bound.** {passed}"
+    return f"**{gate.score:.3f} times {gate.reference}.** {passed}"
 
 
 def experiment_note(case: str, validation: Validation | None, champion: str | None) -> str:
@@ -79,8 +97,8 @@ def experiment_note(case: str, validation: Validation | None, champion: str | No
     first = f"**{title}.**"  # the page shows this line, the rest on a click
     if champion:
         law = champion.removeprefix(f"{case}-")
-        score = Gate.of(validation, law).score
-        beside = "" if score is None else f", {score:.3f} times the bound"
+        gate = Gate.of(validation, law)
+        beside = "" if gate.score is None else f", {gate.score:.3f} times {gate.reference}"
         first += f" Champion: **[{laws.get(law, law)}](#/models/{champion})**{beside}."
     if validation is not None and validation.grounds is not None:
         first += f" Tested {validation.grounds.words}."
@@ -92,5 +110,7 @@ def experiment_note(case: str, validation: Validation | None, champion: str | No
             f"| {laws.get(law, law)} | {scores[law]:.3f} | {Gate.of(validation, law).lock_ups} |"
             for law in sorted(scores, key=lambda law: scores[law])
         ]
-        lines.append("| Control law | Error over the bound's | Lock-ups |\n|---|---|---|\n" + "\n".join(rows))
+        over = "the bound's" if validation is None else validation.gate.reference.replace("the bound", "the bound's")
+        head = f"| Control law | Error over {over} | Lock-ups |\n|---|---|---|\n"
+        lines.append(head + "\n".join(rows))
     return "\n\n".join(lines)

@@ -81,6 +81,26 @@ def test_ctrl_c_before_the_stages_is_one_line(
     assert capsys.readouterr() == ("", said)
 
 
+def test_a_case_without_any_controller_ends_with_a_status_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run, "mistakes", list)
+    monkeypatch.setattr(run, "ask", lambda *_, **__: "{}")
+    monkeypatch.setattr(run, "stages_of", lambda name: [f"report@{name}"])
+    shown: list[str | None] = []
+    monkeypatch.setattr(run, "show_results", lambda _, case: shown.append(case))
+    folder = tmp_path / "artifacts" / "tank"
+    folder.mkdir(parents=True)
+    (folder / "validation.json").write_text("{}")
+    (folder / "pid.json").write_text('{"withheld": "it locked up"}')
+    assert main(["run", "tank"]) == 1
+    assert main(["run"]) == 0  # the other cases have theirs
+    (folder / "other.onnx").write_bytes(b"a controller")
+    assert main(["run", "tank"]) == 0
+    assert shown == ["tank", None, "tank"]
+
+
 def test_the_plan_names_every_stage_or_counts_many() -> None:
     assert plan({}, 0) == ["nothing has changed; everything is up to date"]
     few = plan({"fit@a": ["models.a is modified"]}, 4)

@@ -219,6 +219,6 @@ def test_limits_that_do_not_fit_the_plant_are_refused(params: dict, words: str) 
 
 
 def test_check_refuses_them_before_a_model_is_there(plant: EquationPlant) -> None:
-    Predictive.check(Predictive.Params(cv_high=(0.9,)), {}, plant)
+    Predictive.check_settings(Predictive.Params(cv_high=(0.9,)), plant.signals)
     with pytest.raises(LawError, match="cv_high of C_A is 9"):
-        Predictive.check(Predictive.Params(cv_high=(9.0,)), {}, plant)
+        Predictive.check_settings(Predictive.Params(cv_high=(9.0,)), plant.signals)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from html import unescape
 from pathlib import Path
 
 import made_up_case as made_up
@@ -232,6 +233,59 @@ def test_who_passes_the_gate(law, scores, lock_ups, reason, tmp_path):
     made_up.write_json(path, made_up.evidence(scores, lock_ups))
     refusal = Gate.of(Validation.read(path), law).refusal()
     assert (refusal is None) if reason is None else (reason in refusal)
+
+
+def test_without_a_baseline_the_best_other_law_is_champion_and_its_page_says_why(root, capsys):
+    name = f"{CASE}-inverse_dob"
+    folder = root / "artifacts" / CASE
+    (folder / "pid.onnx").unlink()
+    made_up.write_json(folder / "pid.json", {"withheld": "its <gains> have no inverse"})
+    made_up.write_json(folder / "validation.json", made_up.evidence({"inverse_dob": 1.1}))
+    publish(root)
+    with store() as client:  # it is missing, and nothing says why
+        assert holders(client, "champion") == {}
+    tree = made_up.evidence({"inverse_dob": 1.1, "incad": 1.0}, {"incad": 1})
+    tree["gate"]["no_baseline"] = "its <gains> have no inverse"
+    made_up.write_json(folder / "validation.json", tree)
+    publish(root)
+    with store() as client:
+        assert holders(client, "champion") == {name: 1}
+        model, (version,) = client.get_registered_model(name), versions(client, name)
+        assert version.description.startswith(
+            "Gate score 1.100 (1 = perfect-model NMPC), no lock-up. "
+            "There was no PID to beat, because its &lt;gains&gt; have no inverse.\n"
+        )
+        assert "There was no PID to beat, because its &lt;gains&gt; have no inverse." in model.description
+        assert version.tags["gate_no_baseline"] == "its <gains> have no inverse"
+    # All else is still asked of it.
+    validation = Validation.read(folder / "validation.json")
+    assert Gate.of(validation, "incad").refusal() == "it locked up in 1 of its closed loops"
+    assert Gate.of(validation, "rest").refusal() == "its validation has no gate score"
+
+
+def test_a_score_over_the_pid_s_error_is_never_called_one_over_the_bound(root, capsys):
+    folder = root / "artifacts" / CASE
+    tree = made_up.evidence({"inverse_dob": 0.8, "pid": 1.0})
+    tree["gate"]["relative_to"], tree["bounds"] = "baseline", {}
+    made_up.write_json(folder / "validation.json", tree)
+    publish(root)
+    name = f"{CASE}-inverse_dob"
+    with store() as client:
+        said = unescape(client.get_registered_model(name).description + versions(client, name)[0].description)
+        run = runs_of(client)[f"validate@{CASE}-inverse_dob"].data
+        assert run.metrics["ratio_to_baseline"] == 0.8
+        assert "ratio_to_bound" not in run.metrics
+        note = run.tags["mlflow.note.content"]
+    assert "0.800 times the PID's error" in said
+    assert "Gate score 0.800 (1 = the PID's error, PID 1.000)" in said
+    assert "**0.800 times the PID's error.**" in note
+    assert "`ratio_to_baseline` is the figure that decides: the error divided by that of the PID" in note
+    for text in (said, note):
+        assert "the bound" not in text
+        assert "perfect" not in text
+    capsys.readouterr()
+    assert main(["list"]) == 0
+    assert "gate 0.8 × PID" in capsys.readouterr().out
 
 
 def test_a_result_is_known_by_its_inputs_only(root):

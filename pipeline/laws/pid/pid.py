@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
-from pipeline.laws.pid.tuned import by_simulation, linearization, tuned
-from pipeline.laws.rates import Rates, rates_of
+from pipeline.laws.pid.tuned import by_simulation, linearization, require_numbers, tuned
+from pipeline.laws.rates import Rates
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.base import Model
 from pipeline.plants.equations import equations
@@ -165,9 +165,16 @@ class PID(ControlLaw):
         return law
 
     @classmethod
+    def check_settings(cls, params: Any, signals: Signals) -> None:
+        """Raise LawError for rates that do not fit the signals, or a tuning that lacks numbers or takes one loop."""
+        super().check_settings(params, signals)
+        if params.tuning != "optimized" or params.operating_cv is not None:
+            require_single_loop(signals, cls.name)
+        require_numbers(params)
+
+    @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
-        rates_of(plant.signals, params.mv_rate)
         if by_simulation(params, plant):
             pairings(StepResponses.near_start(plant).share)
         elif params.tuning == "optimized":

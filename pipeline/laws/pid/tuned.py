@@ -58,8 +58,7 @@ def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Sim
         return _searched(p, signals, plant, law_of)
     require_single_loop(signals, "pid")
     if p.tuning == "manual":
-        if p.kc is None or p.ti_s is None:
-            raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
+        require_numbers(p)
         return Tuned(given)
     lin = linearization(params, models, plant)
     if p.tuning == "itae":
@@ -87,6 +86,12 @@ def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Sim
         raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
     rest = {name: getattr(given, name) for name in ("filter_s", "tracking_s", "set_point_weight")}
     return Tuned(replace(settings, **rest))
+
+
+def require_numbers(params: Any) -> None:
+    """Raise LawError where the tuning ``manual`` lacks its numbers."""
+    if params.tuning == "manual" and (params.kc is None or params.ti_s is None):
+        raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
 
 
 def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> Tuned:

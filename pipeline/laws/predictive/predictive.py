@@ -21,7 +21,6 @@ from pipeline.laws.predictive.settling import horizon_for, refuse_unstable
 from pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
 from pipeline.laws.predictive.trials import Trials
 from pipeline.laws.predictive.tuning import Candidate, tuned
-from pipeline.laws.rates import rates_of
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Named, Stage
@@ -209,12 +208,12 @@ class Predictive(ControlLaw):
         return Analysis(figures, notes=(note,), table=tuple(c.row() for c in rows))
 
     @classmethod
-    def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
+    def check_settings(cls, params: Any, signals: Signals) -> None:
         """Raise LawError for a plant with discrete MVs, or for weights, limits or rates that do not fit its signals."""
-        refuse_discrete(plant.signals)
-        rates_of(plant.signals, params.mv_rate)
-        weights_of(plant.signals, params)
-        limits_of(plant.signals, params)
+        refuse_discrete(signals)
+        super().check_settings(params, signals)
+        weights_of(signals, params)
+        limits_of(signals, params)
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""

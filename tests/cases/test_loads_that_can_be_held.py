@@ -1,0 +1,71 @@
+"""Tests with loads of own plants: none that no controller can hold, and their weight then goes to the others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from own_cases import controllers_of_a_lag
+
+from pipeline.cases.own_plant import GATE
+from pipeline.cases.reach import LEAST_LOAD, SCALES, Reach, held_at
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def wanted_load(reach: Reach, monkeypatch: pytest.MonkeyPatch) -> float:
+    """The load before anything is asked of the MVs."""
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.cases.reach.can_command", lambda *_: True)
+        found = reach.load(reach.model, 0)
+    assert found is not None
+    return found
+
+
+def test_a_plant_with_room_has_all_loads_and_its_weights_as_they_are() -> None:
+    case = controllers_of_a_lag({})
+    assert len(case.scenarios()["load"]) == 3
+    assert case.weights == GATE
+    assert case.lacking == ()
+
+
+def test_where_nothing_can_be_held_there_is_no_load_and_the_report_says_why() -> None:
+    """The valve rests within 5 % of its end, where no load leaves it enough room."""
+    case = controllers_of_a_lag({}, moved=(0.97, 0.99))
+    assert [case.reach.load(case.reach.model, 0, up) for up in (True, False)] == [None, None]
+    assert "load" not in case.scenarios()
+    assert case.weights.keys() == GATE.keys() - {"load"}
+    assert sum(case.weights.values()) == pytest.approx(1.0, abs=1e-3)
+    assert case.weights["held_out"] / case.weights["spoilt"] == pytest.approx(GATE["held_out"] / GATE["spoilt"], 1e-3)
+    (line,) = case.lacking
+    assert line.startswith("There is no test with loads: ")
+    assert "cannot hold any load" in line
+    assert line.endswith("Its weight goes to the other tests.")
+
+
+def test_a_small_room_gives_the_load_that_fits_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Downwards the valve must open further, by at most what is left of its range."""
+    case = controllers_of_a_lag({}, moved=(-0.6, 0.6))
+    reach = case.reach
+    wanted = wanted_load(reach, monkeypatch)
+    rest = reach.model.start[1][0]
+    # room for a twentieth of what the load asks of the valve; a tenth is the smallest that was tried before
+    (x, mv), cvs = reach.model.start, reach.model.measure(reach.model.start[0])[:1]
+    p = reach.model.parameters({"load_y0": -0.05 * wanted})
+    held = held_at(reach.model, (x, mv), cvs, reach.model.mv_signals, p)
+    assert held is not None
+    edge = float(held[1][0])
+
+    def can_command(_: object, values: np.ndarray, room: float = 0.0) -> bool:
+        return room == 0.0 or rest - 1e-9 <= values[0] <= edge
+
+    monkeypatch.setattr("pipeline.cases.reach.can_command", can_command)
+    found = reach.load(reach.model, 0, upwards=False)
+    assert found is not None
+    assert LEAST_LOAD <= -found / wanted <= 0.05 < SCALES[-1]
+    assert -found / wanted == pytest.approx(0.05, abs=LEAST_LOAD)
+    assert reach.load(reach.model, 0, upwards=True) is None
