@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.cases.own_plant import LAW_PART, MODEL_SET
+from pipeline.cases.own_ensemble import LAW_PART, MODEL_SET
 from pipeline.config.exports import ExportParams, screened_record
 
 MEMBER_NUMBERS = (1, 2)

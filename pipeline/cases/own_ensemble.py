@@ -1,0 +1,123 @@
+"""The models of an own plant's record, of which one is the law's and the others stand in for the plant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from pipeline.cases.own_model import Doubts, OwnPlant, suits
+from pipeline.cases.reach import Reach, visited_mv
+from pipeline.config.exports import is_exported
+from pipeline.errors import PlantError, RecordError
+from pipeline.evaluation.case import Array, Case
+from pipeline.plants.identified import IdentifiedArrays
+from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Simulator
+from pipeline.records.record import Record
+
+MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
+MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
+
+
+class OwnEnsemble(Case):
+    """A case whose plants are the models of a record; its subclass tests laws on them."""
+
+    signals: ClassVar[Signals]  # the MVs with the ranges that laws command
+    record_signals: ClassVar[Signals]  # the MVs with the ranges of their readings
+    models: ClassVar[Path]
+    data: ClassVar[Path]
+
+    @property
+    def ready(self) -> bool:
+        """Whether models and record are there and of these signals; those of a plant that was edited since are not."""
+        return suits(self._law_file, self.signals) and self._recorded
+
+    @cached_property
+    def _recorded(self) -> bool:
+        if not is_exported(self.name):
+            return True  # a person's own record: whoever reads it says what is wrong
+        try:
+            _ = self.record
+        except (RecordError, OSError):
+            return False  # stage `screen` makes it anew
+        return True
+
+    @property
+    def _law_file(self) -> Path:
+        return self.models / f"{LAW_PART}.npz"
+
+    @cached_property
+    def plant(self) -> Simulator:
+        """The law's own model in place of the plant; only its signals are known before it is trained."""
+        return self._resting(self._model) if self.ready else self.plant_class()
+
+    @property
+    def _nominal(self) -> OwnPlant:
+        assert isinstance(self.plant, OwnPlant)
+        return self.plant
+
+    @cached_property
+    def _model(self) -> OwnPlant:
+        """The law's own model, begun at the median MVs that laws may command."""
+        return self._member(self._law_file, visited_mv(self.record, self.signals.mv)[1])
+
+    @cached_property
+    def members(self) -> tuple[OwnPlant, ...]:
+        """The other models of the ensemble; PlantError where there are none."""
+        paths = sorted(self.models.glob(MEMBERS))
+        if not paths:
+            raise PlantError(
+                f"{self.models} holds no {MEMBERS}, the models to validate on; add parts plant1, plant2, ... of kind "
+                f"identified to models.{self.name}-{MODEL_SET}, and run its fit stage"
+            )
+        return tuple(self._resting(self._member(path, self._model.start[1])) for path in paths)
+
+    def _member(self, path: Path, mv: Array) -> OwnPlant:
+        """A model that begins at MVs (n_mv,)."""
+        with np.load(path, allow_pickle=False) as file:
+            arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
+            colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
+            noise = np.asarray(file["noise"] * file["y_scale"]) / np.sqrt(1 - colour)
+        dv = np.median(self.record.dv, axis=0)
+        most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
+        plant = OwnPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
+        plant.noise, plant.colour, plant.doubts = noise, colour, doubts
+        return plant
+
+    @cached_property
+    def _doubts(self) -> Doubts:
+        """What the record leaves open, by the law's own model: with it tests go wrong on all models."""
+        with np.load(self._law_file, allow_pickle=False) as file:
+            return Doubts.of(file)
+
+    def _resting(self, plant: OwnPlant) -> OwnPlant:
+        """The plant, begun where it rests within the record; most do so already."""
+        rest = self.reach.rest(plant)
+        return plant if rest is None else plant.begun_at(*rest)
+
+    @cached_property
+    def reach(self) -> Reach:
+        """What of its range the record visited, by the law's model."""
+        return Reach(self._model, self.record)
+
+    @cached_property
+    def record(self) -> Record:
+        """The record of the plant."""
+        return Record.read(self.data, self.record_signals)
+
+    @cached_property
+    def recorded(self) -> Mapping[str, tuple[float, float]]:
+        """PV or MV -> its lowest and highest value in the record."""
+        groups = ((self.signals.pv, self.record.pv), (self.signals.mv, self.record.mv))
+        pairs = [(s, v) for signals, values in groups for s, v in zip(signals, values.T, strict=True)]
+        return {s.name: (float(v.min()), float(v.max())) for s, v in pairs}
+
+    @property
+    def replayed(self) -> tuple[Record, int]:
+        """The record, and the samples in which the slowest CV has half answered."""
+        return self.record, self.reach.halfway
