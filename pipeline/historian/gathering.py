@@ -14,7 +14,7 @@ from pipeline.historian.numbers import numbers
 from pipeline.historian.quality import good_quality
 from pipeline.historian.reason import Reason
 
-GROWTH = 1.2  # of an array that is full
+GROWTH = 1.1  # of an array that is full: what is spare takes memory too
 
 
 class Gathered:
