@@ -4,7 +4,7 @@ Ten tags every second, as CSV and as Parquet: three manipulated variables that s
 with noise, a measured disturbance, a set point and a mode; with gaps, empty cells, codes for missing values, outliers
 and a stuck sensor. `new` reads, screens and resamples it, and draws the page. Each file has a process of its own.
 Of every phase the table gives the seconds, those of the CPU, and the largest memory so far [MB]. The 500,000 rows keep
-`make bench` short, about 40 seconds; of 5,000,000 no more than 60 s and 1.5 GB are wanted, on two idle cores.
+`make bench` short, about 35 seconds; of 5,000,000 no more than 60 s and 1.5 GB are wanted, on two idle cores.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.measured:
         return measured(options.measured)
-    print(f"{options.rows} rows of 10 tags through `loopwright new`; about {25 + options.rows // 30_000} s", flush=True)
+    print(f"{options.rows} rows of 10 tags through `loopwright new`; about {25 + options.rows // 50_000} s", flush=True)
     with tempfile.TemporaryDirectory() as own:
         good = [run(options.keep or Path(own), kind, options.rows) for kind in options.format or ("csv", "parquet")]
     return 0 if all(good) else 1
