@@ -60,7 +60,9 @@ def _answers(grid: Grid, series: Series, model: Linear, y: Array, u: Sequence[Ar
     row, bad = row[ok], bad[ok]
     if not bad.size:
         return 0
-    explained = np.abs(series.value[bad] - model.predicted(y, u, row - 1)) < CONFIRM_SD * model.sd
+    parts = np.split(row, np.searchsorted(row, np.arange(CHUNK, len(y), CHUNK)))
+    expected = np.concatenate([model.predicted(y, u, part - 1) for part in parts if part.size])
+    explained = np.abs(series.value[bad] - expected) < CONFIRM_SD * model.sd
     row, bad = row[explained], bad[explained]
     y[row] = series.value[bad]
     series.code[bad] = Reason.GOOD

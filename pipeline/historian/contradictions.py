@@ -64,9 +64,10 @@ class Windows:
         n = np.maximum(count, 1.0)
         my, me = sums(v) / n, sums(e) / n
         vv, ee, ve = sums(v * v) / n - my**2, sums(e * e) / n - me**2, sums(v * e) / n - my * me
-        floor, ceiling = np.where(ok, e, np.inf).reshape(m, part), np.where(ok, e, -np.inf).reshape(m, part)
-        low = np.min([floor.min(axis=1)[i : m - STEPS + 1 + i] for i in range(STEPS)], axis=0) + e0
-        high = np.max([ceiling.max(axis=1)[i : m - STEPS + 1 + i] for i in range(STEPS)], axis=0) + e0
+        floor = np.where(ok, e, np.inf).reshape(m, part).min(axis=1)
+        ceiling = np.where(ok, e, -np.inf).reshape(m, part).max(axis=1)
+        low = np.min([floor[i : m - STEPS + 1 + i] for i in range(STEPS)], axis=0) + e0
+        high = np.max([ceiling[i : m - STEPS + 1 + i] for i in range(STEPS)], axis=0) + e0
         sd, motion = np.sqrt(np.maximum(vv, 0.0)), np.sqrt(np.maximum(ee, 0.0))
         both = ve / np.maximum(sd * motion, 1e-300)
         share = 1.0 - (vv + ee - 2 * ve) / np.maximum(vv, 1e-300)

@@ -45,8 +45,8 @@ class Series:
 
     def counts(self) -> dict[str, int]:
         """Number of readings by reason, GOOD too; together they are all of them."""
-        found = np.bincount(self.code, minlength=len(Reason))
-        return {r.name.lower(): int(found[r]) for r in Reason if found[r]}
+        found = {r.name.lower(): int(np.count_nonzero(self.code == r)) for r in Reason}
+        return {name: n for name, n in found.items() if n}
 
     def lighten(self, around: int = 400) -> None:
         """Keep the bad readings, and the others only near the longest stretch of each reason: what pictures show."""

@@ -116,17 +116,13 @@ def resampled(
     value, code, bridged = {}, {}, {}
     for s in (*pv, *held):
         rate = rates[s.tag]
-        good = s.good
-        t, v = (s.time_s, s.value) if good.all() else (s.time_s[good], s.value[good])
         thin = 0 < rate.step_s * THINNED <= period_s and not s.categories and not rate.irregular
         if s in pv and thin:
-            out, over = _mean(time_s, t, v, period_s)
+            out, over = _mean(time_s, *_good(s), period_s)
         elif thin:
-            out, over = _held(time_s, t, v, period_s, rate.hold_s, thin)
+            out, over = _held(time_s, *_good(s), period_s, rate.hold_s, thin)
         else:
-            out, over = _in_chunks(
-                _line if s in pv and not rate.dead_band else _held, time_s, t, v, period_s, rate.hold_s
-            )
+            out, over = _in_chunks(_line if s in pv and not rate.dead_band else _held, time_s, s, period_s, rate.hold_s)
         value[s.tag], code[s.tag] = out, _reasons(time_s, s, out, period_s)
         bridged[s.tag] = 0 if rate.irregular else int(np.count_nonzero(over))
         done(s.tag)
@@ -170,14 +166,25 @@ def _phase(t: Array, h: float) -> float:
     return float(t[0]) + (shift * h if abs(shift) > 1e-6 else 0.0)
 
 
+def _good(s: Series, rows: slice = slice(None)) -> tuple[Array, Array]:
+    """Times and values (m,) of the good ones among some readings."""
+    good = s.code[rows] == Reason.GOOD
+    return s.time_s[rows][good], s.value[rows][good]
+
+
 def _in_chunks(
-    rule: Callable[..., tuple[Array, NDArray[np.bool_]]], at: Array, t: Array, v: Array, h: float, hold_s: float
+    rule: Callable[..., tuple[Array, NDArray[np.bool_]]], at: Array, s: Series, h: float, hold_s: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The rule over CHUNK rows at a time: its steps need several times the memory of its result."""
+    """The rule over CHUNK rows at a time, and the readings that these rows can see.
+
+    Its steps need several times the memory of its result.
+    """
     out, over = np.empty(len(at)), np.empty(len(at), dtype=bool)
+    reach = hold_s + 2 * h
     for i in range(0, len(at), CHUNK):
-        own = slice(i, i + CHUNK)
-        out[own], over[own] = rule(at[own], t, v, h, hold_s)
+        own = slice(i, min(i + CHUNK, len(at)))
+        first, last = np.searchsorted(s.time_s, (at[own.start] - reach, at[own.stop - 1] + reach))
+        out[own], over[own] = rule(at[own], *_good(s, slice(first, last)), h, hold_s)
     return out, over
 
 

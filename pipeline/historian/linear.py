@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.metrics import Array
 
+Blocks = tuple[tuple[int, int], ...]
+
 Y_LAGS = 3
 BLOCKS = ((0, 1), (1, 2), (2, 3), (3, 6), (6, 11), (11, 21), (21, 41))  # lags of an input that share a coefficient
 AHEAD = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
@@ -32,7 +34,7 @@ class Linear:
     b: Array  # (n_inputs, len(blocks)) per block
     c: float  # over inputs as distances from ``centre``
     centre: Array  # (n_inputs,)
-    blocks: tuple[tuple[int, int], ...]
+    blocks: Blocks
     sd: float  # of the residual, robust
     strength: Mapping[int, float]  # input -> statistic
     ahead: Mapping[int, tuple[float, int]]  # input -> statistic of lags ahead, and by how many rows they lead
@@ -52,7 +54,7 @@ class Linear:
             if self.strength[i] < NO_EFFECT:
                 continue
             part = u[i][first : int(k[-1]) + 1] - self.centre[i]
-            out = out + blocks_of(part, k - first, self.blocks) @ row
+            out += answer_of(part, k - first, self.blocks, row)
         return np.asarray(out)
 
     def step_response(self, i: int, length: int = 600) -> Array:
@@ -82,7 +84,7 @@ def fitted(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | Non
 
     Rows with NaN take no part. At most MOST_ROWS rows are used, in windows spread evenly.
     """
-    blocks: tuple[tuple[int, int], ...] = BLOCKS
+    blocks: Blocks = BLOCKS
     while True:
         rows = rows_of(y, u, run, blocks[-1][1] - 1)
         parameters = Y_LAGS + 1 + len(u) * (len(blocks) + len(AHEAD))
@@ -96,8 +98,8 @@ def fitted(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | Non
     if np.ptp(target) <= 0:
         return None
     centre = np.array([float(np.mean(c[rows])) for c in u])
-    inputs = [blocks_of(c - m, rows, blocks) for c, m in zip(u, centre, strict=True)]
-    ahead = [blocks_of(c - m, rows, AHEAD) for c, m in zip(u, centre, strict=True)]
+    both = [blocks_of(c - m, rows, (*blocks, *AHEAD)) for c, m in zip(u, centre, strict=True)]
+    inputs, ahead = [b[:, : len(blocks)] for b in both], [b[:, len(blocks) :] for b in both]
     x = np.column_stack([past, *inputs, np.ones(len(rows))])
     theta, cov, keep = least_squares(x, target)
     residual = target - x @ theta
@@ -153,12 +155,37 @@ def whole(*columns: Array) -> NDArray[np.bool_]:
     return ok
 
 
-def blocks_of(u: Array, rows: NDArray[np.int64], blocks: tuple[tuple[int, int], ...]) -> Array:
+def blocks_of(u: Array, rows: NDArray[np.int64], blocks: Blocks) -> Array:
     """Means of u over lags first .. last-1 of each row, (n, blocks)."""
-    total = np.r_[0.0, np.cumsum(np.nan_to_num(u))]
+    total = _sums(u)
     return np.column_stack(
         [(total[np.maximum(rows - a + 1, 0)] - total[np.maximum(rows - b + 1, 0)]) / (b - a) for a, b in blocks]
     )
+
+
+def answer_of(u: Array, rows: NDArray[np.int64], blocks: Blocks, weights: Array) -> Array:
+    """``blocks_of`` (n, blocks) times weights (blocks,), without the table: (n,).
+
+    The rows must increase, and u must reach back as far as the blocks do.
+    """
+    total, out = _sums(u), np.zeros(len(rows))
+    start, end = int(rows[0]), int(rows[-1]) + 1
+    for (a, b), weight in zip(blocks, weights, strict=True):
+        if end - start == len(rows):  # all rows of a stretch
+            part = total[start - a + 1 : end - a + 1] - total[start - b + 1 : end - b + 1]
+        else:
+            part = total[rows - a + 1] - total[rows - b + 1]
+        part *= weight / (b - a)
+        out += part
+    return out
+
+
+def _sums(u: Array) -> Array:
+    """Sum of the values of u (n,) before each row and before the end, (n + 1,); a missing one counts as 0."""
+    total = np.empty(len(u) + 1)
+    total[0] = 0.0
+    np.cumsum(np.where(np.isnan(u), 0.0, u), out=total[1:])
+    return total
 
 
 def least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

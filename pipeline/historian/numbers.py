@@ -31,9 +31,11 @@ def numbers(column: Any, decimal: str = ".") -> tuple[Array, Codes, Counter[str]
     if decimal == ",":
         column = _with_points(column)
     try:
-        return _of_numbers(pc.cast(column, pa.float64()))
+        # Empty cells are no reason for the slow way.
+        found = pc.cast(pc.if_else(pc.equal(column, ""), pa.scalar(None, kind), column), pa.float64())
     except pa.ArrowInvalid:
         return _of_texts(column, "" if decimal == "," else ",")
+    return _of_numbers(found)
 
 
 def _with_points(column: Any) -> Any:

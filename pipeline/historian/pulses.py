@@ -63,9 +63,11 @@ def _as_read(grid: Grid, series: Series) -> Array:
 
 def _pulses(u: Array, piece: NDArray[np.int64]) -> NDArray[np.int64]:
     low, high = np.nanquantile(u[:: max(1, len(u) // 200_000)], [0.01, 0.99])
-    k = np.arange(1, len(u) - 1)
-    away = (u[k] != u[k - 1]) & (u[k + 1] == u[k - 1]) & (np.abs(u[k] - u[k - 1]) > SIZE * (high - low))
-    return k[away & (piece[k - 1] == piece[k + 1])]
+    # Slices in place of lists of rows: a long record has room for one more column, not for six.
+    away = (u[2:] == u[:-2]) & (piece[2:] == piece[:-2])
+    away &= np.abs(u[1:-1] - u[:-2]) > SIZE * (high - low)
+    away &= u[1:-1] != u[:-2]
+    return np.flatnonzero(away) + 1
 
 
 def _left(model: Linear, sd: float) -> float:

@@ -18,16 +18,13 @@ from pipeline.errors import RecordError, nearest
 from pipeline.files import sha256
 from pipeline.historian.dialect import Dialect, sniff
 from pipeline.historian.export import Export, Series, joined
+from pipeline.historian.gathering import Gathered
 from pipeline.historian.layout import Layout, layout_of
-from pipeline.historian.numbers import numbers
-from pipeline.historian.quality import good_quality
-from pipeline.historian.reason import Reason
 from pipeline.historian.sent_again import drop_repeated_rows
 from pipeline.records.record_file import split_column
 
 BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17
-GROWTH = 1.2  # of an array that is full
 PARQUET = {".parquet", ".pq"}
 
 
@@ -112,7 +109,7 @@ def bare(column: str) -> str:
 
 # ---------------------------------------------------------------------- one file
 def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> tuple[dict[str, Series], Counter[str]]:
-    gather = _Gather(modes, source.decimal, wide=layout.kind == "wide")
+    gather = Gathered(modes, source.decimal, wide=layout.kind == "wide")
     counts: Counter[str] = Counter()
     values = {v: bare(v) for v in layout.values if not wanted or {v, bare(v)} & wanted or layout.kind == "long"}
     qualities = {v: layout.quality[v] for v in values if v in layout.quality}
@@ -150,7 +147,7 @@ def _stamps(block: Any, layout: Layout) -> Any:
     return pc.binary_join_element_wise(*parts, " ")
 
 
-def _long_block(gather: _Gather, layout: Layout, block: Any, seconds: Any, wanted: set[str]) -> None:
+def _long_block(gather: Gathered, layout: Layout, block: Any, seconds: Any, wanted: set[str]) -> None:
     """Share a block of (tag, time, value, quality) out among the tags."""
     tags = block.column(layout.tag)
     tags = tags if pa.types.is_dictionary(tags.type) else tags.cast(pa.string()).dictionary_encode()
@@ -164,69 +161,6 @@ def _long_block(gather: _Gather, layout: Layout, block: Any, seconds: Any, wante
         if rows.size and (not wanted or name in wanted):
             part = block.take(pa.array(rows))
             gather.add(name, seconds[rows], part.column(value), part.column(quality) if quality else None)
-
-
-class _Gather:
-    """Blocks of readings, put together; of a wide file the time stands once in memory."""
-
-    def __init__(self, modes: set[str], decimal: str, *, wide: bool) -> None:
-        self.modes, self.decimal, self.wide = modes, decimal, wide
-        self.time: dict[str, Growing] = {}
-        self.value: dict[str, Growing] = {}
-        self.code: dict[str, Growing] = {}
-        self.texts: dict[str, Counter[str]] = {}
-        self.names: dict[str, dict[str, int]] = {}
-
-    def add(self, name: str, seconds: Any, column: Any, quality: Any) -> None:
-        if name in self.modes:
-            known = self.names.setdefault(name, {})
-            cells = [("" if c is None else str(c).strip()) for c in column.to_pylist()]
-            values = np.array([known.setdefault(c, len(known)) if c else np.nan for c in cells], dtype=np.float64)
-            codes = np.where(np.isnan(values), np.uint8(Reason.EMPTY), np.uint8(Reason.GOOD))
-        else:
-            values, codes, texts = numbers(column, self.decimal)
-            self.texts.setdefault(name, Counter()).update(texts)
-        if quality is not None:
-            codes[~good_quality(quality) & (codes == Reason.GOOD)] = Reason.QUALITY
-        if not self.wide or name == next(iter(self.value), name):
-            self.time.setdefault("" if self.wide else name, Growing(np.float64)).append(seconds)
-        self.value.setdefault(name, Growing(np.float64)).append(values)
-        self.code.setdefault(name, Growing(np.uint8)).append(codes)
-
-    def series(self) -> dict[str, Series]:
-        times = {name: grown.whole() for name, grown in self.time.items()}
-        return {
-            name: Series(
-                name,
-                times["" if self.wide else name],
-                value.whole(),
-                self.code[name].whole(),
-                self.texts.get(name, Counter()),
-                tuple(self.names.get(name, ())),
-            )
-            for name, value in self.value.items()
-        }
-
-
-class Growing:
-    """An array that grows in place: many blocks leave no copies behind."""
-
-    def __init__(self, dtype: type) -> None:
-        self.values: Any = np.empty(0, dtype)
-        self.length = 0
-
-    def append(self, block: Any) -> None:
-        """Add the values of ``block`` (m,)."""
-        end = self.length + len(block)
-        if end > len(self.values):
-            self.values.resize(max(end, int(GROWTH * end)), refcheck=False)
-        self.values[self.length : end] = block
-        self.length = end
-
-    def whole(self) -> Any:
-        """All values, (n,); nothing may be appended afterwards."""
-        self.values.resize(self.length, refcheck=False)
-        return self.values
 
 
 # ---------------------------------------------------------------------- formats

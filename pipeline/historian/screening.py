@@ -73,24 +73,30 @@ def screened(
     period = period_s or proposed_period(pvs)
     role_of = {t.tag: t.role for t in tags}
     findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag])]
-    counts_of = {t.tag: own[t.tag].counts() for t in tags}
     steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
 
+    counts_of: dict[str, dict[str, int]] = {}
+
+    def let_go(tag: str) -> None:
+        """Count the readings of a tag; nothing but pictures needs them from here on."""
+        counts_of[tag] = own[tag].counts()
+        if len(own[tag]) > LARGE:
+            own[tag].lighten()
+
     def resampled_one(tag: str) -> None:
-        if len(own[tag]) > LARGE and role_of[tag] in {"dv", "sp"}:
-            own[tag].lighten()  # nothing but pictures needs them from here on
+        if role_of[tag] not in {"pv", "mv"}:
+            let_go(tag)
 
     grid, rates = resampled(drawn, held, period, hold_s, resampled_one)
     by_tag = {r.tag: r for r in rates}
     signals = [t for t in tags if t.role in {"pv", "mv", "dv"}]
     findings += of_grid(grid)
     findings += pulses(grid, own, signals)
+    for t in (t for t in tags if t.role == "mv"):
+        let_go(t.tag)
     findings += confirm(grid, own, signals, by_tag)
-    for t in tags:
-        if role_of[t.tag] in {"pv", "mv"}:
-            counts_of[t.tag] = own[t.tag].counts()
-        if len(own[t.tag]) > LARGE and role_of[t.tag] not in {"dv", "sp"}:
-            own[t.tag].lighten()
+    for t in (t for t in tags if t.role == "pv"):
+        let_go(t.tag)
     findings += stretches(grid, signals, by_tag)
     findings += inputs_and_answers(grid, signals)
     findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
@@ -137,13 +143,13 @@ def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
     """Stretches in which PVs and inputs contradict each other are masked, slow motion without the inputs is named."""
     inputs = [t.tag for t in signals if t.role != "pv"]
     u = [_kept(grid, t) for t in inputs]
-    pvs = {t.tag: _kept(grid, t.tag) for t in signals if t.role == "pv"}
-    answers = {tag: explained(y, u, grid.piece) for tag, y in pvs.items()}
+    pvs = [t.tag for t in signals if t.role == "pv"]
+    answers = {tag: explained(_kept(grid, tag), u, grid.piece) for tag in pvs}
     expected = {tag: values for tag, (values, _) in answers.items()}
     settling = {tag: rows for tag, (_, rows) in answers.items()}
     found = contradict(grid, signals, expected, settling)
-    for tag, y in pvs.items():
-        y = np.where(grid.code[tag] == 0, y, np.nan)
+    for tag in pvs:
+        y = _kept(grid, tag)
         found += of_levels(tag, y, expected[tag], float(np.ptp(usual(y))), settling[tag])
     return found
 

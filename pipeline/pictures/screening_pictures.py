@@ -40,18 +40,20 @@ def trends(found: Screened) -> Canvas:
         panels = canvas.subplots(len(tags), 1, sharex=True, squeeze=False)[:, 0]
         start = found.grid.time_s[0]
         _, label = time_axis(found.grid.time_s - start)
+        at = _in_unit(found.grid.time_s - start, found.grid.time_s[-1] - start)
         seen: set[Reason] = set()
         for axes, tag in zip(panels, tags, strict=True):
-            seen |= _trend(axes, found, tag, start)
+            seen |= _trend(axes, found, tag, at)
         panels[-1].set_xlabel(label)
         if seen:
             _reason_legend(canvas, seen)
         return canvas
 
 
-def _trend(axes: Axes, found: Screened, tag: TagReport, start: float) -> set[Reason]:
+def _trend(axes: Axes, found: Screened, tag: TagReport, at: Array) -> set[Reason]:
+    """Of one signal over the grid's rows ``at`` (n,), in the axis' unit."""
     grid, series = found.grid, found.series[tag.tag]
-    at = _in_unit(grid.time_s - start, grid.time_s[-1] - start)
+    start = grid.time_s[0]
     values = grid.value[tag.tag]
     fresh = np.r_[True, np.diff(grid.piece) > 0]
     for mask, colour in ((found.code > 0, "#c8c8c8"), (found.code == 0, LINE)):

@@ -8,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import RecordError
+from pipeline.historian import grid as grid_module
 from pipeline.historian.export import Series
 from pipeline.historian.grid import proposed_period, resampled, sampling
+from pipeline.historian.reason import Reason
 
 
 def series(tag: str, t: np.ndarray, v: np.ndarray) -> Series:
@@ -76,3 +78,21 @@ def test_what_cannot_be_resampled_is_told() -> None:
         resampled([y], [], 1e-3)
     with pytest.raises(RecordError, match="no process variable has two readings"):
         proposed_period([series("y", np.array([1.0]), np.array([1.0]))])
+
+
+def test_a_long_grid_in_chunks_is_the_same_as_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(4)
+    t = np.cumsum(random.choice([0.9, 1.0, 1.1, 7.0], 900, p=[0.3, 0.35, 0.3, 0.05]))
+    bad = random.random(900) < 0.1
+    bad[400:440] = True  # longer than a chunk
+    both = [series(tag, t, random.normal(size=900)) for tag in ("y", "u")]
+    for one in both:
+        one.code[bad] = Reason.TEXT
+    whole, _ = resampled(both[:1], both[1:], 1.0, hold_s=3.0)
+    monkeypatch.setattr(grid_module, "CHUNK", 17)
+    chunks, _ = resampled(both[:1], both[1:], 1.0, hold_s=3.0)
+    assert chunks.bridged == whole.bridged
+    for tag in ("y", "u"):
+        np.testing.assert_array_equal(chunks.value[tag], whole.value[tag])
+        np.testing.assert_array_equal(chunks.code[tag], whole.code[tag])
+        assert np.isnan(whole.value[tag]).any()

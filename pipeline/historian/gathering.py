@@ -1,0 +1,93 @@
+"""Blocks of a file, put together: the series of each tag in arrays that grow, without a copy of the whole."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from pipeline.historian.export import Series
+from pipeline.historian.numbers import numbers
+from pipeline.historian.quality import good_quality
+from pipeline.historian.reason import Reason
+
+GROWTH = 1.1  # of an array that is full: what is spare takes memory too
+
+
+class Gathered:
+    """Blocks of readings, put together; of a wide file the time stands once in memory."""
+
+    def __init__(self, modes: set[str], decimal: str, *, wide: bool) -> None:
+        self.modes, self.decimal, self.wide = modes, decimal, wide
+        self.time: dict[str, Growing] = {}
+        self.value: dict[str, Growing] = {}
+        self.code: dict[str, Growing] = {}
+        self.texts: dict[str, Counter[str]] = {}
+        self.names: dict[str, dict[str, int]] = {}
+
+    def add(self, name: str, seconds: Any, column: Any, quality: Any) -> None:
+        """A block of readings of one tag: seconds (m,), its Arrow column, and the column of its quality or None."""
+        if name in self.modes:
+            known = self.names.setdefault(name, {})
+            index, cells = _categories(column)
+            numbered = [float(known.setdefault(c, len(known))) if c else np.nan for c in cells]
+            values = np.array([*numbered, np.nan])[index]
+            codes = np.where(np.isnan(values), np.uint8(Reason.EMPTY), np.uint8(Reason.GOOD))
+        else:
+            values, codes, texts = numbers(column, self.decimal)
+            self.texts.setdefault(name, Counter()).update(texts)
+        if quality is not None:
+            codes[~good_quality(quality) & (codes == Reason.GOOD)] = Reason.QUALITY
+        if not self.wide or name == next(iter(self.value), name):
+            self.time.setdefault("" if self.wide else name, Growing(np.float64)).append(seconds)
+        self.value.setdefault(name, Growing(np.float64)).append(values)
+        self.code.setdefault(name, Growing(np.uint8)).append(codes)
+
+    def series(self) -> dict[str, Series]:
+        """The series of each tag; nothing may be added afterwards."""
+        times = {name: grown.whole() for name, grown in self.time.items()}
+        return {
+            name: Series(
+                name,
+                times["" if self.wide else name],
+                value.whole(),
+                self.code[name].whole(),
+                self.texts.get(name, Counter()),
+                tuple(self.names.get(name, ())),
+            )
+            for name, value in self.value.items()
+        }
+
+
+class Growing:
+    """An array that grows in place: many blocks leave no copies behind."""
+
+    def __init__(self, dtype: type) -> None:
+        self.values: Any = np.empty(0, dtype)
+        self.length = 0
+
+    def append(self, block: Any) -> None:
+        """Add the values of ``block`` (m,)."""
+        end = self.length + len(block)
+        if end > len(self.values):
+            self.values.resize(max(end, int(GROWTH * end)), refcheck=False)
+        self.values[self.length : end] = block
+        self.length = end
+
+    def whole(self) -> Any:
+        """All values, (n,); nothing may be appended afterwards."""
+        self.values.resize(self.length, refcheck=False)
+        return self.values
+
+
+def _categories(column: Any) -> tuple[Any, list[str]]:
+    """Index (n,) of each cell among the texts of the column, -1 where it is null; the texts as they come first."""
+    if pa.types.is_dictionary(column.type):
+        column = pc.cast(column, column.type.value_type)
+    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    encoded = column.dictionary_encode()
+    index = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    return index, [("" if c is None else str(c).strip()) for c in encoded.dictionary.to_pylist()]
