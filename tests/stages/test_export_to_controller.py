@@ -40,6 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tree = yaml.safe_load(Path("params.yaml").read_text())
         for part in tree["models"]["tank-identified"]["parts"].values():
             part |= SMALL
+        tree["cases"]["tank"]["held_out_seeds"] = [9001, 9002]
         tree["controllers"]["tank-predictive"] |= {"tuning": "given", "horizon": 12, "moves": 4}
         tree["controllers"]["tank-pid"] |= {"development_seeds": [1], "development_set_points": 3}
         Path("params.yaml").write_text(yaml.safe_dump(tree))
