@@ -13,6 +13,10 @@ from pipeline.pictures.drawing import axis_label, ratio_unit
 def tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:
     """Print the rows kept, what was found, the verdict, and where to look next."""
     print(f"{name}: {report.summary}")
+    if report.gaps:
+        many = "s" * (report.gaps != 1)
+        length = f"{report.gap_s / 60:.4g} min together"
+        print(f"  {report.gaps} gap{many} without any reading, {length}; a run ends at each")
     for reason, rows in report.dropped_rows.items():
         print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
     for finding in report.findings:

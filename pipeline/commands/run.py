@@ -25,6 +25,7 @@ ARTIFACTS = Path("artifacts")
 MANY = 25  # stages that a person does not read line by line
 STOPPED = {128 + number for number in (signal.SIGINT, signal.SIGTERM)}
 ABSENT = {"deleted", "not in cache"}  # DVC's words for a file that is not there, whether or not it ever was
+LISTS = "work/code/"  # of the files that each stage runs and reads, with their digests
 # A kind of section of params.yaml -> the stages of each, in their order; the last one is what its name asks for.
 STAGES = {"exports": ("screen",), "records": ("excite",), "models": ("fit",), "controllers": ("design", "validate")}
 
@@ -68,8 +69,9 @@ def _run(options: argparse.Namespace) -> int:
                 f"mend that and run again: results are kept. Python is {sys.executable}; `make setup` gives one with "
                 "all packages"
             ) from None
-    changed = status(targets)
-    expected = affected(changed, targets) if changed else []
+    found = status(targets)
+    expected = affected(found, targets) if found else []
+    changed = {stage: found[stage] for stage in sorted(found, key=(*expected, *found).index)}  # as they run
     print("\n".join(plan(changed, len(expected))), flush=True)
     if options.dry:
         return 0
@@ -179,6 +181,9 @@ def reasons(entries: Iterable[Mapping[str, Mapping[str, Any]] | str]) -> list[st
             return ["never run here, or its results were removed"]
         for items in entry.values():
             for name, how in items.items():
+                if name.startswith(LISTS):
+                    lines.append("its code has changed, or a file that it reads")
+                    continue
                 # Parameters of a file have a word each.
                 words = how if isinstance(how, Mapping) else {name: "not there" if how in ABSENT else how}
                 lines += [f"{key} is {word}" for key, word in words.items()]

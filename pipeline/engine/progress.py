@@ -52,7 +52,7 @@ class Piece:
 
     def show(self, done: float, count: str = "") -> None:
         """Say how much is done, and about how long the rest takes once that can be known."""
-        share = done / self.total if self.total > 0 else 1.0
+        share = min(done / self.total, 1.0) if self.total > 0 else 1.0
         left = (self.lines.clock() - self.begun) * (1 - share) / share if share >= KNOWN else 0.0
         words = f"{self.label}: {count + ', ' if count else ''}{100 * share:.0f} % done"
         self.lines.show(words + (f", about {_rounded(left)} left" if left >= SOON_S else ""))

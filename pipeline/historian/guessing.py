@@ -36,6 +36,7 @@ LOOP = re.compile(r"^(?P<loop>.*?)[ ._:/-]+[A-Za-z ]+$")
 def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     """One guess for every column, in the order of the file."""
     found = [_guess(s, units.get(name, "")) for name, s in export.series.items()]
+    found = [_cascaded(g, found) for g in found]
     if not any(g.tag.role == "mv" for g in found):  # names say nothing: what moves in steps may be one
         found = [
             replace(g, tag=replace(g.tag, role="mv"), remark=f"{g.remark}; guessed: moves in steps".strip("; "))
@@ -51,6 +52,18 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     # A variable that looks like a PV and answers to nothing may drift as the PVs do: no guess makes it a cause of them.
     taken = {g.tag.tag for g in found if g.tag.role == "pv"}
     return disturbances(without_answers(found, export), export, taken)
+
+
+def _cascaded(guess: Guess, found: Sequence[Guess]) -> Guess:
+    """The guess; an MV where it is the set point of a loop of which nothing else is there: a lower loop follows it."""
+    match = LOOP.match(guess.tag.tag)
+    if guess.tag.role != "sp" or match is None or guess.tag.low is None:
+        return guess
+    own = [g for g in found if g is not guess and (m := LOOP.match(g.tag.tag)) and m["loop"] == match["loop"]]
+    if own or any(g.tag.tag == match["loop"] for g in found):
+        return guess
+    words = "guessed: the set point of a loop of which nothing else is here"
+    return replace(guess, tag=replace(guess.tag, role="mv"), remark=f"{guess.remark}; {words}".strip("; "))
 
 
 def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
@@ -70,7 +83,7 @@ def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
     still = [name for name in pvs if not _answers(grid.value[name], u, run)]
     if len(still) == len(pvs):
         return list(found)
-    words = "answers to no MV; role pv if one moves it all the same"
+    words = "answers to no MV; role dv if it disturbs what the MVs move, pv if an MV moves it all the same"
     return [
         replace(g, tag=replace(g.tag, role=""), remark=f"{g.remark}; {words}".strip("; ")) if g.tag.tag in still else g
         for g in found

@@ -19,9 +19,9 @@ from pipeline.files import sha256
 from pipeline.historian.dialect import Dialect, sniff
 from pipeline.historian.export import Export, Series, joined
 from pipeline.historian.gathering import Gathered
+from pipeline.historian.headers import split_header
 from pipeline.historian.layout import Layout, layout_of
 from pipeline.historian.sent_again import drop_repeated_rows
-from pipeline.records.record_file import split_column
 
 BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17
@@ -82,9 +82,9 @@ def read_export(
         kinds.append(layout.kind)
         files.append((str(path), sha256(path)))
         known |= set(found) if layout.kind == "long" else set(map(bare, layout.values))
-    for tag in (*tags, *modes):
-        if tag not in parts:
-            raise RecordError(f"{', '.join(map(str, paths))}: no tag {tag!r}{nearest(tag, known)}")
+    absent = [f"no tag {tag!r}{nearest(tag, known)}" for tag in (*tags, *modes) if tag not in parts]
+    if absent:
+        raise RecordError(f"{', '.join(map(str, paths))}: {'; '.join(absent)}")
     if not totals["rows_read"]:
         raise RecordError(f"{', '.join(map(str, paths))}: no row of data; export a longer time")
     together = {name: joined(p) for name, p in parts.items()}
@@ -104,7 +104,7 @@ def units_of(paths: Sequence[Path]) -> dict[str, str]:
 
 def bare(column: str) -> str:
     """The tag that a header names, without its unit."""
-    return split_column(column)[0]
+    return split_header(column)[0]
 
 
 # ---------------------------------------------------------------------- one file
@@ -175,7 +175,7 @@ def _parquet(path: Path) -> Opened:
     def blocks(names: Sequence[str]) -> Iterator[Any]:
         return pq.ParquetFile(path).iter_batches(batch_size=BLOCK_ROWS, columns=list(names))
 
-    return Opened(path, header, sample, {n: split_column(n)[1] for n in header}, ".", blocks, Counter())
+    return Opened(path, header, sample, {n: split_header(n)[1] for n in header}, ".", blocks, Counter())
 
 
 def _text(path: Path, dialect: Dialect) -> Opened:
@@ -204,5 +204,5 @@ def _text(path: Path, dialect: Dialect) -> Opened:
             ),
         )
 
-    units = {n: unit or split_column(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
+    units = {n: unit or split_header(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
     return Opened(path, dialect.header, sample, units, dialect.decimal, blocks, unreadable)

@@ -18,6 +18,8 @@ from pipeline.plants.simulator import Simulator
 from serving.manifest import Signal
 
 Array = NDArray[np.float64]
+LATE = 10  # an error stays that is there over the last tenth of a run
+STAYS, AT_END = 0.002, 0.001  # of a range: an error that counts, and the distance of an MV that rests at an end
 STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
 
 
@@ -51,10 +53,28 @@ def summary(plant: Simulator, history: History, metric: Metric = METRICS["mae"])
             lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g}" + ("" if s.unit == "-" else f" {s.unit}"))
         else:
             lines.append(f"changes of {s.name} {np.count_nonzero(np.diff(mv[:, i]))}")
+    lines += _jammed(plant, pv[:, : sp.shape[1]] - sp, mv)
     faults = sum(map(bool, history.reason))
     if faults:
         lines.append(f"{faults} scans with a fault, the last one: {next(r for r in reversed(history.reason) if r)}")
     return "\n".join(lines)
+
+
+def _jammed(plant: Simulator, error: Array, mv: Array) -> list[str]:
+    """A line on MVs (n, n_mv) that rest at an end of their range while an error (n, n_cv) stays; else none."""
+    late = len(mv) // LATE + 1
+    spans = np.array([s.high - s.low for s in plant.sp_signals])
+    if not np.any(np.abs(error[-late:].mean(axis=0)) > STAYS * spans):
+        return []
+    ends = [
+        f"{s.name} at {end:g}" + ("" if s.unit == "-" else f" {s.unit}")
+        for s, values in zip(plant.mv_signals, mv[-late:].T, strict=True)
+        for end in (s.low, s.high)
+        if s.values is None and np.all(np.abs(values - end) <= AT_END * (s.high - s.low))
+    ]
+    if not ends:
+        return []
+    return [f"an error stays with {' and '.join(ends)}, an end of its range: these set points may be out of reach"]
 
 
 def write_csv(path: Path, plant: Simulator, history: History) -> None:

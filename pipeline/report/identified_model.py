@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.model_evidence import identified_part
 from pipeline.pictures.drawing import axis_label, gain_unit
@@ -13,6 +15,7 @@ from pipeline.pictures.numbers import figure, number
 
 MOST_TRIED = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
+ANSWERED = 0.05  # of the largest answer: from here on an output has answered
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
 
@@ -35,7 +38,7 @@ VARIABLES = (
     "Residual with itself",
     "with inputs",
 )
-ANSWERS = ("Variable", "Input", "Gain at the middle", "Sign", "Gain over the range", "Dead time [s]")
+ANSWERS = ("Variable", "Input", "Gain at the middle", "Sign", "Gain over the range", "First answer after [s]")
 TRIED = ("Start", "States", "Dead times", "Hidden units", "Held-out error", "Spread", "Chosen")
 
 
@@ -59,6 +62,16 @@ def _verdicts(part: Mapping[str, Any]) -> tuple[str, ...]:
         words.append(f"the largest pole at rests of the visited range is {radius:.4g}; at most 1 is stable")
     warnings = tuple(f"Warning: {text}." for text in part.get("warnings") or ())
     return (*(f"{text[:1].upper()}{text[1:]}." for text in words if text), *warnings)
+
+
+def _asked(evidence: Evidence) -> tuple[str, ...]:
+    """The set points that tests ask for, where they follow from what the models can hold."""
+    if not evidence.case.on_models:
+        return ()
+    asked = np.concatenate([test.sp for tests in evidence.case.tests().values() for test in tests])
+    ends = zip(evidence.case.plant_class.sp_signals, asked.min(axis=0), asked.max(axis=0), strict=True)
+    ranges = ", ".join(f"{s.name} from {number(low)} to {number(high)} {s.unit}".rstrip(" -") for s, low, high in ends)
+    return (f"The tests ask for {ranges}, which the MVs can hold within the record. Nothing is known of others.",)
 
 
 def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
@@ -104,7 +117,8 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
             found = (gains.get(signal.name) or {}).get(given.name)
             if found is None:
                 continue
-            dead = (part.get("dead_times") or {}).get(given.name)
+            curve = ((part.get("step_responses") or {}).get(signal.name) or {}).get(given.name)
+            dead = None if curve is None else first_answer(curve)
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
             rows.append(
                 (
@@ -120,6 +134,17 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
                 )
             )
     return tuple(rows)
+
+
+def first_answer(curve: Mapping[str, Any]) -> float:
+    """Periods before the first ANSWERED of a step response's largest answer, between its points by a straight line."""
+    known = curve["periods"]
+    periods, size = np.array([known[0] - 1, *known], dtype=float), np.abs([0.0, *curve["middle"]])
+    at = int((size >= ANSWERED * size.max()).argmax())
+    if at == 0:
+        return 0.0  # no answer at all
+    share = (ANSWERED * size.max() - size[at - 1]) / (size[at] - size[at - 1])
+    return float(periods[at - 1] + share * (periods[at] - periods[at - 1]))
 
 
 def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:

@@ -146,7 +146,7 @@ def _tests(standing: Standing) -> Table:
     figure = escape(with_unit(standing.metric_long, standing.unit))  # rich would take a unit in brackets for markup
     table.title = f"{standing.case}: {figure}, median over data seeds"
     table.add_column("test", no_wrap=True)
-    for name in ("perfect_NMPC", *(law.law for law in standing.laws)):
+    for name in ("NMPC", *(law.law for law in standing.laws)):
         # Six names side by side fit a line only if each breaks at its underscores.
         table.add_column(name.replace("_", "_\n"), justify="right", no_wrap=True)
 

@@ -290,6 +290,26 @@ def test_guesses_tell_disturbances_from_the_rest_and_controlled_variables_come_f
     assert [s.name for s in read_back("tank")[0].pv] == ["TIC-101.PV", "TI-9.PV"]
 
 
+def test_a_set_point_without_its_loop_is_an_mv_and_units_stand_in_round_brackets_too() -> None:
+    rows = [[r[0], r[1], r[2], r[3]] for r in cells(clean(1500))]
+    write(Path("x.csv"), rows, ("timestamp", "TIC-101.PV (°C)", "PIC-7.SP (bar)", "FI-7 (kg/h)"))
+    assert main(["new", "tank", "x.csv"]) == 0
+    table = {r["tag"]: r for r in csv.DictReader(Path("tank-tags.csv").read_text().splitlines())}
+    assert {tag: (r["role"], r["unit"]) for tag, r in table.items()} == {
+        "TIC-101.PV": ("pv", "°C"),
+        "PIC-7.SP": ("mv", "bar"),
+        "FI-7": ("dv", "kg/h"),
+    }
+
+
+def test_all_tags_that_are_not_there_are_named_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean(600)))
+    assert main(["new", "tank", "x.csv", "--pv", "TIC-102.PV[degC]", "--mv", "TIC-102.OP[%]"]) == 2
+    said = capsys.readouterr().err
+    assert "no tag 'TIC-102.PV'; did you mean 'TIC-101.PV'?" in said
+    assert "no tag 'TIC-102.OP'" in said
+
+
 def test_a_plant_is_replaced_on_request_and_kept_where_the_new_data_fail(capsys: pytest.CaptureFixture[str]) -> None:
     write(Path("x.csv"), cells(clean(2500)))
     assert main(["new", "tank", "x.csv", *ROLES]) == 0

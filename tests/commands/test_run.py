@@ -28,6 +28,8 @@ def test_reasons_are_words_for_what_dvc_says() -> None:
     deps = {"changed deps": {"params.yaml": {"controllers.x.kc": "modified"}, "work/a": "deleted"}}
     said = reasons([deps, {"changed outs": {"work/b": "modified"}}, "changed command"])
     assert said == ["controllers.x.kc is modified", "work/a is not there", "work/b is modified", "changed command"]
+    listed = {"changed deps": {"work/code/screen-tank.json": "modified"}}
+    assert reasons([listed]) == ["its code has changed, or a file that it reads"]
 
 
 @pytest.mark.parametrize("how", ["deleted", "not in cache"])  # of a new section; of a fresh clone
@@ -86,6 +88,7 @@ def test_a_case_without_any_controller_ends_with_a_status_of_its_own(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run, "mistakes", list)
+    monkeypatch.setattr(run, "list_files", lambda: None)
     monkeypatch.setattr(run, "ask", lambda *_, **__: "{}")
     monkeypatch.setattr(run, "stages_of", lambda name: [f"report@{name}"])
     shown: list[str | None] = []

@@ -91,6 +91,7 @@ def test_the_report_says_models_and_no_paper(folder: Path) -> None:
     assert all(np.isfinite(row["mae"]) for laws in tests.values() for row in laws.values())
     assert "Models as likely as this one differ by" in text
     assert "% in the gain of TIC-101.OP" in text
+    assert "The tests ask for TIC-101.PV from " in text
 
 
 def test_the_overview_lists_the_plant(folder: Path) -> None:

@@ -1,0 +1,30 @@
+"""Tags and units of an export's header."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.historian.headers import split_header
+
+
+@pytest.mark.parametrize(
+    ("header", "tag", "unit"),
+    [
+        ("TIC-7.PV [degC]", "TIC-7.PV", "degC"),
+        ("TIC-7.PV (°C)", "TIC-7.PV", "°C"),
+        ("MIC-204.PV (%)", "MIC-204.PV", "%"),
+        ("WI-201.PV (t/h)", "WI-201.PV", "t/h"),
+        ("FI-7(kg/h)", "FI-7", "kg/h"),
+        ("FI-8 (m³/h)", "FI-8", "m³/h"),
+        ("FI-9 (m^3/h)", "FI-9", "m^3/h"),
+        ("PI-3 (mbar)", "PI-3", "mbar"),
+        ("QI-1 (kg/m2 s)", "QI-1", "kg/m2 s"),
+    ],
+)
+def test_a_unit_in_brackets_is_no_part_of_the_tag(header: str, tag: str, unit: str) -> None:
+    assert split_header(header) == (tag, unit)
+
+
+@pytest.mark.parametrize("header", ["FI-7 (raw)", "P-101 (A)", "TIC-7.PV (1)", "Level (north side)", "FI-7 ()", "FI-7"])
+def test_other_brackets_are_part_of_the_tag(header: str) -> None:
+    assert split_header(header) == (header, "")
