@@ -48,9 +48,8 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     if not part:
         return None
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
-    return ModelSection(
-        (*_verdicts(part), *_left_open(part, mvs)), _variables(evidence, part), _answers(evidence, part), _tried(part)
-    )
+    sentences = (*_verdicts(part), *_left_open(part, mvs), *_asked(evidence))
+    return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part))
 
 
 def _verdicts(part: Mapping[str, Any]) -> tuple[str, ...]:
@@ -118,7 +117,7 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
             if found is None:
                 continue
             curve = ((part.get("step_responses") or {}).get(signal.name) or {}).get(given.name)
-            dead = None if curve is None else first_answer(curve)
+            dead = (part.get("dead_times") or {}).get(given.name) if curve is None else first_answer(curve)
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
             rows.append(
                 (
