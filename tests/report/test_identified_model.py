@@ -47,11 +47,13 @@ def section(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelSection:
 
 
 def test_verdicts_are_sentences(section: ModelSection) -> None:
-    assert section.verdicts == (
+    assert section.verdicts[:3] == (
         "Linear is enough: it is as good.",
         "Stable: it settles.",
         "Warning: y0: half of the rows are elsewhere.",
     )
+    assert section.verdicts[3].startswith("The tests ask for y0 from ")
+    assert section.verdicts[3].endswith("which the MVs can hold within the record. Nothing is known of others.")
 
 
 def test_every_variable_has_its_fit_and_its_residual(section: ModelSection) -> None:
