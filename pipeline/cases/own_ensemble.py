@@ -16,6 +16,7 @@ from pipeline.config.exports import is_exported
 from pipeline.errors import PlantError, RecordError
 from pipeline.evaluation.case import Array, Case
 from pipeline.plants.identified import IdentifiedArrays
+from pipeline.plants.noise import deviation
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
@@ -82,7 +83,7 @@ class OwnEnsemble(Case):
         with np.load(path, allow_pickle=False) as file:
             arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
             colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
-            noise = np.asarray(file["noise"] * file["y_scale"]) / np.sqrt(1 - colour)
+            noise = deviation(file["noise"] * file["y_scale"], colour)
         dv = np.median(self.record.dv, axis=0)
         most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
         plant = OwnPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)

@@ -12,9 +12,8 @@ from pipeline.errors import PlantError
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
-from pipeline.plants.spoilt import SpoiltPlant
+from pipeline.plants.spoilt import SpoiltPlant, likely_error
 
-SURE = 2.0  # standard deviations of what the record leaves open, of each error
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
 LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0
 MOST_GAIN, MOST_PACE, MOST_DEAD = 1.0, 0.8, 5.0  # twice the gain; beyond that a record tells nothing worth a test
@@ -33,10 +32,10 @@ class Doubts(NamedTuple):
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> Self:
         """From ``gain_sd`` (n_mv,), ``pace_sd`` (1,) and ``dead_sd`` (1,) of an identified model."""
-        gain = np.clip(SURE * arrays["gain_sd"], LEAST_GAIN, MOST_GAIN)
-        pace = np.clip(SURE * float(arrays["pace_sd"][0]), LEAST_PACE, MOST_PACE)
-        dead = np.clip(SURE * float(arrays["dead_sd"][0]), LEAST_DEAD, MOST_DEAD)
-        return cls(tuple(map(float, gain)), float(pace), float(dead))
+        gain = likely_error(arrays["gain_sd"], LEAST_GAIN, MOST_GAIN)
+        pace = likely_error(arrays["pace_sd"], LEAST_PACE, MOST_PACE)
+        dead = likely_error(arrays["dead_sd"], LEAST_DEAD, MOST_DEAD)
+        return cls(tuple(map(float, gain)), float(pace[0]), float(dead[0]))
 
     def __str__(self) -> str:
         """In words."""

@@ -12,6 +12,7 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.model_evidence import identified_part
 from pipeline.pictures.drawing import axis_label, gain_unit
 from pipeline.pictures.numbers import figure, number
+from pipeline.tuning.responses import reached
 
 MOST_TRIED = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
@@ -117,7 +118,7 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
             if found is None:
                 continue
             curve = ((part.get("step_responses") or {}).get(signal.name) or {}).get(given.name)
-            dead = (part.get("dead_times") or {}).get(given.name) if curve is None else first_answer(curve)
+            dead = (part.get("dead_times") or {}).get(given.name) if curve is None else answers_after(curve)
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
             rows.append(
                 (
@@ -135,15 +136,12 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
     return tuple(rows)
 
 
-def first_answer(curve: Mapping[str, Any]) -> float:
+def answers_after(curve: Mapping[str, Any]) -> float:
     """Periods before the first ANSWERED of a step response's largest answer, between its points by a straight line."""
-    known = curve["periods"]
-    periods, size = np.array([known[0] - 1, *known], dtype=float), np.abs([0.0, *curve["middle"]])
-    at = int((size >= ANSWERED * size.max()).argmax())
-    if at == 0:
-        return 0.0  # no answer at all
-    share = (ANSWERED * size.max() - size[at - 1]) / (size[at] - size[at - 1])
-    return float(periods[at - 1] + share * (periods[at] - periods[at - 1]))
+    known, size = curve["periods"], np.abs(curve["middle"])
+    if not size.any():
+        return 0.0
+    return float(np.interp(reached(size, ANSWERED * size.max()), range(len(known) + 1), [known[0] - 1, *known]))
 
 
 def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:

@@ -122,14 +122,19 @@ class StepResponses:
             return FirstOrder(slope / h, inf, max(0.0, h * (len(y) - end / slope)))
         if not abs(end) > 1e-9 * float(np.abs(self.y).max()):
             raise LawError("the MV does not act on the controlled variable at rest; check the pairing")
-        t28, t63 = (h * _reached(y / end, share) for share in (0.283, 0.632))
+        t28, t63 = (h * reached(y / end, share) for share in (0.283, 0.632))
         tau = max(1.5 * (t63 - t28), h / 2)
         return FirstOrder(end / tau, tau, max(0.0, t63 - tau))
 
 
-def _reached(rising: Array, share: float) -> float:
-    """Samples, between two where it lies there, until a response is at ``share`` for the first time."""
+def reached(rising: Array, share: float) -> float:
+    """Samples, between two where it lies there, until a response (n,) is at ``share`` > 0 for the first time.
+
+    It is 0 at the step, and its first value stands one sample later. One that never gets there gives n.
+    """
     k = int((rising >= share).argmax())
+    if not rising[k] >= share:
+        return float(len(rising))
     before = float(rising[k - 1]) if k else 0.0
     return k + (share - before) / (float(rising[k]) - before)
 

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from pipeline.laws.base import ControlLaw
 from pipeline.models.identified.identified import Identified
-from pipeline.plants.noise import coloured
+from pipeline.plants.noise import coloured, deviation
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
+from pipeline.plants.spoilt import likely_error
 
 LOOPS = 6  # with set points, and as many with loads
 HOLDS = 5  # set points of a loop, and steps of its loads
@@ -28,7 +29,6 @@ GAINS = (0, 1, -1, 1, -1, 0)
 PACES = (0, -1, 1, -1, 1, 0)
 LATE = (0, 1, 0, 1, 0, 0)
 GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors; larger ones of pace and dead time calm loops that need no calm
-SURE = 2.0  # standard deviations of what the record leaves open, of each error
 MOST = 1.0  # of each error; of the dead time in samples
 BIAS = 0.2  # of half an MV's range: the largest steps of a load at the MV
 LOAD = 0.6  # scaled, over the samples of the horizon: steps of a load at the output
@@ -56,8 +56,8 @@ class Trials:
     with the model f, the gains g, the middle m of the MVs' range and the pace p. The loads are biases of the MVs and
     loads at the outputs, in steps and in random walks; the noise is the model's estimate. Every set point is a rest
     of the loop's own plant, so that all are within reach. An output that never comes to rest, as a level, has set
-    points within its record's range. Errors are twice what the record leaves open, and no less than ``GAIN``, ``PACE``
-    and ``DEAD``.
+    points within its record's range. Errors are what the record leaves open (``likely_error``), and no less than
+    ``GAIN``, ``PACE`` and ``DEAD``.
     """
 
     model: Identified
@@ -100,7 +100,7 @@ class Trials:
             else:
                 bias[:, LOOPS + i] = BIAS * half * course[:, i, :n_mv]
         colour = model.colour.numpy()
-        sd = (model.noise * model.y_scale).numpy() / np.sqrt(1 - colour)
+        sd = deviation((model.noise * model.y_scale).numpy(), colour)
         noise = sd * coloured(rng.normal(size=(n, loops, model.n_y)), colour)
         drawn = (torch.as_tensor(t) for t in (mv0, gain, pace, late, sp, bias, load, noise))
         return cls(model, signals, horizon, x0, *drawn)
@@ -162,7 +162,7 @@ def _errors(model: Identified, signs: Array) -> tuple[Array, Array, Array]:
     ``signs`` (2 LOOPS, n_mv) say which MVs' gains are wrong the other way round.
     """
     gain, pace, dead = (
-        np.clip(SURE * sd.numpy(), least, MOST)
+        likely_error(sd.numpy(), least, MOST)
         for sd, least in ((model.gain_sd, GAIN), (model.pace_sd, PACE), (model.dead_sd, DEAD))
     )
     turned = np.tile(GAINS, 2)[:, None] * signs

@@ -73,7 +73,7 @@ def searched(
     Speed and caution together on a coarse grid, then the horizon, then the jumps, then a finer grid. Numbers far from
     the start must gain more: the loops' model is the law's own, and what they gain by little may be lost on the plant.
     """
-    show = steps("tuning in closed loops on the model with errors", 1 + len(COARSE) + len(HORIZONS) + len(FINE))
+    show = steps("tuning in closed loops on the model with errors", 1 + sum(map(len, (COARSE, HORIZONS, JUMPS, FINE))))
     given = trials.run(side_by_side([law_of(start)]), 1)
     tried = judged(given, given, [start])
     best = tried[0]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.plants.simulator import Array
+from pipeline.tuning.responses import reached
 
 RISES = (0.1, 0.63)
 """Shares of its last value between which the time of a step response is its time constant; the first ends dead time."""
@@ -38,19 +39,10 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
         if len(found) < 2 or middle == 0.0:
             continue
         gain[j] = found[:, -1].std(ddof=1) / abs(middle)
-        rises = np.array([[_reached(one, share) for share in RISES] for one in found])
+        rises = np.array([[reached(one / one[-1] if one[-1] else one, share) for share in RISES] for one in found])
         taken = rises[:, 1] - rises[:, 0]
         pace[j], dead[j] = taken.std(ddof=1) / max(float(np.median(taken)), 1.0), rises[:, 0].std(ddof=1)
     return Doubt(gain, np.array([pace.max()]), np.array([dead.max()]))
-
-
-def _reached(curve: Array, share: float) -> float:
-    """The time [periods, from the step] at which a response (length,) reaches a share of its last value."""
-    way = np.concatenate([[0.0], curve / curve[-1] if curve[-1] else curve])
-    after = int((way >= share).argmax())
-    if after == 0:
-        return float(len(curve))
-    return after - (way[after] - share) / (way[after] - way[after - 1])
 
 
 def colour_of(residuals: Sequence[Array]) -> Array:
