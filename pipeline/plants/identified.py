@@ -205,7 +205,7 @@ class IdentifiedPlant(Simulator):
         return np.array([values[n] for n in names])
 
 
-def shift_rows(arrays: IdentifiedArrays) -> NDArray[np.bool_]:
+def shift_rows(arrays: StateEquation) -> NDArray[np.bool_]:
     """Which states (n_x,) are copies of another state or an input of the period before."""
     table = np.concatenate([arrays.a, arrays.b], axis=1)
     copies = (np.count_nonzero(table, axis=1) == 1) & (table.max(axis=1) == 1) & (np.diag(arrays.a) == 0)

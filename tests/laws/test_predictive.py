@@ -536,6 +536,25 @@ def test_plants_of_the_trials_err_as_far_as_the_record_leaves_open_and_no_less_t
     assert open_to.pace[2, 0] == pytest.approx(1.6)
 
 
+def test_errors_of_pace_leave_a_stable_plant_stable() -> None:
+    """A state that swings from sample to sample would grow under x + 1.15 (F(x) - x); larger models have such ones."""
+    a, b = np.array([[0.9, 0.02], [0.0, -0.95]]), np.array([[0.1], [0.5]])
+    model = scaled_model(1, 1, 0, 2, a=a, b=b, rest=np.eye(2, 3))
+    trials = Trials.draw(model, made_signals(), 15, seed=0)
+    outcome = trials.run(law_of(model, horizon=15), 1)
+    assert max(outcome.set_points.max(), outcome.loads.max()) < 10.0
+
+
+def test_errors_of_pace_leave_alone_what_only_remembers() -> None:
+    """y is the MV of two samples ago, whatever the pace: the state between holds the MV, and not a share of it."""
+    a, b = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    trials = Trials.draw(scaled_model(1, 1, 0, 2, a=a, b=b, rest=np.eye(2, 3)), made_signals(), 15, seed=0)
+    x, v = torch.rand(2 * LOOPS, 2).double(), torch.rand(2 * LOOPS, 1).double()
+    ahead = trials.ahead(x, v)
+    assert ahead[:, 0].tolist() == x[:, 1].tolist()
+    assert ahead[:, 1].tolist() == v[:, 0].tolist()
+
+
 def test_noise_of_the_trials_has_the_colour_and_the_strength_of_the_model_s() -> None:
     model = first_order()
     model.noise[:], model.colour[:] = 0.02, 0.75

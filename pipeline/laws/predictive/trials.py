@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from pipeline.laws.base import ControlLaw
 from pipeline.models.identified.identified import Identified
+from pipeline.plants.identified import StateEquation, shift_rows
 from pipeline.plants.noise import coloured, deviation
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
@@ -47,17 +49,18 @@ class Outcome:
     travel: Array  # (C, 2) with set points, with loads
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Trials:
     """Loops side by side over plants that are the model with errors: of gain, of dead time, of pace.
 
-        x+ = x + p (f(x, m + g (u - m) + bias) - x) + [load; 0]
+        F(x) = f(x, m + g (u - m) + bias),      x+ = x + p (F(x) - x) + [load; 0]
 
-    with the model f, the gains g, the middle m of the MVs' range and the pace p. The loads are biases of the MVs and
-    loads at the outputs, in steps and in random walks; the noise is the model's estimate. Every set point is a rest
-    of the loop's own plant, so that all are within reach. An output that never comes to rest, as a level, has set
-    points within its record's range. Errors are what the record leaves open (``likely_error``), and no less than
-    ``GAIN``, ``PACE`` and ``DEAD``.
+    with the model f, the gains g, the middle m of the MVs' range and the pace p; where p is above 1, a part of a second
+    step, which leaves a stable model stable: x+ = F(x) + (p - 1) (F(F(x)) - F(x)) + [load; 0]. States that only
+    remember keep their pace. The loads are biases of the MVs and loads at the outputs, in steps and in random walks;
+    the noise is the model's estimate. Every set point is a rest of the loop's own plant, so that all are within reach.
+    An output that never comes to rest, as a level, has set points within its record's range. Errors are what the record
+    leaves open (``likely_error``), and no less than ``GAIN``, ``PACE`` and ``DEAD``.
     """
 
     model: Identified
@@ -137,6 +140,23 @@ class Trials:
         """Range (n_mv,) of the MVs."""
         return torch.tensor([s.high - s.low for s in self.signals.mv], dtype=torch.float64)
 
+    def ahead(self, x: Tensor, v: Tensor) -> Tensor:
+        """The states (..., 2 LOOPS, n_x) one period later at the loops' paces, without loads."""
+        model, once, pace = self.model, self._remembers, self.pace
+        ahead = model(torch.cat([x, v], dim=-1))
+        fast = torch.nonzero(pace[:, 0] > 1)[:, 0]
+        paced = x + pace * (ahead - x)
+        begun = torch.where(once, x, ahead)[..., fast, :]
+        second = model(torch.cat([begun, v[..., fast, :]], dim=-1))
+        paced[..., fast, :] = begun + (pace[fast] - 1) * (second - begun)
+        return torch.where(once, ahead, paced)
+
+    @cached_property
+    def _remembers(self) -> Tensor:
+        """Which states (n_x,) are copies of another state or an input of the period before."""
+        m = self.model
+        return torch.from_numpy(shift_rows(StateEquation(*(t.numpy() for t in (m.a, m.b, m.c, m.w1, m.b1, m.w2)))))
+
     def _samples(self, laws: ControlLaw, x: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Of loops from the states x (count, 2 LOOPS, n_x), sample by sample: outputs, the MV before, and the MV."""
         model, (n, loops, _), count = self.model, self.sp.shape, len(x)
@@ -152,7 +172,7 @@ class Trials:
             yield y, before, mv
             late = mv + self.late * (before - mv)
             acting = middle + self.gain * (late - middle) + self.bias[k]
-            x = x + self.pace * (model(torch.cat([x, acting, dv], dim=-1)) - x)
+            x = self.ahead(x, torch.cat([acting, dv], dim=-1))
             x = torch.cat([x[..., :n_y] + self.load[k], x[..., n_y:]], dim=-1)
 
 
