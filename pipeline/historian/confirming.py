@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
-from pipeline.historian.grid import Grid, Sampling
+from pipeline.historian.grid import Grid
 from pipeline.historian.linear import Linear, fitted
 from pipeline.historian.reason import Reason
+from pipeline.historian.sampling import Sampling
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
 

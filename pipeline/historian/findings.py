@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pipeline.historian.grid import Sampling
+from pipeline.historian.sampling import Sampling
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,10 @@ from pipeline.historian.character import quantum
 from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, follows, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.first_answer import NONE, first_answer
-from pipeline.historian.grid import proposed_period, resampled
+from pipeline.historian.grid import resampled
 from pipeline.historian.linear import fitted
 from pipeline.historian.reason import Reason
+from pipeline.historian.sampling import proposed_period
 from pipeline.historian.tags import Guess, Tag
 from pipeline.metrics import Array
 

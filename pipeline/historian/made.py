@@ -11,7 +11,8 @@ from pipeline.historian.excerpt import evenly
 from pipeline.historian.excitation import judged
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding, Screening, TagReport
-from pipeline.historian.grid import Grid, Sampling
+from pipeline.historian.grid import Grid
+from pipeline.historian.sampling import Sampling
 from pipeline.historian.screening import Screened, models_of
 from pipeline.records.record import Record
 

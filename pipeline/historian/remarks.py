@@ -12,8 +12,9 @@ from pipeline.historian.excitation import HELD
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.first_answer import NONE, first_answer
-from pipeline.historian.grid import Grid, Sampling
+from pipeline.historian.grid import Grid
 from pipeline.historian.linear import Linear
+from pipeline.historian.sampling import Sampling
 from pipeline.metrics import Array
 from pipeline.records.record import Record
 

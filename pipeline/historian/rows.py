@@ -14,8 +14,9 @@ from pipeline.historian.cells import usual
 from pipeline.historian.character import clipped, runs_of, stuck
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
-from pipeline.historian.grid import Grid, Sampling
+from pipeline.historian.grid import Grid
 from pipeline.historian.reason import Reason
+from pipeline.historian.sampling import Sampling
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
 from pipeline.records.record import Record

@@ -17,13 +17,14 @@ from pipeline.historian.excerpt import SEEN, evenly
 from pipeline.historian.excitation import judged, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding, Screening, TagReport
-from pipeline.historian.grid import Grid, Sampling, proposed_period, resampled, sampling
+from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear, fitted
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
 from pipeline.historian.reason import Reason
 from pipeline.historian.remarks import of_grid, of_mode, of_models, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
+from pipeline.historian.sampling import Sampling, proposed_period, sampling
 from pipeline.historian.static import explained
 from pipeline.historian.tags import Tag
 from pipeline.historian.unmoved import of_answers

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from pipeline.errors import RecordError
 from pipeline.historian import grid as grid_module
 from pipeline.historian.export import Series
-from pipeline.historian.grid import proposed_period, resampled, sampling
+from pipeline.historian.grid import resampled
 from pipeline.historian.reason import Reason
+from pipeline.historian.sampling import proposed_period, sampling
 
 
 def series(tag: str, t: np.ndarray, v: np.ndarray) -> Series:
