@@ -27,7 +27,8 @@ class PredictiveParams:
     within it, 12 to 50. ``moves`` of each MV in a plan; None: 8 of one MV, 5 of each of several.
     ``move_weight`` lambda > 0 of squared moves, mu = lambda (N - dead time)/10, MVs in units of half their range.
     ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
-    by their size. ``weights`` > 0 of the CVs in units of their standard deviation; None: all 1. ``q_x`` and
+    by their size. ``weights`` > 0 of the CVs in units of their standard deviation in the record, for the stated range
+    is often a sensor's and not the plant's; None: all 1. ``q_x`` and
     ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's; q_d
     None: 3e-5 over the noise. ``jumps`` > 0: share of the observer's jump after a step of a load; less calms loops
     over a plant that is not the model. ``loads`` act on the ``mvs`` or the ``outputs``.
@@ -37,8 +38,8 @@ class PredictiveParams:
     horizon and jumps in closed loops over the model with errors and loads, drawn by ``seed``. ``mv_rate`` [mv]:
     largest MV change a sample, which the plan knows, one number or one for each MV; None: that of the plant.
     ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has none; None: no limits. A set point
-    beyond a limit counts as one at the limit. ``preview`` of the set points: ``held``, as they are now; ``ramp``, a
-    known recipe, whose slope goes on.
+    beyond a limit counts as one at the limit. ``preview`` of the set points: ``held``, as they are now; ``ramp``, their
+    last slope goes on, as in a recipe of ramps; steps to come are not known.
     """
 
     speed: float = 1.0

@@ -40,7 +40,7 @@ class Predictive(ControlLaw):
     model or a load leaves no offset; a set point out of reach ends at the nearest output. The last plan, one sample
     on, is where the next one begins. The filter reads the MV that really acted: that is the anti-windup. Without a
     past it starts at the rest that fits the process variables and the applied MV. The set points r stay as they are,
-    or go on with the slope of a known recipe. CVs may have soft limits, whose cost is added.
+    or go on with their last slope. CVs may have soft limits, whose cost is added.
 
     ``Observer``, ``Horizon``, ``Planner``, ``SetPoints`` and ``SoftLimits`` hold the formulas and their sources.
     """
