@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -32,6 +34,16 @@ def drawn(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
     )
 
 
+def contracting(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
+    """Like ``drawn``, and its linear part brings states together under every correction, too.
+
+    A correction takes the outputs' feedback away, so that poles within the unit circle are not enough: the hidden
+    states alone may be unstable. A norm below 1 is enough, because the correction shrinks each state or leaves it.
+    """
+    model = drawn(n_y, n_v, n_x, n_hidden, seed)
+    return replace(model, a=model.a * (0.8 / np.linalg.norm(model.a, 2)))
+
+
 def stretch(model: Dynamics, n_y: int, rows: int, seed: int, noise: float = 0.0) -> Stretch:
     rng = np.random.default_rng(seed)
     v = rng.normal(size=(rows, model.n_v))
@@ -54,7 +66,7 @@ def stretch(model: Dynamics, n_y: int, rows: int, seed: int, noise: float = 0.0)
 def test_the_gradient_is_that_of_the_free_run(
     n_y: int, n_v: int, more: int, n_hidden: int, correction: float, rows: int, seed: int
 ) -> None:
-    model = drawn(n_y, n_v, n_y + more, n_hidden, seed)
+    model = contracting(n_y, n_v, n_y + more, n_hidden, seed)
     data = [stretch(model, n_y, rows, seed + k, 0.3) for k in range(2)]
     starts = fit_starts(model, data, correction, iterations=0)
     theta = model.vector()
@@ -148,3 +160,14 @@ def test_an_explosion_counts_as_an_infinite_error() -> None:
     assert squares(unstable, [np.zeros(1)], [data]) == np.inf
     assert np.isinf(free_run_error(unstable, [data])[0]).all()
     assert sensitivity_sums(unstable, [np.zeros(1)], [data], np.ones(3, dtype=bool), 0.0) is None
+
+
+def test_a_correction_makes_a_stable_model_explode_whose_hidden_states_are_unstable() -> None:
+    """Poles 0.8 and 0.4; measured outputs in place of its own leave the hidden state to itself, with a pole at 1.2."""
+    model = Dynamics.linear(np.array([[0.0, 1.0], [-0.32, 1.2]]), np.array([[1.0], [0.0]]))
+    data, start = Stretch(np.ones((400, 1)), np.ones((400, 1))), np.zeros(2)
+    every = np.ones(len(model.vector()), dtype=bool)
+    assert np.isfinite(squares(model, [start], [data]))
+    assert sensitivity_sums(model, [start], [data], every, 0.0) is not None
+    assert squares(model, [start], [data], 1.0) == np.inf
+    assert sensitivity_sums(model, [start], [data], every, 1.0) is None
