@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.models.identified import dynamics, sensitivities
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.output_error import (
     OutputError,
@@ -145,6 +147,29 @@ def test_a_ridge_shrinks_the_nonlinear_weights() -> None:
         for f in (OutputError(iterations=15, ridge=r).fit(truth, [data]) for r in (0.0, 300.0))
     ]
     assert sizes[1] < 0.8 * sizes[0]
+
+
+def test_a_model_of_another_layout_in_memory_is_not_compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = drawn(1, 1, 3, 2, 4)
+    turned = replace(plain, **{name: np.asfortranarray(getattr(plain, name)) for name in ("a", "b", "w1", "w2")})
+    data, every = stretch(plain, 1, 50, 1, 0.1), np.ones(len(plain.vector()), dtype=bool)
+    layouts = set()
+    for place, name in ((sensitivities, "propagate"), (dynamics, "hold_inputs"), (dynamics, "run_rows")):
+        loop = getattr(place, name)
+
+        def noted(*given: object, name: str = name, loop: Callable[..., object] = loop) -> object:
+            layouts.add((name, *(g.flags.c_contiguous for g in given if isinstance(g, np.ndarray))))
+            return loop(*given)
+
+        monkeypatch.setattr(place, name, noted)
+    sums = [sensitivity_sums(m, [np.zeros(3)], [data], every, 0.0) for m in (plain, turned)]
+    held = [m.hold(np.zeros((4, 3)), np.ones((4, 1)), 20)[0] for m in (plain, turned)]
+    assert sums[0] is not None
+    assert sums[1] is not None
+    assert sums[0].g == pytest.approx(sums[1].g)
+    assert held[0] == pytest.approx(held[1])
+    assert sorted(name for name, *_ in layouts) == ["hold_inputs", "propagate", "run_rows"]
+    assert all(all(flags) for _, *flags in layouts)
 
 
 def test_the_same_data_give_the_same_bytes() -> None:
