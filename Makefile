@@ -8,6 +8,8 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 export MLFLOW_DISABLE_TELEMETRY := true
 export DVC_NO_ANALYTICS := 1
 export DO_NOT_TRACK := 1
+# Python keeps what it has compiled: else each process of the tests compiles all sources again, 10 s for some.
+unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
 
 .DEFAULT_GOAL := help

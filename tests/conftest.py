@@ -88,7 +88,10 @@ LawFactory = Callable[..., ControlLaw]
 
 
 # By their time. Taken first, so that with several workers none is waited for alone at the end.
-LONG_FILES = ("test_pipeline.py", "test_laws_contract.py", "test_tracking.py", "test_rbf.py", "test_report.py")
+LONG_FILES = (
+    *("test_pipeline.py", "test_export_to_controller.py", "test_screen_by_dvc.py", "test_laws_contract.py"),
+    *("test_identified_part.py", "test_tracking.py", "test_new.py", "test_rbf.py", "test_report.py"),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

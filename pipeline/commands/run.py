@@ -59,10 +59,11 @@ def _run(options: argparse.Namespace) -> int:
         raise ParamsError(f"{wrong[0]}{rest}")
     # The list of files that each stage runs comes first: what has changed shows only after it.
     # DVC alone would not make it anew for a data file that has grown, and in a dry run it would change dvc.lock.
+    # Unforced it would put the list back that the same sources had before the file grew.
     list_files()
     if not options.dry:
         try:
-            ask("repro", "--quiet", "code", finish=True)
+            ask("repro", "--quiet", "--force", "code", finish=True)
         except PipelineError as error:
             raise PipelineError(
                 f"the list of the files that each stage runs could not be made, so no stage ran ({error}); "

@@ -24,7 +24,7 @@ from serving.card import card
 
 ROOT = Path(__file__).parents[2]
 ROLES = ("--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]=0..100", "--dv", "FI-7[kg/h]", "--sp", "TIC-101.SP")
-SMALL = {"kind": "identified", "orders": [2, 4], "units": [4], "minutes": 0.3, "rows": 3000}
+SMALL = {"kind": "identified", "orders": [2, 4], "units": [4], "minutes": 0.05, "rows": 1500}
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tree = yaml.safe_load(Path("params.yaml").read_text())
         for part in tree["models"]["tank-identified"]["parts"].values():
             part |= SMALL
-        tree["cases"]["tank"]["held_out_seeds"] = [9001, 9002]
+        tree["cases"]["tank"]["held_out_seeds"] = [9001]
         tree["controllers"]["tank-predictive"] |= {"tuning": "given", "horizon": 12, "moves": 4}
         tree["controllers"]["tank-pid"] |= {"development_seeds": [1], "development_set_points": 3}
         Path("params.yaml").write_text(yaml.safe_dump(tree))

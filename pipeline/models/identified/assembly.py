@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.rests import rest_map
+from pipeline.models.identified.rests import central_map, rest_map
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.plants.simulator import Array
 
@@ -81,7 +81,7 @@ def dead_periods(model: Dynamics, data: ScaledRecord, length: int = 60) -> Array
     An answer is a change within one period of more than a tenth of the fastest one over ``length`` periods.
     """
     middle = np.median(data.v, axis=0)
-    start = rest_map(model, data.y, data.v, 0)[0] @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
+    start = central_map(model, data) @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
     size = 0.5 * data.v.std(axis=0)
     response = step_responses(model, start, middle, size, length)[..., : data.y.shape[1]]
     change = np.abs(np.diff(response, axis=1, prepend=0.0))

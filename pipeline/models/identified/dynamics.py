@@ -91,7 +91,8 @@ class Dynamics(StateEquation):
         ahead, moved = np.array(x, dtype=np.float64), np.zeros(len(x))
         drive, lift = v @ self.b.T + self.c, v @ self.w1[:, self.n_x :].T + self.b1
         w1 = np.ascontiguousarray(self.w1[:, : self.n_x])
-        hold_inputs(self.a, w1, np.ascontiguousarray(self.w2), drive, lift, periods, ahead, moved)
+        a, w2 = np.ascontiguousarray(self.a), np.ascontiguousarray(self.w2)
+        hold_inputs(a, w1, w2, drive, lift, periods, ahead, moved)
         return ahead, moved
 
     def free_run(self, start: Array, data: Stretch, correction: float = 0.0) -> tuple[Array, Array] | None:
@@ -102,7 +103,7 @@ class Dynamics(StateEquation):
         With ``correction`` 0 the two are the same, and y is not used; with 1 the outputs are predicted one step ahead.
         """
         n_x = self.n_x
-        matrix = np.concatenate([self.a, self.w1[:, :n_x]])
+        matrix = np.ascontiguousarray(np.concatenate([self.a, self.w1[:, :n_x]]))
         drive = np.concatenate([data.v @ self.b.T + self.c, data.v @ self.w1[:, n_x:].T + self.b1], axis=1)
         before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
         y, x = np.ascontiguousarray(data.y), np.asarray(start, dtype=np.float64)

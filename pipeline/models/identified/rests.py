@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from pipeline.models.identified.dynamics import Dynamics
+from pipeline.models.identified.scaled_record import ScaledRecord
 from pipeline.plants.simulator import Array
 
 RESTS = 200
@@ -68,6 +71,17 @@ def rest_map(model: Dynamics, y: Array, v: Array, seed: int) -> tuple[Array, Arr
     error = found[good] - design @ table.T
     covariance = error.T @ error / max(len(error), 1)
     return table, (covariance + covariance.T) / 2
+
+
+@lru_cache(maxsize=128)
+def central_map(model: Dynamics, data: ScaledRecord) -> Array:
+    """The map (n_x, n_y + n_v + 1) of ``rest_map`` over the rows of ``data``, for figures of the model.
+
+    Several figures of a model begin with it, so it is made once for each model and record.
+    """
+    table, _ = rest_map(model, data.y, data.v, 0)
+    table.flags.writeable = False
+    return table
 
 
 def steady_gain(model: Dynamics, x: Array, v: Array) -> tuple[Array, Array]:

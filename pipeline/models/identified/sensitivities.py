@@ -59,6 +59,8 @@ def sensitivity_sums(
     n_free, n_x = int(free.sum()), model.n_x
     sums = Equations(np.zeros((n_free, n_free)), np.zeros(n_free))
     columns = np.concatenate([free, np.ones(n_x, dtype=bool)])
+    # Another layout in memory would be compiled anew, which takes seconds.
+    a, w1, w2 = (np.ascontiguousarray(matrix) for matrix in (model.a, model.w1, model.w2))
     for start, stretch in zip(starts, data, strict=True):
         run = model.free_run(start, stretch, correction)
         if run is None:
@@ -75,7 +77,7 @@ def sensitivity_sums(
             z = np.concatenate([from_states[rows], stretch.v[rows]], axis=1)
             history = np.empty((len(z), n_y, width))
             t = np.tanh(z @ model.w1.T + model.b1)
-            propagate(model.a, model.w1, model.w2, z, t, 1 - correction, n_free > 0, s, history)
+            propagate(a, w1, w2, z, t, 1 - correction, n_free > 0, s, history)
             jac = history.reshape(-1, width)
             if 0 < n_free < len(free):
                 jac = jac[:, columns]

@@ -12,7 +12,7 @@ from pipeline.metrics import fit_percent
 from pipeline.models.identified.assembly import dead_periods, step_responses
 from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.output_error import fit_starts
-from pipeline.models.identified.rests import rest_map, settle, steady_gain
+from pipeline.models.identified.rests import central_map, settle, steady_gain
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.selection import INTEGRATES, Selection
 from pipeline.models.identified.structure import Problem
@@ -114,8 +114,7 @@ def rests_of(model: Dynamics, data: ScaledRecord) -> tuple[Array, Array]:
         for q in QUANTILES
     ]
     v = np.array(places)
-    table, _ = rest_map(model, data.y, data.v, 0)
-    start = np.column_stack([np.zeros((len(v), data.y.shape[1])), v, np.ones(len(v))]) @ table.T
+    start = np.column_stack([np.zeros((len(v), data.y.shape[1])), v, np.ones(len(v))]) @ central_map(model, data).T
     x, still = settle(model, v, start)
     return np.where(still[:, None], x, start), v
 
@@ -227,6 +226,6 @@ def dead_times(
 
 def _middle_rest(model: Dynamics, data: ScaledRecord) -> Array:
     middle = np.median(data.v, axis=0)
-    start = rest_map(model, data.y, data.v, 0)[0] @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
+    start = central_map(model, data) @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
     x, still = settle(model, middle[None], start[None])
     return x[0] if still[0] else start

@@ -20,7 +20,7 @@ from pipeline.models.identified.identified_part import IdentifiedPart
 from pipeline.models.part import Learnt, Source
 from pipeline.simulation.rests import local_gains
 
-LINEAR = IdentifiedPart(orders=(2, 3), units=())
+LINEAR = IdentifiedPart(orders=(2, 3), units=(), minutes=0.02)
 SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.05)
 
 
@@ -60,10 +60,9 @@ def test_two_by_two_with_a_measured_disturbance() -> None:
 def test_a_second_process_variable_is_an_output_where_all_measured_ones_are() -> None:
     record, signals = made_plants.two_by_two(600), made_plants.signals_of(2, 2)
     source = Source(record, replace(signals, sp=signals.pv[:1]))
-    small = replace(LINEAR, minutes=0.02)
-    alone, both = (identified(replace(small, outputs=o).learn(source)) for o in ("controlled", "measured"))
+    alone, both = (identified(replace(LINEAR, outputs=o).learn(source)) for o in ("controlled", "measured"))
     assert (alone.n_y, both.n_y) == (1, 2)
-    assert small.groundwork() != replace(small, outputs="measured").groundwork()
+    assert LINEAR.groundwork() != replace(LINEAR, outputs="measured").groundwork()
     assert both.y_center.numpy() == pytest.approx(record.pv.mean(axis=0))
 
 
@@ -127,7 +126,7 @@ def test_its_file_and_its_free_run(tmp_path: Path) -> None:
 
 def test_a_long_record_gives_its_liveliest_blocks() -> None:
     record = made_plants.second_order(1500)
-    learnt = IdentifiedPart(orders=(2, 3), units=(), rows=600).learn(Source(record, made_plants.signals_of(1, 1)))
+    learnt = replace(LINEAR, rows=600).learn(Source(record, made_plants.signals_of(1, 1)))
     assert learnt.metrics["n_train"] <= 600
     assert learnt.metrics["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.02)
 

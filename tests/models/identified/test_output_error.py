@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.models.identified import dynamics, sensitivities
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.output_error import (
     OutputError,
@@ -32,6 +36,16 @@ def drawn(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
     )
 
 
+def contracting(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
+    """Like ``drawn``, and its linear part brings states together under every correction, too.
+
+    A correction takes the outputs' feedback away, so that poles within the unit circle are not enough: the hidden
+    states alone may be unstable. A norm below 1 is enough, because the correction shrinks each state or leaves it.
+    """
+    model = drawn(n_y, n_v, n_x, n_hidden, seed)
+    return replace(model, a=model.a * (0.8 / np.linalg.norm(model.a, 2)))
+
+
 def stretch(model: Dynamics, n_y: int, rows: int, seed: int, noise: float = 0.0) -> Stretch:
     rng = np.random.default_rng(seed)
     v = rng.normal(size=(rows, model.n_v))
@@ -54,7 +68,7 @@ def stretch(model: Dynamics, n_y: int, rows: int, seed: int, noise: float = 0.0)
 def test_the_gradient_is_that_of_the_free_run(
     n_y: int, n_v: int, more: int, n_hidden: int, correction: float, rows: int, seed: int
 ) -> None:
-    model = drawn(n_y, n_v, n_y + more, n_hidden, seed)
+    model = contracting(n_y, n_v, n_y + more, n_hidden, seed)
     data = [stretch(model, n_y, rows, seed + k, 0.3) for k in range(2)]
     starts = fit_starts(model, data, correction, iterations=0)
     theta = model.vector()
@@ -135,6 +149,29 @@ def test_a_ridge_shrinks_the_nonlinear_weights() -> None:
     assert sizes[1] < 0.8 * sizes[0]
 
 
+def test_a_model_of_another_layout_in_memory_is_not_compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = drawn(1, 1, 3, 2, 4)
+    turned = replace(plain, **{name: np.asfortranarray(getattr(plain, name)) for name in ("a", "b", "w1", "w2")})
+    data, every = stretch(plain, 1, 50, 1, 0.1), np.ones(len(plain.vector()), dtype=bool)
+    layouts = set()
+    for place, name in ((sensitivities, "propagate"), (dynamics, "hold_inputs"), (dynamics, "run_rows")):
+        loop = getattr(place, name)
+
+        def noted(*given: object, name: str = name, loop: Callable[..., object] = loop) -> object:
+            layouts.add((name, *(g.flags.c_contiguous for g in given if isinstance(g, np.ndarray))))
+            return loop(*given)
+
+        monkeypatch.setattr(place, name, noted)
+    sums = [sensitivity_sums(m, [np.zeros(3)], [data], every, 0.0) for m in (plain, turned)]
+    held = [m.hold(np.zeros((4, 3)), np.ones((4, 1)), 20)[0] for m in (plain, turned)]
+    assert sums[0] is not None
+    assert sums[1] is not None
+    assert sums[0].g == pytest.approx(sums[1].g)
+    assert held[0] == pytest.approx(held[1])
+    assert sorted(name for name, *_ in layouts) == ["hold_inputs", "propagate", "run_rows"]
+    assert all(all(flags) for _, *flags in layouts)
+
+
 def test_the_same_data_give_the_same_bytes() -> None:
     model = drawn(1, 1, 3, 2, 4)
     data = [stretch(drawn(1, 1, 2, 1, 9), 1, 200, 1, 0.1)]
@@ -148,3 +185,14 @@ def test_an_explosion_counts_as_an_infinite_error() -> None:
     assert squares(unstable, [np.zeros(1)], [data]) == np.inf
     assert np.isinf(free_run_error(unstable, [data])[0]).all()
     assert sensitivity_sums(unstable, [np.zeros(1)], [data], np.ones(3, dtype=bool), 0.0) is None
+
+
+def test_a_correction_makes_a_stable_model_explode_whose_hidden_states_are_unstable() -> None:
+    """Poles 0.8 and 0.4; measured outputs in place of its own leave the hidden state to itself, with a pole at 1.2."""
+    model = Dynamics.linear(np.array([[0.0, 1.0], [-0.32, 1.2]]), np.array([[1.0], [0.0]]))
+    data, start = Stretch(np.ones((400, 1)), np.ones((400, 1))), np.zeros(2)
+    every = np.ones(len(model.vector()), dtype=bool)
+    assert np.isfinite(squares(model, [start], [data]))
+    assert sensitivity_sums(model, [start], [data], every, 0.0) is not None
+    assert squares(model, [start], [data], 1.0) == np.inf
+    assert sensitivity_sums(model, [start], [data], every, 1.0) is None
