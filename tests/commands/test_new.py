@@ -64,6 +64,7 @@ def test_an_export_becomes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
     assert report["files"] == [{"file": "x.csv", "sha256": sha256(path)}]
     page = Path("data/tank/screening.html").read_text()
     assert 'src="data:image/png' in page
+    assert re.search(r"From 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d to 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d, UTC\.", page)
     assert "http://" not in page
     assert "https://" not in page
 
