@@ -91,20 +91,22 @@ def loop_of(law: ControlLaw, test: Scenario) -> Trajectory:
 
 
 def controllers_of_a_lag(
-    controllers: dict[str, dict[str, Any]], gain: float = 2.0, moved: tuple[float, float] = (-0.6, 0.6)
+    controllers: dict[str, dict[str, Any]],
+    gain: float = 2.0,
+    moved: tuple[float, float] = (-0.6, 0.6),
+    noise: float = 0.01,
 ) -> OwnCase:
     """A lag in params.yaml, with a record, models that need no training, and these controllers of it.
 
-    The record's MV was ``moved`` between two values.
+    The record's MV was ``moved`` between two values; ``noise`` is what the models say of the measurement.
     """
     poles = (0.6, 0.55, 0.65)
     mv = np.repeat(np.random.default_rng(0).uniform(*moved, (40, 1)), 10, axis=0)
     y = np.full((400, 1), gain * mv[0])
     for k in range(399):
         y[k + 1] = poles[0] * y[k] + (1 - poles[0]) * gain * mv[k]
-    lags = [
-        scaled_model(1, 1, 0, 1, a=np.array([[p]]), b=np.array([[gain * (1 - p)]]), rest=np.eye(1, 3)) for p in poles
-    ]
+    common = {"rest": np.eye(1, 3), "noise": np.array([noise])}
+    lags = [scaled_model(1, 1, 0, 1, a=np.array([[p]]), b=np.array([[gain * (1 - p)]]), **common) for p in poles]
     case = case_of(section(1, 1), lags, y, mv)
     (case.models.parent / "metrics.json").write_text(json.dumps({"data": {"0": "x"}, "parts": {}}))
     tree = yaml.safe_load(Path("params.yaml").read_text())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cases.reach import ROOM, SCALES, VISITED_MV, held_at
+from pipeline.cases.loads import ROOM
+from pipeline.cases.reach import SCALES, VISITED_MV, held_at
 from pipeline.evaluation.case import Array
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.records.record import Record

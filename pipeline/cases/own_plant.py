@@ -10,14 +10,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from pipeline.cases.loads import held_load, load_size, whole_load
 from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
 from pipeline.cases.own_model import OwnPlant, Untrained, errors_of
-from pipeline.cases.reach import LOAD
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
-from pipeline.evaluation.metric import Metric
+from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import mae
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.signals import Signals
@@ -110,29 +110,35 @@ class OwnCase(OwnEnsemble):
         pairs = [(seed, members[i % len(members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
         held_out = "Set points, on models identified from the record"
         spoilt = f"Set points, on such models gone wrong: {self._doubts}"
-        cvs = self.signals.sp
-        loads = f"A load worth {LOAD:g} standard deviations of the record's {cvs[0].name if len(cvs) == 1 else 'CV'}"
-        loads += "" if len(cvs) == 1 else ", each CV in turn"
-        loads += ", or as much as the MVs can hold"
         errors = errors_of(self._nominal)
         known = {i: [(s, p, p.parameters(errors[i])) for s, p, j in pairs if j == i] for i in (0, 1)}
         wrong = {s: reach.set_points(p, s, q) for rows in known.values() for s, p, q in rows}
         return {
             "held_out": tuple(self._test("held_out", held_out, reach.set_points(p, s), p, s, {}) for s, p, _ in pairs),
             "spoilt": tuple(self._test("spoilt", spoilt, wrong[s], p, s, errors[i]) for s, p, i in pairs),
-            **self._loads(loads, [(p, i == 0) for _, p, i in pairs]),
+            **self._loads([(p, i == 0) for _, p, i in pairs]),
             **self._measured([(p, i == 0) for _, p, i in pairs]),
         }
 
-    def _loads(self, title: str, pairs: Sequence[tuple[OwnPlant, bool]]) -> dict[str, tuple[Scenario, ...]]:
+    def _loads(self, pairs: Sequence[tuple[OwnPlant, bool]]) -> dict[str, tuple[Scenario, ...]]:
         """The test with a load on each CV, on plants, upwards or not; without those that the MVs cannot hold."""
-        found = []
+        found, shares = [], []
         for j, cv in enumerate(self.signals.sp):
             for plant, upwards in pairs:
-                if (size := self.reach.load(plant, j, upwards)) is not None:
+                if (size := held_load(self.reach, plant, j, upwards)) is not None:
+                    shares.append(size / whole_load(self.reach, plant, j, upwards))
                     changed = {f"load_{cv.name}": size}
-                    found.append(self._test(LOADED, title, self._resting_at(plant), plant, None, changed))
+                    found.append(self._test(LOADED, "", self._resting_at(plant), plant, None, changed))
+        least = f", which is at least {100 * min(shares):.2g} % of it" if shares and min(shares) < 1 else ""
+        found = [replace(test, title=f"{self._load_title}{least}") for test in found]
         return {LOADED: tuple(found)} if found else {}
+
+    @property
+    def _load_title(self) -> str:
+        cvs = self.signals.sp
+        sizes = [f"{cv.name} by {load_size(self.reach, j):.3g} {_shown(cv)}".rstrip() for j, cv in enumerate(cvs)]
+        each = ", each in turn" if cvs[1:] else ""
+        return f"A load that moves {' or '.join(sizes)} if no controller acts{each}; or as much as the MVs can hold"
 
     @cached_property
     def weights(self) -> Mapping[str, float]:
@@ -214,6 +220,11 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
 def mae_of(cv: Signal) -> str:
     """Name of the figure of one CV among several."""
     return f"mae_{cv.name}"
+
+
+def _shown(cv: Signal) -> str:
+    """The unit of a CV as a person reads it; empty for a plain number."""
+    return METRICS["mae"].unit_of(cv.unit)
 
 
 def _spans(signals: Sequence[Signal]) -> Array:

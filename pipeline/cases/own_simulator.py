@@ -9,8 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from pipeline.cases.loads import ROOM, load_size
 from pipeline.cases.own_plant import LOADED, OwnCase, own_case
-from pipeline.cases.reach import LOAD, ROOM
 from pipeline.config.plants import PlantParams
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Array, Case
@@ -61,12 +61,15 @@ class SimulatedCase(OwnCase):
             dv = dv - dv[0] + self.simulator.dv_nominal
         if changes or dv is not None:  # such a test begins at rest
             sp = np.tile(self.simulator.measure(x0)[: sp.shape[1]], (len(sp), 1))
-        title = test.title.replace("models identified from the record", "the simulator")
+        # How much of a load the MVs can hold was found on the models.
+        title = (
+            self._load_title if changes else test.title.replace("models identified from the record", "the simulator")
+        )
         return replace(test, title=title, sp=sp, plant=self.simulator, x0=x0, mv0=mv0, changes=changes, dv=dv)
 
     def _load_on_mv(self, cv: int) -> tuple[str, float]:
-        """The load [MV's unit] that moves a CV by LOAD standard deviations within a hold, if no controller acts."""
-        wanted = LOAD * float(self.record.pv[:, cv].std())
+        """The load [MV's unit] that moves a CV by ``load_size`` within a hold, if no controller acts."""
+        wanted = load_size(self.reach, cv)
         answers = {}
         for name, s in zip(self.simulator.parameter_names(), self.simulator.mv_signals, strict=True):
             tried = TRIED * (s.high - s.low)

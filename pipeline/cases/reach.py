@@ -1,4 +1,4 @@
-"""What of a plant's range its record visited, and the set points, holds and loads of tests that follow from it."""
+"""What of a plant's range its record visited, and the set points and holds of tests that follow from it."""
 
 from __future__ import annotations
 
@@ -25,15 +25,12 @@ MOVING = 0.05  # of the CV's visited range in the last quarter of RESTING: a CV 
 TIMES, HOLD = 3, (30, 400)  # a set point lasts so many times as long as an answer; the fewest and most samples
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
 INWARD = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the way from the visited range's middle to its end: where a rest is tried
-LOAD = 0.25  # standard deviations of the record's CV
-LEAST_LOAD = 0.01  # of that: a smaller load is no test
-ROOM = 0.05  # of an MV's range, at each end: what holding a disturbance leaves for a controller to act in
 BALANCED = 1e-6  # largest residual of a balance
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Set points that can be held jointly, how long they are held, and loads, from a model of the plant and its record.
+    """Set points that can be held jointly, and how long they are held, from a model of the plant and its record.
 
     A CV that settles under constant MVs takes the set points of rests under MVs drawn over the visited range; MVs
     whose rests leave the visited range of a CV are drawn nearer to their medians. A CV that never settles (an
@@ -172,35 +169,6 @@ class Reach:
                     found[k] = cvs
                     break
         return found
-
-    def load(self, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float | None:
-        """The load [CV a period] that moves a CV by ``LOAD`` within a hold, if no controller acts.
-
-        An integrating CV moves as far in a third of a hold: there a load is a rate, and three times that is no rest.
-        Where MVs within their ranges cannot hold the CVs against it, it is as much smaller as they need; None
-        where they hold not even ``LEAST_LOAD`` of it.
-        """
-        (x, mv), name = plant.start, f"load_{plant.pv_signals[cv].name}"
-        size = float(self.record.pv[:, cv].std())
-        samples, tried = self.hold // TIMES if cv in self.integrates else self.hold, 1e-3 * size
-        ends = [
-            courses(plant, x, mv[None], samples, plant.parameters({name: load}))[0, -1, cv] for load in (tried, 0.0)
-        ]
-        wanted = (1 if upwards else -1) * tried * LOAD * size / abs(float(ends[0] - ends[1]))
-        cvs = plant.measure(x)[: self.cv.shape[1]]
-
-        def can_hold(scale: float) -> bool:
-            p = plant.parameters({name: scale * wanted})
-            return held_at(plant, (x, mv), cvs, self.model.mv_signals, p, ROOM) is not None
-
-        for scale in SCALES:
-            if can_hold(scale):
-                return scale * wanted
-        held, too_much = 0.0, SCALES[-1]
-        while too_much - held > LEAST_LOAD / 2:
-            middle = 0.5 * (held + too_much)
-            held, too_much = (middle, too_much) if can_hold(middle) else (held, middle)
-        return held * wanted if held >= LEAST_LOAD else None
 
 
 def can_command(mvs: Sequence[Signal], values: Array, room: float = 0.0) -> bool:

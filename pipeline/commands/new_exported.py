@@ -6,12 +6,23 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline.commands.new_widened import Widening
 from pipeline.config.exports import ExportParams
 from pipeline.errors import RecordError
 from pipeline.historian.exported import exported
 from pipeline.historian.guessing import guesses
 from pipeline.historian.reading import read_export, units_of
-from pipeline.historian.tags import EXPLAINED, ROLES, Tag, check_tags, limited, parse_tag, read_tags, write_tags
+from pipeline.historian.tags import (
+    EXPLAINED,
+    ROLES,
+    Tag,
+    as_it_is,
+    check_tags,
+    limited,
+    parse_tag,
+    read_tags,
+    write_tags,
+)
 
 
 def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
@@ -19,10 +30,15 @@ def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
     given = tuple(parse_tag(text, role) for role in ROLES for text in getattr(options, role))
     if given and options.tags:
         raise RecordError("--tags and options of roles are both given; give one of them")
-    found, where = (read_tags(options.tags), str(options.tags)) if options.tags else (given, "the options")
+    # A range in an option was stated; one in a table may be as it was guessed.
+    widen = Widening(options) if options.tags else as_it_is
+    found, where = (read_tags(options.tags, widen), str(options.tags)) if options.tags else (given, "the options")
     if found or options.tags:
         check_tags(found, where)
-    return limited(found, options.command, options.max_move) if found else found, where
+    found = limited(found, options.command, options.max_move, widen) if found else found
+    for note in widen.notes if isinstance(widen, Widening) else ():
+        print(note)
+    return found, where
 
 
 def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:

@@ -153,6 +153,12 @@ class Validation:
         """A bound's figure in the case's metric; None where none was computed."""
         return self.bounds.get(test, {}).get(kind, {}).get(self.metric)
 
+    @property
+    def of_each_cv(self) -> dict[str, str]:
+        """Figure -> words and unit: the metric of each of several CVs, whose shares of ranges make up ``metric``."""
+        figures = self.titles.figures.items() if self.on_models else ()
+        return {name: words for name, words in figures if name.startswith(f"{self.metric}_")}
+
     def floor(self, test: str) -> float:
         """The error that noise can hide in a test; ``test`` has no noise suffix."""
         return self.gate.floors.get(test, self.gate.floor)

@@ -75,7 +75,7 @@ class Export:
     rows: int  # lines or rows of the files
     unreadable_rows: int  # of another length than the header's
     timeless_rows: int  # whose time cannot be read
-    notes: tuple[str, ...] = ()
+    zone: str = ""  # that its dates are in, or that it states none; empty where times are no dates
 
 
 def in_order(series: Series, files: NDArray[np.int64] = NO_CUTS) -> Series:

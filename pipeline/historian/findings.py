@@ -93,6 +93,7 @@ class Screening:
     modes: dict[str, dict[str, int]]  # mode tag -> mode -> rows
     findings: tuple[Finding, ...]
     verdict: Verdict
+    zone: str = ""  # that dates are in, as in Export
 
     @property
     def summary(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
@@ -158,12 +159,9 @@ def _guess(series: Series, unit: str) -> Guess:
     if texts > 0.5 * len(series):
         words = ", ".join(t for t, _ in series.texts.most_common(4))
         return Guess(Tag(tag, role if role == "mode" else "", unit), 0.0, good, f"texts: {words}")
-    values = series.value[series.good]
-    if not values.size:
+    if not series.good.any():
         return Guess(Tag(tag, "", unit), 0.0, good, "no good reading")
-    codes, found = sentinels(np.where(series.code == Reason.GOOD, series.value, np.nan))
-    plain = series.value[series.good & ~codes]
-    plain = plain[~unit_slips(plain)[0]]
+    plain, codes, found = _plain(series)
     remarks = []
     still = np.abs(np.diff(plain)) <= 0
     if np.ptp(plain) == 0:
@@ -178,6 +176,24 @@ def _guess(series: Series, unit: str) -> Guess:
     low, high = _range(plain, unit, role)
     kept = good - float(codes.mean())
     return Guess(Tag(tag, role, unit, low, high), quantum(plain), kept, "; ".join(remarks))
+
+
+def seen_range(series: Series) -> tuple[float, float] | None:
+    """The lowest and highest reading, codes for missing values and slips of the unit left out; None without any.
+
+    The guess of an MV's range, unless its unit says more.
+    """
+    if not series.good.any():
+        return None
+    plain, _, _ = _plain(series)
+    return (float(np.min(plain)), float(np.max(plain))) if plain.size else None
+
+
+def _plain(series: Series) -> tuple[Array, NDArray[np.bool_], Counter[str]]:
+    """Readings that are no code for a missing value and no slip of the unit; where codes are (n,), how often each."""
+    codes, found = sentinels(np.where(series.code == Reason.GOOD, series.value, np.nan))
+    plain = series.value[series.good & ~codes]
+    return plain[~unit_slips(plain)[0]], codes, found
 
 
 def _range(values: Sequence[float] | np.ndarray, unit: str, role: str) -> tuple[float | None, float | None]:

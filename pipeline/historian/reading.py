@@ -22,6 +22,7 @@ from pipeline.historian.gathering import Gathered
 from pipeline.historian.headers import split_header
 from pipeline.historian.layout import Layout, layout_of
 from pipeline.historian.sent_again import drop_repeated_rows
+from pipeline.historian.times import zone_of
 
 BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17
@@ -67,13 +68,14 @@ def read_export(
     if not paths:
         raise RecordError("no file is named; give one or more exports")
     parts: dict[str, list[Series]] = {}
-    files, kinds, totals = [], [], Counter[str]()
+    files, kinds, zones, totals = [], [], list[str](), Counter[str]()
     known: set[str] = set()
     tags, modes = [bare(t) for t in tags], [bare(t) for t in modes]
     for path in paths:
         source = opened(path)
         layout = layout_of(source.path, source.header, source.sample, time_column, time_format)
         found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
+        zones.append(zone_of(layout.clock, source.sample[layout.date or layout.time]))
         drop_repeated_rows(found)
         for name, series in found.items():
             parts.setdefault(name, []).append(series)
@@ -89,9 +91,9 @@ def read_export(
         raise RecordError(f"{', '.join(map(str, paths))}: no row of data; export a longer time")
     together = {name: joined(p) for name, p in parts.items()}
     layouts = " and ".join(dict.fromkeys(kinds))
-    return Export(
-        together, tuple(files), layouts, totals["rows_read"] + totals["rows"], totals["rows"], totals["timeless"]
-    )
+    zone = zones[0] if len(set(zones)) == 1 else ""  # of files that count differently no date is known
+    rows = totals["rows_read"] + totals["rows"]
+    return Export(together, tuple(files), layouts, rows, totals["rows"], totals["timeless"], zone)
 
 
 def units_of(paths: Sequence[Path]) -> dict[str, str]:

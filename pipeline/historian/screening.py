@@ -136,6 +136,7 @@ def screened(
         modes={t.tag: _mode_rows(grid, own[t.tag]) for t in tags if t.role == "mode"},
         findings=merged(findings),
         verdict=verdict,
+        zone=export.zone,
     )
     return Screened(record, grid, code, own, report)
 

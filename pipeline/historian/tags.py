@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -118,7 +118,18 @@ def parse_tag(text: str, role: str) -> Tag:
     return tag
 
 
-def limited(tags: Sequence[Tag], commands: Iterable[str], moves: Iterable[str]) -> tuple[Tag, ...]:
+Widen = Callable[[Tag], Tag]
+"""Gives a tag the range that it may have, before its numbers are checked."""
+
+
+def as_it_is(tag: Tag) -> Tag:
+    """The tag: no range is widened."""
+    return tag
+
+
+def limited(
+    tags: Sequence[Tag], commands: Iterable[str], moves: Iterable[str], widen: Widen = as_it_is
+) -> tuple[Tag, ...]:
     """The tags with what options say of MVs: ``TAG=LOW..HIGH`` to command, ``TAG=CHANGE`` the largest in a minute.
 
     RecordError for another form, for a tag that is no MV, and for numbers that cannot be.
@@ -136,7 +147,7 @@ def limited(tags: Sequence[Tag], commands: Iterable[str], moves: Iterable[str]) 
             raise RecordError(f"{where}: {name!r} is no mv{nearest(name, mvs)}")
         keys = COMMANDS[:2] if form == "LOW..HIGH" else COMMANDS[2:]
         numbers = {key: _number(end, where) for key, end in zip(keys, ends, strict=True)}
-        found[name] = replace(found[name], **numbers)  # type: ignore[arg-type]
+        found[name] = widen(replace(found[name], **numbers))  # type: ignore[arg-type]
         if wrong := _wrong(found[name]):
             raise RecordError(f"{where}: {'; '.join(wrong)}")
     return tuple(found[t.tag] for t in tags)
@@ -174,7 +185,7 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
     write_text(path, out.getvalue())
 
 
-def read_tags(path: Path) -> tuple[Tag, ...]:
+def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
     """The tags that have a role in a corrected table; RecordError names line and column of every mistake.
 
     A spreadsheet's semicolons and decimal commas are read too.
@@ -207,7 +218,7 @@ def read_tags(path: Path) -> tuple[Tag, ...]:
                 numbers |= {key: _number(cells[key], f"{where}, {key}")} if cells.get(key) else {}
             except RecordError as error:
                 wrong.append(str(error))
-        tag = Tag(tag=cells["tag"], role=role, unit=cells.get("unit", ""), name=cells.get("name", ""), **numbers)
+        tag = widen(Tag(tag=cells["tag"], role=role, unit=cells.get("unit", ""), name=cells.get("name", ""), **numbers))
         wrong += [f"{where}: {words}" for words in _wrong(tag)]
         found.append(tag)
     if wrong:

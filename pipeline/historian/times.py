@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import date
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ SHORT = re.compile(r"^(\d{1,4})([./-])(\d{1,2}|[A-Za-z]{3})\2(\d{4}|\d{2})(?=\D|
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 EXCEL_DAYS = 20_000.0, 80_000.0  # since 1899-12-30: years 1954 to 2119
 EXCEL_EPOCH_S = 25_569 * 86_400.0
+SINCE_1970_S = 1e8  # numbers of seconds from here on (1973) count from 1970; smaller ones from some start
+UTC, UNSTATED = "UTC", "the export states no zone"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,21 @@ def clock_of(name: str, sample: Sequence[Any], where: str) -> Clock | None:
     if _most(texts, SHORT):
         return Clock("format", format=_format(texts, where))
     return None
+
+
+def zone_of(clock: Clock, sample: Sequence[Any]) -> str:
+    """The zone that a clock's seconds count in, by the first cells: UTC, or UNSTATED; "" where they are no dates."""
+    cells = [c for c in sample if c is not None and str(c).strip() != ""]
+    if not cells:
+        return ""
+    if isinstance(cells[0], date):
+        return UTC if getattr(cells[0], "tzinfo", None) else UNSTATED
+    if clock.kind == "number":
+        first = float(str(cells[0]).replace(",", ".")) * clock.scale - clock.start_s
+        return "" if first < SINCE_1970_S else UNSTATED if clock.start_s else UTC
+    if clock.kind == "iso":
+        return UTC if ZONE.search(str(cells[0]).strip()[10:]) else UNSTATED
+    return UNSTATED
 
 
 def _most(texts: Sequence[str], pattern: re.Pattern[str]) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,30 +23,54 @@ SPLITS = 40  # places tried for a jump
 RATIO = 0.08  # by which the answer must change with the jump, to be another span
 
 
-def of_levels(name: str, y: Array, expected: Array, span: float, settling: int) -> list[Finding]:
-    """One finding where the levels of y (n,) wander about what the inputs explain, ``expected`` (n,); [] otherwise.
+@dataclass(frozen=True, slots=True, eq=False)
+class Levels:
+    """Means of y about what is expected, of m blocks of rows in the order of time."""
 
-    What a static nonlinearity (a cubic of ``expected``) explains of the levels is none of it.
-    """
+    level: Array  # (m,)
+    expected: Array  # (m,) means of what is expected
+    z: Array  # (m,) the same, scaled
+    curve: Array  # (m, 4) powers of z
+    first: NDArray[np.int64]  # (m,) row at which each begins
+    span: float  # of y
+    least: float  # standard deviation from which on they wander: smaller ones may be noise, or matter little
+
+    @property
+    def wander(self) -> bool:
+        """Whether they do, beyond what a static nonlinearity (a cubic of what is expected) explains."""
+        rest = self.level - self.curve @ np.linalg.lstsq(self.curve, self.level, rcond=None)[0]
+        return float(rest.std()) >= self.least
+
+    @property
+    def percent(self) -> float:
+        """What they move over, in % of the span."""
+        return 100 * float(np.ptp(self.level)) / self.span
+
+
+def levels_of(y: Array, expected: Array, span: float, settling: int) -> Levels | None:
+    """Levels of y (n,) about ``expected`` (n,), for a plant that settles in so many rows; None of too few rows."""
     ok = np.flatnonzero(np.isfinite(y) & np.isfinite(expected))
     length = max(BLOCK, min(settling, len(ok) // (2 * LEVELS)), len(ok) // MOST_LEVELS)
     m = len(ok) // length
     if m < LEVELS or span <= 0:
-        return []
+        return None
     rows = ok[: m * length].reshape(m, length)
     e = expected[rows].mean(axis=1)
-    level = y[rows].mean(axis=1) - e
     z = (e - e.mean()) / max(float(e.std()), 1e-300)
-    curve = np.column_stack([np.ones(m), z, z**2, z**3])
-    rest = level - curve @ np.linalg.lstsq(curve, level, rcond=None)[0]
     noise = float(np.median(np.std(y[rows] - expected[rows], axis=1))) / np.sqrt(length)
-    sd = float(rest.std())
-    if sd < max(WANDERS * span, OF_NOISE * noise):
-        return []
-    return [Finding("drift", name, _words(level, curve, z, e, rows[:, 0], span))]
+    curve = np.column_stack([np.ones(m), z, z**2, z**3])
+    least = max(WANDERS * span, OF_NOISE * noise)
+    return Levels(y[rows].mean(axis=1) - e, e, z, curve, rows[:, 0], span, least)
 
 
-def _words(level: Array, curve: Array, z: Array, e: Array, first: NDArray[np.int64], span: float) -> str:
+def of_levels(name: str, y: Array, expected: Array, span: float, settling: int) -> list[Finding]:
+    """One finding where the levels of y (n,) wander about what the inputs explain, ``expected`` (n,); [] otherwise."""
+    found = levels_of(y, expected, span, settling)
+    return [Finding("drift", name, _words(found))] if found is not None and found.wander else []
+
+
+def _words(found: Levels) -> str:
+    level, curve, z, e, first, span = found.level, found.curve, found.z, found.expected, found.first, found.span
     m = len(level)
     time = np.linspace(-0.5, 0.5, m)
     none = _left(curve, level)[0]
@@ -56,8 +82,7 @@ def _words(level: Array, curve: Array, z: Array, e: Array, first: NDArray[np.int
         jumps.append((left, int(s), float(theta[-2]), float(theta[-1] / max(float(e.std()), 1e-300))))
     left, s, jump, more = min(jumps)
     if min(ramp, left) > (1 - EXPLAINED) * none:
-        size = 100 * float(np.ptp(level)) / span
-        return f"wanders: what the inputs do not explain moves over {size:.0f} % of its span; {WANDERING}"
+        return f"wanders: what the inputs do not explain moves over {found.percent:.0f} % of its span; {WANDERING}"
     if ramp < left + 0.05 * none:
         change = float(slope[-1])
         return (

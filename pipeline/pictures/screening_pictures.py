@@ -16,7 +16,8 @@ from pipeline.historian.findings import TagReport
 from pipeline.historian.reason import Reason
 from pipeline.historian.screening import Screened
 from pipeline.metrics import Array
-from pipeline.pictures.drawing import SIZE, STYLE, axis_label, legend_below, time_axis
+from pipeline.pictures.dates import ExportTimes
+from pipeline.pictures.drawing import SIZE, STYLE, axis_label, legend_below
 
 COLOURS = {
     Reason.EMPTY: "#bbbbbb", Reason.TEXT: "#8c564b", Reason.QUALITY: "#332288", Reason.SENTINEL: "#d55e00",
@@ -38,22 +39,26 @@ def trends(found: Screened) -> Canvas:
     with rc_context(STYLE):
         canvas = Canvas(figsize=(SIZE[0] * 1.25, HEAD + PANEL * len(tags)), layout="constrained")
         panels = canvas.subplots(len(tags), 1, sharex=True, squeeze=False)[:, 0]
-        start = found.grid.time_s[0]
-        _, label = time_axis(found.grid.time_s - start)
-        at = _in_unit(found.grid.time_s - start, found.grid.time_s[-1] - start)
+        times = times_of(found)
         seen: set[Reason] = set()
         for axes, tag in zip(panels, tags, strict=True):
-            seen |= _trend(axes, found, tag, at)
-        panels[-1].set_xlabel(label)
+            seen |= _trend(axes, found, tag, times)
+        times.dress(panels[-1].xaxis)
+        panels[-1].set_xlabel(times.label)
         if seen:
             _reason_legend(canvas, seen)
         return canvas
 
 
-def _trend(axes: Axes, found: Screened, tag: TagReport, at: Array) -> set[Reason]:
-    """Of one signal over the grid's rows ``at`` (n,), in the axis' unit."""
+def times_of(found: Screened) -> ExportTimes:
+    """From the first row to the last one."""
+    return ExportTimes(float(found.grid.time_s[0]), float(found.grid.time_s[-1]), found.report.zone)
+
+
+def _trend(axes: Axes, found: Screened, tag: TagReport, times: ExportTimes) -> set[Reason]:
+    """Of one signal over the grid's rows."""
     grid, series = found.grid, found.series[tag.tag]
-    start = grid.time_s[0]
+    at = times.at(grid.time_s)
     values = grid.value[tag.tag]
     fresh = np.r_[True, np.diff(grid.piece) > 0]
     for mask, colour in ((found.code > 0, "#c8c8c8"), (found.code == 0, LINE)):
@@ -71,7 +76,7 @@ def _trend(axes: Axes, found: Screened, tag: TagReport, at: Array) -> set[Reason
     bad = bad[:: max(1, len(bad) // POINTS)]
     for reason in np.unique(series.code[bad]):
         own = bad[series.code[bad] == reason]
-        x = _in_unit(series.time_s[own] - start, grid.time_s[-1] - start)
+        x = times.at(series.time_s[own])
         axes.plot(x, np.full(len(x), 0.05), "|", color=COLOURS[Reason(reason)], transform=axes.get_xaxis_transform(),
                   markersize=7, markeredgewidth=1.2, zorder=4)  # fmt: skip
         seen.add(Reason(reason))
@@ -117,8 +122,10 @@ def _detail(axes: Axes, found: Screened, tag: TagReport, reason: Reason) -> None
     if near.sum() < 2:  # of a long export only the remarkable readings are kept
         source, values, codes = grid.time_s, grid.value[tag.tag], np.zeros(len(grid), np.uint8)
         near = (source >= first) & (source <= last)
-    t = source[near] - grid.time_s[0]
-    x, label = time_axis(t)
+    t = source[near]
+    # Without dates the time counts from the export's first row, in a unit that suits the detail's end.
+    axis = ExportTimes(float(grid.time_s[0]), float(t[-1]), found.report.zone)
+    x = axis.at(t)
     v, code = values[near], codes[near]
     good = code == Reason.GOOD
     axes.plot(x[good], v[good], ".-", color=LINE, linewidth=0.8, markersize=3)
@@ -130,11 +137,11 @@ def _detail(axes: Axes, found: Screened, tag: TagReport, reason: Reason) -> None
               markersize=9, markeredgewidth=1.5)  # fmt: skip
     if not raw:
         own = (grid.time_s >= first) & (grid.time_s <= last) & (grid.code[tag.tag] == reason)
-        scale = (x[-1] - x[0]) / max(t[-1] - t[0], 1e-9)
-        masked = (grid.time_s[own] - grid.time_s[0]) * scale, grid.value[tag.tag][own]
-        axes.plot(*masked, "o", color=COLOURS[reason], markersize=3)
+        axes.plot(axis.at(grid.time_s[own]), grid.value[tag.tag][own], "o", color=COLOURS[reason], markersize=3)
     axes.set_title(f"{tag.name}: {reason.words}", fontsize=9.5, parse_math=False)
-    axes.set_xlabel(label, fontsize=8.5)
+    axis.dress(axes.xaxis)
+    axes.xaxis.get_offset_text().set_fontsize(8.5)
+    axes.set_xlabel(axis.label, fontsize=8.5)
     axes.tick_params(labelsize=8.5)
 
 
@@ -207,12 +214,6 @@ def _stretches(x: Array, y: Array, mask: NDArray[np.bool_], fresh: NDArray[np.bo
     columns = ([np.concatenate([part[i], end]) for part in parts] for i in (0, 1))
     first, second = (np.concatenate(column) for column in columns)
     return first, second
-
-
-def _in_unit(time_s: Array, whole_s: float) -> Array:
-    """Times in the unit of an axis of length ``whole_s``."""
-    scale = time_axis(np.array([0.0, whole_s]))[0][1] / whole_s if whole_s > 0 else 1.0
-    return np.asarray(time_s * scale)
 
 
 def _reason_legend(canvas: Canvas, seen: set[Reason]) -> None:

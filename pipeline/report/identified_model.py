@@ -12,6 +12,7 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.model_evidence import identified_part
 from pipeline.pictures.drawing import axis_label, gain_unit
 from pipeline.pictures.numbers import figure, number
+from pipeline.report.drift import drift_answers
 from pipeline.tuning.responses import reached
 
 MOST_TRIED = 12  # candidates in the table, the best first
@@ -49,7 +50,7 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     if not part:
         return None
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
-    sentences = (*_verdicts(part), *_left_open(part, mvs), *_asked(evidence))
+    sentences = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs), *_asked(evidence))
     return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part))
 
 

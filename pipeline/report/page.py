@@ -171,7 +171,7 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
             unit = metric.unit_of(case.cv_unit)
             words = f"{metric.short} on {name_of(need.scenario)}; at most {number(need.high)} is asked"
             rows.append((f"{number(late)} {unit}".rstrip(), words))
-    rows = rows[:MOST_HEADLINES]
+    rows = [*rows[:MOST_HEADLINES], *_of_each_cv(evidence, best, name_of(evidence.main_test))]
     if evidence.grounds is not None:
         rows += [
             ("none" if fit is None else f"{fit:.3g} %", f"free-run fit of {name} by the models, over unseen rows")
@@ -185,6 +185,21 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
         lower = f"lower {case.criterion.long} than the {law_name(case.baseline)} on {where}"
         rows.append((f"{100 * (1 - own / other):.0f} %", lower))
     return rows
+
+
+def _of_each_cv(evidence: Evidence, law: str, where: str) -> list[tuple[str, str]]:
+    """Each CV's own error on the main test, of several CVs whose errors are put together in shares of ranges."""
+    case, rows = evidence.case, []
+    for metric in case.own_metrics if case.on_models else ():
+        own, other = (evidence.figure(name, evidence.main_test, metric.name) for name in (law, case.baseline))
+        if metric.name.startswith(f"{case.metric}_") and own is not None:
+            beside = (
+                "" if law == case.baseline or other is None else f"; the {law_name(case.baseline)} has {number(other)}"
+            )
+            rows.append(
+                (f"{number(own)} {metric.unit_of(case.cv_unit)}".rstrip(), f"{metric.short} on {where}{beside}")
+            )
+    return rows[:MOST_HEADLINES]
 
 
 def _locked(evidence: Evidence, law: str) -> dict[str, str]:

@@ -155,6 +155,10 @@ def _tests(standing: Standing) -> Table:
 
     for name in names:
         table.add_row(name, _figure(validation.bound(name)), *(_figure(ours(name, law.law)) for law in standing.laws))
+        for own, words in validation.of_each_cv.items():
+            known = [scenarios[name].get(law.law, {}).get(own) for law in standing.laws]
+            bound = validation.bounds.get(name, {}).get("nmpc", {}).get(own)
+            table.add_row(f"  {escape(words)}", *map(_figure, (bound, *known)), style="dim")
     table.add_section()
     table.add_row(f"{standing.test} / {standing.times[2:]}", "", *(_multiple(standing, law) for law in standing.laws))
     table.add_row("lock-ups", "", *(("-" if law.lock_ups is None else str(law.lock_ups)) for law in standing.laws))

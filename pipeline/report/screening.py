@@ -13,7 +13,7 @@ from pipeline.historian.reason import Reason
 from pipeline.historian.screening import Screened
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.excitation_pictures import inputs, verdict
-from pipeline.pictures.screening_pictures import details, readings, trends
+from pipeline.pictures.screening_pictures import details, readings, times_of, trends
 from pipeline.report.templating import render
 
 VERDICTS = {
@@ -39,6 +39,7 @@ def write_page(path: Path, found: Screened, test: StepTest | None) -> None:
         "words": {r.name.lower(): r.words for r in Reason},
         "pictures": {name: _inline(canvas) for name, canvas in pictures.items() if canvas is not None},
         "kept_percent": 100.0 * report.kept_rows / report.grid_rows,
+        "when": times_of(found).words,
         "test": test,
     }
     write_text(path, render("screening.html.j2", content))

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from pipeline.evaluation.case import Curve, PaperFigure, PaperTable, Requirement
 from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.validation import Statement
 from pipeline.evaluation.verdicts import ABSOLUTE, RELATIVE, Claims, Reason, close, plain_reason
 from pipeline.pictures.numbers import number
 from pipeline.pictures.words import curve_label
+from pipeline.report.own_acceptance import own_acceptance
 
 FINE = 5  # digits shown of a figure that has to be near
 RULE = (
@@ -72,7 +72,10 @@ def table_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> TableRow:
 
 
 def acceptance(evidence: Evidence, claims: Claims) -> list[Statement]:
-    """The whole acceptance list: the case's requirements, the common ones of all cases, and the case's own checks."""
+    """The whole acceptance list: the case's requirements, the common ones, and the case's own checks.
+
+    The common ones of an own plant are ``own_acceptance``.
+    """
     best = evidence.laws[evidence.best] if evidence.best else None
     seeds = 1 if evidence.own_data else evidence.case.data_seeds  # a user's data are one record
     locked = ", ".join(f"{name} {law.lock_ups}" for name, law in evidence.laws.items())
@@ -92,19 +95,9 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[Statement]:
         ),
     ]
     if evidence.case.on_models:
-        common = [row for name in evidence.laws for row in _of_law(name, evidence, seeds)]
+        common = own_acceptance(evidence)
     rows = [requirement(need, evidence) for need in evidence.case.requirements]
     return [*rows, *common, *(check.statement(evidence) for check in claims.acceptance)]
-
-
-def _of_law(name: str, evidence: Evidence, seeds: int) -> list[Statement]:
-    """What is asked of every shipped law, whichever is the best."""
-    law = evidence.laws[name]
-    where = lock_up_text(law.metrics.locked_up)
-    return [
-        Statement(f"{name}, data seeds", f"≥ {seeds}", str(law.seeds), law.seeds >= seeds),
-        Statement(f"{name}, lock-ups over all seeds and scenarios", "0", str(law.lock_ups), law.lock_ups == 0, where),
-    ]
 
 
 def requirement(need: Requirement, evidence: Evidence) -> Statement:

@@ -2,19 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 
 from pipeline.errors import LawError
 from pipeline.plants.simulator import Array
+from serving.manifest import Signal
 
 Pairs = tuple[tuple[int, int], ...]
 """(CV, MV) of each loop, in the order of the MVs."""
 
 ONE_LOOP: Pairs = ((0, 0),)
 
+ALLOWED = "positive relative gains and a positive Niederlinski index"
+
 INDEPENDENT = 1e-6  # least ratio of singular values, of gains in shares of their largest, at which CVs can be held
+
+
+@dataclass(frozen=True, slots=True)
+class TunedPairing:
+    """A pairing whose loops were tuned: the relative gain of each pair, and the error that its best numbers gave."""
+
+    pairs: Pairs
+    relative_gains: tuple[float, ...]
+    error: float  # of closed loops [% of the CVs' ranges], summed over the CVs
+    time_weighted: bool = False  # each error times the periods since its set point moved
+
+    def words(self, cvs: Sequence[Signal], mvs: Sequence[Signal]) -> str:
+        """Which MV holds which CV, with the relative gains."""
+        rows = zip(self.pairs, self.relative_gains, strict=True)
+        return ", ".join(f"{cvs[i].name} by {mvs[j].name} ({gain:.2f})" for (i, j), gain in rows)
+
+
+def choice_words(
+    chosen: TunedPairing, others: Sequence[TunedPairing], cvs: Sequence[Signal], mvs: Sequence[Signal]
+) -> tuple[str, str]:
+    """Two notes: the pairs of several loops with what a relative gain is, and by which rule they were chosen."""
+    held = (
+        f"A loop for each pair, its relative gain beside it: {chosen.words(cvs, mvs)}. With the other loops in manual, "
+        "the gain of a loop is as many times that with them in automatic; at 1 they leave it alone."
+    )
+    rule = (
+        f"Rule of the pairs: a pairing needs {ALLOWED} (gains at rest near the start; of an integrating CV, slopes). "
+    )
+    if not others:
+        return held, f"{rule}This is the only one."
+    errors = ", ".join(f"{other.error:.3g} % for {other.words(cvs, mvs)}" for other in others)
+    weighted = ", times the periods since its set point moved," if chosen.time_weighted else ""
+    return held, (
+        f"{rule}Of these, the {1 + len(others)} with relative gains nearest to 1 were tuned in closed loops, and the "
+        f"smallest error decided, not the relative gains: {chosen.error:.3g} % for this pairing, {errors}. The error "
+        f"is the mean over set points and loads of the development sequences{weighted} in % of each CV's range, added "
+        "up; where there is noise, the price of MV travel is in it."
+    )
 
 
 def relative_gains(gain: Array) -> Array:
@@ -68,7 +111,7 @@ def pairings(gain: Array) -> list[tuple[Pairs, Array]]:
             found.append((spared, float(np.abs(np.diag(table) - 1).sum()), pairs, table))
     if not found:
         raise refused or LawError(
-            "no pairing of controlled variables and MVs has positive relative gains and a positive Niederlinski index: "
-            "single loops do not hold this plant, choose law 'predictive'"
+            f"no pairing of controlled variables and MVs has {ALLOWED}: single loops do not hold this plant, choose "
+            "law 'predictive'"
         )
     return [(pairs, table) for _, _, pairs, table in sorted(found, key=lambda f: f[:2])]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from own_cases import controllers_of_a_lag
 
+from pipeline.cases.loads import ABOVE_NOISE, LEAST_LOAD, LOAD, held_load, load_size, whole_load
 from pipeline.cases.own_plant import GATE
-from pipeline.cases.reach import LEAST_LOAD, SCALES, Reach, held_at
+from pipeline.cases.reach import SCALES, Reach, held_at
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +22,7 @@ def wanted_load(reach: Reach, monkeypatch: pytest.MonkeyPatch) -> float:
     """The load before anything is asked of the MVs."""
     with monkeypatch.context() as patch:
         patch.setattr("pipeline.cases.reach.can_command", lambda *_: True)
-        found = reach.load(reach.model, 0)
+        found = held_load(reach, reach.model, 0)
     assert found is not None
     return found
 
@@ -36,7 +37,7 @@ def test_a_plant_with_room_has_all_loads_and_its_weights_as_they_are() -> None:
 def test_where_nothing_can_be_held_there_is_no_load_and_the_report_says_why() -> None:
     """The valve rests within 5 % of its end, where no load leaves it enough room."""
     case = controllers_of_a_lag({}, moved=(0.97, 0.99))
-    assert [case.reach.load(case.reach.model, 0, up) for up in (True, False)] == [None, None]
+    assert [held_load(case.reach, case.reach.model, 0, up) for up in (True, False)] == [None, None]
     assert "load" not in case.scenarios()
     assert case.weights.keys() == GATE.keys() - {"load"}
     assert sum(case.weights.values()) == pytest.approx(1.0, abs=1e-3)
@@ -64,8 +65,40 @@ def test_a_small_room_gives_the_load_that_fits_it(monkeypatch: pytest.MonkeyPatc
         return room == 0.0 or rest - 1e-9 <= values[0] <= edge
 
     monkeypatch.setattr("pipeline.cases.reach.can_command", can_command)
-    found = reach.load(reach.model, 0, upwards=False)
+    found = held_load(reach, reach.model, 0, upwards=False)
     assert found is not None
     assert LEAST_LOAD <= -found / wanted <= 0.05 < SCALES[-1]
     assert -found / wanted == pytest.approx(0.05, abs=LEAST_LOAD)
-    assert reach.load(reach.model, 0, upwards=True) is None
+    assert held_load(reach, reach.model, 0, upwards=True) is None
+
+
+@pytest.mark.parametrize(("noise", "standard"), [(0.01, LOAD), (0.5, None)])
+def test_a_load_is_seen_above_the_noise_and_its_test_says_its_size(noise: float, standard: float | None) -> None:
+    """The record's standard deviation is .6: a quarter is .15, and three times a noise of .5 is 1.5."""
+    case = controllers_of_a_lag({}, moved=(-0.5, 0.5), noise=noise)
+    spread = float(case.record.pv[:, 0].std())
+    size = load_size(case.reach, 0)
+    assert size == pytest.approx(LOAD * spread if standard else ABOVE_NOISE * noise)
+    test = case.scenarios()["load"][0]
+    assert test.title.startswith(f"A load that moves y0 by {size:.3g} m if no controller acts; or as much as")
+    assert test.plant is not None
+    (x, mv), load = test.plant.start, {"load_y0": test.changes["load_y0"][-1]}
+    for _ in range(case.hold):
+        x = test.plant.step(x, mv, test.plant.dv_nominal, test.plant.parameters(load))
+    moved = abs(float(test.plant.measure(x)[0] - test.plant.measure(test.x0)[0]))
+    assert moved == pytest.approx(size, rel=0.01)
+
+
+def test_a_load_that_the_mvs_cut_says_how_much_is_left() -> None:
+    """Loads of 3 where the valve, at its end, moves the level by 2: some are cut, and the title has the smallest."""
+    case = controllers_of_a_lag({}, noise=1.0)
+    tests = case.scenarios()["load"]
+    (title,) = {test.title for test in tests}
+    share = float(title.rpartition("at least ")[2].removesuffix(" % of it"))
+    assert title.startswith(
+        "A load that moves y0 by 3 m if no controller acts; or as much as the MVs can hold, which is"
+    )
+    wanted = [whole_load(case.reach, test.plant, 0) for test in tests]
+    least = min(abs(test.changes["load_y0"][-1]) / load for test, load in zip(tests, wanted, strict=True))
+    assert share == pytest.approx(100 * least, rel=0.05)
+    assert 20 < share < 70

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from pipeline.cases import CASES, all_cases
+from pipeline.cases.loads import LOAD
 from pipeline.cases.own_model import LEAST_GAIN, Doubts
 from pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
-from pipeline.cases.reach import LOAD
 from pipeline.errors import ParamsError, PlantError
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record

@@ -12,9 +12,9 @@ import yaml
 
 from pipeline.__main__ import main
 from pipeline.cases import all_cases
+from pipeline.cases.loads import LOAD
 from pipeline.cases.own_model import OwnPlant
 from pipeline.cases.own_simulator import SimulatedCase
-from pipeline.cases.reach import LOAD
 from pipeline.plants.simulator_file import FileSimulator
 from pipeline.simulation.simulate import simulate_closed
 from pipeline.stages.check import mistakes

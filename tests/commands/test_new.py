@@ -64,6 +64,7 @@ def test_an_export_becomes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
     assert report["files"] == [{"file": "x.csv", "sha256": sha256(path)}]
     page = Path("data/tank/screening.html").read_text()
     assert 'src="data:image/png' in page
+    assert re.search(r"From 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d to 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d, UTC\.", page)
     assert "http://" not in page
     assert "https://" not in page
 
@@ -444,3 +445,42 @@ def test_the_example_of_the_repository(capsys: pytest.CaptureFixture[str]) -> No
     params, record = read_back("tank")
     assert [s.unit for s in (*params.pv, *params.mv, *params.dv)] == ["degC", "%", "kg/h"]
     assert 25 < record.pv.min() < record.pv.max() < 90
+
+
+def corrected(table: Path, tag: str, **cells_of: str) -> None:
+    """Write other cells of a tag into a table."""
+    lines = list(csv.DictReader(table.read_text().splitlines()))
+    with table.open("w") as file:
+        rows = csv.DictWriter(file, lines[0], lineterminator="\n")
+        rows.writeheader()
+        rows.writerows({**line, **(cells_of if line["tag"] == tag else {})} for line in lines)
+
+
+def test_a_command_widens_a_range_that_was_only_guessed(capsys: pytest.CaptureFixture[str]) -> None:
+    """The file states no units, so that the range of the valve is what it did, 20 to 80."""
+    write(Path("x.csv"), cells(clean()))
+    assert main(["new", "tank", "x.csv"]) == 0
+    table = Path("tank-tags.csv")
+    line = next(r for r in csv.DictReader(table.read_text().splitlines()) if r["tag"] == "TIC-101.OP")
+    low, high = float(line["low"]), float(line["high"])
+    assert 15 < low < high < 85
+    corrected(table, "TIC-101.OP", command_low="10", command_high="70")
+    capsys.readouterr()
+    assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 0
+    said = capsys.readouterr().out
+    assert f"guessed from the readings, {line['low']} to {line['high']}; it is widened to 10 to {line['high']}" in said
+    valve = read_back("tank")[0].mv[0]
+    assert (valve.low, valve.high, valve.command) == (10.0, pytest.approx(high), (10.0, 70.0))
+    corrected(table, "TIC-101.OP", command_low="", command_high="")
+    again = ["new", "tank", "x.csv", "--tags", "tank-tags.csv", "--replace", "--command", "TIC-101.OP=12..95"]
+    assert main(again) == 0
+    assert (read_back("tank")[0].mv[0].low, read_back("tank")[0].mv[0].high) == (12.0, 95.0)
+
+
+def test_a_command_does_not_widen_a_range_that_a_person_stated(capsys: pytest.CaptureFixture[str]) -> None:
+    write(Path("x.csv"), cells(clean()))
+    assert main(["new", "tank", "x.csv"]) == 0
+    corrected(Path("tank-tags.csv"), "TIC-101.OP", low="15", command_low="10")
+    assert main(["new", "tank", "x.csv", "--tags", "tank-tags.csv"]) == 2
+    assert "command_low is 10, outside low to high, 15 to" in capsys.readouterr().err
+    assert not Path("data/tank").exists()

@@ -70,6 +70,14 @@ def coupled(interaction: float) -> Sampled:
     return Sampled(np.diag([0.9, 0.8]), [[0.1, 0.1 * interaction], [0.2 * interaction, 0.2]], np.eye(2))
 
 
+def two_ways() -> Sampled:
+    """Gains 1.22 of each MV on its own CV, slowly, and 1 and -1 on the other one, quickly."""
+    slow, fast = 0.97, 0.5
+    b = np.vstack([(1 - slow) * np.eye(2), (1 - fast) * np.eye(2)])
+    own = np.sqrt(1.5)
+    return Sampled(np.diag([slow, slow, fast, fast]), b, [[own, 0.0, 0.0, 1.0], [0.0, own, -1.0, 0.0]])
+
+
 @given(st.floats(0.6, 0.97), st.sampled_from([-3.0, 0.5]), st.integers(0, 8))
 def test_a_lag_with_dead_time_is_found(pole: float, gain: float, dead: int) -> None:
     found = StepResponses.near_start(lag(pole, gain, dead))
@@ -166,7 +174,7 @@ def test_the_pid_of_any_plant_holds_set_points_and_loads(plant: Simulator) -> No
         x = plant.many(2)(x, mv.numpy() + loops.load[k])
     at_ends = np.array(errors).reshape(3, 150, *np.shape(errors)[1:])[:, -1]
     assert at_ends.max() < 0.06  # 1 % of the range
-    assert len(law.relative_gains) == (2 if len(plant.sp_signals) == 2 else 0)
+    assert bool(law.pairings) == (len(plant.sp_signals) == 2)
 
 
 def test_several_loops_are_single_loops_side_by_side() -> None:
@@ -193,6 +201,21 @@ def test_the_analysis_names_the_pairs_and_their_relative_gains() -> None:
     analysis = PID.design(PID.Params(**quick), {}, plant.signals, plant).analysis(plant)
     assert analysis.figures["relative_gain_y0"] == pytest.approx(1 / (1 - 0.25), rel=0.02)
     assert "y0 by u0 (1.33)" in analysis.notes[0]
+    assert "This is the only one" in analysis.notes[1]  # the others' relative gains are -0.33
+
+
+def test_the_analysis_says_why_the_pairs_were_taken() -> None:
+    """Both pairings have positive relative gains, .6 and .4; that of the smaller error in closed loop is taken."""
+    plant = two_ways()
+    quick = {"development_seeds": (1,), "development_set_points": 2, "development_hold": 60}
+    law = PID.design(PID.Params(**quick), {}, plant.signals, plant)
+    chosen, other = law.pairings
+    assert law.pairs == chosen.pairs == ((1, 0), (0, 1))
+    assert chosen.relative_gains == pytest.approx((0.4, 0.4), abs=0.01)
+    assert other.relative_gains == pytest.approx((0.6, 0.6), abs=0.01)
+    assert chosen.error < other.error
+    note = law.analysis(plant).notes[1]
+    assert f"{chosen.error:.3g} % for this pairing, {other.error:.3g} % for y0 by u0 (0.60), y1 by u1 (0.60)" in note
 
 
 def test_one_loop_of_several_is_refused() -> None:

@@ -20,7 +20,7 @@ from pipeline.plants.equations import equations
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.tuning.loop_search import Loops
-from pipeline.tuning.pairing import ONE_LOOP, Pairs, pairings
+from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, choice_words, pairings
 from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
@@ -44,8 +44,8 @@ class PID(ControlLaw):
     move and the set point then returns to the process variable, the law does not subtract a
     proportional action that the actuator never received (``never_given``).
 
-    Of several loops each has its own numbers; the pairs are those whose relative gains are nearest to 1
-    (``pairings``). An MV that no loop moves stays where it is.
+    Of several loops each has its own numbers; of the two pairings with relative gains nearest to 1 (``pairings``) the
+    pairs are those of the smaller error in closed loop. An MV that no loop moves stays where it is.
 
     Source: the PID that [inverse_rbf, section 4.3] compares with; the tracking
     is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
@@ -113,7 +113,7 @@ class PID(ControlLaw):
     places: Tensor | None  # (n_mv,) of each MV among [the loops' MVs, all applied MVs]; None: as the loops
 
     examined_cv: tuple[float, float] | None = None
-    relative_gains: tuple[float, ...] = ()  # of the pairs, of several loops
+    pairings: tuple[TunedPairing, ...] = ()  # of several loops, those that were tuned; the first is this law's
 
     def __init__(
         self,
@@ -161,7 +161,7 @@ class PID(ControlLaw):
         """The PID tuned as ``params`` says, on part ``linearized`` or on the plant; raises LawError."""
         found = tuned(params, models, signals, plant, partial(cls, signals, mv_rate=params.mv_rate))
         law = cls(signals, found.settings, params.mv_rate, found.pairs)
-        law.examined_cv, law.relative_gains = params.examined_cv, found.relative_gains
+        law.examined_cv, law.pairings = params.examined_cv, found.pairings
         return law
 
     @classmethod
@@ -212,7 +212,7 @@ class PID(ControlLaw):
 
     def analysis(self, plant: Simulator | None) -> Analysis:
         """Stability and gain margin of the linear closed loops over ``examined_cv``; the pairs of several loops."""
-        if self.relative_gains:
+        if self.pairings:
             return self._pairing()
         if self.examined_cv is None:
             return Analysis()
@@ -223,11 +223,10 @@ class PID(ControlLaw):
         return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius})
 
     def _pairing(self) -> Analysis:
-        cvs, mvs = self.signals.sp, self.signals.mv
-        rows = [(cvs[i].name, mvs[j].name, gain) for (i, j), gain in zip(self.pairs, self.relative_gains, strict=True)]
-        held = ", ".join(f"{cv} by {mv} ({gain:.2f})" for cv, mv, gain in rows)
-        note = f"A loop for each pair, its relative gain beside it (1: the other loops leave it alone): {held}."
-        return Analysis({f"relative_gain_{cv}": gain for cv, _, gain in rows}, notes=(note,))
+        cvs, (chosen, *others) = self.signals.sp, self.pairings
+        gains = zip(chosen.pairs, chosen.relative_gains, strict=True)
+        figures = {f"relative_gain_{cvs[i].name}": gain for (i, _), gain in gains}
+        return Analysis(figures, notes=choice_words(chosen, others, cvs, self.signals.mv))
 
 
 def _of(values: Tensor, which: Tensor | None) -> Tensor:

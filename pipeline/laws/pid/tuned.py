@@ -18,7 +18,7 @@ from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning import rules
 from pipeline.tuning.development import DevelopmentLoops
 from pipeline.tuning.loop_search import Loops, searched
-from pipeline.tuning.pairing import ONE_LOOP, Pairs, pairings
+from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, pairings
 from pipeline.tuning.reduction import LagWithDeadTime, start_lag
 from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
@@ -29,11 +29,14 @@ HOLDS = (30, 400)  # where it follows the plant's settling time
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """Settings of one loop, or of the loop of each pair with the pairs' relative gains."""
+    """Settings of one loop, or of the loop of each pair; of several loops also the pairings that were tuned.
+
+    Of ``pairings`` the first is that of ``pairs``.
+    """
 
     settings: PidSettings | Loops
     pairs: Pairs = ONE_LOOP
-    relative_gains: tuple[float, ...] = ()
+    pairings: tuple[TunedPairing, ...] = ()
 
 
 class LawOf(Protocol):
@@ -100,21 +103,24 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
     hold = params.development_hold or int(np.clip(2 * responses.settling, *HOLDS))
     drawn = (params.development_seeds, params.development_set_points, hold)
     plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
-    found: tuple[float, Loops] = (np.inf, ())
+    percent = 100 / (signals.sp[0].high - signals.sp[0].low)
+    found: list[tuple[float, Loops, TunedPairing]] = []
+    weighted = params.criterion == "itae"
     for pairs, table in pairings(responses.share)[:2]:
 
         def cost(rows: Sequence[Loops], pairs: Pairs = pairs) -> Array:
             law = law_of(list(rows), pairs=pairs)
-            weighted = params.criterion == "itae"
             each = [loops.error(law, law.n_state, len(rows), time_weighted=weighted) for loops in plants]
             return np.asarray(np.mean(each, axis=0))
 
         processes = [responses.process(*pair) for pair in pairs]
         tried = searched(processes, signals.period_s, cost, params.given(), params.set_point_weight)
-        if tried[0] < found[0]:
-            found, best, gains = tried, pairs, table
-    relative = tuple(float(gains[cv, cv]) for cv, _ in best) if len(best) > 1 else ()
-    return Tuned(found[1], best, relative)
+        gains = tuple(float(table[cv, cv]) for cv, _ in pairs)
+        found.append((*tried, TunedPairing(pairs, gains, percent * tried[0], weighted)))
+    # The first of equal ones: sorting keeps their order.
+    found.sort(key=lambda row: row[0])
+    _, settings, best = found[0]
+    return Tuned(settings, best.pairs, tuple(row[2] for row in found) if len(best.pairs) > 1 else ())
 
 
 def by_simulation(params: Any, plant: Simulator) -> bool:

@@ -1,0 +1,128 @@
+"""What is asked of the controllers of an own plant, whose tests run on models of its record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from pipeline.evaluation.closed_loop import FAR
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.law_evidence import lock_up_text
+from pipeline.evaluation.validation import Statement
+from pipeline.pictures.drawing import axis_label
+from pipeline.pictures.numbers import number, times
+from pipeline.pictures.words import law_name, scenario_name
+from pipeline.simulation.scenario import NOISE_SUFFIX
+
+UNMEASURED = "not measured"
+
+
+def own_acceptance(evidence: Evidence) -> list[Statement]:
+    """No lock-up of any law; of the best one: it settles, stays in range, bears noise, and is no worse than the PID.
+
+    Every limit is a figure of the evidence, or the one by which a lock-up is told; its row says why.
+    """
+    rows = [_lock_ups(name, evidence) for name in evidence.laws]
+    if evidence.best is None:
+        return rows
+    rows += [_settles(evidence, evidence.best), _in_range(evidence, evidence.best)]
+    if noise := _bears_noise(evidence, evidence.best):
+        rows.append(noise)
+    baseline = evidence.case.baseline
+    if evidence.best != baseline and baseline in evidence.laws and not evidence.no_baseline:
+        rows += [*_beside(evidence, evidence.best, baseline), _score(evidence, evidence.best, baseline)]
+    return rows
+
+
+def _lock_ups(name: str, evidence: Evidence) -> Statement:
+    law = evidence.laws[name]
+    where = lock_up_text(law.metrics.locked_up)
+    return Statement(f"{name}, lock-ups over all tests", "0", str(law.lock_ups), law.lock_ups == 0, where)
+
+
+def _settles(evidence: Evidence, law: str) -> Statement:
+    """The largest error at the end of a hold, in the test where it is largest."""
+    cvs = evidence.case.plant_class.sp_signals
+    limit = FAR * (cvs[0].high - cvs[0].low if len(cvs) == 1 else 100.0)  # of several CVs errors are in % of ranges
+    found = {name: evidence.figure(law, name, "max_asse") for name in evidence.scenarios}
+    ends = {name: value for name, value in found.items() if value is not None}
+    worst = max(ends, key=lambda name: ends[name], default=None)
+    return Statement(
+        f"{law}, largest error at the end of a set point or a disturbance, tests without noise",
+        f"≤ {_with_unit(evidence, limit)}",
+        UNMEASURED if worst is None else f"{_with_unit(evidence, ends[worst])} in test {worst}",
+        None if worst is None else ends[worst] <= limit,
+        f"{100 * FAR:g} % of the range: a loop with more has not reached its set point",
+    )
+
+
+def _in_range(evidence: Evidence, law: str) -> Statement:
+    """Where each PV went, beside its range."""
+    pvs, reached = evidence.case.plant_class.pv_signals, evidence.laws[law].metrics.reached
+    known = [(s, *reached[s.name]) for s in pvs if s.name in reached]
+
+    def words(name: str, unit: str, low: float, high: float) -> str:
+        return axis_label(f"{name} {number(low, 4)} … {number(high, 4)}", unit)
+
+    return Statement(
+        f"{law}, lowest and highest process variable, tests without noise",
+        "within " + ", ".join(words(s.name, s.unit, s.low, s.high) for s in pvs),
+        ", ".join(words(s.name, s.unit, low, high) for s, low, high in known) or UNMEASURED,
+        all(s.low <= low and high <= s.high for s, low, high in known) if known else None,
+        "the range of each variable in params.yaml",
+    )
+
+
+def _bears_noise(evidence: Evidence, law: str) -> Statement | None:
+    """The main test with noise; None where it has none."""
+    test = evidence.main_test.removesuffix(NOISE_SUFFIX)
+    quiet, noisy = (evidence.figure(law, name) for name in (test, test + NOISE_SUFFIX))
+    if quiet is None or noisy is None:
+        return None
+    floor = evidence.floor(test)
+    limit = quiet + floor
+    return Statement(
+        _what(evidence, law, test + NOISE_SUFFIX),
+        f"{evidence.case.criterion.short} ≤ {number(quiet)} + {number(floor)} = {_with_unit(evidence, limit)}",
+        _with_unit(evidence, noisy),
+        noisy <= limit,
+        "without noise it is the first figure, and the second is the noise: more would be noise that the law amplifies",
+    )
+
+
+def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[Statement]:
+    """No worse than the baseline in each test of the gate."""
+    for test in evidence.case.weights:
+        own, other, floor = evidence.figure(law, test), evidence.figure(baseline, test), evidence.floor(test)
+        if own is None or other is None:
+            continue
+        pid, least = law_name(baseline), _with_unit(evidence, floor)
+        hidden = f"the {pid} has {_with_unit(evidence, other)}; errors that noise can hide, up to {least}, are equal"
+        yield Statement(
+            f"{_what(evidence, law, test)}, beside the {pid}",
+            f"{evidence.case.criterion.short} ≤ {_with_unit(evidence, max(other, floor))}",
+            _with_unit(evidence, own),
+            own <= max(other, floor),
+            hidden if other < floor else "",
+        )
+
+
+def _score(evidence: Evidence, law: str, baseline: str) -> Statement:
+    """The gate score beside the baseline's: the errors over the bound's, where there is a bound."""
+    own, other = evidence.score(law), evidence.score(baseline)
+    known = own is not None and other is not None
+    bound = {"nmpc": "the perfect-model NMPC's", "baseline": f"the {law_name(baseline)}'s"}
+    return Statement(
+        f"{law}, error over {bound.get(evidence.relative_to, 'what noise can hide')}, all tests by their weights",
+        UNMEASURED if other is None else f"≤ {times(other)}, the {law_name(baseline)}'s",
+        UNMEASURED if own is None else times(own),
+        own <= other if known else None,  # type: ignore[operator]
+        "the gate score, by which the registry's champion must beat the baseline",
+    )
+
+
+def _what(evidence: Evidence, law: str, test: str) -> str:
+    return f"{law}, {scenario_name(test, evidence.case.recipe, evidence.case.test_words)}"
+
+
+def _with_unit(evidence: Evidence, value: float) -> str:
+    return f"{number(value)} {evidence.case.unit}".rstrip()

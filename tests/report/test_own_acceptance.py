@@ -1,0 +1,116 @@
+"""What is asked of an own plant's controllers: each row can fail, and its limit is a figure of the evidence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from own_cases import controllers_of_a_lag
+
+from pipeline.evaluation.closed_loop import FAR
+from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
+from pipeline.evaluation.validation import Statement
+from pipeline.evaluation.verdicts import PLAIN
+from pipeline.report.own_acceptance import own_acceptance
+from pipeline.report.verdicts import acceptance
+
+NOISE = 0.01
+TESTS = ("held_out", "held_out_noise", "load", "spoilt")
+
+
+def law(name: str, development: float, lock_ups: int = 0, top: float = 2.5, **mae: float) -> LawEvidence:
+    """Evidence with these errors by test; a test ends with a tenth of its error."""
+    rows = {test: {"mae": mae.get(test, 0.1), "max_asse": mae.get(test, 0.1) / 10} for test in TESTS}
+    form = Form({}, (), {test: OverSeeds(row, row, row, {"0": row}) for test, row in rows.items()})
+    return LawEvidence(
+        LawMetrics(
+            name, name, "mae", (0,), 0, {BASE: form}, lock_ups=lock_ups, development={"0": development},
+            locked_up={"spoilt": {"0": lock_ups}} if lock_ups else {}, reached={"y0": (-2.0, top)},
+        ),
+        Path(),
+    )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def evidence(best: LawEvidence, pid: LawEvidence | None) -> Evidence:
+    case = controllers_of_a_lag({}, noise=NOISE)
+    bounds = {test: {"nmpc": {"mae": 0.08}} for test in TESTS}
+    laws = {"predictive": best} | ({} if pid is None else {"pid": pid})
+    return Evidence(case, bounds, laws, {}, own_data=True)
+
+
+def row(found: Evidence, words: str) -> Statement:
+    (one,) = [r for r in own_acceptance(found) if words in r.what]
+    return one
+
+
+def test_a_good_law_meets_them_all_and_no_row_counts_data_seeds() -> None:
+    found = evidence(law("predictive", 1.0), law("pid", 2.0, held_out=0.12))
+    rows = acceptance(found, PLAIN)
+    assert rows == own_acceptance(found)
+    assert all(r.holds for r in rows), [r for r in rows if not r.holds]
+    assert not any("data seeds" in r.what for r in rows)
+    assert [r.what for r in rows[:2]] == ["predictive, lock-ups over all tests", "pid, lock-ups over all tests"]
+
+
+def test_a_lock_up_of_any_law_is_a_failure() -> None:
+    bad = row(evidence(law("predictive", 1.0), law("pid", 2.0, lock_ups=3)), "pid, lock-ups")
+    assert (bad.measured, bad.holds, bad.because) == ("3", False, "spoilt (seed 0)")
+
+
+def test_the_best_law_must_settle_in_every_test() -> None:
+    """The range is 6 m wide: 2 % of it is .12."""
+    good = row(evidence(law("predictive", 1.0, spoilt=1.1), None), "largest error at the end")
+    bad = row(evidence(law("predictive", 1.0, spoilt=1.3), None), "largest error at the end")
+    assert (good.limit, good.measured, good.holds) == (f"≤ {FAR * 6:g} m", "0.11 m in test spoilt", True)
+    assert (bad.measured, bad.holds) == ("0.13 m in test spoilt", False)
+
+
+def test_the_best_law_must_stay_in_range() -> None:
+    assert row(evidence(law("predictive", 1.0, top=3.0), None), "lowest and highest").holds is True
+    bad = row(evidence(law("predictive", 1.0, top=3.01), None), "lowest and highest")
+    assert (bad.limit, bad.measured, bad.holds) == ("within y0 -3 … 3 [m]", "y0 -2 … 3.01 [m]", False)
+    unknown = law("predictive", 1.0)
+    unknown = replace(unknown, metrics=replace(unknown.metrics, reached={}))
+    assert row(evidence(unknown, None), "lowest and highest").holds is None
+
+
+def test_noise_may_add_itself_and_no_more() -> None:
+    assert row(evidence(law("predictive", 1.0, held_out_noise=0.1 + 0.9 * NOISE), None), "with noise").holds is True
+    bad = row(evidence(law("predictive", 1.0, held_out_noise=0.1 + 1.1 * NOISE), None), "with noise")
+    assert (bad.limit, bad.holds) == ("MAE ≤ 0.1 + 0.01 = 0.11 m", False)
+
+
+def test_the_best_law_is_no_worse_than_the_pid_and_what_noise_hides_is_equal() -> None:
+    pid = law("pid", 2.0, held_out=0.11, load=0.002)
+    found = evidence(law("predictive", 1.0, held_out=0.12, load=0.009), pid)
+    assert row(found, "held-out set points, beside").holds is False
+    hidden = row(found, "load, beside the PID")
+    assert (hidden.limit, hidden.measured, hidden.holds) == ("MAE ≤ 0.01 m", "0.009 m", True)
+    assert hidden.because == "the PID has 0.002 m; errors that noise can hide, up to 0.01 m, are equal"
+    assert row(evidence(law("predictive", 1.0, load=0.011), pid), "load, beside the PID").holds is False
+
+
+def test_the_error_over_the_bound_is_compared_with_the_pid_s() -> None:
+    worse = row(evidence(law("predictive", 1.0, held_out=0.2), law("pid", 2.0)), "error over the perfect-model NMPC's")
+    assert (worse.limit, worse.measured, worse.holds) == ("≤ 1.25, the PID's", "1.88", False)
+
+
+def test_without_a_pid_beside_it_nothing_is_compared() -> None:
+    assert not [r for r in own_acceptance(evidence(law("predictive", 1.0), None)) if "PID" in r.what + r.limit]
+    withheld = evidence(law("predictive", 1.0), law("pid", 2.0, lock_ups=1))
+    assert not [r for r in own_acceptance(withheld) if "PID" in r.what + r.limit]
+    best = own_acceptance(evidence(law("predictive", 2.0), law("pid", 1.0)))
+    assert not [r for r in best if "beside" in r.what]
+    assert best[2].what.startswith("pid, ")
+
+
+def test_where_every_law_locks_up_only_that_is_said() -> None:
+    rows = own_acceptance(evidence(law("predictive", 1.0, lock_ups=1), law("pid", 2.0, lock_ups=1)))
+    assert [r.holds for r in rows] == [False, False]
