@@ -80,9 +80,11 @@ def _run(options: argparse.Namespace) -> int:
     if code == 0:
         # Somebody who asked for one case need not look for it in the table of all.
         asked = options.targets if targets and all(t.startswith("report@") for t in targets) else [None]
-        for case in asked:
-            show_results(ARTIFACTS, case=case)
-        if targets and not any(t.startswith("report") for t in targets):
+        part = targets and not any(t.startswith("report") for t in targets)
+        if not part or any(ARTIFACTS.glob("*/validation.json")):
+            for case in asked:
+                show_results(ARTIFACTS, case=case)
+        if part:
             print("the table is of the last report; `loopwright run CASE` makes the report of these results")
         # Who asks for a case asks for its controllers; the table says why there is none.
         code = int(any(case is not None and without_controller(ARTIFACTS, case) for case in asked))

@@ -104,6 +104,18 @@ def test_a_case_without_any_controller_ends_with_a_status_of_its_own(
     assert shown == ["tank", None, "tank"]
 
 
+def test_a_part_runs_where_no_report_was_made_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run, "ARTIFACTS", tmp_path)
+    monkeypatch.setattr(run, "mistakes", list)
+    monkeypatch.setattr(run, "list_files", lambda: None)
+    monkeypatch.setattr(run, "ask", lambda *_, **__: "")
+    monkeypatch.setattr(run, "status", lambda _: {})
+    assert main(["run", "ph_neutralization-nnarx"]) == 0
+    assert "`loopwright run CASE` makes the report" in capsys.readouterr().out
+
+
 def test_the_plan_names_every_stage_or_counts_many() -> None:
     assert plan({}, 0) == ["nothing has changed; everything is up to date"]
     few = plan({"fit@a": ["models.a is modified"]}, 4)
