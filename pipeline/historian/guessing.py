@@ -9,13 +9,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.cells import sentinels, unit_slips, usual
+from pipeline.historian.cells import unit_slips, usual
 from pipeline.historian.character import quantum
 from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, follows, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.grid import resampled
 from pipeline.historian.linear import fitted
+from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import proposed_period
 from pipeline.historian.tags import Guess, Tag
@@ -76,7 +77,7 @@ def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
     pvs, mvs = ([g.tag.tag for g in found if g.tag.role == role and g.tag.low is not None] for role in ("pv", "mv"))
     if not pvs or not mvs:
         return list(found)
-    own = {name: _excerpt(export.series[name]) for name in (*pvs, *mvs)}
+    own = {name: _excerpt(export.series[name], role) for role, tags in (("pv", pvs), ("mv", mvs)) for name in tags}
     grid, _ = resampled([own[n] for n in pvs], [own[n] for n in mvs], proposed_period([own[pvs[0]]]))
     u, run = [grid.value[m] for m in mvs], grid.piece
     if min(len(moves_of(v[np.isfinite(v)], run[np.isfinite(v)])) for v in u) < FEW_MOVES:
@@ -119,8 +120,8 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     free = [tag for tag in free if tag not in taken]
     if not pvs or not mvs or not free:
         return list(found)
-    names = dict.fromkeys((*pvs, *mvs, *free[:MOST_TRIED]))
-    own = {name: _excerpt(export.series[name]) for name in names}
+    roles = dict.fromkeys(pvs, "pv") | dict.fromkeys(mvs, "mv") | dict.fromkeys(free[:MOST_TRIED], "dv")
+    own = {name: _excerpt(export.series[name], role) for name, role in roles.items()}
     grid, _ = resampled(
         [own[n] for n in (*pvs, *free[:MOST_TRIED])], [own[n] for n in mvs], proposed_period([own[pvs[0]]])
     )
@@ -143,11 +144,12 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     ]
 
 
-def _excerpt(series: Series) -> Series:
+def _excerpt(series: Series, role: str) -> Series:
     """The first readings of a tag, those without a reason; codes for missing values left out."""
     n = min(len(series), MOST_READINGS)
     value, code = series.value[:n].copy(), series.code[:n].copy()
-    code[sentinels(np.where(code == Reason.GOOD, value, np.nan))[0] & (code == Reason.GOOD)] = Reason.SENTINEL
+    codes, _ = sentinels(np.where(code == Reason.GOOD, value, np.nan), Tag(series.tag, role))
+    code[codes & (code == Reason.GOOD)] = Reason.SENTINEL
     return Series(series.tag, series.time_s[:n], value, code)
 
 
@@ -161,7 +163,7 @@ def _guess(series: Series, unit: str) -> Guess:
     values = series.value[series.good]
     if not values.size:
         return Guess(Tag(tag, "", unit), 0.0, good, "no good reading")
-    codes, found = sentinels(np.where(series.code == Reason.GOOD, series.value, np.nan))
+    codes, found = sentinels(np.where(series.code == Reason.GOOD, series.value, np.nan), Tag(tag, role, unit))
     plain = series.value[series.good & ~codes]
     plain = plain[~unit_slips(plain)[0]]
     remarks = []

@@ -43,6 +43,8 @@ def stretches(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, Sampling])
             (Reason.SATURATED, *clipped(values, tag.low, tag.high)),
             (Reason.STUCK, stuck(values, others, together), ""),
         ):
+            if tag.role == "dv":
+                where &= values != 0.0  # a flow that stopped holds its zero
             new = where & (code == 0)
             if new.any():
                 code[new] = reason

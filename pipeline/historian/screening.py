@@ -26,6 +26,7 @@ from pipeline.historian.remarks import of_grid, of_mode, of_models, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.sampling import Sampling, proposed_period, sampling
 from pipeline.historian.static import explained
+from pipeline.historian.stopped import of_zeros
 from pipeline.historian.tags import Tag
 from pipeline.historian.unmoved import of_answers
 from pipeline.historian.wandering import of_levels
@@ -99,6 +100,7 @@ def screened(
     for t in (t for t in tags if t.role == "pv"):
         let_go(t.tag)
     findings += stretches(grid, signals, by_tag)
+    findings += of_zeros(grid, signals)
     findings += inputs_and_answers(grid, signals)
     findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
     code = row_codes(grid, signals, tags, own, without_modes)
