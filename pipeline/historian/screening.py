@@ -16,6 +16,7 @@ from pipeline.historian.contradictions import contradict
 from pipeline.historian.excerpt import SEEN, evenly
 from pipeline.historian.excitation import judged, moves_of
 from pipeline.historian.export import Export, Series
+from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear, fitted
@@ -112,7 +113,7 @@ def screened(
         default=0,
     )
     findings += of_models(excerpt, models)
-    verdict = judged(excerpt, models, moved, len(record))
+    verdict = with_levels(judged(excerpt, models, moved, len(record)), excerpt, tags)
     findings += of_answers([s.name for s in record.pv_signals], verdict)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dirty_plant import TAGS, Clean, clean, screen_of
+from dirty_plant import TAGS, clean, screen_of, spoilt
 
 from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.screening import Screened
@@ -16,19 +16,6 @@ from pipeline.historian.tags import Tag
 PV, MV, DV = TAGS
 RANGED = (replace(PV, low=0.0, high=120.0), replace(MV, low=0.0, high=100.0), DV)
 ZERO = np.r_[200:260, 500:590, 900:1000, 1200:1280]
-
-
-def answered(mv: np.ndarray, dv: np.ndarray) -> np.ndarray:
-    """What the PV of ``clean`` does under other inputs."""
-    y = np.full(len(mv), 55.0)
-    for k in range(len(mv) - 1):
-        y[k + 1] = y[k] + 0.1 * (20 + 0.8 * mv[max(k - 2, 0)] - 0.02 * (dv[k] - 500) - y[k])
-    return y + np.random.default_rng(2).normal(0, 0.1, len(mv))
-
-
-def spoilt(**columns: np.ndarray) -> Clean:
-    data = clean().with_(**columns)
-    return data.with_(pv=answered(data.mv, data.dv))
 
 
 def zeroed(values: np.ndarray) -> np.ndarray:
