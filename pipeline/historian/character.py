@@ -41,6 +41,14 @@ def quantum(values: Array) -> float:
     return q if whole.mean() >= 0.99 and len(levels) < 0.9 * len(sample) else 0.0
 
 
+def smallest_difference(values: Array) -> float:
+    """The smallest difference of two of the values (n,); 0 where all are one."""
+    levels = np.unique(values[np.isfinite(values)][:SAMPLE])
+    apart = np.diff(levels)
+    apart = apart[apart > 1e-9 * float(np.abs(levels).max(initial=1e-300))]
+    return float(f"{apart.min():.6g}") if apart.size else 0.0
+
+
 def runs_of(mask: Where) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First row and first row after each stretch of True, both (m,)."""
     edge = np.diff(np.r_[False, mask, False].astype(np.int8))

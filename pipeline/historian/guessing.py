@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.cells import unit_slips, usual
-from pipeline.historian.character import quantum
+from pipeline.historian.character import smallest_difference
 from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, follows, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.first_answer import NONE, first_answer
@@ -156,10 +156,12 @@ def _excerpt(series: Series, role: str) -> Series:
 def _guess(series: Series, unit: str) -> Guess:
     tag, good = series.tag, float(series.good.mean()) if len(series) else 0.0
     role = next((r for pattern, r in ENDINGS if re.search(pattern, tag, re.IGNORECASE)), "")
-    texts = sum(series.texts.values())
+    texts, counts = sum(series.texts.values()), series.counts()
     if texts > 0.5 * len(series):
         words = ", ".join(t for t, _ in series.texts.most_common(4))
-        return Guess(Tag(tag, role if role == "mode" else "", unit), 0.0, good, f"texts: {words}")
+        if role == "mode":
+            return Guess(Tag(tag, role, unit), 0.0, 1.0 - counts.get("empty", 0) / len(series), f"texts: {words}")
+        return Guess(Tag(tag, "", unit), 0.0, good, f"texts: {words}")
     values = series.value[series.good]
     if not values.size:
         return Guess(Tag(tag, "", unit), 0.0, good, "no good reading")
@@ -179,7 +181,7 @@ def _guess(series: Series, unit: str) -> Guess:
         remarks.append("texts: " + ", ".join(repr(t) for t, _ in series.texts.most_common(3)))
     low, high = _range(plain, unit, role)
     kept = good - float(codes.mean())
-    return Guess(Tag(tag, role, unit, low, high), quantum(plain), kept, "; ".join(remarks))
+    return Guess(Tag(tag, role, unit, low, high), smallest_difference(plain), kept, "; ".join(remarks))
 
 
 def _range(values: Sequence[float] | np.ndarray, unit: str, role: str) -> tuple[float | None, float | None]:

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from pipeline.errors import RecordError, nearest
 from pipeline.files import sha256
 from pipeline.historian.dialect import Dialect, sniff
-from pipeline.historian.export import Export, Series, joined
+from pipeline.historian.export import Contents, Export, Series, joined
 from pipeline.historian.gathering import Gathered
 from pipeline.historian.headers import split_header
 from pipeline.historian.layout import Layout, layout_of
@@ -67,7 +67,7 @@ def read_export(
     if not paths:
         raise RecordError("no file is named; give one or more exports")
     parts: dict[str, list[Series]] = {}
-    files, kinds, totals = [], [], Counter[str]()
+    files, kinds, totals, contents = [], [], Counter[str](), list[Contents]()
     known: set[str] = set()
     tags, modes = [bare(t) for t in tags], [bare(t) for t in modes]
     for path in paths:
@@ -75,6 +75,7 @@ def read_export(
         layout = layout_of(source.path, source.header, source.sample, time_column, time_format)
         found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
         drop_repeated_rows(found)
+        contents.append(_contents(path, found, counts["rows_read"]))
         for name, series in found.items():
             parts.setdefault(name, []).append(series)
         pa.default_memory_pool().release_unused()
@@ -89,9 +90,17 @@ def read_export(
         raise RecordError(f"{', '.join(map(str, paths))}: no row of data; export a longer time")
     together = {name: joined(p) for name, p in parts.items()}
     layouts = " and ".join(dict.fromkeys(kinds))
-    return Export(
-        together, tuple(files), layouts, totals["rows_read"] + totals["rows"], totals["rows"], totals["timeless"]
+    rows = totals["rows_read"] + totals["rows"]
+    return Export(together, tuple(files), layouts, rows, totals["rows"], totals["timeless"], tuple(contents))
+
+
+def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
+    times = [s.time_s for s in found.values() if len(s)]
+    first, last = (
+        min((float(t.min()) for t in times), default=np.nan),
+        max((float(t.max()) for t in times), default=np.nan),
     )
+    return Contents(str(path), frozenset(found), rows, first, last)
 
 
 def units_of(paths: Sequence[Path]) -> dict[str, str]:

@@ -20,10 +20,11 @@ from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear, fitted
+from pipeline.historian.modes import check_modes
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
 from pipeline.historian.reason import Reason
-from pipeline.historian.remarks import of_grid, of_mode, of_models, of_series
+from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.sampling import Sampling, proposed_period, sampling
 from pipeline.historian.static import explained
@@ -64,7 +65,8 @@ def screened(
     RecordError where nothing of a signal is left, or its given range misses most of its readings.
     """
     own = {t.tag: export.series[t.tag] for t in tags}
-    findings: list[Finding] = []
+    check_modes(without_modes, tags, own)
+    findings: list[Finding] = [*of_files(export, tags)]
     for tag in tags:
         if tag.role != "mode":
             findings += clean(own[tag.tag], tag)
