@@ -271,6 +271,7 @@ KINDS: tuple[Kind, ...] = (
     Kind("-9999 in 0.5 %", lambda: pv(SPOT[::2], -9999.0)),
     Kind("-9999 in the MV", lambda: mv(SPOT[::2], -9999.0)),
     Kind("0 of a dead sensor, 10 %", lambda: pv(MIDDLE, 0.0)),
+    Kind("0 of a dead disturbance sensor, 10 %", lambda: export_of(c.with_(dv=at(c.dv, MIDDLE, 0.0)))),
     Kind("0 of a dead sensor, 0 is usual", lambda: flow_around_zero(True)),
     Kind("values around 0, no fault", lambda: flow_around_zero(False)),
     Kind("outliers of half the span, 1 %", lambda: pv(SPOT, c.pv[SPOT] + 25)),

@@ -35,11 +35,24 @@ class Clean:
 def clean(n: int = 1500, seed: int = 0, noise: float = 0.1) -> Clean:
     """y(k+1) = y + 0.1 (20 + 0.8 u(k-2) - 0.02 (d - 500) - y), with steps of u and d of 10 to 60 rows."""
     random = np.random.default_rng(seed)
-    mv, dv, y = steps(random, n, 20, 80), 500 + steps(random, n, -50, 50), np.full(n, 55.0)
-    for k in range(n - 1):
-        y[k + 1] = y[k] + 0.1 * (20 + 0.8 * mv[max(k - 2, 0)] - 0.02 * (dv[k] - 500) - y[k])
-    pv = np.round(y + random.normal(0, noise, n), 3)
+    mv, dv = steps(random, n, 20, 80), 500 + steps(random, n, -50, 50)
+    pv = np.round(answer(mv, dv) + random.normal(0, noise, n), 3)
     return Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(dv + random.normal(0, 0.5, n), 2))
+
+
+def spoilt(**columns: np.ndarray) -> Clean:
+    """The clean export of 1,500 rows with other inputs, and the PV's answer to them."""
+    data = clean().with_(**columns)
+    noise = np.random.default_rng(2).normal(0, 0.1, len(data.pv))
+    return data.with_(pv=answer(data.mv, data.dv) + noise)
+
+
+def answer(mv: np.ndarray, dv: np.ndarray) -> np.ndarray:
+    """The PV (n,) without noise under inputs (n,) each."""
+    y = np.full(len(mv), 55.0)
+    for k in range(len(mv) - 1):
+        y[k + 1] = y[k] + 0.1 * (20 + 0.8 * mv[max(k - 2, 0)] - 0.02 * (dv[k] - 500) - y[k])
+    return y
 
 
 def steps(random: np.random.Generator, n: int, low: float, high: float) -> np.ndarray:

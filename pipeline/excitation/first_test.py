@@ -13,6 +13,7 @@ from pipeline.plants.simulator import Array, Simulator
 STEP = 0.05  # of an MV's range
 SHORT, LONGEST = 200, 6_400  # periods of a run: doubled until it settles
 SETTLED = 0.05  # of the change
+EXPLODES = 1e5  # ranges of a PV within LONGEST periods: no integrator that can be controlled gets there
 STILL_MOVES = 0.1  # of the change, in the last fifth of a run: it does not settle
 RESTS = 0.02  # of a PV's range, in LONGEST periods without a step: the start is a rest
 TRIED = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # shares of the way from the start to an end of the MV's range
@@ -38,11 +39,12 @@ class FirstTest:
 def first_test(plant: Simulator) -> FirstTest:
     """Steps of each MV from the start, up and down, without noise and under the nominal disturbances.
 
-    Raises PlantError where no MV moves any PV.
+    Raises PlantError where no MV moves any PV, and where the plant explodes without a controller.
     """
     _x0, mv0 = plant.start
     room = np.array([s.high - s.low for s in plant.pv_signals])
     base = _course(plant, mv0, LONGEST)
+    _refuse_exploding(plant, base, "without a step")
     times, gains, settles = [], np.zeros((len(room), len(mv0))), True
     for j, signal in enumerate(plant.mv_signals):
         step = STEP * (signal.high - signal.low)
@@ -50,6 +52,7 @@ def first_test(plant: Simulator) -> FirstTest:
         moved = mv0.copy()
         moved[j] += step
         change, rests = _settled(plant, base, moved)
+        _refuse_exploding(plant, change + base[: len(change)], f"after a step of {signal.name} to {moved[j]:.4g}")
         if not np.any(np.abs(change) > 1e-9 * room):
             continue
         settles &= rests
@@ -71,6 +74,18 @@ def first_test(plant: Simulator) -> FirstTest:
     ends = [[_reach(plant, mv0, j, end, look) for j, end in enumerate(side)] for side in _sides(plant)]
     stays = bool(np.all(np.abs(base - base[0]) <= RESTS * room)) if len(base) else False
     return FirstTest(slowest, settles, stays, tuple(map(tuple, gains.tolist())), tuple(ends[0]), tuple(ends[1]))
+
+
+def _refuse_exploding(plant: Simulator, course: Array, when: str) -> None:
+    """PlantError where a PV of a course (n, n_pv) goes EXPLODES of its ranges away, or to no finite number."""
+    for s, y in zip(plant.pv_signals, course.T, strict=True):
+        if np.abs(y - y[0]).max() > EXPLODES * (s.high - s.low):
+            raise PlantError(
+                f"plant {plant.name!r}: {when} {s.name} goes to {y[-1]:.3g} {s.unit} within {len(y)} periods, far "
+                f"from its range {s.low:g} to {s.high:g}: the plant is unstable, and its experiment holds the MVs "
+                "without a controller; check the signs in step(), or put a controller that stabilises it into the "
+                "simulator"
+            )
 
 
 def _sides(plant: Simulator) -> tuple[list[float], list[float]]:

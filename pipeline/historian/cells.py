@@ -1,4 +1,4 @@
-"""Readings that are no measurements: codes for missing values, other units, single outliers.
+"""Readings that are no measurements: values in another unit, and single outliers.
 
 Each function takes the series of one tag and returns where they are; the values of what it saw go into the report.
 """
@@ -17,11 +17,6 @@ from pipeline.metrics import Array
 
 Where = NDArray[np.bool_]
 
-CODES = (-9999.0, 9999.0, -999.0, -999.25, -99999.0, 99999.0, -999999.0, 32767.0, -32768.0, 65535.0, 2147483647.0)
-AWAY = 0.25  # spans of the usual values between them and zero, from which zero is a dead sensor
-FAR = 2.0  # spans of the usual values between them and a code
-REPEATED, REPEATED_SHARE = 3, 2e-4  # readings of one value far outside, from which it is a code
-MAINLY = 0.3  # of all values that far
 SAMPLE = 200_000  # readings that a distribution is estimated from
 WINDOW = 9  # readings of the running median
 SPIKE_SD, SPIKE_SPAN = 8.0, 0.03  # of the residual's robust sd, and of the usual span
@@ -72,33 +67,6 @@ def core(values: Array) -> tuple[float, float]:
     near = sample[np.abs(sample - np.median(sample)) <= 10 * spread]
     low, high = np.quantile(near, [0.01, 0.99]) if near.size else (q1, q3)
     return float(low), float(high)
-
-
-def sentinels(values: Array) -> tuple[Where, Counter[str]]:
-    """Where (n,) codes for a missing value stand, and how often each.
-
-    A code is one of CODES, zero, or a value that comes again exactly, farther from the usual ones than FAR of their
-    spans. Zero is a dead sensor only where no other value lies between it and the usual ones.
-    """
-    low, high = core(values[values != 0.0])  # zeros of a dead sensor must not widen it
-    span = max(high - low, 1e-6 * max(abs(low), abs(high), 1e-9))
-    out = (values < low - FAR * span) | (values > high + FAR * span)
-    away = max(low, -high)  # from zero
-    found: Counter[str] = Counter()
-    where = np.zeros(len(values), dtype=bool)
-    if away > AWAY * span:
-        zero = values == 0.0
-        between = (np.abs(values) < 0.5 * away) & ~zero & np.isfinite(values)
-        if zero.any() and np.count_nonzero(between) <= 0.2 * np.count_nonzero(zero):
-            where |= zero
-            found["0"] = int(np.count_nonzero(zero))
-    far = values[out & ~where]
-    for value, times in zip(*np.unique(far, return_counts=True), strict=True):
-        many = times >= max(REPEATED, REPEATED_SHARE * len(values), MAINLY * len(far))
-        if value in CODES or abs(value) > 1e15 or many:
-            where |= values == value
-            found[f"{value:g}"] = int(times)
-    return where, found
 
 
 def noise_sd(values: Array) -> float:

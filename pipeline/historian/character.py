@@ -14,6 +14,7 @@ STUCK_CHANCE = 1e-4  # of a stretch as long by chance anywhere in the record
 SHORTEST_STUCK, LONGEST_STUCK = 8, 400  # rows
 NOISY = 0.2  # share of equal neighbours, up to which a value that repeats is a fault whatever the others do
 CLIPPED_ROWS = 5
+HELD = 0.6  # share of rows without a move, from which a signal is moved in steps
 LINEAR_ROWS = 5  # of a stretch that a compressed signal's interpolation makes straight
 
 Where = NDArray[np.bool_]
@@ -38,6 +39,14 @@ def quantum(values: Array) -> float:
     # Few levels of a signal that was hardly moved prove nothing; as many as readings are plain floats.
     q = float(f"{q:.6g}")
     return q if whole.mean() >= 0.99 and len(levels) < 0.9 * len(sample) else 0.0
+
+
+def smallest_difference(values: Array) -> float:
+    """The smallest difference of two of the values (n,); 0 where all are one."""
+    levels = np.unique(values[np.isfinite(values)][:SAMPLE])
+    apart = np.diff(levels)
+    apart = apart[apart > 1e-9 * float(np.abs(levels).max(initial=1e-300))]
+    return float(f"{apart.min():.6g}") if apart.size else 0.0
 
 
 def runs_of(mask: Where) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -81,23 +90,32 @@ def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where
     """Where (n,) a sensor stands at the end of its range, and the end in words.
 
     An end is the range that was given, or the largest (smallest) value, where that is repeated at least CLIPPED_ROWS
-    rows on end and three times as often as all values within the next 2 % of the span.
+    rows on end and three times as often as all values within the next 2 % of the span. Of values that move in steps,
+    each held, only the range that was given is an end: the largest step is none.
     """
     where, words = np.zeros(len(values), dtype=bool), []
     finite = values[np.isfinite(values)]
     if finite.size < 10 * CLIPPED_ROWS or np.ptp(finite) == 0:
         return where, ""
     span = float(np.ptp(finite))
+    held = held_share(values) >= HELD
     for end, given, sign in ((float(finite.max()), high, 1), (float(finite.min()), low, -1)):
         at = np.abs(values - end) <= 1e-9 * span
         start, stop = runs_of(at)
         longest = int((stop - start).max())
         near = int(np.count_nonzero((sign * (end - finite) > 1e-9 * span) & (sign * (end - finite) <= 0.02 * span)))
         at_given = given is not None and abs(end - given) <= 1e-6 * span
-        if longest >= CLIPPED_ROWS and (at_given or at.sum() > 3 * near):
+        if longest >= CLIPPED_ROWS and (at_given or (at.sum() > 3 * near and not held)):
             where |= at
             words.append(f"{end:g} in {int(at.sum())} rows")
     return where, " and ".join(words)
+
+
+def held_share(values: Array) -> float:
+    """Share of the steps from row to row that change nothing, outside the lowest and the highest value."""
+    same = np.diff(values) == 0
+    inner = (values[1:] < np.nanmax(values)) & (values[1:] > np.nanmin(values))
+    return float(np.mean(same[inner])) if inner.any() else 0.0
 
 
 def straight_share(values: Array) -> float:

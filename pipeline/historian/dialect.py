@@ -57,6 +57,8 @@ def sniff(path: Path) -> Dialect:
         if place is not None:
             break
     else:
+        if sum(bool(line.strip()) for line in lines) == 1:
+            raise RecordError(f"{path}: there is one line and no row below it; export a longer time")
         raise RecordError(
             f"{path}: no table was found in the first {len(lines)} lines; a header of names and rows of equal length "
             "are wanted, separated by comma, semicolon, tab or |"

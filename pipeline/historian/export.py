@@ -65,6 +65,17 @@ class Series:
         return int(np.count_nonzero(new))
 
 
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What one file holds of the tags that were asked for, in how many rows, and from when to when [s]."""
+
+    path: str
+    tags: frozenset[str]
+    rows: int
+    first_s: float
+    last_s: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Export:
     """All readings of the tags that were asked for, in one or more files."""
@@ -76,6 +87,7 @@ class Export:
     unreadable_rows: int  # of another length than the header's
     timeless_rows: int  # whose time cannot be read
     zone: str = ""  # that its dates are in, or that it states none; empty where times are no dates
+    contents: tuple[Contents, ...] = ()  # of each file
 
 
 def in_order(series: Series, files: NDArray[np.int64] = NO_CUTS) -> Series:

@@ -99,6 +99,11 @@ def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray
         if n >= LEAST_PIECE:
             times.append(first + h * np.arange(n, dtype=np.float64))
             pieces.append(np.full(n, len(pieces), dtype=np.int64))
+    if not times and len(clock) > 1 and gap_s < float(np.median(np.diff(clock))):
+        raise RecordError(
+            f"the hold of {gap_s:g} s is shorter than the time between two readings, "
+            f"{float(np.median(np.diff(clock))):.4g} s, so that each stands alone; give a longer --hold, or none"
+        )
     if not times:
         raise RecordError(
             f"no stretch of the export is longer than {LEAST_PIECE} periods of {h:g} s; give a shorter --period"

@@ -10,13 +10,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.cells import sentinels, unit_slips, usual
-from pipeline.historian.character import quantum
+from pipeline.historian.cells import unit_slips, usual
+from pipeline.historian.character import smallest_difference
 from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, follows, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.grid import resampled
 from pipeline.historian.linear import fitted
+from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import proposed_period
 from pipeline.historian.tags import Guess, Tag
@@ -77,7 +78,7 @@ def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
     pvs, mvs = ([g.tag.tag for g in found if g.tag.role == role and g.tag.low is not None] for role in ("pv", "mv"))
     if not pvs or not mvs:
         return list(found)
-    own = {name: _excerpt(export.series[name]) for name in (*pvs, *mvs)}
+    own = {name: _excerpt(export.series[name], role) for role, tags in (("pv", pvs), ("mv", mvs)) for name in tags}
     grid, _ = resampled([own[n] for n in pvs], [own[n] for n in mvs], proposed_period([own[pvs[0]]]))
     u, run = [grid.value[m] for m in mvs], grid.piece
     if min(len(moves_of(v[np.isfinite(v)], run[np.isfinite(v)])) for v in u) < FEW_MOVES:
@@ -120,8 +121,8 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     free = [tag for tag in free if tag not in taken]
     if not pvs or not mvs or not free:
         return list(found)
-    names = dict.fromkeys((*pvs, *mvs, *free[:MOST_TRIED]))
-    own = {name: _excerpt(export.series[name]) for name in names}
+    roles = dict.fromkeys(pvs, "pv") | dict.fromkeys(mvs, "mv") | dict.fromkeys(free[:MOST_TRIED], "dv")
+    own = {name: _excerpt(export.series[name], role) for name, role in roles.items()}
     grid, _ = resampled(
         [own[n] for n in (*pvs, *free[:MOST_TRIED])], [own[n] for n in mvs], proposed_period([own[pvs[0]]])
     )
@@ -144,24 +145,27 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     ]
 
 
-def _excerpt(series: Series) -> Series:
+def _excerpt(series: Series, role: str) -> Series:
     """The first readings of a tag, those without a reason; codes for missing values left out."""
     n = min(len(series), MOST_READINGS)
     value, code = series.value[:n].copy(), series.code[:n].copy()
-    code[sentinels(np.where(code == Reason.GOOD, value, np.nan))[0] & (code == Reason.GOOD)] = Reason.SENTINEL
+    codes, _ = sentinels(np.where(code == Reason.GOOD, value, np.nan), Tag(series.tag, role))
+    code[codes & (code == Reason.GOOD)] = Reason.SENTINEL
     return Series(series.tag, series.time_s[:n], value, code)
 
 
 def _guess(series: Series, unit: str) -> Guess:
     tag, good = series.tag, float(series.good.mean()) if len(series) else 0.0
     role = next((r for pattern, r in ENDINGS if re.search(pattern, tag, re.IGNORECASE)), "")
-    texts = sum(series.texts.values())
+    texts, counts = sum(series.texts.values()), series.counts()
     if texts > 0.5 * len(series):
         words = ", ".join(t for t, _ in series.texts.most_common(4))
-        return Guess(Tag(tag, role if role == "mode" else "", unit), 0.0, good, f"texts: {words}")
+        if role == "mode":
+            return Guess(Tag(tag, role, unit), 0.0, 1.0 - counts.get("empty", 0) / len(series), f"texts: {words}")
+        return Guess(Tag(tag, "", unit), 0.0, good, f"texts: {words}")
     if not series.good.any():
         return Guess(Tag(tag, "", unit), 0.0, good, "no good reading")
-    plain, codes, found = _plain(series)
+    plain, codes, found = _plain(series, Tag(tag, role, unit))
     remarks = []
     still = np.abs(np.diff(plain)) <= 0
     if np.ptp(plain) == 0:
@@ -175,23 +179,23 @@ def _guess(series: Series, unit: str) -> Guess:
         remarks.append("texts: " + ", ".join(repr(t) for t, _ in series.texts.most_common(3)))
     low, high = _range(plain, unit, role)
     kept = good - float(codes.mean())
-    return Guess(Tag(tag, role, unit, low, high), quantum(plain), kept, "; ".join(remarks))
+    return Guess(Tag(tag, role, unit, low, high), smallest_difference(plain), kept, "; ".join(remarks))
 
 
 def seen_range(series: Series) -> tuple[float, float] | None:
-    """The lowest and highest reading, codes for missing values and slips of the unit left out; None without any.
+    """Lowest and highest reading of an MV, without codes for missing values and slips of the unit; None without any.
 
     The guess of an MV's range, unless its unit says more.
     """
     if not series.good.any():
         return None
-    plain, _, _ = _plain(series)
+    plain, _, _ = _plain(series, Tag(series.tag, "mv"))
     return (float(np.min(plain)), float(np.max(plain))) if plain.size else None
 
 
-def _plain(series: Series) -> tuple[Array, NDArray[np.bool_], Counter[str]]:
+def _plain(series: Series, tag: Tag) -> tuple[Array, NDArray[np.bool_], Counter[str]]:
     """Readings that are no code for a missing value and no slip of the unit; where codes are (n,), how often each."""
-    codes, found = sentinels(np.where(series.code == Reason.GOOD, series.value, np.nan))
+    codes, found = sentinels(np.where(series.code == Reason.GOOD, series.value, np.nan), tag)
     plain = series.value[series.good & ~codes]
     return plain[~unit_slips(plain)[0]], codes, found
 

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from pipeline.errors import RecordError, nearest
 from pipeline.files import sha256
 from pipeline.historian.dialect import Dialect, sniff
-from pipeline.historian.export import Export, Series, joined
+from pipeline.historian.export import Contents, Export, Series, joined
 from pipeline.historian.gathering import Gathered
 from pipeline.historian.headers import split_header
 from pipeline.historian.layout import Layout, layout_of
@@ -68,7 +68,7 @@ def read_export(
     if not paths:
         raise RecordError("no file is named; give one or more exports")
     parts: dict[str, list[Series]] = {}
-    files, kinds, zones, totals = [], [], list[str](), Counter[str]()
+    files, kinds, zones, totals, contents = [], [], list[str](), Counter[str](), list[Contents]()
     known: set[str] = set()
     tags, modes = [bare(t) for t in tags], [bare(t) for t in modes]
     for path in paths:
@@ -77,6 +77,7 @@ def read_export(
         found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
         zones.append(zone_of(layout.clock, source.sample[layout.date or layout.time]))
         drop_repeated_rows(found)
+        contents.append(_contents(path, found, counts["rows_read"]))
         for name, series in found.items():
             parts.setdefault(name, []).append(series)
         pa.default_memory_pool().release_unused()
@@ -93,7 +94,17 @@ def read_export(
     layouts = " and ".join(dict.fromkeys(kinds))
     zone = zones[0] if len(set(zones)) == 1 else ""  # of files that count differently no date is known
     rows = totals["rows_read"] + totals["rows"]
-    return Export(together, tuple(files), layouts, rows, totals["rows"], totals["timeless"], zone)
+    unreadable, timeless = totals["rows"], totals["timeless"]
+    return Export(together, tuple(files), layouts, rows, unreadable, timeless, zone, tuple(contents))
+
+
+def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
+    times = [s.time_s for s in found.values() if len(s)]
+    first, last = (
+        min((float(t.min()) for t in times), default=np.nan),
+        max((float(t.max()) for t in times), default=np.nan),
+    )
+    return Contents(str(path), frozenset(found), rows, first, last)
 
 
 def units_of(paths: Sequence[Path]) -> dict[str, str]:

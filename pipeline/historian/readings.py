@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
-from pipeline.historian.cells import MV_CONVERSIONS, outliers, sentinels, unit_slips, usual
+from pipeline.historian.cells import MV_CONVERSIONS, outliers, unit_slips, usual
 from pipeline.historian.copies import copied
 from pipeline.historian.dialect import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
+from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.reason import Reason
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
@@ -46,7 +47,7 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
     if series.rounded_s:
         words = f"stamps are rounded to {series.rounded_s:g} s: readings that share one were spread evenly over it"
         found.append(Finding("rounded", tag.tag, words))
-    where, codes = sentinels(np.where(series.good, series.value, np.nan))
+    where, codes = sentinels(np.where(series.good, series.value, np.nan), tag)
     if series.flag(where, Reason.SENTINEL):
         words = ", ".join(f"{c} {n} times" for c, n in codes.most_common(3))
         found.append(Finding("sentinel", tag.tag, f"codes for a missing value: {words}", True))
@@ -54,7 +55,7 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
     if tag.role in {"pv", "dv"}:
         found += _unlike_the_rest(series, tag)
     elif tag.role == "mv":
-        place = np.flatnonzero(series.good)
+        place = np.flatnonzero(series.good & (series.value != 0.0))  # zero is a closed valve in every unit
         found += _slipped(series, tag, place, *unit_slips(series.value[place], MV_CONVERSIONS))
     return found
 
@@ -92,7 +93,8 @@ def _unlike_the_rest(series: Series, tag: Tag) -> list[Finding]:
     values = series.value[place]
     calm = ~outliers(values)
     slipped = np.zeros(len(values), dtype=bool)
-    slipped[calm], kinds = unit_slips(values[calm])
+    unlike_zero = calm & (values != 0.0) if tag.role == "dv" else calm  # a flow that stopped is 0 in every unit
+    slipped[unlike_zero], kinds = unit_slips(values[unlike_zero])
     found += _slipped(series, tag, place, slipped, kinds)
     place, values = place[~slipped], values[~slipped]
     alone = outliers(values) if slipped.any() else ~calm

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.historian.few_levels import on_off
 from pipeline.historian.screening import Screened
 from pipeline.historian.tags import Tag, commanded_range
 from pipeline.metrics import Array
@@ -30,6 +31,8 @@ def refusal(found: Screened, tags: Sequence[Tag], anyway: bool) -> Refusal | Non
             return Refusal(f"{signal.name} is {values[0]:g} {signal.unit} in every row", step_test=True)
         if words := unvisited(signal, values, tags):
             return Refusal(words)
+    if (switched := on_off(record, tags)) and not anyway:
+        return Refusal(switched[0], anyway=True)
     if verdict.rows < verdict.parameters:
         return Refusal(f"{verdict.reasons[0]}; with fewer rows than parameters --anyway does not help")
     if verdict.carries == "no" and not anyway:

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pipeline.historian.cells import noise_sd, usual
 from pipeline.historian.character import quantum, staircase, straight_share
 from pipeline.historian.excitation import HELD
-from pipeline.historian.export import Series
+from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.first_answer import NONE, first_answer
 from pipeline.historian.grid import Grid
 from pipeline.historian.linear import Linear
 from pipeline.historian.sampling import Sampling
+from pipeline.historian.tags import SIGNAL_ROLES, Tag
 from pipeline.metrics import Array
 from pipeline.records.record import Record
 
 COARSE = 0.002  # of the usual span: a converter's step that a model feels
 STRAIGHT = 0.3  # share of rows in straight lines, from which a signal was compressed
 BRIDGED = 0.05  # of the rows, drawn or held because no reading is near
+ELSEWHERE = 0.1  # readings of other files for each row of the file that lacks the tag: stored apart, by exception
 AHEAD = 25.0  # strength of moves still to come
 
 
@@ -56,6 +58,20 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
         words = f"moves in steps of {step:.4g}, {100 * step / span:.2g} % of its span"
         words += ", more than its noise" if step > 2 * noise else ""
         found.append(Finding("quantization", series.tag, words))
+    return found
+
+
+def of_files(export: Export, tags: Sequence[Tag]) -> list[Finding]:
+    """Tags that one of several files lacks, while no other file has them at its time."""
+    found = []
+    for tag in (t.tag for t in tags):
+        times = export.series[tag].time_s
+        for file in (f for f in export.contents if tag not in f.tags and f.rows):
+            inside = np.count_nonzero((times >= file.first_s) & (times <= file.last_s))
+            if inside < ELSEWHERE * file.rows:
+                role = next(t.role for t in tags if t.tag == tag)
+                end = f": its {file.rows} rows are left out" if role in SIGNAL_ROLES else ""
+                found.append(Finding("lacking", tag, f"{file.path} has no {tag}{end}", bool(end)))
     return found
 
 

@@ -43,6 +43,8 @@ def stretches(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, Sampling])
             (Reason.SATURATED, *clipped(values, tag.low, tag.high)),
             (Reason.STUCK, stuck(values, others, together), ""),
         ):
+            if tag.role == "dv":
+                where &= values != 0.0  # a flow that stopped holds its zero
             new = where & (code == 0)
             if new.any():
                 code[new] = reason
@@ -62,9 +64,6 @@ def row_codes(
         code = np.where(code == 0, grid.code[t.tag], code)
     for t in (t for t in tags if t.role == "mode"):
         names = own[t.tag].categories
-        unknown = [w for w in without if w not in names]
-        if unknown and sum(x.role == "mode" for x in tags) == 1:
-            raise RecordError(f"--without-mode {unknown[0]}: {t.tag} has the modes {', '.join(names)}")
         left_out = np.isin(grid.value[t.tag], [names.index(w) for w in without if w in names])
         code[left_out & (code == 0)] = Reason.MODE
     start, end = runs_of(code == 0)
@@ -86,7 +85,7 @@ def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Re
     if not kept.size:
         counts = np.bincount(code, minlength=len(Reason))
         words = ", ".join(f"{int(counts[r])} x {r.words}" for r in Reason if counts[r])
-        raise RecordError(f"no row of {len(code)} is good in all signals: {words}; name fewer tags, or a longer --hold")
+        raise RecordError(f"no row of {len(code)} is good in all signals: {words}; {_remedy(counts)}")
     fresh = np.r_[True, (np.diff(kept) > 1) | (np.diff(grid.piece[kept]) > 0)]
     run = np.cumsum(fresh) - 1
     groups = {r: [t for t in signals if t.role == r] for r in ("pv", "mv", "dv")}
@@ -101,6 +100,17 @@ def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Re
     return Record(
         grid.period_s, own["pv"], own["mv"], own["dv"], run, time_s, columns["pv"], columns["mv"], columns["dv"]
     )
+
+
+def _remedy(counts: NDArray[np.int64]) -> str:
+    """What to do, by the reason that most rows have; short pieces follow from the others."""
+    causes = {r: int(counts[r]) for r in Reason if r not in {Reason.GOOD, Reason.SHORT_RUN}}
+    most = max(causes, key=lambda r: causes[r])
+    if most == Reason.MODE:
+        return "leave fewer modes out: give --without-mode for fewer of them"
+    if most == Reason.GAP or not causes[most]:
+        return "name fewer tags, or a longer --hold"
+    return "name fewer tags, or export them again"
 
 
 def _signal(tag: Tag, values: Array) -> Signal:

@@ -16,16 +16,19 @@ from pipeline.historian.contradictions import contradict
 from pipeline.historian.excerpt import SEEN, evenly
 from pipeline.historian.excitation import judged, moves_of
 from pipeline.historian.export import Export, Series
+from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear, fitted
+from pipeline.historian.modes import check_modes
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
 from pipeline.historian.reason import Reason
-from pipeline.historian.remarks import of_grid, of_mode, of_models, of_series
+from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.sampling import Sampling, proposed_period, sampling
 from pipeline.historian.static import explained
+from pipeline.historian.stopped import of_zeros
 from pipeline.historian.tags import Tag
 from pipeline.historian.unmoved import of_answers
 from pipeline.historian.wandering import of_levels
@@ -62,7 +65,8 @@ def screened(
     RecordError where nothing of a signal is left, or its given range misses most of its readings.
     """
     own = {t.tag: export.series[t.tag] for t in tags}
-    findings: list[Finding] = []
+    check_modes(without_modes, tags, own)
+    findings: list[Finding] = [*of_files(export, tags)]
     for tag in tags:
         if tag.role != "mode":
             findings += clean(own[tag.tag], tag)
@@ -99,6 +103,7 @@ def screened(
     for t in (t for t in tags if t.role == "pv"):
         let_go(t.tag)
     findings += stretches(grid, signals, by_tag)
+    findings += of_zeros(grid, signals)
     findings += inputs_and_answers(grid, signals)
     findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
     code = row_codes(grid, signals, tags, own, without_modes)
@@ -110,7 +115,7 @@ def screened(
         default=0,
     )
     findings += of_models(excerpt, models)
-    verdict = judged(excerpt, models, moved, len(record))
+    verdict = with_levels(judged(excerpt, models, moved, len(record)), excerpt, tags)
     findings += of_answers([s.name for s in record.pv_signals], verdict)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags

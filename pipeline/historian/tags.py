@@ -77,7 +77,7 @@ class Guess:
     """One line of the table: the tag as guessed, and what its readings look like."""
 
     tag: Tag
-    step: float  # smallest step between two values; 0 where it has none
+    step: float  # smallest difference of two values; 0 where it has none
     good: float  # share of good readings
     remark: str
 
@@ -181,7 +181,9 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
         t = g.tag
         good = f"{100 * g.good:.2f}"
         numbers = ["" if v is None else f"{v:.6g}" for v in (getattr(t, name) for name in NUMBERS)]
-        rows.writerow([t.tag, t.role, safe_name(t.tag), t.unit, *numbers, f"{g.step:.6g}", good, g.remark])
+        rows.writerow(
+            [t.tag, t.role, safe_name(t.tag), t.unit, *numbers, f"{g.step:.6g}" if g.step else "", good, g.remark]
+        )
     write_text(path, out.getvalue())
 
 

@@ -131,18 +131,28 @@ class FileSimulator(Simulator):
         return noise
 
     def _check(self) -> None:
-        """One step twice from the same state: what differs is kept somewhere beside the state."""
+        """Finite steps at the start and at the ends of the MVs; one twice: what differs is kept beside the state."""
         dv, p = self._dv0, self.parameters()
         self.measure(self._x0)
         first = self.step(self._x0, self._mv0, dv, p)
+        self._check_finite(first, self._mv0)
         for mv in (self._low, self._high):
-            self.step(first, mv, dv, p)
+            self._check_finite(self.step(first, mv, dv, p), mv)
         again = self.step(self._x0, self._mv0, dv, p)
         if not np.array_equal(self._program.compared(first), self._program.compared(again)):
             raise self._program.wrong(
                 "a step from the same state gives another result when it is done again: the simulator keeps something "
                 "of its own; all that the plant remembers must stand in the state, and no random numbers be drawn"
             )
+
+    def _check_finite(self, x: Array, mv: Array) -> None:
+        if np.isfinite(self._program.compared(x)).all() and np.isfinite(self.measure(x)).all():
+            return
+        at = ", ".join(f"{s.name} = {v:g}" for s, v in zip(self.mv_signals, mv, strict=True))
+        raise self._program.wrong(
+            f"the first steps, with {at}, give a state or a measurement that is no finite number; check divisions, "
+            "roots and logarithms in step() and measure()"
+        )
 
 
 def is_fmu(path: Path) -> bool:

@@ -182,7 +182,7 @@ def test_a_clock_set_back_is_ambiguous_not_mixed(tmp_path: Path) -> None:
         (b"\n\n\n", "the file is empty"),
         (b"timestamp\n1\n2\n", "no table was found"),
         (b"1,2,3\n4,5,6\n7,8,9\n", "no table was found"),
-        (b"timestamp,TIC-101.PV,TIC-101.OP,FI-7\n", "no table was found"),
+        (b"timestamp,TIC-101.PV,TIC-101.OP,FI-7\n", "there is one line and no row below it; export a longer time"),
         (b"a,b,c\nx,1,2\ny,3,4\nz,5,6\n", "no column holds times"),
         (b"timestamp,a,a\n1700000000,1,2\n1700000001,1,2\n", "stands twice in the header"),
         (b"timestamp,TIC-101.PW\n1700000000,1\n1700000001,2\n", "no tag 'TIC-101.PV'; did you mean 'TIC-101.PW'"),

@@ -71,8 +71,11 @@ def test_new_says_all_that_the_record_needs_and_no_more() -> None:
             {"tag": "FI-7", "role": "dv", "unit": "kg/h", "low": 300.0, "high": 700.0},
         ],
     }
-    more = ["--period", "12", "--hold", "60", "--time", "timestamp", "--anyway", "--without-mode", "MAN"]
-    assert main(["new", "kettle", "x.csv", *ROLES, *more]) == 0
+    more = ["--period", "12", "--hold", "60", "--time", "timestamp", "--anyway"]
+    more += ["--mode", "TIC-101.MODE", "--without-mode", "MAN"]
+    mode = [[*row, "MAN" if k < 100 else "AUTO"] for k, row in enumerate(cells(clean(3000)))]
+    write(Path("y.csv"), mode, ("timestamp", "TIC-101.PV", "TIC-101.OP", "FI-7", "TIC-101.MODE"))
+    assert main(["new", "kettle", "y.csv", *ROLES, *more]) == 0
     own = ExportParams.read("kettle")
     assert (own.period_s, own.hold_s, own.time, own.anyway, own.without_mode) == (12, 60, "timestamp", True, ("MAN",))
     assert mistakes() == []

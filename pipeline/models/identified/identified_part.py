@@ -17,7 +17,7 @@ from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from pipeline.models.identified.residual_tests import residual_figures
-from pipeline.models.identified.scaled_record import ScaledRecord
+from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.selection import Selection
 from pipeline.models.identified.stability import stability_figures
 from pipeline.models.identified.structure import Problem, Structure
@@ -34,6 +34,8 @@ from pipeline.models.identified.verdict import (
 )
 from pipeline.models.part import Learnt, Part, Source
 from pipeline.plants.simulator import Array
+from pipeline.records.levels import levels_of, only_between
+from serving.manifest import Signal
 
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
@@ -134,7 +136,7 @@ class IdentifiedPart(Part):
             "parameters": len(fitted.model.vector()),
             "member": self.member,
             "outputs": runs,
-            "structure": structure_figures(selection),
+            "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
             "gains": gain_figures(bands, rows, scales, pvs, inputs),
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
             "open": {name: values.tolist() for name, values in open_to.items()},
@@ -147,6 +149,13 @@ class IdentifiedPart(Part):
         }
         time_s: Array = source.signals.period_s * np.arange(len(predictions["measured"]), dtype=np.float64)
         return Learnt(model, metrics, predictions={"time_s": time_s, **predictions})
+
+
+def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:
+    """What MVs of a few values leave unseen, a clause each."""
+    values = (rows.v * scales.v_scale + scales.v_center).T
+    levels = [levels_of(of) for of in values[: len(mvs)]]
+    return [only_between(s.name, found, s.unit) for s, found in zip(mvs, levels, strict=True) if found]
 
 
 def _member(problem: Problem, selection: Selection, member: int) -> Fitted:

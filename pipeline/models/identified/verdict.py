@@ -34,8 +34,11 @@ STEP = 0.3
 """Size of a step, in standard deviations of the input in the data."""
 
 
-def structure_figures(selection: Selection) -> dict[str, Any]:
-    """The chosen structure, the errors of both classes, and the verdict in words."""
+def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[str, Any]:
+    """The chosen structure, the errors of both classes, and the verdict in words.
+
+    ``unseen`` says what of the plant's curves the record cannot show, a clause each; it stands with the verdict.
+    """
     chosen, network = selection.chosen, selection.network
     s = chosen.structure
     if network is None:
@@ -62,7 +65,7 @@ def structure_figures(selection: Selection) -> dict[str, Any]:
         "network_error": None if network is None else network.error,
         "network_spread": None if network is None else network.spread,
         "nonlinear_factor": selection.factor,
-        "verdict": words,
+        "verdict": "; but ".join((words, *unseen[:1])) + "".join(f"; {more}" for more in unseen[1:]),
         "nominal_seconds": selection.spent,
     }
 

@@ -45,6 +45,15 @@ def test_second_order_with_dead_time() -> None:
     assert float(identified(learnt).dead[0]) == 5
 
 
+def test_a_record_of_two_values_shows_no_curve() -> None:
+    record = made_plants.second_order(1000)
+    mv = np.where(record.mv > 50, 80.0, 20.0)
+    pv = 20 + 0.5 * np.convolve(mv[:, 0], 0.1 * 0.9 ** np.arange(60))[: len(mv), None]
+    learnt = LINEAR.learn(Source(replace(record, mv=mv, pv=pv), made_plants.signals_of(1, 1)))
+    words = learnt.metrics["structure"]["verdict"]
+    assert words.endswith("; but u0 moves between 2 values only (20 and 80 %): a curve between them cannot be seen")
+
+
 def test_two_by_two_with_a_measured_disturbance() -> None:
     record, signals = made_plants.two_by_two(1000, measured=True), made_plants.signals_of(2, 2, 1)
     learnt = LINEAR.learn(Source(record, signals))
