@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import combinations
 
 import numpy as np
@@ -77,10 +77,13 @@ def follows(u: Array, y: Array, run: Runs) -> float:
     return float(share) if share * (len(k) - 7) / max(1 - share, 1e-9) / 3 > 10 else 0.0
 
 
-def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int, rows: int) -> Verdict:
+def judged(
+    record: Record, models: Mapping[str, Linear | None], moved_sp: int, rows: int, drifts: Collection[str] = ()
+) -> Verdict:
     """The verdict over a record of ``rows`` rows, or an excerpt of it.
 
-    ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points.
+    ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points, ``drifts`` PVs with slow motion
+    that the inputs do not explain.
     """
     signals = [(s, "mv") for s in record.mv_signals] + [(s, "dv") for s in record.dv_signals]
     u = np.hstack([record.mv, record.dv])
@@ -93,8 +96,12 @@ def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int, r
     parameters = 3 * len(record.pv_signals) + 7 * len(signals) + 1
     used = max((len(m.rows) for m in models.values() if m), default=0)
     reasons, level = _reasons(record, inputs, correlation, parameters, moved_sp, rows)
+    unsure = tuple(n for n, m in models.items() if n in drifts and m is not None and not m.sure)
+    if unsure:
+        reasons.append(f"gain and settling time of {', '.join(unsure)} are unreliable: drift looks like a slow answer")
+        level = max(level, 1)
     carries = ("yes", "doubtful", "no")[level]
-    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used)
+    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used, unsure)
 
 
 def spectra_of(record: Record, models: Mapping[str, Linear | None]) -> dict[str, list[Spectrum]]:
@@ -147,6 +154,7 @@ def _input(
         settling_s=settling * record.period_s,
         first_answer_s={n: k * record.period_s for n, k in first.items() if k != NONE},
         gain={n: _gain(seen[n], i) if n in seen else 0.0 for n in pvs},
+        rate={n: m.slope(i) * 60 / record.period_s for n, m in seen.items() if m.integrates and m.ramps(i)},
         band_share=max((s.band_share for s in known.values()), default=-1.0),
         coherence={n: s.band_coherence for n, s in known.items()},
     )
@@ -211,7 +219,8 @@ def _band_and_delay(i: InputReport, period_s: float) -> list[tuple[int, str]]:
     for pv, after in i.first_answer_s.items():
         if after < 0.5 * period_s:
             found.append((1, f"{pv} answers before {i.name} moves, by {-after:g} s or more: its column is late"))
-        if after >= LEAST_DELAY * period_s and after > LONG_DELAY * (i.settling_s - after):
+        waits = after > LONG_DELAY * (i.settling_s - after) and pv not in i.rate  # an integrator never settles
+        if after >= LEAST_DELAY * period_s and waits:
             found.append(
                 (1, f"{pv} answers to {i.name} only after {after:g} s: a long dead time, or clocks that differ")
             )

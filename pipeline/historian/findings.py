@@ -54,6 +54,7 @@ class InputReport:
     settling_s: float  # [s] of the slowest PV that answers; 0 where none does
     first_answer_s: dict[str, float]  # PV -> [s] after a move, of an input that is held and where one is seen
     gain: dict[str, float]  # PV -> change at rest over the input's, by the quick model; 0 where none is seen
+    rate: dict[str, float]  # PV that integrates -> change in a minute over the input's, after its answer has begun
     band_share: float  # of its power in the band of the plant; -1 where the record is too short to tell
     coherence: dict[str, float]  # PV -> median in that band; empty where it is too short
 
@@ -69,6 +70,7 @@ class Verdict:
     rows: int
     parameters: int  # of a plain linear model, to compare the rows with
     rows_used: int  # by the quick models, in windows spread evenly
+    unsure: tuple[str, ...] = ()  # PVs whose gain and settling time may come from a drift
 
 
 @dataclass(frozen=True, slots=True)
