@@ -67,7 +67,7 @@ def test_an_answer_says_its_sign_and_how_sure_that_is(section: ModelSection) -> 
     assert signs == {("y0", "u0"): "+", ("y0", "u1"): "uncertain", ("y1", "u0"): "−"}
     assert "turns its sign" in section.answers[1][4]
     assert [row[2] for row in section.answers] == ["0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V a period]"]
-    assert [row[5] for row in section.answers] == ["3", "0", "3"]
+    assert [row[5] for row in section.answers] == ["4", "1", "4"]
 
 
 def test_the_best_structures_are_listed_and_the_chosen_one_whatever_its_error(section: ModelSection) -> None:
