@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.findings import InputReport, Verdict
-from pipeline.historian.first_answer import NONE, first_answer
+from pipeline.historian.first_answer import first_answer
 from pipeline.historian.linear import Linear
 from pipeline.historian.spectra import Spectrum, spectra
 from pipeline.metrics import Array
@@ -152,7 +152,9 @@ def _input(
         answers=answers,
         follows={n: follows(u, y, record.run) for n, y in pvs.items()} if role == "mv" else {},
         settling_s=settling * record.period_s,
-        first_answer_s={n: k * record.period_s for n, k in first.items() if k != NONE},
+        first_answer_s={n: k.last * record.period_s for n, k in first.items() if k},
+        against=tuple(n for n, k in first.items() if k and k.feedback) if role == "mv" else (),
+        first_possible_s={n: k.first * record.period_s for n, k in first.items() if k},
         gain={n: _gain(seen[n], i) if n in seen else 0.0 for n in pvs},
         rate={n: m.slope(i) * 60 / record.period_s for n, m in seen.items() if m.integrates and m.ramps(i)},
         band_share=max((s.band_share for s in known.values()), default=-1.0),
@@ -185,6 +187,9 @@ def _reasons(
             if any(s > FOLLOWS for s in i.follows.values()):
                 words += f"; {i.name} answers to a PV instead: are the two swapped, or is it a controller's output"
             found.append((2, words))
+        if i.against:
+            words = "feedback, by hand or by a controller, and no late column"
+            found.append((0, f"{i.name} is moved against what {', '.join(i.against)} did before: {words}"))
         found += _band_and_delay(i, record.period_s)
         if 0 < span < NARROW * (i.high - i.low):
             found.append((1, f"{i.name} moved over {100 * span / (i.high - i.low):.1f} % of its range"))

@@ -17,6 +17,7 @@ WINDOW, WINDOWS = 400, 8  # rows of a free run that is compared, and how many th
 KNOTS = (32, 8)  # of lines in time that take up a drift
 SETTLINGS = 4  # between two knots at least: shorter lines take up the answers too
 AS_GOOD = 1.1  # error over another model's
+UNEXPLAINED = 0.8  # of the motion of y: an integrator that leaves more is none
 STRONG = 4.0  # inputs with an answer
 GAIN, SETTLES = 0.1, 1.3  # relative change of a gain, and ratio of two settling times: by a drift
 
@@ -35,8 +36,10 @@ def believed(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | N
     level = fitted(y, u, run, integrates=True)
     ramps = [i for i in range(len(u)) if level is not None and level.ramps(i)]
     settles = any(plain.settling(i) for i in ramps)
-    if level is not None and ramps and not settles and free_run_error(level, y, u, run) <= AS_GOOD * error:
-        return replace(level, sure=True)
+    if level is not None and ramps and not settles:
+        most = min(AS_GOOD * error, UNEXPLAINED * _motion(y, run))
+        if free_run_error(level, y, u, run) <= most:
+            return replace(level, sure=True)
     for knots in KNOTS:
         beside = fitted(y, u, run, slow=knots)
         if beside is None or not _within_lines(beside, len(plain.rows) / knots):
@@ -84,7 +87,11 @@ def free_run(model: Linear, u: Sequence[Array], run: NDArray[np.int64]) -> Array
 
 def free_run_error(model: Linear, y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> float:
     """Standard deviation of y (n,) about the free run within windows, each about its own mean; inf if it explodes."""
-    rest = y - free_run(model, u, run)
+    return _motion(y - free_run(model, u, run), run)
+
+
+def _motion(rest: Array, run: NDArray[np.int64]) -> float:
+    """Standard deviation of what is left (n,) within windows, each about its own mean, NaN left out."""
     ok = np.flatnonzero(~np.isnan(rest))
     length = max(min(WINDOW, len(ok) // WINDOWS), 2)
     m = len(ok) // length

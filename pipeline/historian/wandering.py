@@ -24,6 +24,7 @@ WANDERING = (
     "make a tag that measures such a load dv, and where you know of none check the tag and its times"
 )
 UNEXPLAINED = 0.3  # of the standard deviation of an integrator's change from block to block
+HALF = 0.5  # of the rows, that are judged at least
 RESTS = 2  # settling times, after which a free run has come to the plant's level
 SPLITS = 40  # places tried for a jump
 RATIO = 0.08  # by which the answer must change with the jump, to be another span
@@ -70,13 +71,20 @@ def of_quick_models(
         if model.integrates:
             still = of_changes(tags[name], y, run, record.run)
         else:
-            acting = [i for i, strength in model.strength.items() if strength >= NO_EFFECT]
-            settling = max((model.settling(i) for i in acting), default=0)
-            begun = np.flatnonzero(np.diff(record.run, prepend=-1))[record.run]
-            run[np.arange(len(y)) - begun < RESTS * settling] = np.nan  # it began at another level than the plant
-            still = own if of_levels(name, y, run, float(np.ptp(usual(y))), settling) else []
+            still = own if _wanders(y, run, model, record.run) else []
         found = [f for f in found if f not in own] + still
     return found
+
+
+def _wanders(y: Array, expected: Array, model: Linear, run: NDArray[np.int64]) -> bool:
+    """Whether the levels of y (n,) wander about the free run, or the free run takes too long to tell."""
+    settling = [model.settling(i) for i, strength in model.strength.items() if strength >= NO_EFFECT]
+    begun = np.flatnonzero(np.diff(run, prepend=-1))[run]
+    reached = np.arange(len(y)) - begun >= RESTS * max(settling, default=0)
+    if not settling or 0 in settling or reached.mean() < HALF:
+        return True
+    own = np.where(reached, expected, np.nan)
+    return bool(of_levels("", y, own, float(np.ptp(usual(y))), max(settling)))
 
 
 def of_changes(name: str, y: Array, expected: Array, run: NDArray[np.int64]) -> list[Finding]:
