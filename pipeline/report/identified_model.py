@@ -15,6 +15,7 @@ from pipeline.pictures.numbers import figure, number
 
 MOST_TRIED = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
+OF_NOISE = 1.1  # error over the noise: no model is nearer
 ANSWERED = 0.1  # of the steepest slope: from here on an output answers
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
@@ -93,11 +94,11 @@ def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, 
         if found is None:
             continue
         residual = (part.get("residual") or {}).get(signal.name) or {}
-        fit, thirds = found.get("fit_percent"), found.get("rmse_by_third") or ()
+        thirds = found.get("rmse_by_third") or ()
         rows.append(
             (
                 axis_label(signal.name, signal.unit),
-                "the run explodes" if fit is None else f"{fit:.3g} %",
+                _fit(found),
                 figure(found.get("free_run_rmse")),
                 ", ".join(figure(third) for third in thirds),
                 _noise(found),
@@ -177,6 +178,15 @@ def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
         )
         for row in (*best, *chosen)
     )
+
+
+def _fit(found: Mapping[str, Any]) -> str:
+    """Fit in percent; it says little where the variable hardly moves, so an error no larger than the noise is named."""
+    fit, error, noise = (found.get(key) for key in ("fit_percent", "free_run_rmse", "noise_sd"))
+    if fit is None:
+        return "the run explodes"
+    good = error is not None and noise is not None and error <= OF_NOISE * noise
+    return f"{fit:.3g} %{', as good as the noise' if good else ''}"
 
 
 def _noise(found: Mapping[str, Any]) -> str:

@@ -85,3 +85,22 @@ def test_rows_have_a_cell_a_column(section: ModelSection) -> None:
 def test_a_case_without_an_identified_model_has_no_such_section() -> None:
     models = {"nnarx": {"parts": {"a": {"kind": "nnarx"}}}}
     assert model_section(SimpleNamespace(models=models)) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("rmse", "noise", "words"),
+    [
+        (0.306, 0.297, "8.14 %, as good as the noise"),
+        (0.33, 0.297, "8.14 %"),
+        (0.306, None, "8.14 %"),
+    ],
+)
+def test_a_fit_of_rows_that_hardly_move_is_held_against_the_noise(
+    rmse: float, noise: float | None, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = {**PART, "outputs": {"y0": {"fit_percent": 8.142, "free_run_rmse": rmse, "noise_sd": noise}}}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    assert found.variables[0][1] == words
