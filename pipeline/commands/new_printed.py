@@ -45,12 +45,27 @@ def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:
     for i in verdict.inputs:
         for pv, gain in i.gain.items():
             first = i.first_answer_s.get(pv)
-            if not gain and first is None:
+            rate = i.rate.get(pv)
+            if not gain and first is None and rate is None:
                 continue
             # The report has the gain at the middle of the record, by the models that are fitted later.
             known = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
-            words = [known if gain else "gain not clear"]
-            words += [f"first answer after {first:g} s"] if first is not None else []
+            words = [known if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
+            words += [_after(first, i.first_possible_s[pv])] if first is not None else []
             words += [f"the slowest settles in {i.settling_s:g} s"] if i.settling_s and gain else []
+            words += ["gain and settling unreliable: drift"] if gain and pv in verdict.unsure else []
             lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
     return lines
+
+
+def _ramp(rate: float, top: str, bottom: str) -> str:
+    """Change of a PV that integrates, in a minute, with its unit and that of the input."""
+    per = f"per {axis_label('', bottom).strip() or 'unit'}"
+    return f"integrates: {axis_label(f'{rate:.3g}', top)} {per} and minute"
+
+
+def _after(first_s: float, possible_s: float) -> str:
+    """When a PV answers first, as a range where the noise hides how early."""
+    if possible_s <= 0 < first_s:
+        return f"first answer after {first_s:g} s at most"
+    return f"first answer after {f'{possible_s:g} to ' if possible_s < first_s else ''}{first_s:g} s"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.findings import InputReport, Verdict
-from pipeline.historian.first_answer import NONE, first_answer
+from pipeline.historian.first_answer import first_answer
 from pipeline.historian.linear import Linear
 from pipeline.historian.spectra import Spectrum, spectra
 from pipeline.metrics import Array
@@ -77,10 +77,13 @@ def follows(u: Array, y: Array, run: Runs) -> float:
     return float(share) if share * (len(k) - 7) / max(1 - share, 1e-9) / 3 > 10 else 0.0
 
 
-def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int, rows: int) -> Verdict:
+def judged(
+    record: Record, models: Mapping[str, Linear | None], moved_sp: int, rows: int, drifts: Collection[str] = ()
+) -> Verdict:
     """The verdict over a record of ``rows`` rows, or an excerpt of it.
 
-    ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points.
+    ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points, ``drifts`` PVs with slow motion
+    that the inputs do not explain.
     """
     signals = [(s, "mv") for s in record.mv_signals] + [(s, "dv") for s in record.dv_signals]
     u = np.hstack([record.mv, record.dv])
@@ -93,8 +96,12 @@ def judged(record: Record, models: Mapping[str, Linear | None], moved_sp: int, r
     parameters = 3 * len(record.pv_signals) + 7 * len(signals) + 1
     used = max((len(m.rows) for m in models.values() if m), default=0)
     reasons, level = _reasons(record, inputs, correlation, parameters, moved_sp, rows)
+    unsure = tuple(n for n, m in models.items() if n in drifts and m is not None and not m.sure)
+    if unsure:
+        reasons.append(f"gain and settling time of {', '.join(unsure)} are unreliable: drift looks like a slow answer")
+        level = max(level, 1)
     carries = ("yes", "doubtful", "no")[level]
-    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used)
+    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used, unsure)
 
 
 def spectra_of(record: Record, models: Mapping[str, Linear | None]) -> dict[str, list[Spectrum]]:
@@ -145,8 +152,11 @@ def _input(
         answers=answers,
         follows={n: follows(u, y, record.run) for n, y in pvs.items()} if role == "mv" else {},
         settling_s=settling * record.period_s,
-        first_answer_s={n: k * record.period_s for n, k in first.items() if k != NONE},
+        first_answer_s={n: k.last * record.period_s for n, k in first.items() if k},
+        against=tuple(n for n, k in first.items() if k and k.feedback) if role == "mv" else (),
+        first_possible_s={n: k.first * record.period_s for n, k in first.items() if k},
         gain={n: _gain(seen[n], i) if n in seen else 0.0 for n in pvs},
+        rate={n: m.slope(i) * 60 / record.period_s for n, m in seen.items() if m.integrates and m.ramps(i)},
         band_share=max((s.band_share for s in known.values()), default=-1.0),
         coherence={n: s.band_coherence for n, s in known.items()},
     )
@@ -177,6 +187,9 @@ def _reasons(
             if any(s > FOLLOWS for s in i.follows.values()):
                 words += f"; {i.name} answers to a PV instead: are the two swapped, or is it a controller's output"
             found.append((2, words))
+        if i.against:
+            words = "feedback, by hand or by a controller, and no late column"
+            found.append((0, f"{i.name} is moved against what {', '.join(i.against)} did before: {words}"))
         found += _band_and_delay(i, record.period_s)
         if 0 < span < NARROW * (i.high - i.low):
             found.append((1, f"{i.name} moved over {100 * span / (i.high - i.low):.1f} % of its range"))
@@ -211,7 +224,8 @@ def _band_and_delay(i: InputReport, period_s: float) -> list[tuple[int, str]]:
     for pv, after in i.first_answer_s.items():
         if after < 0.5 * period_s:
             found.append((1, f"{pv} answers before {i.name} moves, by {-after:g} s or more: its column is late"))
-        if after >= LEAST_DELAY * period_s and after > LONG_DELAY * (i.settling_s - after):
+        waits = after > LONG_DELAY * (i.settling_s - after) and pv not in i.rate  # an integrator never settles
+        if after >= LEAST_DELAY * period_s and waits:
             found.append(
                 (1, f"{pv} answers to {i.name} only after {after:g} s: a long dead time, or clocks that differ")
             )

@@ -53,7 +53,10 @@ class InputReport:
     follows: dict[str, float]  # PV -> share of the moves that its past explains
     settling_s: float  # [s] of the slowest PV that answers; 0 where none does
     first_answer_s: dict[str, float]  # PV -> [s] after a move, of an input that is held and where one is seen
+    first_possible_s: dict[str, float]  # PV -> [s] from which on that answer may begin already, beneath the noise
+    against: tuple[str, ...]  # PVs against whose past the input is moved, by hand or by a controller
     gain: dict[str, float]  # PV -> change at rest over the input's, by the quick model; 0 where none is seen
+    rate: dict[str, float]  # PV that integrates -> change in a minute over the input's, after its answer has begun
     band_share: float  # of its power in the band of the plant; -1 where the record is too short to tell
     coherence: dict[str, float]  # PV -> median in that band; empty where it is too short
 
@@ -69,6 +72,7 @@ class Verdict:
     rows: int
     parameters: int  # of a plain linear model, to compare the rows with
     rows_used: int  # by the quick models, in windows spread evenly
+    unsure: tuple[str, ...] = ()  # PVs whose gain and settling time may come from a drift
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from pipeline.historian.cells import unit_slips, usual
 from pipeline.historian.character import smallest_difference
 from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, follows, moves_of
 from pipeline.historian.export import Export, Series
-from pipeline.historian.first_answer import NONE, first_answer
+from pipeline.historian.first_answer import first_answer
 from pipeline.historian.grid import resampled
 from pipeline.historian.linear import fitted
 from pipeline.historian.missing_codes import sentinels
@@ -97,7 +97,7 @@ def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
     """Whether y (n,) answers to one of the inputs u, (n,) each, by the quick model or by what follows their moves."""
     model = fitted(y, list(u), run)
     seen = model is not None and max(model.strength[i] for i in range(len(u))) > SEEN
-    return seen or any(first_answer(y, v, run) != NONE for v in u)
+    return seen or any(first_answer(y, v, run) is not None for v in u)
 
 
 def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from pipeline.metrics import Array
 
@@ -20,6 +21,7 @@ SETTLED = 0.8  # of the rows that an answer is followed: later it has not settle
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
 LEAST_ROWS = 60
 NO_EFFECT = 2.0  # strength of an input that a prediction leaves out
+RAMPS = 5.0  # likely errors of the sum of an input's coefficients, from which y integrates it
 LONG = 1_000_000  # rows, of which a part is looked at
 
 
@@ -41,6 +43,9 @@ class Linear:
     explained: float  # share of the variance of y(k+1) - y(k)
     rows: NDArray[np.int64]  # (n,) rows k of the fit
     residual: Array  # (n,)
+    integrates: bool = False  # a pole at 1 was asked for: sum a_i = 1
+    ramp: Mapping[int, float] = field(default_factory=dict)  # input -> sum of its coefficients over its likely error
+    sure: bool = False  # a drift would change little, or was taken off
 
     def predicted(self, y: Array, u: Sequence[Array], k: NDArray[np.int64]) -> Array:
         """y(k+1) (m,) from the rows up to k (m,) of y (n,) and of each input u (n,); NaN where one is missing.
@@ -59,15 +64,21 @@ class Linear:
 
     def step_response(self, i: int, length: int = 600) -> Array:
         """Answer of y to a unit step of input ``i`` at k = 0, (length,)."""
-        y = np.zeros(length + Y_LAGS)
         drive = np.zeros(length)
         for (first, last), b in zip(self.blocks, self.b[i], strict=True):
             for lag in range(first, last):
                 drive[lag:] += b / (last - first)
-        for k in range(length - 1):
-            past = y[k + Y_LAGS - 1 - np.arange(Y_LAGS)] if k >= 0 else y[:Y_LAGS]
-            y[k + Y_LAGS] = self.a @ past + drive[k]
-        return y[Y_LAGS - 1 : -1]
+        with np.errstate(over="ignore", invalid="ignore"):  # an unstable model
+            return np.asarray(lfilter([0.0, 1.0], np.r_[1.0, -self.a], drive))
+
+    def slope(self, i: int) -> float:
+        """Change of y in a row, long after a unit step of input ``i``; 0 where y does not integrate."""
+        past = self.a @ np.arange(len(self.a), dtype=np.float64)  # of y(k) = k: what sum a_i y(k-i) lacks to y(k+1)
+        return float(self.b[i].sum() / (1.0 + past)) if self.integrates else 0.0
+
+    def ramps(self, i: int) -> bool:
+        """Whether input ``i`` makes y rise or fall for ever, beyond doubt."""
+        return self.integrates and abs(self.ramp[i]) > RAMPS
 
     def settling(self, i: int, length: int = 600) -> int:
         """Rows after which the answer to input ``i`` stays within 10 % of its end; 0 if not in ``length``."""
@@ -79,10 +90,13 @@ class Linear:
         return rows if rows < SETTLED * length else 0
 
 
-def fitted(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | None:
+def fitted(
+    y: Array, u: Sequence[Array], run: NDArray[np.int64], integrates: bool = False, slow: int = 0
+) -> Linear | None:
     """The model of y (n,) from inputs u, (n,) each, within runs (n,); None where too few rows or no motion are there.
 
-    Rows with NaN take no part. At most MOST_ROWS rows are used, in windows spread evenly.
+    Rows with NaN take no part. At most MOST_ROWS rows are used, in windows spread evenly. ``integrates``: with a pole
+    at 1. ``slow``: lines in time from this many knots on to the next take up a drift, and stay out of the model.
     """
     blocks: Blocks = BLOCKS
     while True:
@@ -93,26 +107,29 @@ def fitted(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | Non
         if len(blocks) <= 3:
             return None
         blocks = blocks[:-1]
-    target = y[rows + 1]
     past = np.column_stack([y[rows - i] for i in range(Y_LAGS)])
-    if np.ptp(target) <= 0:
+    growth = y[rows + 1] - past[:, 0]
+    if np.ptp(y[rows + 1]) <= 0:
         return None
+    target, own = (growth, past[:, :-1] - past[:, 1:]) if integrates else (y[rows + 1], past)
     centre = np.array([float(np.mean(c[rows])) for c in u])
     both = [blocks_of(c - m, rows, (*blocks, *AHEAD)) for c, m in zip(u, centre, strict=True)]
     inputs, ahead = [b[:, : len(blocks)] for b in both], [b[:, len(blocks) :] for b in both]
-    x = np.column_stack([past, *inputs, np.ones(len(rows))])
+    x = np.column_stack([own, *inputs, *_lines(rows, slow), np.ones(len(rows))])
     theta, cov, keep = least_squares(x, target)
     residual = target - x @ theta
     sd = _robust_sd(residual[keep])
-    m = len(blocks)
-    places = {i: slice(Y_LAGS + i * m, Y_LAGS + (i + 1) * m) for i in range(len(u))}
+    m, first = len(blocks), own.shape[1]
+    places = {i: slice(first + i * m, first + (i + 1) * m) for i in range(len(u))}
     strength = {i: _wald(theta[p], cov[p, p]) for i, p in places.items()}
-    growth = np.var((target - past[:, 0])[keep])
-    explained = 1.0 - np.var(residual[keep]) / growth if growth > 0 else 0.0
+    ramp = {i: float(theta[p].sum() / np.sqrt(max(cov[p, p].sum(), 1e-300))) for i, p in places.items()}
+    moved = np.var(growth[keep])
+    explained = 1.0 - np.var(residual[keep]) / moved if moved > 0 else 0.0
     b = np.array([theta[p] for p in places.values()]).reshape(len(u), m)
     early = {i: _early(x, ahead[i], target) for i in range(len(u))}
+    a = np.r_[1.0 + theta[0], np.diff(theta[:first]), -theta[first - 1]] if integrates else theta[:Y_LAGS]
     return Linear(
-        theta[:Y_LAGS],
+        a,
         b,
         float(theta[-1]),
         centre,
@@ -123,7 +140,15 @@ def fitted(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | Non
         float(explained),
         rows,
         residual,
+        integrates,
+        ramp,
     )
+
+
+def _lines(rows: NDArray[np.int64], knots: int) -> list[Array]:
+    """Of each knot but the first, a line (n,) over the rows that is 1 there and 0 at the others."""
+    at = np.linspace(rows[0], rows[-1], max(knots, 1))
+    return [np.interp(rows, at, unit) for unit in np.eye(max(knots, 1))[1:]]
 
 
 def rows_of(y: Array, u: Sequence[Array], run: NDArray[np.int64], lag: int) -> NDArray[np.int64]:

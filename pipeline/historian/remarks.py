@@ -11,7 +11,7 @@ from pipeline.historian.character import quantum, staircase, straight_share
 from pipeline.historian.excitation import HELD
 from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding
-from pipeline.historian.first_answer import NONE, first_answer
+from pipeline.historian.first_answer import first_answer
 from pipeline.historian.grid import Grid
 from pipeline.historian.linear import Linear
 from pipeline.historian.sampling import Sampling
@@ -108,8 +108,13 @@ def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Findi
         early = {name: m.ahead[i] for name, m in models.items() if m is not None and m.ahead[i][0] > AHEAD}
         # In a loop the MV follows the PV at every row; an MV that holds does not know what comes.
         if early and held >= HELD:
-            first = {n: first_answer(y, record.mv[:, i], record.run) for n, y in zip(models, record.pv.T, strict=True)}
-            lead = max(max(early.values())[1], *(1 - k for k in first.values() if k != NONE))
+            answers = {
+                n: first_answer(y, record.mv[:, i], record.run) for n, y in zip(models, record.pv.T, strict=True)
+            }
+            first = [k for n, k in answers.items() if k and not k.feedback]
+            if not first:  # an operator moves it against the PV
+                continue
+            lead = max(max(early.values())[1], *(1 - k.last for k in first))
             words = (
                 f"{', '.join(early)} answers about {lead} row{'s' if lead > 1 else ''} before {signal.name} moves: the "
                 f"export stores {signal.name} late, or an operator moves it at once when the other changes"

@@ -18,8 +18,9 @@ from pipeline.historian.excitation import judged, moves_of
 from pipeline.historian.export import Export, Series
 from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
+from pipeline.historian.free_run import believed
 from pipeline.historian.grid import Grid, resampled
-from pipeline.historian.linear import Linear, fitted
+from pipeline.historian.linear import Linear
 from pipeline.historian.modes import check_modes
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
@@ -31,7 +32,7 @@ from pipeline.historian.static import explained
 from pipeline.historian.stopped import of_zeros
 from pipeline.historian.tags import Tag
 from pipeline.historian.unmoved import of_answers
-from pipeline.historian.wandering import of_levels
+from pipeline.historian.wandering import of_levels, of_quick_models
 from pipeline.metrics import Array
 from pipeline.records.record import Record
 
@@ -114,8 +115,10 @@ def screened(
         (len(moves_of(grid.value[t.tag][code == 0][:SEEN], record.run[:SEEN])) for t in tags if t.role == "sp"),
         default=0,
     )
+    findings = of_quick_models(findings, excerpt, models, {t.name: t.tag for t in signals})
     findings += of_models(excerpt, models)
-    verdict = with_levels(judged(excerpt, models, moved, len(record)), excerpt, tags)
+    drifts = {t.name for t in signals for f in findings if f.kind == "drift" and f.tag == t.tag}
+    verdict = with_levels(judged(excerpt, models, moved, len(record), drifts), excerpt, tags)
     findings += of_answers([s.name for s in record.pv_signals], verdict)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
@@ -170,7 +173,7 @@ def _kept(grid: Grid, tag: str) -> Array:
 def models_of(record: Record) -> dict[str, Linear | None]:
     """The quick linear model of each PV from all inputs."""
     u = [*record.mv.T, *record.dv.T]
-    return {s.name: fitted(y, u, record.run) for s, y in zip(record.pv_signals, record.pv.T, strict=True)}
+    return {s.name: believed(y, u, record.run) for s, y in zip(record.pv_signals, record.pv.T, strict=True)}
 
 
 def merged(findings: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.historian.cells import usual
 from pipeline.historian.findings import Finding
+from pipeline.historian.free_run import free_run
+from pipeline.historian.linear import NO_EFFECT, Linear
 from pipeline.metrics import Array
+from pipeline.records.record import Record
 
 BLOCK = 20  # rows at least that one level is the mean of; more where the plant is slow
 LEVELS, MOST_LEVELS = 12, 2_000
@@ -19,6 +24,9 @@ WANDERING = (
     "loads that nobody measures, or an answer far from linear: the model is less exact, feedback corrects the rest; "
     "make a tag that measures such a load dv, and where you know of none check the tag and its times"
 )
+UNEXPLAINED = 0.3  # of the standard deviation of an integrator's change from block to block
+HALF = 0.5  # of the rows, that are judged at least
+RESTS = 2  # settling times, after which a free run has come to the plant's level
 SPLITS = 40  # places tried for a jump
 RATIO = 0.08  # by which the answer must change with the jump, to be another span
 
@@ -67,6 +75,58 @@ def of_levels(name: str, y: Array, expected: Array, span: float, settling: int) 
     """One finding where the levels of y (n,) wander about what the inputs explain, ``expected`` (n,); [] otherwise."""
     found = levels_of(y, expected, span, settling)
     return [Finding("drift", name, _words(found))] if found is not None and found.wander else []
+
+
+def of_quick_models(
+    findings: Sequence[Finding], record: Record, models: Mapping[str, Linear | None], tags: Mapping[str, str]
+) -> list[Finding]:
+    """The findings, without those of PVs that their quick models explain; ``tags`` are by the PV's name as models are.
+
+    An answer slower than the lags of ``expected`` looks like wandering, but not beside a free run. A PV that
+    integrates keeps every small load for ever, so its changes are judged in place of its levels.
+    """
+    u = [*record.mv.T, *record.dv.T]
+    found = list(findings)
+    for (name, model), y in zip(models.items(), record.pv.T, strict=True):
+        own = [f for f in found if f.kind == "drift" and f.tag == tags[name]]
+        if model is None or not (own or model.integrates):
+            continue
+        run = free_run(model, u, record.run)
+        if model.integrates:
+            still = of_changes(tags[name], y, run, record.run)
+        else:
+            still = own if _wanders(y, run, model, record.run) else []
+        found = [f for f in found if f not in own] + still
+    return found
+
+
+def _wanders(y: Array, expected: Array, model: Linear, run: NDArray[np.int64]) -> bool:
+    """Whether the levels of y (n,) wander about the free run, or the free run takes too long to tell."""
+    settling = [model.settling(i) for i, strength in model.strength.items() if strength >= NO_EFFECT]
+    begun = np.flatnonzero(np.diff(run, prepend=-1))[run]
+    reached = np.arange(len(y)) - begun >= RESTS * max(settling, default=0)
+    if not settling or 0 in settling or reached.mean() < HALF:
+        return True
+    own = np.where(reached, expected, np.nan)
+    return bool(of_levels("", y, own, float(np.ptp(usual(y))), max(settling)))
+
+
+def of_changes(name: str, y: Array, expected: Array, run: NDArray[np.int64]) -> list[Finding]:
+    """One finding where the inputs leave much of the change of y (n,) from block to block to other causes."""
+    ok = np.flatnonzero(np.isfinite(y) & np.isfinite(expected))
+    m = len(ok) // BLOCK
+    if m < LEVELS:
+        return []
+    rows = ok[: m * BLOCK].reshape(m, BLOCK)
+    same = run[rows[1:, -1]] == run[rows[:-1, 0]]
+    change = np.diff(y[rows].mean(axis=1))[same]
+    rest = change - np.diff(expected[rows].mean(axis=1))[same]
+    noise = float(np.median(np.std(y[rows] - expected[rows], axis=1))) * np.sqrt(2 / BLOCK)
+    share = float(rest.std() / max(float(change.std()), 1e-300))
+    if share < UNEXPLAINED or rest.std() < OF_NOISE * noise:
+        return []
+    words = f"integrates, and its inputs do not explain {100 * min(share, 1.0) ** 2:.0f} % of its changes; {WANDERING}"
+    return [Finding("drift", name, words)]
 
 
 def _words(found: Levels) -> str:

@@ -41,7 +41,11 @@ def inputs(found: Screened) -> Canvas:
         for i, (row, report) in enumerate(zip(panels, reports, strict=True)):
             _moves(row[0], report, moves_of(u[:, i], record.run))
             _spectrum(row[1], report, {pv: s[i] for pv, s in spectra.items()}, record.period_s)
-            answers = {pv: m.step_response(i, 200) for pv, m in models.items() if m and report.gain.get(pv)}
+            answers = {
+                pv: m.step_response(i, 200)
+                for pv, m in models.items()
+                if m and (report.gain.get(pv) or pv in report.rate)
+            }
             _answer(row[2], report, answers, record.period_s)
         return canvas
 

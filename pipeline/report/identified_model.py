@@ -13,11 +13,11 @@ from pipeline.evaluation.model_evidence import identified_part
 from pipeline.pictures.drawing import axis_label, gain_unit
 from pipeline.pictures.numbers import figure, number
 from pipeline.report.drift import drift_answers
-from pipeline.tuning.responses import reached
 
 MOST_TRIED = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
-ANSWERED = 0.05  # of the largest answer: from here on an output has answered
+OF_NOISE = 1.1  # error over the noise: no model is nearer
+ANSWERED = 0.1  # of the steepest slope: from here on an output answers
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
 
@@ -95,11 +95,11 @@ def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, 
         if found is None:
             continue
         residual = (part.get("residual") or {}).get(signal.name) or {}
-        fit, thirds = found.get("fit_percent"), found.get("rmse_by_third") or ()
+        thirds = found.get("rmse_by_third") or ()
         rows.append(
             (
                 axis_label(signal.name, signal.unit),
-                "the run explodes" if fit is None else f"{fit:.3g} %",
+                _fit(found),
                 figure(found.get("free_run_rmse")),
                 ", ".join(figure(third) for third in thirds),
                 _noise(found),
@@ -119,7 +119,8 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
             if found is None:
                 continue
             curve = ((part.get("step_responses") or {}).get(signal.name) or {}).get(given.name)
-            dead = (part.get("dead_times") or {}).get(given.name) if curve is None else answers_after(curve)
+            dead = (part.get("dead_times") or {}).get(given.name)
+            first = answers_after(curve, dead or 0.0) if curve else None if dead is None else dead + 1.0
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
             rows.append(
                 (
@@ -131,18 +132,35 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
                     ),
                     SIGNS.get(found["sign"], found["sign"]),
                     f"{number(found['low'])} … {number(found['high'])}, {varies}",
-                    "–" if dead is None else number(dead * plant.period_s),
+                    "–" if not first else number(first * plant.period_s),
                 )
             )
     return tuple(rows)
 
 
-def answers_after(curve: Mapping[str, Any]) -> float:
-    """Periods before the first ANSWERED of a step response's largest answer, between its points by a straight line."""
-    known, size = curve["periods"], np.abs(curve["middle"])
-    if not size.any():
+def answers_after(curve: Mapping[str, Any], dead: float = 0.0) -> float:
+    """Periods from the step to the first sample of a step response that differs by it: one more than the dead time.
+
+    The line through the first point beyond doubt, as steep as the response there or as it becomes next, begins one
+    sample before the answer. A point is beyond doubt where its slope is more than ANSWERED of the steepest, and its
+    value more than half of the steepest change in a period and than the band of the fits. It does not matter how
+    long the response is or whether it ends, and its points may lie several periods apart. Never earlier than after
+    the ``dead`` periods of the model; 0 where nothing answers.
+    """
+    at = np.array([curve["periods"][0] - 1, *curve["periods"]], dtype=np.float64)
+    size = np.array([0.0, *curve["middle"]])
+    width = np.array(curve["high"]) - np.array(curve["low"]) if "high" in curve else np.zeros(len(size) - 1)
+    slope = np.diff(size) / np.diff(at)
+    steep = np.abs(slope)
+    sure = (steep > ANSWERED * steep.max()) & (np.abs(size[1:]) > np.maximum(width, 0.5 * steep.max()))
+    if not sure.any():
         return 0.0
-    return float(np.interp(reached(size, ANSWERED * size.max()), range(len(known) + 1), [known[0] - 1, *known]))
+    k = int(sure.argmax())
+    later = np.maximum(slope[k + 1 : k + 3] * np.sign(size[k + 1]), 0.0)
+    flattens = max(later[0] - later[1], 0.0) if len(later) == 2 else 0.0  # a lag was steeper before
+    steepest = max(steep[k], (later[0] if len(later) else 0.0) + flattens)
+    begins = at[k + 1] - abs(size[k + 1]) / steepest
+    return float(max(min(begins + 1.0, at[k + 1]), np.floor(dead) + 1.0))
 
 
 def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
@@ -161,6 +179,15 @@ def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
         )
         for row in (*best, *chosen)
     )
+
+
+def _fit(found: Mapping[str, Any]) -> str:
+    """Fit in percent; it says little where the variable hardly moves, so an error no larger than the noise is named."""
+    fit, error, noise = (found.get(key) for key in ("fit_percent", "free_run_rmse", "noise_sd"))
+    if fit is None:
+        return "the run explodes"
+    good = error is not None and noise is not None and error <= OF_NOISE * noise
+    return f"{fit:.3g} %{', as good as the noise' if good else ''}"
 
 
 def _noise(found: Mapping[str, Any]) -> str:

@@ -67,7 +67,7 @@ def test_an_answer_says_its_sign_and_how_sure_that_is(section: ModelSection) -> 
     assert signs == {("y0", "u0"): "+", ("y0", "u1"): "uncertain", ("y1", "u0"): "−"}
     assert "turns its sign" in section.answers[1][4]
     assert [row[2] for row in section.answers] == ["0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V a period]"]
-    assert [row[5] for row in section.answers] == ["3", "0", "3"]
+    assert [row[5] for row in section.answers] == ["4", "1", "4"]
 
 
 def test_the_best_structures_are_listed_and_the_chosen_one_whatever_its_error(section: ModelSection) -> None:
@@ -85,3 +85,22 @@ def test_rows_have_a_cell_a_column(section: ModelSection) -> None:
 def test_a_case_without_an_identified_model_has_no_such_section() -> None:
     models = {"nnarx": {"parts": {"a": {"kind": "nnarx"}}}}
     assert model_section(SimpleNamespace(models=models)) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("rmse", "noise", "words"),
+    [
+        (0.306, 0.297, "8.14 %, as good as the noise"),
+        (0.33, 0.297, "8.14 %"),
+        (0.306, None, "8.14 %"),
+    ],
+)
+def test_a_fit_of_rows_that_hardly_move_is_held_against_the_noise(
+    rmse: float, noise: float | None, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = {**PART, "outputs": {"y0": {"fit_percent": 8.142, "free_run_rmse": rmse, "noise_sd": noise}}}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    assert found.variables[0][1] == words

@@ -1,0 +1,54 @@
+"""A drift does not pass for a slow answer: gain and settling are those beside it, or are said to be unreliable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dirty_plant import PERIOD_S, Clean, clean, screen_of
+
+from pipeline.commands.new_printed import sayings
+from pipeline.historian.findings import InputReport
+from pipeline.historian.screening import Screened
+
+N = 4000
+ALONG = np.linspace(0.0, 1.0, N)
+SETTLES_S = 25 * PERIOD_S  # 0.9^22 = 0.1, behind a dead time of two rows
+
+
+def slow_plant(drift: np.ndarray) -> Clean:
+    """A lag of 100 rows, moved every 10 to 60."""
+    data = clean(N)
+    y = np.full(N, 50.0)
+    for k in range(N - 1):
+        y[k + 1] = y[k] + 0.01 * (20 + 0.8 * data.mv[k] - y[k])
+    noise = np.random.default_rng(1).normal(0, 0.1, N)
+    return data.with_(pv=(y + drift + noise).round(3))
+
+
+def valve_of(found: Screened) -> InputReport:
+    return found.report.verdict.inputs[0]
+
+
+@pytest.mark.parametrize("drift", [15 * ALONG, 5 * np.sin(25 * ALONG), -20 * ALONG**2], ids=["ramp", "wave", "curve"])
+def test_gain_and_settling_are_those_beside_a_drift(drift: np.ndarray, tmp_path: Path) -> None:
+    data = clean(N)
+    found = screen_of(data.with_(pv=data.pv + drift), tmp_path)
+    assert "drift" in {f.kind for f in found.report.findings}
+    assert valve_of(found).gain["TIC-101.PV"] == pytest.approx(0.8, rel=0.05)
+    assert valve_of(found).settling_s == pytest.approx(SETTLES_S, rel=0.2)
+    assert found.report.verdict.unsure == ()
+
+
+def test_a_drift_beside_a_slow_plant_makes_its_figures_unreliable(tmp_path: Path) -> None:
+    found = screen_of(slow_plant(10 * ALONG), tmp_path)
+    verdict = found.report.verdict
+    assert verdict.unsure == ("TIC-101.PV",)
+    assert verdict.carries == "doubtful"
+    assert "unreliable: drift" in " ".join(verdict.reasons)
+    assert "gain and settling unreliable: drift" in "\n".join(sayings(verdict, {}))
+
+
+def test_a_slow_plant_without_a_drift_is_not_doubted(tmp_path: Path) -> None:
+    assert screen_of(slow_plant(0 * ALONG), tmp_path).report.verdict.unsure == ()
