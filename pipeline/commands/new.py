@@ -33,9 +33,8 @@ from pipeline.historian.tags import RANGES, ROLES, TableError, Tag, limited, nam
 from pipeline.plants.simulator_file import FileSimulator, is_fmu
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
-from pipeline.stages.paths import WORK
+from pipeline.stages.paths import DATA, WORK
 
-DATA = Path("data")
 LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
          "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip

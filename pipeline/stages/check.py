@@ -5,12 +5,15 @@ A typo in a controller's section would otherwise show only when its own stage ru
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
+from fnmatch import fnmatch
 from typing import Any
 
 import numpy as np
 
 from pipeline.cases import all_cases
+from pipeline.cases.own_ensemble import LAW_PART, MEMBERS, MODEL_SET, OwnEnsemble
 from pipeline.config.exports import ExportParams, is_exported, screened_record
 from pipeline.config.params import (
     CaseParams,
@@ -25,7 +28,7 @@ from pipeline.config.params import (
 from pipeline.config.plants import PlantParams, own_plants
 from pipeline.errors import ParamsError, PipelineError
 from pipeline.evaluation.case import Case
-from pipeline.historian.agreement import check_agreement
+from pipeline.historian.agreement import check_agreement, check_period
 from pipeline.historian.exported import signal_tags
 from pipeline.historian.tags import check_tags
 from pipeline.laws import LAWS
@@ -36,8 +39,10 @@ from pipeline.models.training.network_parts import trainer_of
 from pipeline.optimal.bounds import bounds_path, stored_bounds
 from pipeline.stages.excite import excitations
 from pipeline.stages.fit import parts_of
-from pipeline.stages.paths import WORK, record_folder
+from pipeline.stages.paths import DATA, WORK, record_folder
 from serving.errors import LoopwrightError
+
+REPORT = "screening.json"
 
 
 def mistakes() -> list[str]:
@@ -114,6 +119,17 @@ def _export(name: str) -> None:
     tags = signal_tags(params.tags)
     check_tags(tags, f"exports.{name}.tags")
     check_agreement(params, plant, tags)
+    period_s = params.period_s or _screened_period(name)
+    if period_s is not None:
+        check_period(params, plant, period_s)
+
+
+def _screened_period(name: str) -> float | None:
+    """The sampling period [s] of a plant's record, as the last screening made it; None where there was none."""
+    for report in (screened_record(name).with_name(REPORT), DATA / name / REPORT):
+        if report.is_file():
+            return float(json.loads(report.read_text(encoding="utf-8"))["period_s"])
+    return None
 
 
 def _record(name: str) -> None:
@@ -132,6 +148,12 @@ def _model(name: str) -> None:
                 trainer_of(trainer)
             except ParamsError as error:
                 raise ParamsError(f"{where}.parts.{name}: {error}") from None
+    if params.case in own_plants() and params.model == MODEL_SET:
+        lacking = [] if LAW_PART in params.parts else [f"{LAW_PART}, the model that laws are designed on"]
+        if not any(fnmatch(f"{part}.npz", MEMBERS) for part in params.parts):
+            lacking.append("plant1, plant2, ..., the models that controllers are tested on")
+        if lacking:
+            raise ParamsError(f"{where}.parts lacks {' and '.join(lacking)}; add it, of kind {LAW_PART}")
     records = {record_folder(r.case, r.record) for r in map(RecordParams.read, sections("records"))}
     records |= {screened_record(plant) for plant in sections("exports")}
     if params.data.is_relative_to(WORK) and params.data not in records:
@@ -185,6 +207,9 @@ def _plant(name: str) -> None:
     params = PlantParams.read(name)
     if not is_exported(name) and not params.data.is_file():
         raise ParamsError(f"plants.{name}.data is {params.data}, which is not there; `loopwright new` writes it")
+    case = all_cases().get(name)
+    if not is_exported(name) and isinstance(case, OwnEnsemble):
+        _ = case.record  # RecordError where it is not that of the plant, its signals and its period
 
 
 def _known_case(case: str, where: str) -> None:

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 WORK = Path("work")
+DATA = Path("data")  # a plant's report of `loopwright new`, and the record of its simulator
 ARTIFACTS = Path("artifacts")
 TIMING = Path("timing")  # durations; apart from WORK, because no stage may depend on them
 

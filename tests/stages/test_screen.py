@@ -291,3 +291,40 @@ def test_what_was_learnt_from_a_screened_record_descends_from_it() -> None:
     made = StageResult("screen@tank", "", {"work/code/screen-tank.json": "0"}, {}, {folder: "1.dir"})
     fit = StageResult("fit@tank-identified", "", {RECORD.as_posix(): "2"}, {}, {"work/tank/models/identified": "3.dir"})
     assert datasets(fit, [made, fit]) == datasets(made, [made, fit]) == {folder: "1.dir"}
+
+
+LATE: dict[str, tuple[Edit, str]] = {
+    "another period than the record's": (
+        lambda tree: tree["plants"]["tank"].update(period_s=12.0),
+        "the record of exports.tank has a period of 6 s, plants.tank has 12 s",
+    ),
+    "a horizon that nobody waits for": (
+        lambda tree: tree["controllers"]["tank-predictive"].update(horizon=100_000),
+        "horizon is 100000; give 8 to 500 samples",
+    ),
+    "no models to test on": (
+        lambda tree: [tree["models"]["tank-identified"]["parts"].pop(name) for name in ("plant1", "plant2")],
+        "models.tank-identified.parts lacks plant1, plant2, ..., the models that controllers are tested on",
+    ),
+    "no model to design on": (
+        lambda tree: tree["models"]["tank-identified"]["parts"].pop("identified"),
+        "models.tank-identified.parts lacks identified, the model that laws are designed on",
+    ),
+}
+
+
+@pytest.mark.parametrize("screened", [False, True])
+@pytest.mark.parametrize("name", LATE)
+def test_the_check_finds_what_a_stage_would_meet_after_hours(name: str, screened: bool) -> None:
+    if screened:
+        screen("tank")
+    assert mistakes() == []
+    edit, said = LATE[name]
+    edited(edit)
+    found = mistakes()
+    assert any(said in line for line in found), found
+
+
+def test_a_period_that_both_sections_state_is_no_mistake() -> None:
+    edited(lambda tree: (tree["plants"]["tank"].update(period_s=12.0), tree["exports"]["tank"].update(period_s=12.0)))
+    assert mistakes() == []

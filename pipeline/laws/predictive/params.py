@@ -15,6 +15,7 @@ from pipeline.models.identified.identified import Identified
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
 
+LONGEST = 500  # samples of a horizon: the law's graph and its design grow with each
 Limits = tuple[float | None, ...] | None
 
 
@@ -23,7 +24,7 @@ class PredictiveParams:
     """Two knobs, and the numbers behind them, which follow from the model where they are None.
 
     ``speed`` > 0: 2 moves as boldly as a quarter of ``move_weight``. ``caution`` > 0: 2 follows loads as slowly
-    as a quarter of ``q_d``. ``horizon`` N samples, 8 or more; None: 90 % of the model's step responses settle
+    as a quarter of ``q_d``. ``horizon`` N samples, 8 to LONGEST; None: 90 % of the model's step responses settle
     within it, 12 to 50. ``moves`` of each MV in a plan; None: 8 of one MV, 5 of each of several.
     ``move_weight`` lambda > 0 of squared moves, mu = lambda (N - dead time)/10, MVs in units of half their range.
     ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
@@ -78,6 +79,11 @@ class PredictiveParams:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} is {value}; it must be at least {least}")
+        if self.horizon is not None and self.horizon > LONGEST:
+            raise ValueError(
+                f"horizon is {self.horizon}; give 8 to {LONGEST} samples, or leave it out: 50 or fewer suffice where "
+                "the sampling period suits the plant"
+            )
         if any(not 0 < w < np.inf for w in self.weights or ()):
             raise ValueError(f"weights are {list(self.weights or ())}; each must be above 0, and finite")
         for i, (low, high) in enumerate(zip_longest(self.cv_low or (), self.cv_high or ())):
