@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import shutil
 import sys
@@ -96,7 +97,10 @@ def _run(options: argparse.Namespace) -> int:
         return 0
     export = asked(options, given)
     tags = with_units(controlled_first(named(given)), export)
-    return _write(name, folder, screened_export(export, tags), options, tags, export=export)
+    found = screened_export(export, tags)
+    if found.report.period_s != found.step_s:  # the record that stage `screen` makes has the same one
+        export = dataclasses.replace(export, period_s=found.report.period_s)
+    return _write(name, folder, found, options, tags, export=export)
 
 
 def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:

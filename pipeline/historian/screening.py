@@ -19,6 +19,7 @@ from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear, fitted
+from pipeline.historian.pace import of_period, pace_of
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
 from pipeline.historian.reason import Reason
@@ -47,6 +48,7 @@ class Screened:
     code: NDArray[np.uint8]  # (n,) Reason of each row of the grid
     series: Mapping[str, Series]  # the readings of each tag, with their reasons
     report: Screening
+    step_s: float = 0.0  # of the export's own readings, where the rows were resampled from some
 
 
 def screened(
@@ -71,7 +73,10 @@ def screened(
     drawn = [own[t.tag] for t in tags if t.role in {"pv", "dv"}]
     held = [own[t.tag] for t in tags if t.role in {"mv", "sp", "mode"}]
     pvs = [own[t.tag] for t in tags if t.role == "pv"]
-    period = period_s or proposed_period(pvs)
+    step = proposed_period(pvs)
+    pace = pace_of(own, tags, step)
+    period = period_s or pace.period(step)
+    findings += of_period(pace, period, step, given=period_s is not None)
     role_of = {t.tag: t.role for t in tags}
     findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag])]
     steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
@@ -137,7 +142,7 @@ def screened(
         findings=merged(findings),
         verdict=verdict,
     )
-    return Screened(record, grid, code, own, report)
+    return Screened(record, grid, code, own, report, step)
 
 
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
