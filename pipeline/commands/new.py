@@ -59,7 +59,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--max-move", metavar="TAG=CHANGE", action="append", default=[],
         help="largest change of an MV in a minute that the controller may make, in the MV's unit")  # fmt: skip
     add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
-    add("--period", metavar="S", type=_positive, help="sampling period of the record (default: from the data)")
+    add("--period", metavar="S", type=_positive,
+        help="sampling period of the record (default: the export's step, longer for a slow plant)")  # fmt: skip
     add("--hold", metavar="S", type=_positive, help="longest time that a reading is held or drawn on over")
     add("--without-mode", metavar="MODE", action="append", default=[], help="leave rows of this mode out")
     add("--time", metavar="COLUMN", default="", help="the column of times (default: found by name and content)")
