@@ -43,6 +43,7 @@ PHASES: tuple[tuple[str, Any, str], ...] = (
     ("reading", exported, "read_export"),
     ("screening of readings", screening, "clean"),
     ("remarks on readings", screening, "of_series"),
+    ("settling", screening, "pace_of"),
     ("resampling", screening, "resampled"),
     ("pulses", screening, "pulses"),
     ("outliers by a model", screening, "confirm"),

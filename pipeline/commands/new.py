@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import shutil
 import sys
@@ -57,7 +58,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--max-move", metavar="TAG=CHANGE", action="append", default=[],
         help="largest change of an MV in a minute that the controller may make, in the MV's unit")  # fmt: skip
     add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
-    add("--period", metavar="S", type=_positive, help="sampling period of the record (default: from the data)")
+    add("--period", metavar="S", type=_positive,
+        help="sampling period of the record (default: the export's step, longer for a slow plant)")  # fmt: skip
     add("--hold", metavar="S", type=_positive, help="longest time that a reading is held or drawn on over")
     add("--without-mode", metavar="MODE", action="append", default=[], help="leave rows of this mode out")
     add("--time", metavar="COLUMN", default="", help="the column of times (default: found by name and content)")
@@ -95,7 +97,10 @@ def _run(options: argparse.Namespace) -> int:
         return 0
     export = asked(options, given)
     tags = with_units(controlled_first(named(given)), export)
-    return _write(name, folder, screened_export(export, tags), options, tags, export=export)
+    found = screened_export(export, tags)
+    if found.report.period_s != found.step_s:  # the record that stage `screen` makes has the same one
+        export = dataclasses.replace(export, period_s=found.report.period_s)
+    return _write(name, folder, found, options, tags, export=export)
 
 
 def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:

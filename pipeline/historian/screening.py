@@ -22,6 +22,7 @@ from pipeline.historian.free_run import believed
 from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear
 from pipeline.historian.modes import check_modes
+from pipeline.historian.pace import of_period, pace_of
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of
 from pipeline.historian.reason import Reason
@@ -51,6 +52,7 @@ class Screened:
     code: NDArray[np.uint8]  # (n,) Reason of each row of the grid
     series: Mapping[str, Series]  # the readings of each tag, with their reasons
     report: Screening
+    step_s: float = 0.0  # of the export's own readings, where the rows were resampled from some
 
 
 def screened(
@@ -76,7 +78,10 @@ def screened(
     drawn = [own[t.tag] for t in tags if t.role in {"pv", "dv"}]
     held = [own[t.tag] for t in tags if t.role in {"mv", "sp", "mode"}]
     pvs = [own[t.tag] for t in tags if t.role == "pv"]
-    period = period_s or proposed_period(pvs)
+    step = proposed_period(pvs)
+    pace = pace_of(own, tags, step)
+    period = period_s or pace.period(step)
+    findings += of_period(pace, period, step, given=period_s is not None)
     role_of = {t.tag: t.role for t in tags}
     findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag])]
     steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
@@ -146,7 +151,7 @@ def screened(
         verdict=verdict,
         zone=export.zone,
     )
-    return Screened(record, grid, code, own, report)
+    return Screened(record, grid, code, own, report, step)
 
 
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:

@@ -17,10 +17,11 @@ from pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_v
 from pipeline.laws.predictive.params import PredictiveParams, check_sizes, limits_of, refuse_discrete, weights_of
 from pipeline.laws.predictive.plan import Cost, Planner
 from pipeline.laws.predictive.set_points import SetPoints
-from pipeline.laws.predictive.settling import horizon_for, refuse_unstable
+from pipeline.laws.predictive.settling import horizon_for, mvs_of, refuse_unstable
+from pipeline.laws.predictive.sight import Sight
 from pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
 from pipeline.laws.predictive.trials import Trials
-from pipeline.laws.predictive.tuning import Candidate, tuned
+from pipeline.laws.predictive.tuning import Candidate, in_words, tuned
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Named, Stage
@@ -53,6 +54,7 @@ class Predictive(ControlLaw):
     Params: ClassVar[type[Any]] = PredictiveParams
 
     tried: tuple[Candidate, ...] = ()  # of a search, the numbers that it started from first
+    remarks: tuple[str, ...] = ()  # on a horizon that is short for the model
     shift: Tensor  # (m, m) of a plan to the next sample
     upper: Tensor  # where the flat covariance's upper half stands
     whole: Tensor  # (n_a n_a,) the flat covariance's entries in its upper half
@@ -68,10 +70,7 @@ class Predictive(ControlLaw):
         weights = weights_of(signals, params)
         n_cv, n_mv = len(signals.sp), len(signals.mv)
         middle, half = 0.5 * (self.high + self.low), 0.5 * (self.high - self.low)
-
-        def mv_of(z: Tensor) -> Tensor:  # within -1..1 -> scaled as the model's
-            return (middle + half * z - model.v_center[:n_mv]) / model.v_scale[:n_mv]
-
+        mv_of = mvs_of(model, middle, half)
         horizon = horizon_for(model, mv_of) if params.horizon is None else params.horizon
         refuse_unstable(model)
         count = (8 if n_mv == 1 else 5) if params.moves is None else params.moves
@@ -171,7 +170,12 @@ class Predictive(ControlLaw):
         refuse_discrete(signals)
         model = require_kind(models, Identified, cls.name, "")
         law = cls(signals, model, params)
-        return law if params.tuning == "given" else law._searched(model, params)
+        sight = Sight.of(model, mvs_of(model, law.mv_middle, law.mv_half), len(signals.sp))
+        sight.require(law.moves.horizon)
+        if params.tuning == "search":
+            law = law._searched(model, params)
+        law.remarks = sight.notes(law.moves.horizon)
+        return law
 
     def _searched(self, model: Identified, params: PredictiveParams) -> Self:
         """The law with the best numbers of a search that starts from this one's.
@@ -192,20 +196,14 @@ class Predictive(ControlLaw):
         return law
 
     def analysis(self, plant: Simulator | None) -> Analysis:
-        """The numbers that a search chose, and its cost at first and at last; empty without one."""
+        """The numbers that a search chose, and its cost at first and at last; nothing else without one."""
         if not self.tried:
-            return Analysis()
+            return Analysis(notes=self.remarks)
         best, damping = min(self.tried, key=lambda c: c.cost), float(self.planner.damping)
         first = self.tried[0].cost
         figures = {**best.numbers, "damping": damping, "cost": best.cost, "cost_given": first, "tried": len(self.tried)}
-        note = (
-            f"{len(self.tried)} sets of numbers were tried in closed loops over the model with errors of gain, pace "
-            f"and dead time, with loads and noise; the cost fell from {first:.3g} to {best.cost:.3g}. It is the mean "
-            "of the errors at set points and under loads, each over that with the first numbers, .05 for a travel of "
-            "1 % of the MVs' range a sample, and a little for numbers far from the first. The cheapest is taken."
-        )
         rows = sorted(self.tried, key=lambda c: c.cost)
-        return Analysis(figures, notes=(note,), table=tuple(c.row() for c in rows))
+        return Analysis(figures, notes=(in_words(self.tried), *self.remarks), table=tuple(c.row() for c in rows))
 
     @classmethod
     def check_settings(cls, params: Any, signals: Signals) -> None:

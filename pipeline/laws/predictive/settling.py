@@ -24,6 +24,12 @@ SHORTEST, LONGEST = 12, 50
 EXPLODED = 100.0  # scaled; a state this large that grows on fourfold in half of BEFORE comes from an unstable model
 
 
+def mvs_of(model: Identified, middle: Tensor, half: Tensor) -> Callable[[Tensor], Tensor]:
+    """The scaled MVs (..., n_mv) of the model for MVs within -1..1, of ranges middle +- half [mv]."""
+    center, scale = model.v_center[: model.n_mv], model.v_scale[: model.n_mv]
+    return lambda z: (middle + half * z - center) / scale
+
+
 @torch.no_grad()
 def horizon_for(model: Identified, mv_of: Callable[[Tensor], Tensor]) -> int:
     """Samples in which 90 % of the model's step responses over its range settle to 10 %, within 12 to 50.

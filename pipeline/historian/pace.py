@@ -1,0 +1,246 @@
+"""How long a plant takes to settle, by readings of any rate, and the sampling period that suits it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RecordError
+from pipeline.historian.excerpt import SEEN
+from pipeline.historian.export import Series
+from pipeline.historian.findings import Finding
+from pipeline.historian.grid import Grid, resampled
+from pipeline.historian.linear import Linear, fitted
+from pipeline.historian.sampling import NICE_S
+from pipeline.historian.tags import Tag
+from pipeline.metrics import Array
+
+MOST_PERIODS, WANTED, LEAST_PERIODS = 60, 40, 28  # in which a plant settles: the longest look ahead, and what is usual
+FINE = 240  # periods up to which an export keeps its step, where its rows as they are show the settling
+FAST, A_HOLD = 4, 3  # periods that the fastest answer, and a hold of an MV, still have
+WINDOWS = 4  # of a long export
+FACTORS = (1, 3, 10, 30, 100, 300, 1000)  # by which the rows are thinned out
+LEAST_ROWS = 200  # of a fit
+RESOLVED = 8  # rows from which an answer's settling is known well enough
+AGREES = 1.3  # ratio of two settling times that are the same
+CLEAR = 10.0  # strength of an answer
+A_PART = 0.1  # of what the largest answer of a PV is: smaller ones do not count
+MOST_SHARE = 0.2  # of the rows, up to which an answer's settling is believed
+STEADY = 0.9  # share of its slope that an answer keeps which goes on and on
+LINE, LATE = (41, 120), 3  # rows between which a ramp's line is laid, and how often its lateness is taken
+MOVE = 0.02  # of an MV's span
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """How long a PV takes to settle after a move of an MV; one that goes on as a ramp, to get going and to stop."""
+
+    pv: str
+    mv: str
+    settles_s: float
+    shown: bool  # by the export's rows as they are, and not only when they are thinned out
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """The clear answers of a plant, and how long its MVs are usually held."""
+
+    answers: tuple[Answer, ...] = ()
+    hold_s: float = np.inf  # [s] the shortest usual one
+
+    @property
+    def slowest(self) -> Answer | None:
+        """The answer that takes longest; None where none is clear."""
+        return max(self.answers, key=lambda a: a.settles_s, default=None)
+
+    def suits(self, step_s: float) -> bool:
+        """Whether rows of step_s [s] show how the plant settles, and it does in some MOST_PERIODS, or at most FINE."""
+        slowest = self.slowest
+        return slowest is None or slowest.settles_s <= (FINE if slowest.shown else MOST_PERIODS) * step_s
+
+    def period(self, step_s: float) -> float:
+        """The period [s] for an export with a reading every step_s: step_s itself where that suits.
+
+        Else a usual number in which the slowest answer takes some WANTED periods and at most MOST_PERIODS or so, and,
+        as far as that leaves room, the fastest one FAST of them, and a hold of an MV A_HOLD.
+        """
+        return step_s if self.slowest is None or self.suits(step_s) else self.longer(step_s, self.slowest.settles_s)
+
+    def longer(self, step_s: float, slow: float) -> float:
+        """A multiple of step_s with which the plant settles within MOST_PERIODS; slow [s] is its settling."""
+        fast = min(a.settles_s for a in self.answers)
+        wanted = max(min(slow / WANTED, fast / FAST, self.hold_s / A_HOLD), slow / MOST_PERIODS)
+        usual = [n for n in NICE_S if slow / MOST_PERIODS <= n <= slow / LEAST_PERIODS and _is_multiple(n, step_s)]
+        if usual:
+            return float(min(usual, key=lambda n: abs(np.log(n / wanted))))
+        return float(f"{step_s * np.ceil(wanted / step_s - 1e-6):.6g}")
+
+
+def of_period(pace: Pace, period_s: float, step_s: float, *, given: bool) -> list[Finding]:
+    """What the record's period is and why, where it is not the export's own or short for the plant."""
+    slowest = pace.slowest
+    if slowest is None or slowest.settles_s <= MOST_PERIODS * step_s:
+        return []
+    settles = f"takes about {in_words(slowest.settles_s)} to settle after {slowest.mv}"
+    if slowest.settles_s > MOST_PERIODS * period_s:
+        rows, better = slowest.settles_s / period_s, pace.longer(step_s, slowest.settles_s)
+        words = f"{settles}, {rows:.0f} rows of {period_s:g} s: predictive control looks at most {MOST_PERIODS} ahead"
+        words += "" if slowest.shown else ", and a model learns the noise of such rows"
+        return [Finding("period", slowest.pv, f"{words}; --period {better:g} lets it look as far as the plant settles")]
+    if period_s <= step_s:
+        return []
+    words = f"one row every {period_s:g} s: it {settles}, and the export has a reading every {step_s:g} s"
+    return [Finding("period", slowest.pv, words + "; --period says another" * (not given))]
+
+
+def in_words(seconds: float) -> str:
+    """A length of time with two digits, in the unit that a person would choose."""
+    unit, name = next((u for u in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")) if seconds >= 2 * u[0]), (1.0, "s"))
+    value = seconds / unit
+    digits = max(0, 1 - int(np.floor(np.log10(value)))) if value < 10 else 0
+    return f"{round(value, digits):g} {name}"
+
+
+def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) -> Pace:
+    """The pace of the plant, by an excerpt of the readings of its signals; ``step_s`` between those of the PVs.
+
+    The linear models of ``fitted`` see the rows as they are and thinned out. Of fast rows they learn the noise, and of
+    sparse ones the settling is no more than a row or two; so the sparsest count by which an answer is resolved.
+    No answer where the readings give no rows.
+    """
+    pv, mv, dv = ([series[t.tag] for t in tags if t.role == role] for role in ("pv", "mv", "dv"))
+    cut = _excerpt(pv, (*pv, *mv, *dv), step_s)
+    try:
+        grid, _ = resampled([cut[s.tag] for s in (*pv, *dv)], [cut[s.tag] for s in mv], step_s)
+    except RecordError:  # of the record's own rows, whose period a person may have given, it is raised again
+        return Pace()
+    names, inputs = [s.tag for s in pv], [s.tag for s in (*mv, *dv)]
+    spans = np.array([_span(grid.value[tag]) for tag in inputs])
+    found: dict[tuple[str, str], list[tuple[int, bool, float]]] = {}
+    for factor in FACTORS:
+        if factor > 1 and len(grid) < factor * LEAST_ROWS:
+            break
+        value, run = _thinned(grid, {s.tag for s in mv}, factor)
+        for name in names:
+            model = fitted(value[name], [value[tag] for tag in inputs], run)
+            if model is not None:
+                for i, answer in _answers(model, spans, len(mv)).items():
+                    found.setdefault((name, inputs[i]), []).append((factor, *answer))
+    settled = {pair: _settling(rows) for pair, rows in found.items()}
+    most = MOST_SHARE * len(grid)
+    answers = tuple(Answer(*pair, n * step_s, shown) for pair, (n, shown) in settled.items() if 0 < n <= most)
+    return Pace(answers, min((_hold(grid.value[s.tag], grid.piece) for s in mv), default=np.inf) * step_s)
+
+
+def _excerpt(clock: Sequence[Series], series: Sequence[Series], step_s: float) -> dict[str, Series]:
+    """The series, of a long export WINDOWS stretches of their time, each of SEEN / WINDOWS steps."""
+    length = SEEN / WINDOWS * step_s
+    first, last = (f(float(s.time_s[i]) for s in clock) for f, i in ((min, 0), (max, -1)))
+    if last - first <= 1.5 * WINDOWS * length:
+        return {s.tag: s for s in series}
+    starts = np.linspace(first, last - length, WINDOWS)
+
+    def cut(s: Series) -> Series:
+        ends = [np.searchsorted(s.time_s, (a, a + length)) for a in starts]
+        time_s, value, code = (np.concatenate([c[a:b] for a, b in ends]) for c in (s.time_s, s.value, s.code))
+        return replace(s, time_s=time_s, value=value, code=code)
+
+    return {s.tag: cut(s) for s in series}
+
+
+def _thinned(grid: Grid, held: set[str], factor: int) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    """Values (m,) of the grid's tags by ``factor`` rows, and the pieces (m,): means, as ``resampled`` takes them.
+
+    Row k has what is ``held`` from its time on, and the others up to its time.
+    """
+    if factor == 1:
+        return grid.value, grid.piece
+    place = np.arange(len(grid)) - np.searchsorted(grid.piece, grid.piece)
+    row = np.flatnonzero(place % factor == factor - 1)
+    row = row[row + factor <= len(grid)]
+    row = row[grid.piece[row + factor - 1] == grid.piece[row]]
+    return {
+        tag: _means(v, row if tag in held else row - factor + 1, factor) for tag, v in grid.value.items()
+    }, grid.piece[row]
+
+
+def _means(v: Array, first: NDArray[np.int64], n: int) -> Array:
+    """Means over n rows of v from each of ``first`` on; NaN where less than half of them are known."""
+    known = np.isfinite(v)
+    middle = float(np.mean(v[known])) if known.any() else 0.0
+    total, count = np.r_[0.0, np.cumsum(np.where(known, v - middle, 0.0))], np.r_[0, np.cumsum(known)]
+    have = count[first + n] - count[first]
+    return np.where(2 * have >= n, middle + (total[first + n] - total[first]) / np.maximum(have, 1), np.nan)
+
+
+def _answers(model: Linear, spans: Array, n_mv: int) -> dict[int, tuple[bool, float]]:
+    """MV -> whether its clear answer settles, and the rows that it takes to; of a ramp, to get going and to stop."""
+    courses = {i: model.step_response(i) for i in range(len(spans)) if model.strength[i] > CLEAR}
+    sizes = {i: float(np.ptp(y)) * spans[i] for i, y in courses.items() if np.isfinite(y).all()}
+    found: dict[int, tuple[bool, float]] = {}
+    for i, size in sizes.items():
+        if i >= n_mv or size < A_PART * max(sizes.values()):
+            continue
+        rows = model.settling(i)
+        if rows:
+            found[i] = (True, float(rows))
+        elif _goes_on(courses[i]):
+            found[i] = (False, _late(courses[i]))
+    return found
+
+
+def _goes_on(course: Array) -> bool:
+    """Whether a step response (n,) ends with a steady slope."""
+    middle, end = (float(np.median(part)) for part in np.array_split(np.diff(course), 3)[1:])
+    return end != 0 and STEADY < middle / end < 1 / STEADY
+
+
+def _late(course: Array) -> float:
+    """LATE times the rows by which a ramp comes later than one that begins at once: dead time and lags together."""
+    first, last = LINE
+    slope = (course[last] - course[first]) / (last - first)
+    late = last - course[last] / slope if slope else 0.0
+    return LATE * max(float(late), 0.5)
+
+
+def _settling(rows: Sequence[tuple[int, bool, float]]) -> tuple[float, bool]:
+    """Steps in which an answer settles, of (factor, whether it settles, rows) from the finest on; 0 where none is sure.
+
+    And whether the rows as they are show the same. The sparsest rows say whether it settles at all, since noise makes a
+    ramp seem to end. A thinned fit must agree with the finer one before it, and both count.
+    """
+    settles = rows[-1][1]
+    same = [(factor * n, n) for factor, kind, n in rows if kind is settles]
+    at = max((i for i, (_, n) in enumerate(same) if n >= RESOLVED), default=0)
+    steps, before = same[at][0], same[at - 1][0]
+    row = steps / same[at][1]
+    if not settles and same[at][1] < RESOLVED:  # a ramp that begins at once, by rows of any rate
+        return min(n for n, _ in same), True
+    finest, first, own = rows[0]
+    if at == 0:
+        return (steps, True) if finest == 1 and first is settles else (0.0, False)
+    if not (steps - row) / AGREES < before < (steps + row) * AGREES:
+        return 0.0, False
+    steps = float(np.sqrt(before * steps))
+    shown = finest == 1 and first is settles and 1 / AGREES < own / steps < AGREES
+    return (own, True) if shown else (steps, False)
+
+
+def _span(v: Array) -> float:
+    """From the 1 % to the 99 % quantile."""
+    known = v[np.isfinite(v)]
+    return float(np.ptp(np.quantile(known, [0.01, 0.99]))) if known.size else 0.0
+
+
+def _hold(u: Array, piece: NDArray[np.int64]) -> float:
+    """Rows that an MV u (n,) is usually held for, at least: the 10 % quantile; infinite where it is not."""
+    step = np.abs(np.diff(u))
+    at = np.flatnonzero((step > MOVE * _span(u)) & (piece[1:] == piece[:-1]))
+    return float(np.quantile(np.diff(at), 0.1)) if len(at) > 1 else np.inf
+
+
+def _is_multiple(n: float, step_s: float) -> bool:
+    return n > step_s * (1 - 1e-6) and abs(n / step_s - round(n / step_s)) < 1e-6
