@@ -222,7 +222,10 @@ def _band_and_delay(i: InputReport, period_s: float) -> list[tuple[int, str]]:
         found.append((1, f"{pv} owes {100 * share:.0f} % of its motion to {i.name} (coherence in the plant's band): "
                          "noise, other causes, or a strong nonlinearity"))  # fmt: skip
     for pv, after in i.first_answer_s.items():
-        if after < 0.5 * period_s:
+        if abs(after) < 0.5 * period_s:
+            found.append((1, f"{pv} answers in the row in which {i.name} moves: its column is late, or a row is long "
+                             "beside the dead time"))  # fmt: skip
+        elif after < 0:
             found.append((1, f"{pv} answers before {i.name} moves, by {-after:g} s or more: its column is late"))
         waits = after > LONG_DELAY * (i.settling_s - after) and pv not in i.rate  # an integrator never settles
         if after >= LEAST_DELAY * period_s and waits:
