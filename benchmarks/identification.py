@@ -201,7 +201,9 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--rows", type=int, default=8_000, help="that are fitted at most (8000)")
     parser.add_argument("--minutes", type=float, help="of the search on one core (2)")
     options = parser.parse_args(argv)
-    part = IdentifiedPart(rows=options.rows, minutes=options.minutes)
+    if not options.folder.is_dir():
+        parser.error(f"{options.folder} is no folder; give the one that holds the records")
+    part, rows = IdentifiedPart(rows=options.rows, minutes=options.minutes), 0
     print("RMSE of the free run over test rows, beside what is published")
     for name in options.records or RECORDS:
         public = RECORDS[name]
@@ -211,7 +213,8 @@ def main(argv: list[str]) -> int:
             print(f"{name:20} {' and '.join(public.files)} .csv or .mat not found under {options.folder}", flush=True)
             continue
         print(row_of(name, public.task([columns(p) for p in there]), public.unit, public.published, part), flush=True)
-    return 0
+        rows += 1
+    return 0 if rows else 1
 
 
 if __name__ == "__main__":

@@ -163,7 +163,10 @@ def stages_of(name: str) -> list[str]:
         if name in sections(kind):
             return [f"{stages[-1]}@{name}"]
     known = [name for kind in ("cases", *STAGES) for name in sections(kind)]
-    raise ParamsError(f"params.yaml has no case, controller, model or record {name!r}{nearest(name, known)}")
+    hint, cases = nearest(name, known).partition(" known:")[0], ", ".join(sections("cases"))
+    raise ParamsError(
+        f"params.yaml has no case, controller, model or record {name!r}{hint} cases: {cases}; it lists the others"
+    )
 
 
 def status(targets: Iterable[str]) -> Mapping[str, list[str]]:

@@ -33,6 +33,16 @@ def lag(u: np.ndarray, seed: int) -> np.ndarray:
     return y + 0.01 * np.random.default_rng(seed).normal(size=len(u))
 
 
+def test_a_folder_without_records_is_no_success(
+    benchmark: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert benchmark.main([str(tmp_path)]) == 1
+    with pytest.raises(SystemExit) as raised:
+        benchmark.main([str(tmp_path / "nothing")])
+    assert raised.value.code == 2
+    assert "is no folder" in capsys.readouterr().err
+
+
 def test_a_short_column_of_a_csv_ends_where_its_cells_do(benchmark: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     path = tmp_path / "deep" / "databenchmark.CSV"
