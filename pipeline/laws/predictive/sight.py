@@ -52,8 +52,8 @@ class Sight:
             return ()
         return (
             f"The law looks {horizon} samples ahead. By the model the controlled variables answer after {self.first} "
-            f"and take {self.settles} samples or more to settle, so the law plans without the larger part of its "
-            "moves' effect. A longer sampling period lets it see more.",
+            f"and take {self.settles} samples or more to settle over the MVs' whole range: the plan ends before they "
+            "have come half of that time. With a longer horizon or a longer sampling period it sees more.",
         )
 
 
