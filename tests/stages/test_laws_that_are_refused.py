@@ -13,7 +13,6 @@ from own_cases import controllers_of_a_lag
 from rich.console import Console
 
 from pipeline.cases.own_plant import OwnCase
-from pipeline.cases.reach import Reach
 from pipeline.errors import LawError, ModelError, ParamsError, PlantError, RecordError
 from pipeline.evaluation.validation import Validation
 from pipeline.laws.pid.pid import PID
@@ -171,7 +170,7 @@ def test_without_any_law_the_report_shows_the_model_and_the_reasons(
 
 
 def test_a_plant_without_loads_is_scored_by_its_other_tests(plant: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Reach, "load", lambda *_: None)
+    monkeypatch.setattr("pipeline.cases.own_plant.held_load", lambda *_: None)
     found = designed_and_validated("pid")
     assert found.gate.laws["pid"].score is not None
     assert found.gate.weights == {"held_out": 0.5882, "held_out_noise": 0.2353, "spoilt": 0.1765}
