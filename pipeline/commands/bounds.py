@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 
 from pipeline.cases import CASES
 from pipeline.config.params import choose
+from pipeline.engine.cluster import local_cluster
 from pipeline.stages.bounds import compute
 
 
@@ -22,5 +24,6 @@ def run(options: argparse.Namespace) -> None:
     tests = case.tests()
     for name in options.scenario or ():
         choose(tests, name, "scenario", f"case {case.name!r}")
-    for line in compute(case, options.scenario or list(tests), options.jobs):
-        print(line, flush=True)
+    with local_cluster(options.jobs) if options.jobs > 1 else contextlib.nullcontext():
+        for line in compute(case, options.scenario or list(tests)):
+            print(line, flush=True)

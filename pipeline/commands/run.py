@@ -1,4 +1,4 @@
-"""The pipeline or a part of it: says what will run and why, then runs it with the libraries loaded once."""
+"""The pipeline or a part of it: says what will run and why, then runs it on one cluster of workers."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def repro(targets: Sequence[str], changed: Iterable[str], expected: Sequence[str
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        command = [sys.executable, "-m", "pipeline.engine.warm", *lanes]
+        command = [sys.executable, "-m", "pipeline.engine.with_cluster", *lanes]
         with subprocess.Popen(command, env=environment(), preexec_fn=begin) as process:
             running.append(process)
             if asked:

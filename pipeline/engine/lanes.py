@@ -10,8 +10,8 @@ once those beside it have ended. Results are those of one lane.
 
 What the lanes write comes line by line to one output, with each stage announced by its number among those ``of``
 which the run may have to run. After SIGINT or SIGTERM no line comes any more, and no stage begins. DVC itself is not
-interrupted while it may be writing down a finished stage: the warm process ends the stage that runs and refuses the
-next, so that DVC ends by itself.
+interrupted while it may be writing down a finished stage: the run's door shuts, by which the stage that runs ends and
+the next is refused, so that DVC ends by itself.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from pathlib import Path
 from pipeline.engine.announcements import Announcements, words_of
 from pipeline.engine.dvc import COMMAND, environment
 from pipeline.engine.lifeline import end_with_parent
-from pipeline.engine.start import VARIABLE
+from pipeline.engine.start import DOOR
 
-LANES = 2  # more fill no core further: every stage already starts a process a core
+LANES = 2  # more fill no core further: a stage's pieces already go to every worker
 GRACE_S = 15.0  # in which DVC ends by itself
 
 
@@ -137,7 +137,7 @@ class _Lanes:
         if self.stopped:
             return
         self.stopped, self.patience_ends = number, time.monotonic() + GRACE_S
-        served = VARIABLE in os.environ  # by a process that ends the stages
+        served = DOOR in os.environ  # by a process that ends the stages
         self._end([process for process, lane in self.running.items() if not (served and lane.ran)])
 
     @staticmethod

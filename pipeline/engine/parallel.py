@@ -1,204 +1,245 @@
-"""Independent pieces of one stage, side by side, with a line of progress."""
+"""Independent pieces of one stage, side by side on the engine's workers, with progress.
+
+Pieces are values in and bytes out. Which worker does one, and how many there are, changes no result.
+"""
 
 from __future__ import annotations
 
-import multiprocessing
+import contextlib
+import hashlib
 import os
 import pickle
-import sys
 import traceback
-import warnings
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, wait
-from contextlib import ExitStack
-from multiprocessing.connection import Connection
-from threading import Thread
-from typing import Any, TypeVar
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cloudpickle
-import joblib
 from threadpoolctl import threadpool_limits
 
-from pipeline.engine.lifeline import end_with_parent
+from pipeline.engine.cluster import address, connected
+from pipeline.engine.fingerprint import difference, fingerprint
+from pipeline.engine.folder import Changes, Files, apply, changes_since, within_folder
 from pipeline.engine.progress import piece, progress_bar, within
 from pipeline.errors import PipelineError
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-# A fork has everything imported already, which takes seconds. Elsewhere the system's own libraries do not survive one.
-CONTEXT: Any = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+RETRIES = 2  # of a piece whose worker was lost
+LARGE = 50_000  # bytes of a function, from which on it is sent once and not with every piece
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The stage that this thread of a worker runs: the files that it began with, and whether it is still wanted."""
+
+    files: Files
+    wanted: Callable[[], bool]
+
+
+_stage: ContextVar[Stage | None] = ContextVar("stage", default=None)
+_in_piece: ContextVar[bool] = ContextVar("in_piece", default=False)
+
+
+class NotWantedError(PipelineError):
+    """Nobody waits for the stage any more."""
 
 
 def parallel_map(
-    function: Callable[[Item], Result], items: Iterable[Item], label: str, weights: Sequence[float] | None = None
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    label: str,
+    weights: Sequence[float] | None = None,
+    *,
+    in_folder: bool = False,
 ) -> list[Result]:
-    """``[function(i) for i in items]`` over processes, in order; ``label`` (``STAGE: WHAT``) names the progress.
+    """``[function(i) for i in items]`` on the cluster's workers, in order; here where there is no cluster.
 
-    One process a core here, this one among them; the workers of a Dask cluster where
-    ``DASK_SCHEDULER_ADDRESS`` names its scheduler (that needs the package ``distributed``). ``weights`` are about
-    what the items cost beside each other (None: all the same), for the progress alone.
+    ``label`` (``STAGE: WHAT``) names the progress. ``weights`` are about what the items cost beside each other (None:
+    all the same), for the progress alone. With ``in_folder`` a piece finds the stage's files in its working folder,
+    and what it writes there is written here.
 
-    Raises whatever ``function`` raises, of the first item that fails, and PipelineError where a
-    process dies.
+    Raises whatever ``function`` raises, of the first item that fails, and PipelineError where a worker is lost again
+    and again or runs other code.
     """
     work = list(items)
-    address = os.environ.get("DASK_SCHEDULER_ADDRESS")
-    if address:
-        return _on_cluster(address, function, work, label)
-    return _here(function, work, label, [1.0] * len(work) if weights is None else list(weights))
+    found: dict[int, Result] = {}
+    shares = [1.0] * len(work) if weights is None else list(weights)
+    # The steps of a single item are what there is to show; those of several would be mixed up.
+    with progress_bar() as bar, within(label.partition(": ")[0] if len(work) == 1 and bar.disable else ""):
+        task = bar.add_task(label, total=len(work))
+        whole = piece(label, sum(shares)) if bar.disable and work[1:] else None
+        ended = set[int]()
+
+        def show(i: int) -> None:
+            ended.add(i)
+            bar.advance(task)
+            if whole is not None:
+                whole.show(sum(shares[k] for k in ended), f"{len(ended)} of {len(work)}")
+
+        found.update(as_done(function, work, in_folder=in_folder, show=show))
+    return [found[i] for i in range(len(work))]
 
 
-def _one_thread(function: Callable[[Item], Result], item: Item) -> Result:
+def as_done(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    in_folder: bool = False,
+    show: Callable[[int], object] = lambda _: None,
+) -> Iterator[tuple[int, Result]]:
+    """(place, result) of each item, see ``parallel_map``; ``show`` is told the place of each as it ends.
+
+    A client has each result as it ends; a stage on a worker has them once all have ended.
+    """
+    work, stage, at = list(items), _stage.get(), address()
+    # A piece is the smallest unit: it does by itself whatever it could share.
+    if len(work) < 2 or _in_piece.get() or (stage is None and at is None):
+        for i, item in enumerate(work):
+            yield i, _alone(function, item)
+            show(i)
+        return
+    if stage is None:
+        assert at is not None
+        for i, (result, changes) in _answers(connected(at), function, work, {} if in_folder else None):
+            apply(changes)
+            show(i)
+            yield i, result
+        return
+    from distributed import worker_client
+
+    answers = dict[int, tuple[Any, Changes]]()
+    # While this thread waits, pieces of this and other stages run in its process, and change its working folder.
+    here = os.getcwd()
+    try:
+        with worker_client() as client:
+            for i, answer in _answers(client, function, work, stage.files if in_folder else None, stage):
+                answers[i] = answer
+                show(i)
+    finally:
+        os.chdir(here)
+    for i in sorted(answers):
+        result, changes = answers[i]
+        apply(changes)
+        yield i, result
+
+
+@contextlib.contextmanager
+def conducting(stage: Stage) -> Iterator[None]:
+    """Within, this thread runs a stage, whose pieces go to the cluster."""
+    token = _stage.set(stage)
+    try:
+        yield
+    finally:
+        _stage.reset(token)
+
+
+def lost(error: Exception, what: str) -> PipelineError:
+    """The line for work that the cluster could not do."""
+    from distributed import KilledWorker
+
+    if isinstance(error, KilledWorker):
+        return PipelineError(
+            f"{what}: {RETRIES + 1} workers died of it (often the memory was not enough); start fewer, and run it again"
+        )
+    return PipelineError(f"{what}: the cluster gave it up ({' '.join(str(error).split())}); run it again")
+
+
+# ---------------------------------------------------------------------- the client's side
+def _answers(
+    client: Client, function: Callable[[Any], Any], work: list[Any], files: Files | None, stage: Stage | None = None
+) -> Iterator[tuple[int, tuple[Any, Changes]]]:
+    """(place, (result, changed files)) of each item as it ends; raises what the first to fail raised."""
+    from distributed import as_completed
+
+    shared: Any = cloudpickle.dumps((function, files))
+    if len(shared) > LARGE:
+        shared = client.scatter(shared, hash=False)
+    name, ours = f"piece-{uuid.uuid4().hex[:12]}", dict(fingerprint())
+    futures = {
+        client.submit(_piece, shared, cloudpickle.dumps(item), ours, key=f"{name}-{i}", pure=False, retries=RETRIES): i
+        for i, item in enumerate(work)
+    }
+    try:
+        for future in as_completed(list(futures), loop=client.loop):
+            if stage is not None and not stage.wanted():
+                raise NotWantedError("nobody waits for this stage any more")
+            try:
+                answer = future.result()
+            except Exception as error:
+                raise lost(error, f"piece {futures[future] + 1} of {len(work)}") from None
+            failed, result, changes = pickle.loads(answer)
+            if failed is not None:
+                raise failed
+            yield futures[future], (result, changes)
+            future.release()
+    finally:
+        client.cancel([f for f in futures if not f.done()])
+
+
+# ---------------------------------------------------------------------- the worker's side
+def _piece(shared: bytes, item: bytes, theirs: Mapping[str, str]) -> bytes:
+    """(error, result, changed files), pickled; the error or the other two are None or empty."""
+    token = _in_piece.set(True)
+    try:
+        if other := difference(theirs, fingerprint()):
+            raise mixture(other)
+        function, files = _opened(hashlib.sha256(shared).digest(), _Content(shared))
+        if files is None:
+            return pickle.dumps((None, _alone(function, pickle.loads(item)), {}))
+        with within_folder(files):
+            result = _alone(function, pickle.loads(item))
+            return pickle.dumps((None, result, changes_since(files)))
+    except Exception as error:
+        error.add_note(f"on a worker:\n{traceback.format_exc()}")
+        return _as_bytes(error)
+    finally:
+        _in_piece.reset(token)
+
+
+def mixture(other: str) -> PipelineError:
+    """The line for a worker that runs other code or other versions than who asks it."""
+    return PipelineError(
+        f"a worker runs something else than this run: {other}; results of a mixture are of no use: "
+        "install the same on both and start the workers again (sources that were edited meanwhile count, too)"
+    )
+
+
+class _Content:
+    """Bytes that are no part of a key."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content = content
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Content)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=4)
+def _opened(_digest: bytes, shared: _Content) -> Any:
+    """Made once for all pieces: what a function computes on first use and keeps (a plant's functions) is kept."""
+    return pickle.loads(shared.content)
+
+
+def _alone(function: Callable[[Item], Result], item: Item) -> Result:
     # Processes that each start a thread per core only fight over the cores.
     with threadpool_limits(1):
         return function(item)
 
 
-# ---------------------------------------------------------------------- this machine
-def _here(function: Callable[[Item], Result], work: list[Item], label: str, weights: Sequence[float]) -> list[Result]:
-    """Share the items out between this process and helpers on the other cores, one by one."""
-    left = deque(range(len(work)))
-    futures: list[Future[Result]] = [Future() for _ in work]
-    # Before the bar, whose thread could hold a lock that a fork would then never see released.
-    # A helper has no helpers: it runs the pieces of a piece by itself.
-    cores = 1 if multiprocessing.current_process().daemon else os.cpu_count() or 1
-    helpers = [_Helper(function, label) for _ in range(min(len(work), cores) - 1)]
-    finished = False
+def _as_bytes(error: Exception) -> bytes:
     try:
-        # The steps of a single item are what there is to show; those of several would be mixed up.
-        with progress_bar() as bar, within(label.partition(": ")[0] if len(work) == 1 and bar.disable else ""):
-            task = bar.add_task(label, total=len(work))
-            whole = piece(label, sum(weights)) if bar.disable and work[1:] else None
-            ended_ones = set[int]()
-
-            def advance(i: int) -> None:
-                bar.advance(task)
-                ended_ones.add(i)
-                if whole is not None:
-                    whole.show(sum(weights[k] for k in tuple(ended_ones)), f"{len(ended_ones)} of {len(work)}")
-
-            def take(run: Callable[[Item], Result]) -> None:
-                while True:
-                    try:
-                        i = left.popleft()
-                    except IndexError:
-                        return
-                    try:
-                        futures[i].set_result(run(work[i]))
-                    except Exception as error:
-                        left.clear()
-                        futures[i].set_exception(error)
-                    advance(i)
-
-            for helper in helpers:
-                Thread(target=helper.help_along, args=(take,), daemon=True).start()
-            take(lambda item: _one_thread(function, item))
-            ended, _ = wait(futures, return_when=FIRST_EXCEPTION)
-            for error in (future.exception() for future in ended):
-                if error is not None:
-                    raise error
-        finished = True
-    finally:
-        for helper in reversed(helpers):  # a fork holds the connections of those before it
-            helper.end(kill=not finished)
-    return [future.result() for future in futures]
-
-
-class _Helper:
-    """A process beside this one that runs item after item; it ends when this one does."""
-
-    def __init__(self, function: Callable[[Any], Any], label: str) -> None:
-        self.label, self.ready = label, False
-        self.connection, theirs = CONTEXT.Pipe()
-        forked = CONTEXT.get_start_method() == "fork"
-        # Pickled once: what it computes on first use and keeps (a plant's functions) is then kept for all its items.
-        given = (function, self.connection) if forked else (cloudpickle.dumps(function), None)
-        self.process = CONTEXT.Process(target=_help, args=(theirs, *given), daemon=True)
-        with warnings.catch_warnings():
-            # The threads that Python 3.12 warns of are those of the linear algebra, which expects forks.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            self.process.start()
-        theirs.close()
-
-    def help_along(self, take: Callable[[Callable[[Any], Any]], None]) -> None:
-        """Have the process run what ``take`` gives, once it is ready: little work may be done before it is."""
-        try:
-            self.connection.recv()
-        except (EOFError, OSError):
-            return  # ended before it was ready
-        self.ready = True
-        take(self.run)
-
-    def run(self, item: Any) -> Any:
-        """One item, there; raises what it raises."""
-        try:
-            self.connection.send(item)
-            answer = self.connection.recv_bytes()
-        except (EOFError, OSError):
-            self.process.join(1)
-            raise PipelineError(
-                f"{self.label}: a helper process died (exit code {self.process.exitcode}; -9 often means that the "
-                "memory was not enough); run it again"
-            ) from None
-        error, result = pickle.loads(answer)
-        if error is not None:
-            raise error
-        return result
-
-    def end(self, kill: bool) -> None:
-        """Wait for the process, which ends where no item comes; or stop it where it is."""
-        if kill or not self.ready:
-            self.process.kill()
-        self.connection.close()
-        self.process.join()
-
-
-def _help(connection: Connection, function: Callable[[Any], Any] | bytes, others: Connection | None) -> None:
-    """Run items as they come, in a helper, until the other end is closed."""
-    end_with_parent()
-    if others is not None:
-        others.close()  # this fork's copy, which would keep it from seeing the end
-    try:
-        work = cloudpickle.loads(function) if isinstance(function, bytes) else function
-        connection.send(None)
-        while True:
-            connection.send_bytes(_answer(work, connection.recv()))
-    except (EOFError, OSError, KeyboardInterrupt):
-        return
-
-
-def _answer(function: Callable[[Any], Any], item: Any) -> bytes:
-    """The error of an item and its result, one of which is None, pickled."""
-    try:
-        return pickle.dumps((None, _one_thread(function, item)))
-    except Exception as error:
-        error.add_note(f"in a helper process:\n{traceback.format_exc()}")
-        try:
-            answer = pickle.dumps((error, None))
-            pickle.loads(answer)
-        except Exception:  # not every error survives the way
-            return pickle.dumps((PipelineError(f"{type(error).__name__}: {error}"), None))
-        return answer
-
-
-# ---------------------------------------------------------------------- a cluster
-def _on_cluster(address: str, function: Callable[[Item], Result], work: list[Item], label: str) -> list[Result]:
-    with ExitStack() as stack:
-        bar = stack.enter_context(progress_bar())
-        stack.enter_context(joblib.parallel_config(backend="dask", client=stack.enter_context(_cluster(address))))
-        found = joblib.Parallel(n_jobs=-1, return_as="generator")(
-            joblib.delayed(_one_thread)(function, item) for item in work
-        )
-        return list(bar.track(found, total=len(work), description=label))
-
-
-def _cluster(address: str) -> Any:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise PipelineError(
-            f"DASK_SCHEDULER_ADDRESS is {address}, which needs the package distributed: "
-            "pip install '.[cluster]', or unset it to use this machine's cores"
-        ) from None
-    return Client(address)
+        answer = pickle.dumps((error, None, {}))
+        pickle.loads(answer)
+    except Exception:  # not every error survives the way
+        return pickle.dumps((PipelineError(f"{type(error).__name__}: {error}"), None, {}))
+    return answer

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from threading import Lock
 
@@ -58,30 +59,41 @@ class Piece:
         self.lines.show(words + (f", about {_rounded(left)} left" if left >= SOON_S else ""))
 
 
-_LINES = Lines()
-_within = list[str]()  # the labels of the work that this process does; empty ones where others share it
+# Of a thread and not of a process: a worker's process holds several stages at a time.
+_lines: ContextVar[Lines] = ContextVar("lines", default=Lines())  # noqa: B039 - one for whoever has none of its own
+_label: ContextVar[str] = ContextVar("label", default="")  # of the work that this thread does; empty: others share it
+
+
+@contextmanager
+def lines_anew() -> Iterator[None]:
+    """Within, a stage begins: its lines wait for no others."""
+    token = _lines.set(Lines())
+    try:
+        yield
+    finally:
+        _lines.reset(token)
 
 
 @contextmanager
 def within(label: str) -> Iterator[None]:
     """Whatever ``steps`` shows inside belongs to ``label``; an empty label shows nothing."""
-    _within.append(label)
+    token = _label.set(label)
     try:
         yield
     finally:
-        _within.pop()
+        _label.reset(token)
 
 
 def piece(label: str, total: float) -> Piece:
     """A piece of work of a stage, whose lines begin with ``label``."""
-    return Piece(label, total, _LINES)
+    return Piece(label, total, _lines.get())
 
 
 def steps(what: str, total: int) -> Callable[[int], None]:
     """Shows how many of ``total`` steps of one item of work are done; nothing outside ``within``."""
-    if not _within or not _within[-1]:
+    if not _label.get():
         return lambda done: None
-    own = piece(f"{_within[-1]}: {what}", total)
+    own = piece(f"{_label.get()}: {what}", total)
     return own.show
 
 

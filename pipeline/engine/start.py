@@ -1,10 +1,10 @@
-"""``python -m pipeline.engine.start KIND [NAME]``: one stage in a process of its own, as dvc.yaml runs them.
+"""``python -m pipeline.engine.start KIND [NAME]``: one stage, as dvc.yaml runs it.
 
-The same as ``python -m pipeline.stages.KIND [NAME]``, without seconds of imports where
-``python -m pipeline.engine.warm`` runs around it: the stage is then a fork of that process. This module
-imports the standard library alone, because every stage starts with it.
+A stage that works long runs on the cluster that DASK_SCHEDULER_ADDRESS names, which `loopwright run` starts on this
+machine; without one it starts its own. This process then only reads, waits and writes. Under DVC a stage that
+succeeded leaves a receipt of its start and duration, see ``write_receipt``.
 
-Under DVC a stage that succeeded leaves a receipt of its start and duration, see ``write_receipt``.
+This module imports the standard library alone, because every stage starts with it.
 """
 
 from __future__ import annotations
@@ -12,20 +12,17 @@ from __future__ import annotations
 import json
 import os
 import runpy
+import signal
 import socket
 import sys
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
 
-# Set for the commands under pipeline.engine.warm: its socket, and the installation and folder that it serves.
-VARIABLE = "LOOPWRIGHT_WARM"
-DIED = 70
-
-
-def served() -> list[str]:
-    """Environment and folder, which a warm process must share with this one to stand in for it."""
-    return [sys.prefix, os.getcwd()]
+# Set for the commands under pipeline.engine.with_cluster: the door of a run, which is open as long as the run goes on.
+DOOR = "LOOPWRIGHT_RUN"
+STOPPED = 130  # exit status of a stage that was ended with the whole run, as a shell counts Ctrl-C
 
 
 def receipt_path(root: Path, stage: str) -> Path:
@@ -46,49 +43,56 @@ def write_receipt(started: float, seconds: float) -> None:
         os.replace(draft, path)
 
 
-def run_warm(arguments: list[str]) -> int | None:
-    """The exit status of the stage, run by the warm process; None where there is none, and nothing was run."""
+def end_with_run() -> None:
+    """Have this process end when the run that it belongs to ends; STOPPED at once if it has ended already."""
+    door = os.environ.get(DOOR)
+    if not door:
+        return
+    line = socket.socket(socket.AF_UNIX)
     try:
-        address, *of = json.loads(os.environ.get(VARIABLE, ""))
-        if of != served():
-            return None
-        line = socket.socket(socket.AF_UNIX)
-        line.connect(address)
-    except (OSError, ValueError):
-        return None
-    with line:
-        request = json.dumps({"arguments": arguments, "environment": dict(os.environ)}).encode() + b"\n"
-        socket.send_fds(line, [b" "], [0, 1, 2])
-        line.sendall(request)
-        with line.makefile() as reader:
-            answer = reader.readline()
-    if not answer:
-        print(f"stage {' '.join(arguments)}: the process that ran it died; run it again", file=sys.stderr)
-        return DIED
-    code = int(answer)
-    if code < 0:
-        print(f"stage {' '.join(arguments)} was ended by signal {-code}", file=sys.stderr)
-        return 128 - code
-    return code
+        line.connect(door)
+    except OSError:
+        sys.exit(STOPPED)
+
+    def wait() -> None:
+        with suppress(OSError):
+            line.recv(1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
-def run_here(arguments: list[str]) -> None:
-    """The stage in this process; ends with SystemExit, as the stage does."""
-    kind = arguments[0]
+def run_here(arguments: list[str]) -> int | str | None:
+    """The stage in this process; what it gives to ``sys.exit``."""
     sys.argv[1:] = arguments[1:]
-    runpy.run_module(f"pipeline.stages.{kind}", run_name="__main__", alter_sys=True)
-
-
-def run(arguments: list[str]) -> int | str | None:
-    """Run the stage, warm or here; returns what ``sys.exit`` is to be given."""
-    code = run_warm(arguments)
-    if code is not None:
-        return code
     try:
-        run_here(arguments)
+        runpy.run_module(f"pipeline.stages.{arguments[0]}", run_name="__main__", alter_sys=True)
     except SystemExit as end:
         return end.code
     return 0
+
+
+def run(arguments: list[str]) -> int | str | None:
+    """The stage, on a cluster or here; what ``sys.exit`` is to be given."""
+    from pipeline.engine.stage_files import on_cluster
+
+    files = on_cluster(arguments[0], arguments[1]) if len(arguments) == 2 else None
+    if files is None:
+        return run_here(arguments)
+    from pipeline.engine.cluster import address, local_cluster
+    from pipeline.engine.remote import run_on
+    from pipeline.errors import PipelineError
+
+    try:
+        at = address()
+        if at is not None:
+            return run_on(at, arguments, files)
+        with local_cluster() as own:
+            return run_on(own, arguments, files)
+    except PipelineError as error:
+        return f"{' '.join(arguments)}: {error}"
+    except KeyboardInterrupt:
+        return STOPPED
 
 
 def main() -> None:
@@ -96,11 +100,17 @@ def main() -> None:
     arguments = sys.argv[1:]
     if not arguments or not arguments[0].isidentifier():
         sys.exit("usage: python -m pipeline.engine.start KIND [NAME]: a stage, as dvc.yaml runs it")
+    end_with_run()
     started, clock = time.time(), time.monotonic()
     code = run(arguments)
     if not code:
         write_receipt(started, time.monotonic() - clock)
-    sys.exit(code)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Nothing is left to do: the connection's threads need not be waited for.
+    if isinstance(code, str):
+        print(code, file=sys.stderr, flush=True)
+    os._exit(code if isinstance(code, int) else int(code is not None))
 
 
 if __name__ == "__main__":

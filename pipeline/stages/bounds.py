@@ -14,12 +14,12 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from joblib import Parallel, delayed
-from threadpoolctl import threadpool_limits
 
+from pipeline.engine.parallel import as_done
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.metric import mean_of_draws
 from pipeline.files import write_text
@@ -46,16 +46,15 @@ def _compute(case: Case, job: Job) -> tuple[Job, dict[str, dict[str, float]], fl
     plant = equations(job.scenario.plant or case.plant, f"a bound of case {case.name!r}").relaxed()
     ahead, criterion = case.foreseen, case.criterion
     first = job.kinds[0]
-    with threadpool_limits(1):
-        nmpc = PerfectNmpc(plant, criterion, case.effort, case.limits)
-        noise, draws = (case.noise_std.tolist(), case.noise_draws) if first == "nmpc_noise" else (None, 1)
-        seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
-        know = (ahead, case.unforeseen, case.score)
-        figures = {first: mean_of_draws(run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds)}
-        if "offline" in job.kinds:
-            aim = (criterion, ahead, case.effort, case.score, case.limits)
-            best = run_offline(plant, job.scenario, *aim, np.array(nmpc.moves))
-            figures["offline"] = better(best, figures[first], case.metric)
+    nmpc = PerfectNmpc(plant, criterion, case.effort, case.limits)
+    noise, draws = (case.noise_std.tolist(), case.noise_draws) if first == "nmpc_noise" else (None, 1)
+    seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
+    know = (ahead, case.unforeseen, case.score)
+    figures = {first: mean_of_draws(run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds)}
+    if "offline" in job.kinds:
+        aim = (criterion, ahead, case.effort, case.score, case.limits)
+        best = run_offline(plant, job.scenario, *aim, np.array(nmpc.moves))
+        figures["offline"] = better(best, figures[first], case.metric)
     return job, figures, time.perf_counter() - begun
 
 
@@ -76,7 +75,7 @@ def _remark(figures: dict[str, float]) -> str:
     return f" - {'; '.join(remarks)}" if remarks else ""
 
 
-def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = None) -> Iterator[str]:
+def compute(case: Case, names: list[str], path: Path | None = None) -> Iterator[str]:
     """Compute and store the bounds of some scenarios; yields a line for a person for each figure.
 
     The line says where an offline optimum did not converge, or is the NMPC's.
@@ -100,8 +99,7 @@ def compute(case: Case, names: list[str], jobs: int = 1, path: Path | None = Non
         for i, s in enumerate(scenarios[name])
         for together in (("nmpc", "offline"), ("nmpc_noise",))[: 1 + noisy_too]
     ]
-    results = Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(_compute)(case, job) for job in work)
-    for done, (job, figures, seconds) in enumerate(results, start=1):
+    for done, (_, (job, figures, seconds)) in enumerate(as_done(partial(_compute, case), work), start=1):
         entry = stored["figures"].setdefault(job.scenario.name, {}).setdefault(job.scenario.digest(), {})
         for kind, row in figures.items():
             entry[kind] = {key: float(f"{value:.6g}") for key, value in row.items()}

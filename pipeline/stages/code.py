@@ -22,6 +22,7 @@ from pipeline.cases import all_cases
 from pipeline.config.exports import ExportParams, is_exported
 from pipeline.config.params import entries, read_section, sections
 from pipeline.engine.command import run_stage
+from pipeline.engine.stage_files import DATA
 from pipeline.files import digest, sha256, write_json
 from pipeline.stages.paths import WORK
 
@@ -63,6 +64,8 @@ def code() -> None:
         if stage == "screen" and not is_exported(case):
             continue
         write_json(WORK / "code" / f"{stage}{case and '-' + case}.json", listing(Path.cwd(), stage, case))
+    # For the engine, which sends a stage's files to a worker: no stage depends on this list.
+    write_json(DATA, sorted({p.as_posix() for case in all_cases().values() for p in case.reads}))
 
 
 def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:

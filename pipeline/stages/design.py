@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -17,6 +16,7 @@ import numpy as np
 from pipeline.cases import all_cases
 from pipeline.config.params import ControllerParams, choose, parse
 from pipeline.engine.command import reason, run_stage
+from pipeline.engine.origin import commit
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError, PipelineError, WithheldError
 from pipeline.evaluation.case import Case
@@ -50,13 +50,13 @@ def design(name: str) -> None:
     folder = design_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
     data = read_json(models / "metrics.json").get("data", {})
-    provenance = {"params_sha256": digest(forms), "commit": _commit(), "versions": _versions()}
+    provenance = {"params_sha256": digest(forms), "commit": commit(), "versions": _versions()}
     work = [(form, seed) for form in forms for seed in seeds]
     arguments = (params, read, models, case.plant, provenance, data)
     label = f"design {name}: controllers, tuned and written as ONNX files"
     try:
         _require_fit(law, case)
-        rows = parallel_map(partial(_export, *arguments, withhold=case.on_models), work, label)
+        rows = parallel_map(partial(_export, *arguments, withhold=case.on_models), work, label, in_folder=True)
     except WithheldError as error:
         _withhold(folder, law, str(error))
         print(f"design {name}: {error}", file=sys.stderr)
@@ -145,17 +145,6 @@ def _closed_loop(plant: Simulator) -> Callable[[Array], Array]:
         return plant.measure(state)
 
     return drive
-
-
-def _commit() -> str:
-    """Commit of the code, with "-dirty" where it or params.yaml was edited since."""
-    git = partial(subprocess.run, capture_output=True, text=True, timeout=10)
-    try:
-        head = git(["git", "rev-parse", "HEAD"], check=True).stdout.strip()
-        edited = git(["git", "diff", "--quiet", "HEAD", "--", "pipeline", "serving", "params.yaml"]).returncode
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return head + ("-dirty" if edited else "")
 
 
 def _versions() -> dict[str, str]:

@@ -31,6 +31,7 @@ def excite(name: str) -> None:
         partial(_record, excitation, case.plant, folder),
         params.seeds,
         f"excite {name}: experiments on the simulated plant",
+        in_folder=True,
     )
     write_json(folder / "metrics.json", {"record": params.record, "per_seed": dict(rows)})
 

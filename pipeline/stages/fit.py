@@ -7,7 +7,7 @@ import statistics
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,10 @@ def fit(name: str) -> None:
     shared = {seed: done(needed, _source(data, case, seed), label) for seed in data if needed}
     work = [(seed, part) for seed in data for part in parts]
     learnt = parallel_map(
-        partial(_learn, parts, data, case, shared, folder), work, f"{label}: the models, their errors and their bands"
+        partial(_learn, parts, data, case, shared, folder),
+        work,
+        f"{label}: the models, their errors and their bands",
+        in_folder=True,
     )
     results = dict(zip(work, learnt, strict=True))
     digests = {str(seed): digest for (seed, _), (digest, _, _) in results.items()}
@@ -102,13 +105,9 @@ def _learn(
 
 
 def _source(data: Mapping[int, Path | None], case: Case, seed: int) -> Source:
-    return Source(_record(data[seed], case), case.plant.signals, case.regions, seed, case.plant)
-
-
-@lru_cache(maxsize=1)
-def _record(path: Path | None, case: Case) -> Record | None:
-    """The record of a file; the last one is kept, because a seed's parts follow each other."""
-    return None if path is None else Record.read(path, case.record_signals)
+    path = data[seed]
+    record = None if path is None else Record.read(path, case.record_signals)
+    return Source(record, case.plant.signals, case.regions, seed, case.plant)
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

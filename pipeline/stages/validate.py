@@ -69,7 +69,8 @@ def validate(name: str) -> None:
         raise LawError(f"controllers.{name} has no exported files; run its design stage first")
     forms = (BASE, *params.variants)
     work = [(form, seed, controller_file(params.case, params.name, form, seed)) for form in forms for seed in seeds]
-    trials = parallel_map(partial(try_file, case, choices.noise_seed), work, f"validate {name}: files in closed loop")
+    label = f"validate {name}: files in closed loop"
+    trials = parallel_map(partial(try_file, case, choices.noise_seed), work, label, in_folder=True)
     base = [t for t in trials if t.form == BASE]
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))

@@ -1,0 +1,100 @@
+"""The cluster that does a run's work: one of this machine's cores, or the one that DASK_SCHEDULER_ADDRESS names.
+
+TLS and all else of the connection is set as Dask sets it (``DASK_DISTRIBUTED__COMM__TLS__...``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import tempfile
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+ADDRESS = "DASK_SCHEDULER_ADDRESS"
+CONNECT_S = 20.0
+# Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
+CONFIG = {
+    "distributed.scheduler.worker-ttl": None,
+    "distributed.admin.large-graph-warning-threshold": "1GB",  # a stage's files are its arguments
+    "logging.distributed": "critical",
+    "logging.tornado": "critical",
+}
+
+
+@contextlib.contextmanager
+def local_cluster(workers: int | None = None) -> Iterator[str]:
+    """Workers on this machine (None: one a core), of one thread each, until the block ends; its scheduler's address.
+
+    The address stands in the environment meanwhile, where whatever is started looks for it. The workers come in their
+    own time: work that comes before them waits.
+    """
+    import dask
+
+    with dask.config.set(CONFIG):
+        from distributed import LocalCluster
+
+        with tempfile.TemporaryDirectory(prefix="loopwright-workers-", ignore_cleanup_errors=True) as folder:
+            cluster = LocalCluster(
+                n_workers=0,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address=_dashboard(),
+                memory_limit=0,
+                local_directory=folder,
+                preload=["pipeline.engine.preload"],
+            )
+            before = os.environ.get(ADDRESS)
+            try:
+                os.environ[ADDRESS] = cluster.scheduler_address
+                cluster.scale(workers or os.cpu_count() or 1)
+                yield cluster.scheduler_address
+            finally:
+                os.environ.pop(ADDRESS, None)
+                if before is not None:
+                    os.environ[ADDRESS] = before
+                connected.cache_clear()
+                cluster.close(timeout=5)
+
+
+def address() -> str | None:
+    """The scheduler that work goes to; None where there is none, and work is done in place."""
+    return os.environ.get(ADDRESS) or None
+
+
+@functools.lru_cache(maxsize=1)
+def connected(to: str) -> Client:
+    """The connection of this process to a scheduler. Raises PipelineError where none answers."""
+    import dask
+
+    dask.config.set(CONFIG)
+    from distributed import Client
+
+    try:
+        return Client(to, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise PipelineError(
+            f"no scheduler answers at {to} ({text}); start it (`dask scheduler`), correct {ADDRESS}, "
+            "or unset it to use this machine's cores"
+        ) from None
+
+
+def dashboard(of: Any) -> str:
+    """The address of a cluster's page for people; empty where the package bokeh, which draws it, is missing."""
+    return of.dashboard_link if _dashboard() else ""
+
+
+def _dashboard() -> str | None:
+    try:
+        import bokeh  # noqa: F401
+    except ImportError:
+        return None
+    return "127.0.0.1:0"

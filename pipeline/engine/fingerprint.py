@@ -1,0 +1,61 @@
+"""What a process runs: versions of what decides results, and a digest of the sources.
+
+Results of a run must come of one code. A client sends its fingerprint with every task; a worker with another refuses.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "torch",
+    "casadi",
+    "onnx",
+    "onnxruntime",
+    "onnxscript",
+    "scikit-learn",
+    "numba",
+    "pyarrow",
+)
+FOLDERS = ("pipeline", "serving")
+CODE = "code"
+
+
+@cache
+def fingerprint() -> Mapping[str, str]:
+    """Versions by name, and under ``CODE`` the digest of all sources, as this process found them at its first call."""
+    return {"Python": platform.python_version(), **{name: _version(name) for name in PACKAGES}, CODE: _digest()}
+
+
+def difference(ours: Mapping[str, str], theirs: Mapping[str, str]) -> str:
+    """What differs, in words: "torch 2.13.0 here and 2.12.1 there"; empty where nothing does."""
+    names = sorted({*ours, *theirs})
+    pairs = [(name, ours.get(name, "none"), theirs.get(name, "none")) for name in names]
+    return ", ".join(f"{name} {_short(a)} here and {_short(b)} there" for name, a, b in pairs if a != b)
+
+
+def _digest() -> str:
+    """sha256 over the names and contents of the sources, of whichever folder this very module was imported from."""
+    root, found = Path(__file__).parents[2], hashlib.sha256()
+    for path in sorted(p for folder in FOLDERS for p in (root / folder).rglob("*.py")):
+        content = path.read_bytes()
+        found.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
+    return found.hexdigest()
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "none"
+
+
+def _short(value: str) -> str:
+    return value[:12]

@@ -1,0 +1,93 @@
+"""A stage on a worker: files in, files out.
+
+The client reads what the stage reads and writes what it wrote; in between it only waits, so that it needs no library
+of the pipeline. A stage that fails leaves the client's files as they were.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pickle
+import shutil
+import sys
+import traceback
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.engine.cluster import connected
+from pipeline.engine.fingerprint import difference, fingerprint
+from pipeline.engine.folder import apply, changes_since, read_files, within_folder
+from pipeline.engine.origin import commit, told
+from pipeline.engine.stage_files import StageFiles
+
+FAILED = 2
+
+
+def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
+    """Run a stage on the cluster at an address; its exit status. What it says is said here, as it says it."""
+    from pipeline.engine.parallel import lost  # with what the pieces need, which a client does not
+
+    client, topic = connected(at), f"stage-{uuid.uuid4().hex[:12]}"
+    # Outputs of a run before are no inputs: DVC removes them, by hand they may be there.
+    read = read_files(files.reads)
+
+    def say(event: tuple[float, Any]) -> None:
+        stream, text = event[1]
+        print(text, end="", file=getattr(sys, stream), flush=True)
+
+    client.subscribe_topic(topic, say)
+    ours = dict(fingerprint())
+    future = client.submit(
+        _run, list(arguments), pickle.dumps(read), ours, topic, commit(), key=topic, pure=False, retries=1
+    )
+    try:
+        answer = future.result()
+    except KeyboardInterrupt:
+        future.cancel()
+        raise
+    except Exception as error:
+        print(f"{' '.join(arguments)}: {lost(error, 'the stage')}", file=sys.stderr)
+        return FAILED
+    code, changes, said = pickle.loads(answer)
+    client.unsubscribe_topic(topic)
+    for stream, text in said:
+        print(text, end="", file=getattr(sys, stream), flush=True)
+    if not code:
+        for path in files.writes:
+            if path.is_dir():
+                shutil.rmtree(path)
+        apply(changes)
+    return int(code)
+
+
+def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: str, of: str) -> bytes:
+    """(exit status, changed files, what was said last), pickled; on a worker."""
+    from distributed import get_worker
+
+    from pipeline.engine.command import run_stage
+    from pipeline.engine.parallel import Stage, conducting, mixture
+    from pipeline.engine.progress import lines_anew
+    from pipeline.engine.spoken import spoken_to
+
+    worker, files = get_worker(), pickle.loads(read)
+    kind, *names = arguments
+    said = list[tuple[str, str]]()
+
+    def wanted() -> bool:
+        task = worker.state.tasks.get(topic)
+        return task is not None and task.state not in {"cancelled", "released", "forgotten"}
+
+    def say(stream: str, text: str) -> None:
+        worker.log_event(topic, (stream, text))
+
+    with spoken_to(say), told(of), lines_anew():
+        if other := difference(theirs, fingerprint()):
+            return pickle.dumps((FAILED, {}, [("stderr", f"{' '.join(arguments)}: {mixture(other)}\n")]))
+        with within_folder(files), conducting(Stage(files, wanted)):
+            try:
+                stage = getattr(importlib.import_module(f"pipeline.stages.{kind}"), kind)
+                code = run_stage(stage, [kind, *names], "NAME" if names else "")
+            except Exception:
+                return pickle.dumps((1, {}, [("stderr", traceback.format_exc())]))
+            return pickle.dumps((code, changes_since(files), said))
