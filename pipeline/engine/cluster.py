@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
 CONNECT_S = 20.0
+PRELOAD = ["pipeline.engine.preload"]
 # Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
 CONFIG = {
     "distributed.scheduler.worker-ttl": None,
@@ -49,7 +50,7 @@ def local_cluster(workers: int | None = None) -> Iterator[str]:
                 dashboard_address=_dashboard(),
                 memory_limit=0,
                 local_directory=folder,
-                preload=["pipeline.engine.preload"],
+                preload=PRELOAD,
             )
             before = os.environ.get(ADDRESS)
             try:

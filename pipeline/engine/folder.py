@@ -20,7 +20,7 @@ Changes = Mapping[str, bytes | None]  # None: removed
 
 
 def read_files(paths: Iterable[Path]) -> dict[str, bytes]:
-    """Name -> content of some files and of all files in some folders; what is not there, or lies outside, is left out."""
+    """Name -> content of some files, and of those in some folders; what is not there or lies outside is left out."""
     found = dict[str, bytes]()
     for path in paths:
         if _outside(path):

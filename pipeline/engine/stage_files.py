@@ -16,7 +16,8 @@ from typing import Any
 import yaml
 
 DVC_FILE, PARAMS_FILE = Path("dvc.yaml"), Path("params.yaml")
-DATA = Path("work/code/data.json")  # files of own plants that dvc.yaml cannot list
+DATA = Path("work/code/data.json")  # case -> files of own plants that dvc.yaml cannot list
+EVERY = "*"  # in place of a case: what the stages of all need
 _FIELD = re.compile(r"\$\{([\w.]+)\}")
 
 
@@ -48,7 +49,8 @@ def on_cluster(kind: str, name: str) -> StageFiles | None:
         return [Path(_FIELD.sub(lambda found: str(_value(values, found[1])), n)) for n in names]
 
     outs, replaced = paths(entry.get("outs")), paths(entry["meta"].get("replaces"))
-    reads = [PARAMS_FILE, *paths(entry.get("deps")), *paths(entry["meta"].get("reads")), *replaced, *_data()]
+    reads = [PARAMS_FILE, *paths(entry.get("deps")), *paths(entry["meta"].get("reads")), *replaced]
+    reads += _data(str(items[name].get("case", "")))
     return StageFiles(tuple(reads), tuple(outs))
 
 
@@ -59,8 +61,9 @@ def _value(values: Mapping[str, Any], name: str) -> Any:
     return found
 
 
-def _data() -> list[Path]:
+def _data(case: str) -> list[Path]:
     try:
-        return [Path(name) for name in json.loads(DATA.read_text(encoding="utf-8"))]
+        found = json.loads(DATA.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return []
+    return [Path(name) for of in (EVERY, case) for name in found.get(of, ())]

@@ -21,8 +21,9 @@ import grimp
 from pipeline.cases import all_cases
 from pipeline.config.exports import ExportParams, is_exported
 from pipeline.config.params import entries, read_section, sections
+from pipeline.config.plants import PlantParams
 from pipeline.engine.command import run_stage
-from pipeline.engine.stage_files import DATA
+from pipeline.engine.stage_files import DATA, EVERY
 from pipeline.files import digest, sha256, write_json
 from pipeline.stages.paths import WORK
 
@@ -65,7 +66,9 @@ def code() -> None:
             continue
         write_json(WORK / "code" / f"{stage}{case and '-' + case}.json", listing(Path.cwd(), stage, case))
     # For the engine, which sends a stage's files to a worker: no stage depends on this list.
-    write_json(DATA, sorted({p.as_posix() for case in all_cases().values() for p in case.reads}))
+    simulators = {p.as_posix() for case in all_cases().values() for p in case.reads}  # the list of cases loads them all
+    records = {name: [PlantParams.read(name).data.as_posix()] for name in sections("plants")}
+    write_json(DATA, {EVERY: sorted(simulators), **records})
 
 
 def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:

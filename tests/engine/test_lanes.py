@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from processes import lives, within
 
-from pipeline.engine.start import VARIABLE
+from pipeline.engine.start import DOOR
 
 ROOT = Path(__file__).parents[2]
 # In place of DVC: says what it was asked, then what the name of its last stage tells it to do.
@@ -114,12 +114,12 @@ def test_dvc_ends_by_itself_where_its_stage_is_ended(
     folder: Path, further: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A signal in the middle of writing dvc.lock would cost the finished stages; what it then says is of no use."""
-    monkeypatch.setenv(VARIABLE, "a process that ends the stages")
+    monkeypatch.setenv(DOOR, "which shuts, so that stages end")
     process = begin(folder, "repro", *further, "waits")
     pid = folder / "pid"
     assert within(30, lambda: pid.exists() and bool(pid.read_text()))
     process.send_signal(signal.SIGTERM)
-    os.kill(int(pid.read_text()), signal.SIGTERM)  # as the warm process does
+    os.kill(int(pid.read_text()), signal.SIGTERM)  # as the shutting door does
     out, err = process.communicate(timeout=10)
     assert process.returncode == 128 + signal.SIGTERM
     assert (out.splitlines(), err) == (["ran waits", "stage 1 of 1: fit x"], "")

@@ -1,24 +1,26 @@
-"""Independent pieces side by side: order, errors, and what stands in for a cluster."""
+"""Independent pieces in order, with their errors; here without a cluster, see test_cluster.py for one."""
 
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
+import pickle
 from functools import partial
 from pathlib import Path
-from threading import Event
 
 import pytest
 
 from pipeline.engine import parallel
-from pipeline.engine.parallel import parallel_map
+from pipeline.engine.fingerprint import difference, fingerprint
+from pipeline.engine.folder import apply, changes_since, read_files, within_folder
+from pipeline.engine.parallel import as_done, parallel_map
 from pipeline.errors import PipelineError
 
 
 def test_results_come_in_the_order_of_the_items() -> None:
     assert parallel_map(math.sqrt, [4.0, 1.0, 9.0], "roots") == [2.0, 1.0, 3.0]
     assert parallel_map(math.sqrt, [], "none") == []
+    assert list(as_done(math.sqrt, [4.0, 1.0])) == [(0, 2.0), (1, 1.0)]
 
 
 def test_an_error_of_one_piece_is_the_error_of_all() -> None:
@@ -26,52 +28,14 @@ def test_an_error_of_one_piece_is_the_error_of_all() -> None:
         parallel_map(math.sqrt, [1.0, -1.0], "roots")
 
 
-def mark(folder: Path, item: int) -> int:
-    with (folder / f"{item}").open("a") as file:
-        file.write(f"{os.getpid()}\n")
-    return item**2
+def test_a_cluster_that_does_not_answer_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:1")
+    monkeypatch.setattr("pipeline.engine.cluster.CONNECT_S", 0.2)
+    with pytest.raises(PipelineError, match=r"no scheduler answers at tcp://127.0.0.1:1 .*start it"):
+        parallel_map(math.sqrt, [1.0, 4.0], "roots")
 
 
-def test_every_piece_is_done_once_whoever_takes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    assert parallel_map(partial(mark, tmp_path), range(20), "squares") == [i**2 for i in range(20)]
-    taken = [(tmp_path / f"{i}").read_text().split() for i in range(20)]
-    assert all(len(pids) == 1 for pids in taken)
-    assert [str(os.getpid())] in taken  # this process works too
-
-
-def meet(folder: Path, item: int) -> int:
-    """Wait, at most a minute, until another process has begun the other item."""
-    (folder / f"{item}").write_text(str(os.getpid()))
-    other = folder / f"{1 - item}"
-    for _ in range(6_000):
-        if other.exists() and other.read_text():
-            return int(other.read_text())
-        Event().wait(0.01)
-    raise TimeoutError("no other process came")
-
-
-def test_pieces_run_side_by_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    one, other = parallel_map(partial(meet, tmp_path), [0, 1], "meetings")
-    assert one != other
-    assert os.getpid() in (one, other)
-
-
-def give_up(here: int, item: int) -> int:
-    if os.getpid() != here:
-        os._exit(3)
-    Event().wait(0.05)
-    return item
-
-
-def test_a_helper_that_dies_is_an_error_and_no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    with pytest.raises(PipelineError, match=r"exits: a helper process died \(exit code 3"):
-        parallel_map(partial(give_up, os.getpid()), range(2_000), "exits")
-    assert multiprocessing.active_children() == []
-
-
+# ---------------------------------------------------------------------- what a worker does, called here
 class TwoPartError(Exception):
     """An error that pickle cannot make again."""
 
@@ -79,41 +43,73 @@ class TwoPartError(Exception):
         super().__init__(f"{one} {other}")
 
 
-def fail_elsewhere(here: int, kind: str, item: int) -> object:
-    Event().wait(0.05)
-    if os.getpid() == here:
-        return item
+def fail(kind: str, item: int) -> object:
     if kind == "result":
         return lambda: item
     raise TwoPartError("two", "parts") if kind == "two parts" else ValueError("of its own")
+
+
+def answer(function: object, item: object, files: dict[str, bytes] | None = None) -> tuple[Exception, object, dict]:
+    shared = pickle.dumps((function, files))
+    return pickle.loads(parallel._piece(shared, pickle.dumps(item), fingerprint()))
 
 
 @pytest.mark.parametrize(
     ("kind", "error", "text"),
     [
         ("plain", ValueError, "of its own"),
-        ("two parts", PipelineError, "TwoPartError: two parts"),
+        ("two parts", (TwoPartError, PipelineError), "two parts"),  # a PipelineError without the help of tblib
         ("result", Exception, "pickle"),
     ],
 )
-def test_what_a_helper_raises_arrives(
-    monkeypatch: pytest.MonkeyPatch, kind: str, error: type[Exception], text: str
+def test_what_a_worker_raises_arrives(
+    kind: str, error: type[Exception] | tuple[type[Exception], ...], text: str
 ) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    failed, result, _ = answer(partial(fail, kind), 1)
+    assert result is None
     with pytest.raises(error, match=text):
-        parallel_map(partial(fail_elsewhere, os.getpid(), kind), range(100), "failures")
-    assert multiprocessing.active_children() == []
+        raise failed
 
 
-def test_where_a_fork_is_not_safe_helpers_start_afresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "CONTEXT", multiprocessing.get_context("spawn"))
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    assert parallel_map(math.sqrt, [4.0, 1.0, 9.0], "roots") == [2.0, 1.0, 3.0]
-    assert multiprocessing.active_children() == []
+def test_a_worker_with_other_code_refuses_and_names_both() -> None:
+    theirs = {**fingerprint(), "torch": "9.9", "code": "f" * 64}
+    failed, _, _ = pickle.loads(parallel._piece(pickle.dumps((math.sqrt, None)), pickle.dumps(1.0), theirs))
+    own = fingerprint()
+    assert f"code ffffffffffff here and {own['code'][:12]} there, torch 9.9 here and {own['torch'][:12]}" in str(failed)
+    assert isinstance(failed, PipelineError)
+    assert difference(own, own) == ""
 
 
-def test_a_cluster_without_its_package_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:1")
-    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
-    with pytest.raises(PipelineError, match="needs the package distributed"):
-        parallel_map(math.sqrt, [1.0], "roots")
+def writes(folder: Path, item: int) -> str:
+    (folder / f"{item}.txt").write_text(str(item))
+    (folder / "old.txt").unlink()
+    return (folder / "read.txt").read_text()
+
+
+def test_a_piece_has_its_files_around_it_and_gives_back_what_changed(tmp_path: Path) -> None:
+    here = os.getcwd()
+    files = {"a/read.txt": b"given", "a/old.txt": b"goes"}
+    failed, result, changes = answer(partial(writes, Path("a")), 3, files)
+    assert failed is None
+    assert (result, changes) == ("given", {"a/old.txt": None, "a/3.txt": b"3"})
+    assert os.getcwd() == here
+
+
+# ---------------------------------------------------------------------- files as values
+def test_files_come_back_as_they_were_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    apply({"deep/in/a.txt": b"1", "b.txt": b"2"})
+    files = read_files([Path("deep"), Path("b.txt"), Path("missing"), Path("/etc/hostname"), Path("../b.txt")])
+    assert files == {"deep/in/a.txt": b"1", "b.txt": b"2"}
+    with within_folder(files):
+        assert changes_since(files) == {}
+        Path("b.txt").write_bytes(b"3")
+        assert changes_since(files) == {"b.txt": b"3"}
+    assert Path("b.txt").read_bytes() == b"2"
+
+
+@pytest.mark.parametrize("name", ["../out.txt", "/out.txt", "a/../../out.txt"])
+def test_no_file_is_written_out_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="leads out of the folder"):
+        apply({name: b""})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import pytest
 
@@ -20,12 +21,13 @@ class Clock:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """The time of the lines of this process; enough has passed for a first one."""
+def clock() -> Iterator[Clock]:
+    """The time of the lines of this thread; enough has passed for a first one."""
     found = Clock()
-    monkeypatch.setattr(progress, "_LINES", Lines(found))
+    token = progress._lines.set(Lines(found))
     found.now += EVERY_S
-    return found
+    yield found
+    progress._lines.reset(token)
 
 
 def test_a_piece_says_what_is_done_and_how_long_the_rest_takes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,11 +67,7 @@ def test_the_steps_of_a_single_item_are_shown_under_its_label(clock: Clock, caps
     assert capsys.readouterr().err == ""
 
 
-def test_several_items_are_counted_by_their_weights(
-    clock: Clock, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
-
+def test_several_items_are_counted_by_their_weights(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     def item(value: float) -> float:
         clock.now += EVERY_S
         return math.sqrt(value)
