@@ -31,6 +31,16 @@ def dask_setup(worker: object) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers in order
     listen()
     load()
+    trace()
+
+
+def trace() -> None:
+    """Export a module of one product, which brings up all that an export needs, before any task does in its thread."""
+    with contextlib.suppress(Exception):
+        import torch
+
+        program = torch.export.export(torch.nn.Linear(1, 1).double(), (torch.zeros(1, dtype=torch.float64),))
+        torch.onnx.export(program, dynamo=True, external_data=False, verbose=False, optimize=False)
 
 
 def load() -> None:

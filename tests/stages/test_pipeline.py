@@ -32,7 +32,7 @@ ENVIRONMENT = {
 
 
 class Copy:
-    """A copy of the repository in which DVC runs, in a shell whose stages all start warm."""
+    """A copy of the repository in which DVC runs, in a shell whose stages share one cluster."""
 
     def __init__(self, path: Path, shell: subprocess.Popen[str]) -> None:
         self.path, self.shell = path, shell
@@ -98,7 +98,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
     tree["cases"][CASE]["held_out_seeds"] = tree["cases"][CASE]["held_out_seeds"][:1]
     (path / "params.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     subprocess.run(["git", "init", "--quiet"], cwd=path, check=True)
-    warm = [sys.executable, "-m", "pipeline.engine.warm", "bash"]
+    warm = [sys.executable, "-m", "pipeline.engine.with_cluster", "bash"]
     with subprocess.Popen(
         warm, cwd=path, env=ENVIRONMENT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as shell:
