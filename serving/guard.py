@@ -45,7 +45,7 @@ class Guard(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Complete:
-    """Every value is there and finite. Only the applied MV may be None: it need not be read back."""
+    """Every value that the law uses is there and finite. Only the applied MV may be None: it need not be read back."""
 
     manifest: Manifest
     memory: int = field(default=0, init=False)
@@ -60,6 +60,8 @@ class Complete:
         ):
             if values is None and (signals is m.mv or not signals):
                 continue
+            if label == "DV" and "dv" not in m.inputs:
+                continue  # a sensor that the law does not listen to stops no loop
             if not isinstance(values, np.ndarray):
                 return f"{label} is of the type {type(values).__name__}; it needs an array of {len(signals)} numbers"
             if values.dtype.kind not in "fiu":

@@ -14,9 +14,9 @@ m = json.loads(session.get_modelmeta().custom_metadata_map["loopwright.manifest"
 names = [output.name for output in session.get_outputs()]
 state, mv = np.zeros(m["n_state"]), np.array([s["low"] for s in m["mv"]])
 for k in range(100):  # once every m["period_s"] seconds
-    sp = np.array([(s["low"] + s["high"]) / 2 for s in m["sp"]])
+    given = {n: np.array([(s["low"] + s["high"]) / 2 for s in m[n]]) for n in ("sp", "dv")}
     pv = np.array([s["low"] + (s["high"] - s["low"]) * (k % 10) / 10 for s in m["pv"]])
-    given = {"sp": sp, "pv": pv, "mv_applied": mv, "state": state}
+    given |= {"pv": pv, "mv_applied": mv, "state": state}
     result = dict(zip(names, session.run(None, {n: given[n] for n in m["inputs"]}), strict=True))
     mv, state, info = result["mv"], result.get("state_next", state), result.get("info", np.zeros(0))
     if not np.isfinite(mv).all():  # the runtime also checks ranges, inputs and the file itself

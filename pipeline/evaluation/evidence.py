@@ -264,6 +264,8 @@ class Evidence:
         errors = {n: law.development for n, law in shown.items() if law.development is not None}
         if self.best is None:
             return ""
+        if set(errors) == {self.best}:
+            return "no other law is shipped"
         if not errors:
             return "it has the lowest gate score of the laws that did not lock up"
         others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)

@@ -134,9 +134,11 @@ def parity_gate(
         k = int(np.argmax(~(relative <= allowed).all(axis=1)))
         i = int(np.argmax(relative[k] / allowed))
         raise ExportError(
-            f"law {law.name!r}: graph and module differ by {relative[:, i].max():.1e} (allowed {allowed[i]:.0e}), "
-            f"first at step {k} in {names[i]}: torch {torch_side[k, i]:.17g}, onnxruntime {onnx_side[k, i]:.17g}; keep "
-            "the law's constants in float64 buffers, and avoid a transposed constant in front of a vector product"
+            f"law {law.name!r}: the exported file and the law part by {relative[:, i].max():.1e} of the largest value "
+            f"of {names[i]} within {steps} steps (allowed {allowed[i]:.0e}; at step {k}, the first beyond, torch has "
+            f"{torch_side[k, i]:.17g}, onnxruntime {onnx_side[k, i]:.17g}): a law that amplifies rounding would act "
+            "differently on every machine; a longer sampling period often cures it, and in a law of your own float64 "
+            "buffers for all constants, and no transposed constant in front of a vector product"
         )
     return float(relative[:, :n_fed].max())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -29,6 +30,7 @@ IN_BAND = 0.1  # share of an input's power in the plant's band
 COHERENT = 0.3  # coherence in the band
 LONG_DELAY, LEAST_DELAY = 1.0, 20  # dead time over what follows it, and rows
 UNKNOWN_SETTLING = 30  # rows, where no answer is seen
+OUT_OF_RANGE = 0.1  # share of the rows dropped for it, from which the record is doubtful
 HELD = 0.6  # share of rows without a move, from which an input is moved in steps
 
 
@@ -102,6 +104,21 @@ def judged(
         level = max(level, 1)
     carries = ("yes", "doubtful", "no")[level]
     return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used, unsure)
+
+
+def with_rows_out_of_range(verdict: Verdict, dropped: int, rows: int) -> Verdict:
+    """The verdict, "doubtful" at best where many rows were dropped because a reading left a range that was given.
+
+    What is left is what the plant does inside the range, and every excursion is torn out of its course.
+    """
+    if dropped <= OUT_OF_RANGE * rows:
+        return verdict
+    words = (
+        f"{100 * dropped / rows:.0f} % of the rows have a reading outside the range that was given: widen the range if "
+        "the plant goes there, or correct the unit"
+    )
+    carries = verdict.carries if verdict.carries == "no" else "doubtful"
+    return replace(verdict, carries=carries, reasons=(*verdict.reasons, words))
 
 
 def spectra_of(record: Record, models: Mapping[str, Linear | None]) -> dict[str, list[Spectrum]]:

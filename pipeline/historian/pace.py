@@ -210,23 +210,27 @@ def _settling(rows: Sequence[tuple[int, bool, float]]) -> tuple[float, bool]:
     """Steps in which an answer settles, of (factor, whether it settles, rows) from the finest on; 0 where none is sure.
 
     And whether the rows as they are show the same. The sparsest rows say whether it settles at all, since noise makes a
-    ramp seem to end. A thinned fit must agree with the finer one before it, and both count.
+    ramp seem to end. A thinned fit must agree with the finer one before it, and both count; where loads that nobody
+    measures bend the sparsest fits, finer ones do.
     """
     settles = rows[-1][1]
     same = [(factor * n, n) for factor, kind, n in rows if kind is settles]
     at = max((i for i, (_, n) in enumerate(same) if n >= RESOLVED), default=0)
-    steps, before = same[at][0], same[at - 1][0]
-    row = steps / same[at][1]
     if not settles and same[at][1] < RESOLVED:  # a ramp that begins at once, by rows of any rate
         return min(n for n, _ in same), True
     finest, first, own = rows[0]
     if at == 0:
-        return (steps, True) if finest == 1 and first is settles else (0.0, False)
-    if not (steps - row) / AGREES < before < (steps + row) * AGREES:
-        return 0.0, False
-    steps = float(np.sqrt(before * steps))
-    shown = finest == 1 and first is settles and 1 / AGREES < own / steps < AGREES
-    return (own, True) if shown else (steps, False)
+        return (same[0][0], True) if finest == 1 and first is settles else (0.0, False)
+    for place in range(at, 0, -1):
+        (before, _), (steps, n) = same[place - 1], same[place]
+        row = steps / n
+        if (steps - row) / AGREES < before < (steps + row) * AGREES:
+            both = float(np.sqrt(before * steps))
+            if place < at and both <= FINE:  # less sure, and no reason to leave the export's step
+                break
+            shown = finest == 1 and first is settles and 1 / AGREES < own / both < AGREES
+            return (own, True) if shown else (both, False)
+    return 0.0, False
 
 
 def _span(v: Array) -> float:

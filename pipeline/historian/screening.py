@@ -14,7 +14,7 @@ from pipeline.historian.character import quantum
 from pipeline.historian.confirming import confirm
 from pipeline.historian.contradictions import contradict
 from pipeline.historian.excerpt import SEEN, evenly
-from pipeline.historian.excitation import judged, moves_of
+from pipeline.historian.excitation import judged, moves_of, with_rows_out_of_range
 from pipeline.historian.export import Export, Series
 from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
@@ -123,12 +123,13 @@ def screened(
     findings = of_quick_models(findings, excerpt, models, {t.name: t.tag for t in signals})
     findings += of_models(excerpt, models)
     drifts = {t.name for t in signals for f in findings if f.kind == "drift" and f.tag == t.tag}
+    counts = np.bincount(code, minlength=len(Reason))
     verdict = with_levels(judged(excerpt, models, moved, len(record), drifts), excerpt, tags)
+    verdict = with_rows_out_of_range(verdict, int(counts[Reason.RANGE]), len(code))
     findings += of_answers([s.name for s in record.pv_signals], verdict)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
     )
-    counts = np.bincount(code, minlength=len(Reason))
     lengths = np.bincount(record.run) if len(record) else np.zeros(1, dtype=np.int64)
     report = Screening(
         plant=plant,

@@ -60,6 +60,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(
             "!          number of closed loops that locked up; the law reproduces a paper: do not run it on a plant"
         )
+    best = None
     if case is None:
         if any(standing.hidden for standing in standings.values()):
             console.print("n          noise can hide more than the bound: the ratio is to the hidden error, at least 1")
@@ -75,8 +76,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         if best is not None:
             console.print(f"the best   {where / f'{best}.onnx'}")
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
-    console.print(f"try one    loopwright simulate {where / '<law>.onnx'}")
-    console.print(f"read one   loopwright inspect {where / '<law>.onnx'}")
+    # In quotes where a word has to be put in: a shell takes the brackets for something else.
+    one = f"{where / best}.onnx" if best is not None else f"'{where / '<law>.onnx'}'"
+    console.print(f"try one    loopwright simulate {one}")
+    console.print(f"read one   loopwright inspect {one}")
     console.print("registry   make registry, then /#/models in the browser")
 
 

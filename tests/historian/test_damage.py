@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -242,6 +243,16 @@ def test_a_wrong_range_is_refused(tmp_path: Path) -> None:
     tags = (Tag("TIC-101.PV", "pv", "K", 300, 400), *TAGS[1:])
     with pytest.raises(RecordError, match=r"outside its range 300 to 400 K; correct the range or the unit"):
         screen_of(clean(), tmp_path, tags)
+
+
+def test_rows_torn_out_by_a_narrow_range_make_a_record_doubtful(tmp_path: Path) -> None:
+    narrow = (Tag("TIC-101.PV", "pv", "degC", 50, 90), *TAGS[1:])
+    verdict = screen_of(clean(), tmp_path, narrow).report.verdict
+    assert verdict.carries == "doubtful"
+    assert re.search(
+        r"[1-4]\d % of the rows have a reading outside the range that was given: widen", verdict.reasons[-1]
+    )
+    assert screen_of(clean(), tmp_path).report.verdict.carries == "yes"
 
 
 def test_a_constant_mv_and_regulation_without_excitation_are_told(tmp_path: Path) -> None:

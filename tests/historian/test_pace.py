@@ -16,7 +16,7 @@ from pipeline.__main__ import main
 from pipeline.config.exports import ExportParams, screened_record
 from pipeline.historian.excerpt import SEEN
 from pipeline.historian.export import Series
-from pipeline.historian.pace import FINE, MOST_PERIODS, Answer, Pace, in_words, of_period, pace_of
+from pipeline.historian.pace import FINE, MOST_PERIODS, Answer, Pace, _settling, in_words, of_period, pace_of
 from pipeline.historian.tags import Tag
 from pipeline.stages.screen import screen
 
@@ -111,6 +111,15 @@ def test_an_export_that_suits_keeps_its_step(seed: int, lag_s: int) -> None:
         found = pace([lagged(u, lag_s) + load + noise(seed + 7, len(u), 0.3)], [u])
         assert found.period(1.0) == 1.0
         assert of_period(found, 1.0, 1.0, given=False) == []
+
+
+def test_sparse_fits_that_a_load_bends_leave_the_word_to_finer_ones() -> None:
+    # (rows taken as one, whether the answer settles, rows that it takes); from a furnace of which 27 rows are dead time
+    rows = [(1, True, 292.0), (3, True, 121.0), (10, True, 229.0), (30, True, 7.0), (100, True, 11.0)]
+    assert _settling(rows) == (292.0, True)
+    assert Pace((Answer("pv0", "mv0", 584.0, shown=True),)).period(2.0) == 12.0
+    # The same spread over a plant that its rows suit says nothing.
+    assert _settling([(factor, kind, n / 5) for factor, kind, n in rows[:3]] + [(30, True, 9.0)]) == (0.0, False)
 
 
 def test_rows_that_show_a_long_settling_keep_their_step_and_the_remark_names_a_better_one() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -238,3 +240,14 @@ def test_rules_that_do_not_hold_name_those_that_do(tuning: str) -> None:
     plant = Chain(back=0.1)
     with pytest.raises(LawError, match=r"no zero; .* choose tuning `optimized` or `itae`"):
         PID.design(PID.Params(tuning=tuning), {}, plant.signals, plant)
+
+
+def test_the_settings_stand_in_words_as_another_pid_takes_them(signals: Signals) -> None:
+    law = PID(signals, PidSettings(0.5, 40.0, 5.0, 0.5, 0.7))
+    (note,) = law.analysis(None).notes
+    cv, mv = signals.sp[0], signals.mv[0]
+    assert note.startswith(
+        f"{mv.name} by {cv.name}: Kc 0.5 {mv.unit}/({cv.unit}), Ti 40 s, Td 5 s with a filter of 0.5 s"
+    )
+    (note,) = PID(signals, PidSettings(0.5, math.inf)).analysis(None).notes
+    assert "no integral part, no derivative" in note

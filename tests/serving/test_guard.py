@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ MANIFEST = Manifest(
     mv=(Signal("valve", "%", 0.0, 100.0),),
     n_state=0,
     info=(),
-    inputs=("sp", "pv"),
+    inputs=("sp", "pv", "dv"),
 )
 
 
@@ -74,6 +75,13 @@ def test_a_good_run_passes_every_guard(guard: Guard) -> None:
 )
 def test_complete(bad: Sample, reason: str) -> None:
     assert Complete(MANIFEST).check(bad, ()) == reason
+
+
+def test_a_disturbance_that_the_law_does_not_use_need_not_be_measured() -> None:
+    unused = Complete(replace(MANIFEST, inputs=("sp", "pv")))
+    for dv in (np.zeros(0), np.array([math.nan])):
+        assert unused.check(Sample(np.array([1.0, 300.0]), dv=dv), ()) is None
+        assert Complete(MANIFEST).check(Sample(np.array([1.0, 300.0]), dv=dv), ()) is not None
 
 
 def test_the_applied_mv_need_not_be_read_back() -> None:

@@ -361,7 +361,6 @@ JUNK = [
     Sample(pv=np.array([0.8, None]), dv=np.zeros(1)),
     Sample(pv=np.array(["0.8", "300"]), dv=np.zeros(1)),
     Sample(pv=np.array([0.8, 300.0 + 1j]), dv=np.zeros(1)),
-    Sample(pv=np.array([0.8, 300.0]), dv=None),  # type: ignore[arg-type]
     Sample(pv=np.array([0.8, 300.0]), dv=np.zeros(1), mv_applied=[40.0]),  # type: ignore[arg-type]
     Sample(pv=np.array([0.8, 300.0]), dv=np.zeros(1), mv_applied=np.zeros((1, 1))),
     Sample(pv=np.array([0.8, 300.0]), dv=np.zeros(1), age_s=None),  # type: ignore[arg-type]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from math import isfinite
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -151,7 +152,7 @@ class PID(ControlLaw):
         self.register_buffer("mvs", torch.tensor(mvs) if idle else None)
         self.register_buffer("places", torch.tensor(places) if idle else None)
         self.register_buffer("near", 1e-3 * _of(self.high - self.low, self.mvs))
-        self.settings, self.pairs = rows[0][0], pairs
+        self.settings, self.loops, self.pairs = rows[0][0], rows[0], pairs
         self.n_state = 1 + 6 * len(pairs)  # started; p, y, d, the last request, the same limited, mv_applied, all k-1
         names = [signals.mv[j].name for j in mvs]
         self.info = ("mv_requested",) if len(pairs) == 1 else tuple(f"{name}_requested" for name in names)
@@ -211,22 +212,36 @@ class PID(ControlLaw):
         return mv, torch.cat([started, p, y, d, requested, _of(mv, self.mvs), applied], dim=-1), requested
 
     def analysis(self, plant: Simulator | None) -> Analysis:
-        """Stability and gain margin of the linear closed loops over ``examined_cv``; the pairs of several loops."""
+        """The settings in words; stability and gain margin over ``examined_cv``; the pairs of several loops."""
         if self.pairings:
             return self._pairing()
         if self.examined_cv is None:
-            return Analysis()
+            return Analysis(notes=self._in_words())
         known = equations(plant, "law 'pid' with `examined_cv`")
         loops = FrozenLoops.of(known, self, self.n_state, np.linspace(*self.examined_cv, EXAMINED))
         radius = spectral_radius(loops.matrices())
         figures = {"frozen_radius": float(radius.max()), "gain_margin": loops.gain_margin()}
-        return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius})
+        return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius}, self._in_words())
 
     def _pairing(self) -> Analysis:
         cvs, (chosen, *others) = self.signals.sp, self.pairings
         gains = zip(chosen.pairs, chosen.relative_gains, strict=True)
         figures = {f"relative_gain_{cvs[i].name}": gain for (i, _), gain in gains}
-        return Analysis(figures, notes=choice_words(chosen, others, cvs, self.signals.mv))
+        return Analysis(figures, notes=(*self._in_words(), *choice_words(chosen, others, cvs, self.signals.mv)))
+
+    def _in_words(self) -> tuple[str, ...]:
+        """The settings of each loop, as somebody types them into another PID."""
+        words = []
+        for (i, j), s in zip(self.pairs, self.loops, strict=True):
+            cv, mv = self.signals.sp[i], self.signals.mv[j]
+            integral = f"Ti {s.ti_s:.4g} s" if isfinite(s.ti_s) else "no integral part"
+            derivative = f"Td {s.td_s:.4g} s with a filter of {s.filter_s:.4g} s" if s.td_s else "no derivative"
+            words.append(
+                f"{mv.name} by {cv.name}: Kc {s.kc:.4g} {mv.unit}/({cv.unit}), {integral}, {derivative}, set-point "
+                f"weight {s.set_point_weight:.4g}, anti-windup within {s.tracking_time_s:.4g} s "
+                "(ideal form; derivative of the process variable)."
+            )
+        return tuple(words)
 
 
 def _of(values: Tensor, which: Tensor | None) -> Tensor:
