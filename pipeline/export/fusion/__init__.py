@@ -1,0 +1,28 @@
+"""Affine fusion: the affine parts of a graph as few matrix products, so that a law may be written as its formulas."""
+
+from __future__ import annotations
+
+import onnx
+
+from pipeline.export.fusion.choice import choose
+from pipeline.export.fusion.emission import emitted
+from pipeline.export.fusion.forms import Forms
+from pipeline.export.fusion.reading import Reading
+
+LEAST_SHARE = 0.01
+"""Of its price a graph must save so much; else it stays as it is."""
+
+
+def fused(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The same function with fewer operators; the model itself where nothing is gained.
+
+    What is affine in the inputs and in the results of nonlinear operators is computed by few
+    products, never by one that is dearer than what it replaces. Equal to the given graph but for
+    the rounding. The graph must have static shapes and operators that a controller may have.
+    """
+    reading = Reading(model)
+    forms = Forms(reading)
+    after = choose(forms)
+    if after > (1 - LEAST_SHARE) * reading.price_before:
+        return model
+    return emitted(forms, model)

@@ -1,0 +1,59 @@
+"""Which form each value gets: the cheapest of some uniform preferences, then one by one while that pays."""
+
+from __future__ import annotations
+
+from pipeline.export.fusion.forms import Forms
+from pipeline.export.fusion.plan import Account, Choice, Item
+
+PREFERENCES = (
+    ("selection", "elementwise", "gather", "squares", "increment", "recipe", "segments", "group"),
+    ("selection", "group", "gather", "squares", "recipe", "segments", "increment", "elementwise"),
+    ("selection", "squares", "recipe", "elementwise", "increment", "segments", "group", "gather"),
+    ("selection", "elementwise", "squares", "segments", "increment", "group", "gather", "recipe"),
+)
+SWEEPS = 2
+LEAST_GAIN = 0.01  # ns
+
+
+def choose(forms: Forms) -> float:
+    """Choose a form for each value; the price of all [ns]."""
+    roots = [item for _, item in forms.outputs if isinstance(item, Item)]
+    prices = []
+    for preference in PREFERENCES:
+        account = _with(preference, forms, roots)
+        prices.append(account.total)
+        _without(account, roots)
+    account = _with(PREFERENCES[prices.index(min(prices))], forms, roots)
+    for _ in range(SWEEPS):
+        before = account.total
+        for choice in sorted(forms.choices, key=lambda c: c.order, reverse=True):
+            if choice.count:
+                _improve(account, choice)
+        if account.total > before - LEAST_GAIN:
+            break
+    return account.total
+
+
+def _improve(account: Account, choice: Choice) -> None:
+    """The cheapest form of one choice, the others as they are."""
+    best, least = choice.kind, account.total
+    for kind in choice.forms:
+        if kind != best:
+            account.choose(choice, kind)
+            if account.total < least - LEAST_GAIN:
+                best, least = kind, account.total
+    account.choose(choice, best)
+
+
+def _with(preference: tuple[str, ...], forms: Forms, roots: list[Item]) -> Account:
+    account = Account()
+    for choice in forms.choices:
+        account.choose(choice, next((kind for kind in preference if kind in choice.forms), next(iter(choice.forms))))
+    for root in roots:
+        account.need(root)
+    return account
+
+
+def _without(account: Account, roots: list[Item]) -> None:
+    for root in roots:
+        account.drop(root)
