@@ -20,9 +20,12 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
     products, never by one that is dearer than what it replaces. Equal to the given graph but for
     the rounding. The graph must have static shapes and operators that a controller may have.
     """
-    reading = Reading(model)
-    forms = Forms(reading)
-    after = choose(forms)
+    candidates = []
+    for factors in (True, False):
+        reading = Reading(model, factors=factors)
+        forms = Forms(reading)
+        candidates.append((choose(forms), forms))
+    after, forms = min(candidates, key=lambda c: c[0])
     if after > (1 - LEAST_SHARE) * reading.price_before:
         return model
     return emitted(forms, model)

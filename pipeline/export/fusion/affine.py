@@ -116,7 +116,7 @@ def applied(
         parts = {b: m.sum(axis=tuple(a + 1 for a in axes), keepdims=keep) for b, m in first.parts.items()}
         return [Affine(np.asarray(first.constant.sum(axis=axes, keepdims=keep)), parts)]
     if isinstance(first, Affine) and all(isinstance(o, np.ndarray) or o is None for o in operands[1:]):
-        places = _places(op, attributes, np.arange(prod(first.shape)).reshape(first.shape), operands[1:], shapes)
+        places = places_of(op, attributes, np.arange(prod(first.shape)).reshape(first.shape), operands[1:], shapes)
         return None if places is None else [first.picked(p) for p in places]
     return None
 
@@ -159,7 +159,7 @@ def _product(op: str, attributes: Attributes, operands: Sequence[Affine | Array 
     return [product.plus(_affine(operands[2]).times(np.array(attributes.get("beta", 1.0))))]
 
 
-def _places(
+def places_of(
     op: str, attributes: Attributes, index: Array, more: Sequence[Any], shapes: Sequence[Shape]
 ) -> list[Array] | None:
     """Where the elements of an operator's outputs come from; None if it does more than move them."""

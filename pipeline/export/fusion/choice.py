@@ -6,24 +6,35 @@ from pipeline.export.fusion.forms import Forms
 from pipeline.export.fusion.plan import Account, Choice, Item
 
 PREFERENCES = (
+    ("recipe", "selection", "elementwise", "segments", "increment", "group"),
     ("selection", "elementwise", "gather", "squares", "increment", "recipe", "segments", "group"),
     ("selection", "group", "gather", "squares", "recipe", "segments", "increment", "elementwise"),
     ("selection", "squares", "recipe", "elementwise", "increment", "segments", "group", "gather"),
     ("selection", "elementwise", "squares", "segments", "increment", "group", "gather", "recipe"),
 )
-SWEEPS = 2
+SWEEPS = 4
 LEAST_GAIN = 0.01  # ns
 
 
 def choose(forms: Forms) -> float:
     """Choose a form for each value; the price of all [ns]."""
     roots = [item for _, item in forms.outputs if isinstance(item, Item)]
-    prices = []
+    found = []
     for preference in PREFERENCES:
         account = _with(preference, forms, roots)
-        prices.append(account.total)
+        _sweep(account, forms)
+        found.append((account.total, [c.kind for c in forms.choices]))
         _without(account, roots)
-    account = _with(PREFERENCES[prices.index(min(prices))], forms, roots)
+    account = Account()
+    for choice, kind in zip(forms.choices, min(found)[1], strict=True):
+        account.choose(choice, kind)
+    for root in roots:
+        account.need(root)
+    return account.total
+
+
+def _sweep(account: Account, forms: Forms) -> None:
+    """One value after the other, latest first, again while that pays."""
     for _ in range(SWEEPS):
         before = account.total
         for choice in sorted(forms.choices, key=lambda c: c.order, reverse=True):
@@ -31,7 +42,6 @@ def choose(forms: Forms) -> float:
                 _improve(account, choice)
         if account.total > before - LEAST_GAIN:
             break
-    return account.total
 
 
 def _improve(account: Account, choice: Choice) -> None:

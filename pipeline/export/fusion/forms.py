@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape
+from pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, places_of
 from pipeline.export.fusion.plan import Choice, Given, Group, Input, Item, Member, Output, Selection, Several, Step
-from pipeline.export.fusion.reading import Block, Operand, Reading, Value
+from pipeline.export.fusion.reading import Block, Operand, Origin, Reading, Value
 
 TERMS = 3  # blocks of an elementwise form at most
 RUNS = 8  # pieces of a value put together from runs at most
@@ -29,6 +29,7 @@ class Forms:
         self._steps: dict[Any, Step] = {}
         self._selections: dict[int, Selection] = {}
         self._groups: dict[int, Group] = {}
+        self._splits: dict[Any, Several] = {}
         self._open: list[tuple[Choice, Value]] = []
         self.outputs = [(name, self.of(operand)) for name, operand in reading.outputs]
         while self._open:
@@ -145,13 +146,22 @@ class Forms:
         places = index.ravel()
         source = self.flat(number)
         if len(places) > 0 and (np.diff(places) == 1).all():
-            if number not in self._selections:
-                self._selections[number] = Selection(source)
-            member = Member((len(places),), self._selections[number])
-            self._selections[number].runs[id(member)] = (int(places[0]), int(places[-1]) + 1)
-            item: Item = self.reshaped(member, value.shape)
+            item: Item = self.reshaped(self._piece(source, (int(places[0]), int(places[-1]) + 1)), value.shape)
             return item
         return self.step("Gather", [source, index.astype(np.int64)], value.shape, {"axis": 0})
+
+    def _piece(self, source: Item, run: tuple[int, int]) -> Member:
+        """Elements start .. stop - 1 of a vector."""
+        if id(source) not in self._selections:
+            self._selections[id(source)] = Selection(source)
+        selection = self._selections[id(source)]
+        for member in selection.all:
+            if selection.runs[id(member)] == run:
+                return member
+        member = Member((run[1] - run[0],), selection)
+        selection.runs[id(member)] = run
+        selection.all.append(member)
+        return member
 
     def _elementwise(self, value: Value) -> Item | None:
         """Factors times blocks, plus a constant."""
@@ -164,16 +174,20 @@ class Forms:
             return None
         plain, scaled, negative = [], [], []
         for number, matrix in affine.parts.items():
-            block = self.reading.blocks[number]
-            factor = _factor(matrix, block.shape, affine.shape)
+            shape = self.reading.blocks[number].shape
+            if prod(shape) == prod(affine.shape):
+                shape = affine.shape
+            factor = _factor(matrix, shape, affine.shape)
             if factor is None:
                 return None
-            if block.shape == affine.shape and (factor == 1).all():
-                plain.append(self.block(block))
-            elif block.shape == affine.shape and (factor == -1).all() and (start is not None or len(affine.parts) > 1):
-                negative.append(self.block(block))
+            item = self.reshaped(self.block(self.reading.blocks[number]), shape)
+            whole = shape == affine.shape
+            if whole and (factor == 1).all():
+                plain.append(item)
+            elif whole and (factor == -1).all() and (start is not None or len(affine.parts) > 1):
+                negative.append(item)
             else:
-                scaled.append(self.step("Mul", [self.block(block), factor], affine.shape))
+                scaled.append(self.step("Mul", [item, factor], affine.shape))
         total: Input = start
         constant = affine.constant if affine.constant.any() else None
         for term in plain + scaled:
@@ -235,9 +249,9 @@ class Forms:
 
     def _squares(self, value: Value) -> Item | None:
         """The sum of the squares of a value."""
-        if value.origin is None or value.origin[0] != "ReduceSum":
+        if value.origin is None or value.origin.op != "ReduceSum":
             return None
-        _, (squared, *axes), attributes = value.origin
+        squared, *axes = value.origin.operands
         picked = _picked(squared) if isinstance(squared, Value) else None
         if picked is None or not isinstance(squared, Value):
             return None
@@ -246,16 +260,26 @@ class Forms:
             return None
         if (picked[1].ravel() != np.arange(prod(block.shape))).any():
             return None
-        return self.step("ReduceSumSquare", [self.of(block.operands[0]), *map(self.of, axes)], value.shape, attributes)
+        return self.step("ReduceSumSquare", [self.of(block.operands[0]), *map(self.of, axes)], value.shape, value.origin.attributes)
 
     def _recipe(self, value: Value) -> Item | None:
         """The operator that stands in the graph."""
-        if value.origin is None or value.origin[0] in MOVING:
+        origin = value.origin
+        if origin is None:
             return None
-        op, operands, attributes = value.origin
-        if any(isinstance(o, Value) and (o.level > value.level or o.number >= value.number) for o in operands):
+        if any(isinstance(o, Value) and (o.level > value.level or o.number >= value.number) for o in origin.operands):
             return None
-        return self.step(op, [self.of(o) for o in operands], value.shape, attributes)
+        inputs = [self.of(o) for o in origin.operands]
+        if origin.op in MOVING and isinstance(inputs[0], Item):
+            run = _run(origin, inputs[0].shape)
+            if run is not None:
+                return self._piece(inputs[0], run)
+            if origin.op == "Split":
+                key = (id(inputs[0]), tuple(origin.shapes), origin.attributes.get("axis", 0))
+                if key not in self._splits:
+                    self._splits[key] = Several(origin.op, inputs, origin.shapes, origin.attributes)
+                return Output(self._splits[key], origin.place)
+        return self.step(origin.op, inputs, value.shape, origin.attributes)
 
     def _group(self, value: Value) -> Item | None:
         """A piece of the product of its level."""
@@ -291,6 +315,16 @@ def _picked(value: Value) -> tuple[int, Array] | None:
     if np.count_nonzero(matrix) != prod(affine.shape) or not (matrix.max(axis=0, initial=0) == 1).all():
         return None
     return number, np.asarray(matrix.argmax(axis=0))
+
+
+def _run(origin: Origin, shape: Shape) -> tuple[int, int] | None:
+    """The elements of a vector that a Slice, Split or Gather takes, where they stand side by side."""
+    if len(shape) != 1 or len(origin.shapes[origin.place]) != 1:
+        return None
+    places = places_of(origin.op, origin.attributes, np.arange(shape[0]), origin.operands[1:], origin.shapes)
+    if places is None or not len(places[origin.place]) or (np.diff(places[origin.place]) != 1).any():
+        return None
+    return int(places[origin.place][0]), int(places[origin.place][-1]) + 1
 
 
 def _factor(matrix: Array, block: Shape, shape: Shape) -> Array | None:

@@ -107,11 +107,12 @@ class Pool(Item):
 class Selection(Pool):
     """Runs of elements (start, stop) of one flat block: by a Split where they are many, else by a Gather each."""
 
-    __slots__ = ("runs", "source")
+    __slots__ = ("all", "runs", "source")
 
     def __init__(self, source: Item) -> None:
         super().__init__()
         self.source = source
+        self.all: list[Member] = []
         self.runs: dict[int, tuple[int, int]] = {}  # by the member's id
 
     def lengths(self) -> list[tuple[Member | None, int]] | None:

@@ -20,6 +20,8 @@ DOUBLE = onnx.TensorProto.DOUBLE
 # Where an operand may leave the finite numbers; what is made of it may too, but not behind GUARDS.
 RISKS = frozenset({"Div", "Log", "Exp", "Pow", "Sqrt", "Reciprocal", "Tan"})
 GUARDS = frozenset({"Where", "Clip", "Min", "Max", "Tanh", "Sigmoid", "Softmax", "Sign"})
+BROADCASTING = frozenset({"Mul", "Div", "Min", "Max", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Equal"})
+OWN = ""  # the name of a value that the graph does not have
 GATHERED = 200  # elements of a Where that may be chosen by a Gather, at most
 
 
@@ -55,13 +57,24 @@ class Value:
     level: int
     affine: Affine | None
     block: Block | None = None
-    origin: tuple[str, list[Operand], Attributes] | None = None
+    origin: Origin | None = None
+
+
+@dataclass(eq=False)
+class Origin:
+    """The operator that gives a value first: the output at ``place`` of outputs of these ``shapes``."""
+
+    op: str
+    operands: list[Operand]
+    attributes: Attributes
+    shapes: list[Shape]
+    place: int = 0
 
 
 class Reading:
     """The graph, read. ``price_before`` is what its operators cost [ns]."""
 
-    def __init__(self, model: onnx.ModelProto) -> None:
+    def __init__(self, model: onnx.ModelProto, *, factors: bool = True) -> None:
         graph = model.graph
         found, _ = graph_values(read_model(model.SerializeToString())["graph"])
         self.shapes = {name: v.shape for name, v in found.items()}
@@ -72,6 +85,7 @@ class Reading:
         self._computed: dict[Any, list[Value]] = {}
         self.names: dict[str, Operand] = {"": None}
         self.price_before = 0.0
+        self.factors = factors
         for tensor in graph.initializer:
             self.names[tensor.name] = numpy_helper.to_array(tensor)
         for given in graph.input:
@@ -84,7 +98,7 @@ class Reading:
         return self.names[name]
 
     # ------------------------------------------------------------------ values
-    def value(self, affine: Affine, origin: tuple[str, list[Operand], Attributes] | None = None) -> Value:
+    def value(self, affine: Affine, origin: Origin | None = None) -> Value:
         """The value of an affine function, the same for equal functions."""
         key = affine.key()
         if key not in self._known:
@@ -101,7 +115,7 @@ class Reading:
 
     def _of_block(self, block: Block) -> Value:
         """The value that is a block."""
-        if self.types[block.name] == DOUBLE and 0 < prod(block.shape) ** 2 <= DENSE:
+        if self.types.get(block.name, DOUBLE) == DOUBLE and 0 < prod(block.shape) ** 2 <= DENSE:
             return self.value(Affine.block(block.number, block.shape))
         value = Value(len(self.values), block.shape, block.level, None, block)
         self.values.append(value)
@@ -126,12 +140,12 @@ class Reading:
         """The outputs of an operator as affine functions; None where they are not, or have too large matrices."""
         if any(self.types[n] != DOUBLE for n in names):
             return None
+        if op == "Where":
+            return self._switched(operands, shapes[0])
         if any(isinstance(o, Value) and o.affine is None for o in operands):
             return None
         if not any(isinstance(o, Value) for o in operands):
             return None
-        if op == "Where":
-            return self._switched(operands, shapes[0])
         arguments = [o.affine if isinstance(o, Value) else o for o in operands]
         blocks = {b: len(m) for a in arguments if isinstance(a, Affine) for b, m in a.parts.items()}
         if sum(blocks.values()) * max(prod(s) for s in shapes) > DENSE:
@@ -139,35 +153,52 @@ class Reading:
         results = applied(op, attributes, arguments, shapes)
         if results is None:
             return None
-        return [self.value(r, (op, operands, attributes)) for r in results]
+        return [self.value(r, Origin(op, operands, attributes, shapes, i)) for i, r in enumerate(results)]
 
     def _switched(self, operands: list[Operand], shape: Shape) -> list[Value] | None:
-        """Where between two constants: affine in the condition as a number, where that gives the same bits."""
+        """Where between constants, or a value and zero, by the condition as a number, where that gives the same bits."""
         condition, one, other = operands
-        if not (isinstance(condition, Value) and isinstance(one, np.ndarray) and isinstance(other, np.ndarray)):
+        if not isinstance(condition, Value) or prod(shape) ** 2 > DENSE:
+            return None
+        if isinstance(one, Value) and isinstance(other, np.ndarray) and not other.any():
+            return self._kept(condition, one, shape)
+        if isinstance(other, Value) and isinstance(one, np.ndarray) and not one.any():
+            kept = self._kept(condition, other, shape)
+            if kept is None or kept[0].affine is None or other.affine is None:
+                return None
+            return [self.value(other.affine.spread(shape).plus(kept[0].affine.times(np.array(-1.0))))]
+        if not (isinstance(one, np.ndarray) and isinstance(other, np.ndarray)):
             return None
         with np.errstate(invalid="ignore"):
             change = one - other
-        if prod(condition.shape) ** 2 > DENSE or not (other + change == one).all() or not np.isfinite(other).all():
+        if not (other + change == one).all() or not np.isfinite(other).all():
             return None
         cast = self._cast(condition).affine
         assert cast is not None
         return [self.value(cast.spread(shape).times(change).plus(Affine(np.asarray(other), {})))]
 
+    def _kept(self, condition: Value, value: Value, shape: Shape) -> list[Value] | None:
+        """A value where the condition holds, else zero: their product, if the value is surely finite."""
+        if value.affine is None or self.risky(value):
+            return None
+        return self._nonlinear("Mul", {}, [value, self._cast(condition)], [OWN], [shape])
+
     def _cast(self, condition: Value) -> Value:
         """A condition as the number 0 or 1."""
         key = ("Cast", (condition.number,), (("to", str(DOUBLE)),))
         if key not in self._computed:
-            name = f"cast of {condition.number}"
-            self.types[name] = DOUBLE
-            self._computed[key] = self._made("Cast", {"to": DOUBLE}, [condition], [name], [condition.shape])
+            self._computed[key] = self._made("Cast", {"to": DOUBLE}, [condition], [OWN], [condition.shape])
         return self._computed[key][0]
 
     def _nonlinear(
         self, op: str, attributes: Attributes, operands: list[Operand], names: list[str], shapes: list[Shape]
     ) -> list[Value]:
         factor: Array | None = None
-        if op in ("Mul", "Div"):
+        if op in BROADCASTING:
+            operands = list(operands)
+            for place in range(len(operands)):
+                operands[place] = self._narrow(place, operands, shapes[0])
+        if self.factors and op in ("Mul", "Div"):
             operands, factor = self._without_factors(op, operands, shapes[0])
         if op in ("Min", "Max"):
             op, operands, attributes = _clip(op, operands, attributes, self.blocks, shapes[0])
@@ -223,7 +254,30 @@ class Reading:
         joined = applied("Concat", {"axis": 0}, flat, [(2 * n,)])
         assert joined is not None
         pieces: list[Operand] = [self.value(f) if f.parts else f.constant for f in flat]
-        return self.value(joined[0], ("Concat", pieces, {"axis": 0}))
+        return self.value(joined[0], Origin("Concat", pieces, {"axis": 0}, [(2 * n,)]))
+
+    def _narrow(self, place: int, operands: list[Operand], shape: Shape) -> Operand:
+        """An operand without the axes of length one, and without the copies, that the operator makes itself."""
+        operand = operands[place]
+        if not isinstance(operand, Value) or operand.affine is None:
+            return operand
+        others = [o.shape for i, o in enumerate(operands) if i != place and o is not None]
+        if not others:
+            return operand
+        affine, rest = operand.affine, np.broadcast_shapes(*others)
+        if affine.shape == shape == rest and affine.constant.size > 1 and len(affine.parts) == 1:
+            same = [a for a in (affine.constant, *affine.parts.values())]
+            first = affine.picked(np.zeros((1,) * len(shape), dtype=int))
+            if all((a == b).all() for a, b in zip(same, (first.constant, *first.parts.values()), strict=False)):
+                affine = first
+        origin = operand.origin
+        if affine is operand.affine and origin is not None and origin.op in ("Unsqueeze", "Reshape"):
+            bare = origin.operands[0]
+            if isinstance(bare, Value) and len(rest) == len(shape):
+                ones = len(operand.shape) - len(bare.shape)
+                if ones > 0 and operand.shape == (1,) * ones + bare.shape:
+                    return bare
+        return operand if affine is operand.affine else self.value(affine)
 
     def _without_factors(self, op: str, operands: list[Operand], shape: Shape) -> tuple[list[Operand], Array | None]:
         """The operands of a product or a quotient without constant factors, and the factor of the result."""
