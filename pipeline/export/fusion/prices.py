@@ -9,12 +9,12 @@ from pipeline.export.fusion.affine import Shape
 
 DEAR = frozenset({"Tanh", "Log", "Exp", "Sigmoid", "Softmax", "Pow"})
 FIXED = {
-    "Concat": 130.0, "Split": 150.0, "Gather": 175.0, "Slice": 285.0, "Reshape": 110.0, "Unsqueeze": 180.0,
-    "Squeeze": 180.0, "Cast": 140.0, "Where": 680.0, "Clip": 170.0, "ReduceSum": 240.0, "ReduceSumSquare": 240.0,
-    "Transpose": 250.0, "Tile": 300.0, "Expand": 300.0, "Identity": 100.0, "Abs": 150.0, "Neg": 150.0, "Relu": 150.0,
+    "Concat": 90.0, "Split": 95.0, "Gather": 205.0, "Slice": 375.0, "Reshape": 235.0, "Unsqueeze": 220.0,
+    "Squeeze": 220.0, "Cast": 130.0, "Where": 665.0, "Clip": 200.0, "ReduceSum": 385.0, "ReduceSumSquare": 385.0,
+    "Transpose": 240.0, "Tile": 300.0, "Expand": 300.0, "Identity": 100.0, "Neg": 160.0, "Relu": 170.0, "And": 145.0,
 }  # fmt: skip
-INPUT, OUTPUT = 70.0, 95.0  # of a Concat, of a Split
-MULTIPLY_ADD, LARGE, BATCHED = 0.2, 0.35, 0.4
+INPUT, OUTPUT = 90.0, 155.0  # of a Concat, of a Split
+PRODUCT, MULTIPLY_ADD, LARGE, BATCHED = 415.0, 0.21, 0.35, 0.4
 LARGE_FROM = 4_000  # multiply-adds
 
 
@@ -32,7 +32,7 @@ def price(op: str, inputs: Sequence[Shape], outputs: Sequence[Shape]) -> float:
         return fixed + 3 * n
     elif op in ("ReduceSum", "ReduceSumSquare"):
         n = prod(inputs[0])
-    return fixed + (3.0 if op in DEAR else 0.3) * n
+    return fixed + (3.0 if op in DEAR else 0.5) * n
 
 
 def product(left: Shape, right: Shape, out: Shape) -> float:
@@ -42,4 +42,4 @@ def product(left: Shape, right: Shape, out: Shape) -> float:
     rows = max(1, prod(out) // max(columns, 1))
     work = rows * inner * -(-columns // 8) * 8
     each = (LARGE if work > LARGE_FROM else MULTIPLY_ADD) * (BATCHED if rows > 1 else 1.0)
-    return 350.0 + each * work
+    return PRODUCT + each * work
