@@ -6,10 +6,12 @@ import onnx
 
 from pipeline.export.fusion.choice import choose
 from pipeline.export.fusion.emission import emitted
-from pipeline.export.fusion.forms import Forms
+from pipeline.export.fusion.forms import forms
+from pipeline.export.fusion.items import Items
+from pipeline.export.fusion.plan import Item
 from pipeline.export.fusion.reading import Reading
 
-LEAST_SHARE = 0.01
+LEAST_SHARE = 0.002
 """Of its price a graph must save so much; else it stays as it is."""
 
 
@@ -23,9 +25,14 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
     candidates = []
     for factors in (True, False):
         reading = Reading(model, factors=factors)
-        forms = Forms(reading)
-        candidates.append((choose(forms), forms))
-    after, forms = min(candidates, key=lambda c: c[0])
+        items = Items(reading)
+        outputs = [(name, items.of(operand)) for name, operand in reading.outputs]
+        while items.undecided:
+            choice, value = items.undecided.pop()
+            choice.forms = forms(items, value)
+        after = choose(items.choices, [item for _, item in outputs if isinstance(item, Item)])
+        candidates.append((after, items, outputs))
+    after, items, outputs = min(candidates, key=lambda c: c[0])
     if after > (1 - LEAST_SHARE) * reading.price_before:
         return model
-    return emitted(forms, model)
+    return emitted(items, outputs, model)

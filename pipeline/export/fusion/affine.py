@@ -68,7 +68,9 @@ class Affine:
         if shape == self.shape:
             return self
         lead = (1,) * (len(shape) - len(self.shape))
-        parts = {b: np.broadcast_to(m.reshape(len(m), *lead, *self.shape), (len(m), *shape)) for b, m in self.parts.items()}
+        parts = {
+            b: np.broadcast_to(m.reshape(len(m), *lead, *self.shape), (len(m), *shape)) for b, m in self.parts.items()
+        }
         return Affine(np.broadcast_to(self.constant, shape), parts)
 
     def plus(self, other: Affine) -> Affine:

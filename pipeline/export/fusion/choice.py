@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pipeline.export.fusion.forms import Forms
 from pipeline.export.fusion.plan import Account, Choice, Item
 
 PREFERENCES = (
@@ -16,28 +15,27 @@ SWEEPS = 4
 LEAST_GAIN = 0.01  # ns
 
 
-def choose(forms: Forms) -> float:
+def choose(choices: list[Choice], roots: list[Item]) -> float:
     """Choose a form for each value; the price of all [ns]."""
-    roots = [item for _, item in forms.outputs if isinstance(item, Item)]
     found = []
     for preference in PREFERENCES:
-        account = _with(preference, forms, roots)
-        _sweep(account, forms)
-        found.append((account.total, [c.kind for c in forms.choices]))
+        account = _with(preference, choices, roots)
+        _sweep(account, choices)
+        found.append((account.total, [c.kind for c in choices]))
         _without(account, roots)
     account = Account()
-    for choice, kind in zip(forms.choices, min(found)[1], strict=True):
+    for choice, kind in zip(choices, min(found)[1], strict=True):
         account.choose(choice, kind)
     for root in roots:
         account.need(root)
     return account.total
 
 
-def _sweep(account: Account, forms: Forms) -> None:
+def _sweep(account: Account, choices: list[Choice]) -> None:
     """One value after the other, latest first, again while that pays."""
     for _ in range(SWEEPS):
         before = account.total
-        for choice in sorted(forms.choices, key=lambda c: c.order, reverse=True):
+        for choice in sorted(choices, key=lambda c: c.order, reverse=True):
             if choice.count:
                 _improve(account, choice)
         if account.total > before - LEAST_GAIN:
@@ -55,9 +53,9 @@ def _improve(account: Account, choice: Choice) -> None:
     account.choose(choice, best)
 
 
-def _with(preference: tuple[str, ...], forms: Forms, roots: list[Item]) -> Account:
+def _with(preference: tuple[str, ...], choices: list[Choice], roots: list[Item]) -> Account:
     account = Account()
-    for choice in forms.choices:
+    for choice in choices:
         account.choose(choice, next((kind for kind in preference if kind in choice.forms), next(iter(choice.forms))))
     for root in roots:
         account.need(root)

@@ -5,27 +5,29 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from math import prod
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
 from pipeline.export.fusion.affine import Array, Attributes
-from pipeline.export.fusion.forms import Forms
+from pipeline.export.fusion.items import Items
 from pipeline.export.fusion.plan import Choice, Given, Group, Input, Item, Member, Output, Selection, Several, Step
 
 ONE = np.ones(1)
+Outputs: TypeAlias = Sequence[tuple[str, Input]]
+"""The graph's outputs by their names."""
 
 
-def emitted(forms: Forms, model: onnx.ModelProto) -> onnx.ModelProto:
+def emitted(items: Items, outputs: Outputs, model: onnx.ModelProto) -> onnx.ModelProto:
     """The model with the graph of the chosen forms, its inputs and outputs as they are."""
-    return _Writer(forms, model).model()
+    return _Writer(items, outputs, model).model()
 
 
 class _Writer:
-    def __init__(self, forms: Forms, model: onnx.ModelProto) -> None:
-        self.forms, self.source = forms, model
+    def __init__(self, items: Items, outputs: Outputs, model: onnx.ModelProto) -> None:
+        self.items, self.outputs, self.source = items, outputs, model
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[Any, tuple[str, Array]] = {}
         self.names: dict[int, str] = {}
@@ -36,13 +38,13 @@ class _Writer:
     def model(self) -> onnx.ModelProto:
         """The whole."""
         ends: dict[int, str] = {}
-        for name, item in self.forms.outputs:
+        for name, item in self.outputs:
             if isinstance(item, Item):
                 ends.setdefault(id(_chosen(item)), name)
         self.ends = ends
         for item in self._ordered():
             self._write(item)
-        for name, item in self.forms.outputs:
+        for name, item in self.outputs:
             if self._name(item) != name:
                 self.nodes.append(helper.make_node("Identity", [self._name(item)], [name]))
         nodes = _apart(self.nodes, self.constants, self._constant)
@@ -61,7 +63,7 @@ class _Writer:
         """All items that are needed, each behind those that it uses."""
         found: list[Item] = []
         seen: set[int] = set()
-        stack = [(item, False) for _, item in reversed(self.forms.outputs) if isinstance(item, Item)]
+        stack = [(item, False) for _, item in reversed(self.outputs) if isinstance(item, Item)]
         while stack:
             item, left = stack.pop()
             if left:
@@ -119,7 +121,10 @@ class _Writer:
             parts = [a.parts.get(b) for a in affines if a is not None]
             rows.append(
                 np.concatenate(
-                    [np.zeros((size, n)) if p is None else p.reshape(size, n) for p, n in zip(parts, columns, strict=True)],
+                    [
+                        np.zeros((size, n)) if p is None else p.reshape(size, n)
+                        for p, n in zip(parts, columns, strict=True)
+                    ],
                     axis=1,
                 )
             )
@@ -141,7 +146,7 @@ class _Writer:
         """A vector that holds the group's blocks, its blocks in their order, and whether a one stands behind them."""
         used = group.used()
         if len(used) == 1:
-            return self._name(self.forms.flat(used[0])), used, False
+            return self._name(self.items.flat(used[0])), used, False
         best, covered = None, 1
         for vector in self.vectors:
             _, blocks, _ = vector
@@ -158,7 +163,7 @@ class _Writer:
         order = [*(best[1] if best is not None else []), *rest]
         if best is not None and best[2]:  # the one stands in the middle: it is a block of its own then
             return self._with_one_inside(best, rest)
-        names += [self._name(self.forms.flat(b)) for b in rest]
+        names += [self._name(self.items.flat(b)) for b in rest]
         if needs_one:
             names.append(self._constant(ONE))
         made = self._fresh()
@@ -169,7 +174,7 @@ class _Writer:
     def _with_one_inside(self, best: tuple[str, list[int], bool], rest: list[int]) -> tuple[str, list[int], bool]:
         """The new blocks before an older vector, whose last element is a one."""
         made = self._fresh()
-        self._raw("Concat", [*(self._name(self.forms.flat(b)) for b in rest), best[0]], {"axis": 0}, [made])
+        self._raw("Concat", [*(self._name(self.items.flat(b)) for b in rest), best[0]], {"axis": 0}, [made])
         self.vectors.append((made, [*rest, *best[1]], True))
         return self.vectors[-1]
 
@@ -207,9 +212,7 @@ def _chosen(item: Item) -> Item:
     return item
 
 
-def _apart(
-    nodes: list[onnx.NodeProto], constants: dict[Any, tuple[str, Array]], constant: Any
-) -> list[onnx.NodeProto]:
+def _apart(nodes: list[onnx.NodeProto], constants: dict[Any, tuple[str, Array]], constant: Any) -> list[onnx.NodeProto]:
     """The nodes, with no constant of one element beside a MatMul: onnxruntime would fuse the two in float32.
 
     Its FusedMatMul has a factor ``alpha``, which is a float32 attribute. A factor for several
@@ -227,5 +230,9 @@ def _apart(
             continue
         factor = values[node.input[single[0]]].reshape(())
         other = node.input[1 - single[0]]
-        found.append(helper.make_node("MatMul", [other, constant(np.array([[factor if node.op_type == "Mul" else 1 / factor]]))], node.output))
+        found.append(
+            helper.make_node(
+                "MatMul", [other, constant(np.array([[factor if node.op_type == "Mul" else 1 / factor]]))], node.output
+            )
+        )
     return found

@@ -11,7 +11,7 @@ from pipeline.export.fusion.affine import Array, Attributes, Shape
 from pipeline.export.fusion.prices import FIXED, INPUT, OUTPUT, price, product
 
 if TYPE_CHECKING:
-    from pipeline.export.fusion.reading import Block, Value
+    from pipeline.export.fusion.values import Block, Value
 
 
 class Item:
@@ -107,13 +107,20 @@ class Pool(Item):
 class Selection(Pool):
     """Runs of elements (start, stop) of one flat block: by a Split where they are many, else by a Gather each."""
 
-    __slots__ = ("all", "runs", "source")
+    __slots__ = ("_pieces", "runs", "source")
 
     def __init__(self, source: Item) -> None:
         super().__init__()
         self.source = source
-        self.all: list[Member] = []
         self.runs: dict[int, tuple[int, int]] = {}  # by the member's id
+        self._pieces: dict[tuple[int, int], Member] = {}
+
+    def piece(self, start: int, stop: int) -> Member:
+        """Elements start .. stop - 1."""
+        if (start, stop) not in self._pieces:
+            member = self._pieces[start, stop] = Member((stop - start,), self)
+            self.runs[id(member)] = (start, stop)
+        return self._pieces[start, stop]
 
     def lengths(self) -> list[tuple[Member | None, int]] | None:
         """The pieces of a Split, in their order; None where Gathers are cheaper or the runs overlap."""
@@ -152,6 +159,12 @@ class Group(Pool):
         super().__init__()
         self.level, self.blocks, self.flat = level, blocks, flat
         self.values: dict[int, Value] = {}  # by the member's id
+
+    def piece(self, value: Value) -> Member:
+        """A value as a vector."""
+        member = Member((prod(value.shape),), self)
+        self.values[id(member)] = value
+        return member
 
     def used(self) -> list[int]:
         """Numbers of the blocks that the members depend on, ascending."""
