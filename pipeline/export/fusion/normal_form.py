@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 
 from pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied
-from pipeline.export.fusion.values import Operand, Origin, Value, whole
+from pipeline.export.fusion.values import Block, Operand, Origin, Value, whole
 
 if TYPE_CHECKING:
     from pipeline.export.fusion.reading import Reading
@@ -149,10 +149,17 @@ def clipped(
         return unchanged
     value, high = outer
     block = reading.blocks[next(iter(outer[0].affine.parts))]
-    inner = _bound(block.operands) if block.op == "Max" and whole(value, block) else None
+    inner = _floor(block) if whole(value, block) else None
     if inner is None or not (inner[0].shape == block.shape == value.shape == shape) or inner[1] > high:
         return unchanged
     return "Clip", [inner[0], np.array(inner[1]), np.array(high)], {}
+
+
+def _floor(block: Block) -> tuple[Value, float] | None:
+    """The value and the number of a block that is max(value, number)."""
+    if block.op == "Relu":
+        return (block.operands[0], 0.0) if isinstance(block.operands[0], Value) else None
+    return _bound(block.operands) if block.op == "Max" else None
 
 
 def _bound(operands: list[Operand]) -> tuple[Value, float] | None:
