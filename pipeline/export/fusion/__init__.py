@@ -5,8 +5,8 @@ from __future__ import annotations
 import onnx
 
 from pipeline.export.fusion.choice import choose
-from pipeline.export.fusion.emission import emitted
-from pipeline.export.fusion.forms import forms
+from pipeline.export.fusion.emission import Outputs, emitted
+from pipeline.export.fusion.forms import forms_of
 from pipeline.export.fusion.items import Items
 from pipeline.export.fusion.plan import Item
 from pipeline.export.fusion.reading import Reading
@@ -25,14 +25,20 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
     candidates = []
     for factors in (True, False):
         reading = Reading(model, factors=factors)
-        items = Items(reading)
-        outputs = [(name, items.of(operand)) for name, operand in reading.outputs]
-        while items.undecided:
-            choice, value = items.undecided.pop()
-            choice.forms = forms(items, value)
+        items, outputs = listed(reading)
         after = choose(items.choices, [item for _, item in outputs if isinstance(item, Item)])
         candidates.append((after, items, outputs))
     after, items, outputs = min(candidates, key=lambda c: c[0])
     if after > (1 - LEAST_SHARE) * reading.price_before:
         return model
     return emitted(items, outputs, model)
+
+
+def listed(reading: Reading) -> tuple[Items, Outputs]:
+    """All that the graph may be made of, and its outputs."""
+    items = Items(reading)
+    outputs = [(name, items.of(operand)) for name, operand in reading.outputs]
+    while items.undecided:
+        choice, value = items.undecided.pop()
+        choice.forms = forms_of(items, value)
+    return items, outputs

@@ -16,14 +16,21 @@ Attributes: TypeAlias = Mapping[str, Any]
 
 DENSE = 20_000
 """Numbers in the matrices of a value at most; one with more is computed as its operator says."""
+FAINT = 1e-300
+"""Stands in a matrix for a zero that the graph multiplies by: the value must still depend on the block, as 0 times what
+is no number is none. ``numbers`` gives the zero back."""
+
+
+def numbers(matrix: Array) -> Array:
+    """A matrix as it is computed with."""
+    return np.where(np.abs(matrix) < 1e-200, 0.0, matrix)
 
 
 @dataclass(frozen=True, eq=False)
 class Affine:
     """``constant + sum over blocks of block @ matrix``, of some shape.
 
-    ``parts`` maps a block's number to its matrix (block size, *shape). A part may be all zero where
-    the graph multiplies by zero: what is not a number stays none, so the dependence must stay.
+    ``parts`` maps a block's number to its matrix (block size, *shape).
     """
 
     constant: Array
@@ -61,7 +68,8 @@ class Affine:
     def times(self, factor: Array) -> Affine:
         """Multiplied element by element; the factor may have more elements than the value."""
         wide = self.spread(np.broadcast_shapes(self.shape, factor.shape))
-        return Affine(np.asarray(wide.constant * factor), {b: np.asarray(m * factor) for b, m in wide.parts.items()})
+        faint = np.where(factor == 0, FAINT, factor)
+        return Affine(np.asarray(wide.constant * factor), {b: np.asarray(m * faint) for b, m in wide.parts.items()})
 
     def spread(self, shape: Shape) -> Affine:
         """Broadcast to a shape."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from math import prod
 from typing import Any, TypeAlias
@@ -11,7 +10,7 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from pipeline.export.fusion.affine import Array, Attributes
+from pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
 from pipeline.export.fusion.items import Items
 from pipeline.export.fusion.plan import Choice, Given, Group, Input, Item, Member, Output, Selection, Several, Step
 
@@ -31,6 +30,7 @@ class _Writer:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[Any, tuple[str, Array]] = {}
         self.names: dict[int, str] = {}
+        self.shapes: dict[str, Shape] = {}  # of what an operator with one output gives
         self.vectors: list[tuple[str, list[int], bool]] = []  # name, blocks, ends in a one
         self.taken = {i.name for i in model.graph.input} | {o.name for o in model.graph.output}
         self.count = 0
@@ -47,7 +47,7 @@ class _Writer:
         for name, item in self.outputs:
             if self._name(item) != name:
                 self.nodes.append(helper.make_node("Identity", [self._name(item)], [name]))
-        nodes = _apart(self.nodes, self.constants, self._constant)
+        nodes = self._apart()
         used = {name for node in nodes for name in node.input}
         made = onnx.ModelProto()
         made.CopyFrom(self.source)
@@ -133,7 +133,7 @@ class _Writer:
         separate = bool(bias.any()) and not one
         single = len(members) == 1
         product = self._new(members[0]) if single and not separate else self._fresh()
-        self._raw("MatMul", [vector, self._constant(np.concatenate(rows))], {}, [product])
+        self._raw("MatMul", [vector, self._constant(numbers(np.concatenate(rows)))], {}, [product])
         if separate:
             total = self._new(members[0]) if single else self._fresh()
             self._raw("Add", [product, self._constant(bias)], {}, [total])
@@ -186,6 +186,7 @@ class _Writer:
     def _new(self, item: Item) -> str:
         """A name for an item: an output's, where it is one."""
         self.names[id(item)] = self.ends.get(id(item)) or self._fresh()
+        self.shapes[self.names[id(item)]] = item.shape
         return self.names[id(item)]
 
     def _name(self, item: Input) -> str:
@@ -205,34 +206,37 @@ class _Writer:
     def _raw(self, op: str, inputs: list[str], attributes: Attributes, outputs: list[str]) -> None:
         self.nodes.append(helper.make_node(op, inputs, outputs, **attributes))
 
+    def _apart(self) -> list[onnx.NodeProto]:
+        """The nodes, with no constant of one element beside a MatMul: onnxruntime would fuse the two in float32.
+
+        Its FusedMatMul has a factor ``alpha``, which is a float32 attribute. A factor of several
+        elements is written out for each; a factor of one element becomes a product with a 1 x 1 matrix.
+        """
+        products = {n.output[0] for n in self.nodes if n.op_type == "MatMul"}
+        multiplied = {name for n in self.nodes if n.op_type == "MatMul" for name in n.input}
+        values = dict(self.constants.values())
+        found = []
+        for node in self.nodes:
+            beside = node.op_type in ("Mul", "Div") and bool(
+                node.output[0] in multiplied or products.intersection(node.input)
+            )
+            places = [i for i, name in enumerate(node.input) if name in values and values[name].size == 1]
+            shape = self.shapes.get(node.output[0], ())
+            if not beside or not places or (node.op_type == "Div" and places == [0]) or shape == ():
+                found.append(node)
+                continue
+            name, factor = node.input[1 - places[0]], values[node.input[places[0]]].reshape(())
+            if prod(shape) > 1:
+                inputs = [name, name]
+                inputs[places[0]] = self._constant(np.full(shape, factor))
+                found.append(helper.make_node(node.op_type, inputs, node.output))
+            else:
+                factor = 1 / factor if node.op_type == "Div" else factor
+                found.append(helper.make_node("MatMul", [name, self._constant(np.array([[factor]]))], node.output))
+        return found
+
 
 def _chosen(item: Item) -> Item:
     while isinstance(item, Choice):
         item = item.uses[0]
     return item
-
-
-def _apart(nodes: list[onnx.NodeProto], constants: dict[Any, tuple[str, Array]], constant: Any) -> list[onnx.NodeProto]:
-    """The nodes, with no constant of one element beside a MatMul: onnxruntime would fuse the two in float32.
-
-    Its FusedMatMul has a factor ``alpha``, which is a float32 attribute. A factor for several
-    elements is written out for each; a factor for one element becomes a product with a 1 x 1 matrix.
-    """
-    products = {n.output[0] for n in nodes if n.op_type == "MatMul"}
-    multiplied = Counter(name for n in nodes if n.op_type == "MatMul" for name in n.input)
-    values = dict(constants.values())
-    found = []
-    for node in nodes:
-        beside = node.op_type in ("Mul", "Div") and (multiplied[node.output[0]] or not products.isdisjoint(node.input))
-        single = [i for i, name in enumerate(node.input) if name in values and values[name].size == 1]
-        if not (beside and single) or (node.op_type == "Div" and single == [0]):
-            found.append(node)
-            continue
-        factor = values[node.input[single[0]]].reshape(())
-        other = node.input[1 - single[0]]
-        found.append(
-            helper.make_node(
-                "MatMul", [other, constant(np.array([[factor if node.op_type == "Mul" else 1 / factor]]))], node.output
-            )
-        )
-    return found

@@ -11,17 +11,17 @@ from math import prod
 
 import numpy as np
 
-from pipeline.export.fusion.affine import DENSE, Affine, Array, Shape, places_of
+from pipeline.export.fusion.affine import DENSE, Affine, Array, Shape, numbers, places_of
 from pipeline.export.fusion.items import Items
 from pipeline.export.fusion.plan import Input, Item
-from pipeline.export.fusion.values import Origin, Value, picked
+from pipeline.export.fusion.values import Operand, Origin, Value, picked
 
 TERMS = 3  # blocks of an elementwise form at most
 RUNS = 8  # pieces of a value put together from runs at most
 MOVING = frozenset({"Slice", "Split", "Gather"})
 
 
-def forms(items: Items, value: Value) -> dict[str, Item]:
+def forms_of(items: Items, value: Value) -> dict[str, Item]:
     """The items that give a value, by the kind of form; at least one."""
     affine = value.affine
     assert affine is not None
@@ -59,8 +59,8 @@ def _sum(items: Items, affine: Affine, start: Item | None) -> Item | None:
         block = items.reading.blocks[number]
         shape = affine.shape if prod(block.shape) == prod(affine.shape) else block.shape
         factor = _factor(matrix, shape, affine.shape)
-        if factor is None:
-            return None
+        if factor is None or (block.risky and not factor.all()):
+            return None  # 0 x inf
         item = items.reshaped(items.block(block), shape)
         same = shape == affine.shape
         if same and (factor == 1).all():
@@ -112,7 +112,7 @@ def _segments(items: Items, value: Value, affine: Affine) -> Item | None:
         single[uses & (np.count_nonzero(matrix, axis=0) == 1) & (matrix.max(axis=0) == 1)] = number + 1
     single[(many != 1) | (affine.constant != 0)] = 0
     ends = [0, *(np.flatnonzero(np.diff(level) | np.diff(single)) + 1).tolist(), value.shape[0]]
-    if not 2 < len(ends) <= RUNS + 1:
+    if len(ends) == 2 or (len(ends) > RUNS + 1 and not items.reading.risky(value)):
         return None
     pieces = []
     for start, stop in pairwise(ends):
@@ -145,7 +145,7 @@ def _recipe(items: Items, value: Value) -> Item | None:
     origin = value.origin
     if origin is None:
         return None
-    if any(isinstance(o, Value) and (o.level > value.level or o.number >= value.number) for o in origin.operands):
+    if not all(_before(o, value) for o in origin.operands):
         return None
     inputs = [items.of(o) for o in origin.operands]
     if origin.op in MOVING and isinstance(inputs[0], Item):
@@ -155,6 +155,11 @@ def _recipe(items: Items, value: Value) -> Item | None:
         if origin.op == "Split":
             return items.split(inputs, origin.shapes, origin.attributes, origin.place)
     return items.step(origin.op, inputs, value.shape, origin.attributes)
+
+
+def _before(operand: Operand, value: Value) -> bool:
+    """Whether a value may be computed from an operand: by cancellation it may be part of what it is made of."""
+    return not isinstance(operand, Value) or (operand.level <= value.level and operand.number < value.number)
 
 
 def _group(items: Items, value: Value, affine: Affine) -> Item | None:
@@ -185,4 +190,4 @@ def _factor(matrix: Array, block: Shape, shape: Shape) -> Array | None:
     factor = flat[source.ravel(), np.arange(flat.shape[1])]
     if np.count_nonzero(flat) != np.count_nonzero(factor):
         return None
-    return np.asarray(factor.reshape(shape))
+    return numbers(factor.reshape(shape))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import onnx
 
-from pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied
+from pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied, numbers
 from pipeline.export.fusion.values import Block, Operand, Origin, Value, whole
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def _stripped(affine: Affine) -> tuple[Affine, Array] | None:
     ((block, matrix),) = affine.parts.items()
     marks = matrix != 0
     factor = matrix.sum(axis=0)
-    if not (marks.sum(axis=0) == 1).all() or (factor == 1).all():
+    if not (marks.sum(axis=0) == 1).all() or (factor == 1).all() or not numbers(factor).all():
         return None
     return Affine(affine.constant, {block: marks.astype(np.float64)}), factor
 
