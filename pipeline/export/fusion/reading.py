@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from math import prod
+from math import inf, prod
 from typing import Any
 
 import onnx
 from onnx import helper, numpy_helper
 
-from pipeline.export.fusion import normal_form
+from pipeline.export.fusion import intervals, normal_form
 from pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied
 from pipeline.export.fusion.prices import OUTPUT, price
 from pipeline.export.fusion.values import Block, Operand, Origin, Value
@@ -17,7 +17,7 @@ from serving.onnx_bytes import read_model
 
 DOUBLE = onnx.TensorProto.DOUBLE
 OWN = ""  # the name of a value that the graph does not have; it is a double
-# What these give may be infinite or no number, and so may what is made of that, but for what the guards give.
+# What these give may be infinite or no number, and so may what is made of that, but for what the guards give of it.
 RISKS = frozenset({"Div", "Log", "Exp", "Pow", "Sqrt", "Reciprocal", "Tan"})
 GUARDS = frozenset({"Where", "Clip", "Min", "Max", "Tanh", "Sigmoid", "Softmax", "Sign"})
 
@@ -138,13 +138,14 @@ class Reading:
         """New blocks."""
         used = [o for o in operands if isinstance(o, Value)]
         level = 1 + max((v.level for v in used), default=-1)
-        risky = op in RISKS or (op not in GUARDS and any(map(self.risky, used)))
-        blocks = [
-            self._block(n, s, op=op, operands=operands, attributes=attributes, level=level, risky=risky)
-            for n, s in zip(names, shapes, strict=True)
-        ]
+        given = [intervals.interval(o, self.blocks) for o in operands]
+        risky = op in RISKS and not intervals.finite(op, given)
+        risky = risky or (op not in GUARDS and any(map(self.risky, used)))
+        low, high = intervals.bounds(op, operands, given)
+        blocks = [self._block(n, s, op=op, level=level, risky=risky) for n, s in zip(names, shapes, strict=True)]
         for block in blocks:
-            block.siblings = blocks
+            block.operands, block.attributes, block.siblings = operands, attributes, blocks
+            block.low, block.high = (-inf, inf) if risky else (low, high)
         if op == "Where" and self._types[names[0]] == DOUBLE:
             blocks[0].wide = normal_form.wide(self, operands, shapes[0])
         return [self._of_block(b) for b in blocks]

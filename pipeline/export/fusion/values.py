@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import prod
+from math import inf, prod
 from typing import TypeAlias
 
 import numpy as np
@@ -16,9 +16,9 @@ class Block:
     """An input, or an output of an operator that is computed as it stands.
 
     ``level``: one more than that of all that it depends on, 0 for an input. ``risky``: it may be
-    infinite or no number while the inputs are finite. ``siblings``: all outputs of its operator.
-    ``wide`` of a Where on a single condition: its two branches as one vector, the second first,
-    from which a Gather can take one.
+    infinite or no number while the inputs are finite. ``low`` and ``high``: bounds of its elements.
+    ``siblings``: all outputs of its operator. ``wide`` of a Where on a single condition: its two
+    branches as one vector, the second first, from which a Gather can take one.
     """
 
     number: int
@@ -29,6 +29,8 @@ class Block:
     attributes: Attributes = field(default_factory=dict)
     level: int = 0
     risky: bool = False
+    low: float = -inf
+    high: float = inf
     siblings: list[Block] = field(default_factory=list)
     wide: Value | None = None
 
