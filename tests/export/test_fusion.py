@@ -50,8 +50,11 @@ def graph(nodes: Nodes, outputs: dict[str, tuple[int, ...]], **inputs: tuple[int
     return model
 
 
-def session(model: onnx.ModelProto, optimized: Path | None = None) -> Any:
+def session(model: onnx.ModelProto, optimized: Path | None = None, *, plain: bool = False) -> Any:
+    """``plain``: the operators as they stand. onnxruntime's own fusion computes some in float32."""
     options = ort.SessionOptions()
+    if plain:
+        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
     options.intra_op_num_threads = 1
     options.log_severity_level = 4
     if optimized is not None:
@@ -71,8 +74,8 @@ def narrow(model: onnx.ModelProto, folder: Path) -> list[str]:
     return found
 
 
-def results(model: onnx.ModelProto, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
-    return session(model).run([o.name for o in model.graph.output], feed)
+def results(model: onnx.ModelProto, feed: dict[str, np.ndarray], *, plain: bool = False) -> list[np.ndarray]:
+    return session(model, plain=plain).run([o.name for o in model.graph.output], feed)
 
 
 def assert_equal(model: onnx.ModelProto, made: onnx.ModelProto, steps: int = 5, **fixed: np.ndarray) -> None:
@@ -80,7 +83,7 @@ def assert_equal(model: onnx.ModelProto, made: onnx.ModelProto, steps: int = 5, 
     onnx.checker.check_model(made, full_check=True)
     for _ in range(steps):
         feed = {i.name: rng.normal(size=[d.dim_value for d in i.type.tensor_type.shape.dim]) for i in model.graph.input}
-        for a, b in zip(results(model, feed | fixed), results(made, feed | fixed), strict=True):
+        for a, b in zip(results(model, feed | fixed, plain=True), results(made, feed | fixed), strict=True):
             np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * max(1.0, np.nan_to_num(np.abs(a)).max(initial=0)))
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pipeline.export.fusion.plan import Account, Choice, Item
 
 PREFERENCES = (
-    ("recipe", "selection", "elementwise", "segments", "increment", "group"),
-    ("selection", "elementwise", "gather", "squares", "increment", "recipe", "segments", "group"),
-    ("selection", "group", "gather", "squares", "recipe", "segments", "increment", "elementwise"),
-    ("selection", "squares", "recipe", "elementwise", "increment", "segments", "group", "gather"),
-    ("selection", "elementwise", "squares", "segments", "increment", "group", "gather", "recipe"),
+    ("recipe", "selection", "elementwise", "segments", "increment", "row", "group"),
+    ("selection", "elementwise", "gather", "squares", "increment", "recipe", "segments", "row", "group"),
+    ("selection", "row", "group", "gather", "squares", "recipe", "segments", "increment", "elementwise"),
+    ("selection", "squares", "recipe", "elementwise", "increment", "segments", "row", "group", "gather"),
+    ("selection", "elementwise", "squares", "segments", "increment", "row", "group", "gather", "recipe"),
 )
 SWEEPS = 4
 LEAST_GAIN = 0.01  # ns

@@ -14,9 +14,10 @@ from pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
 from pipeline.export.fusion.items import Items
 from pipeline.export.fusion.plan import Choice, Given, Group, Input, Item, Member, Output, Selection, Several, Step
 
-ONE = np.ones(1)
 Outputs: TypeAlias = Sequence[tuple[str, Input]]
 """The graph's outputs by their names."""
+Vector: TypeAlias = tuple[str, list[int], bool]
+"""A vector's or a row's name, the blocks in it, and whether a one stands behind them."""
 
 
 def emitted(items: Items, outputs: Outputs, model: onnx.ModelProto) -> onnx.ModelProto:
@@ -31,7 +32,7 @@ class _Writer:
         self.constants: dict[Any, tuple[str, Array]] = {}
         self.names: dict[int, str] = {}
         self.shapes: dict[str, Shape] = {}  # of what an operator with one output gives
-        self.vectors: list[tuple[str, list[int], bool]] = []  # name, blocks, ends in a one
+        self.vectors: dict[Shape, list[Vector]] = {(): [], (1,): []}
         self.taken = {i.name for i in model.graph.input} | {o.name for o in model.graph.output}
         self.count = 0
 
@@ -140,15 +141,15 @@ class _Writer:
             product = total
         if not single:
             names = [self._new(m) for m in members]
-            self._raw("Split", [product, self._constant(np.array(columns))], {"axis": 0}, names)
+            self._raw("Split", [product, self._constant(np.array(columns))], {"axis": len(group.lead)}, names)
 
-    def _vector(self, group: Group, *, needs_one: bool) -> tuple[str, list[int], bool]:
+    def _vector(self, group: Group, *, needs_one: bool) -> Vector:
         """A vector that holds the group's blocks, its blocks in their order, and whether a one stands behind them."""
         used = group.used()
         if len(used) == 1:
-            return self._name(self.items.flat(used[0])), used, False
+            return self._name(group.flat(used[0])), used, False
         best, covered = None, 1
-        for vector in self.vectors:
+        for vector in self.vectors[group.lead]:
             _, blocks, _ = vector
             more = [b for b in blocks if b not in used]
             spare = sum(prod(group.blocks[b].shape) for b in more)
@@ -162,21 +163,21 @@ class _Writer:
         names = [best[0]] if best is not None else []
         order = [*(best[1] if best is not None else []), *rest]
         if best is not None and best[2]:  # the one stands in the middle: it is a block of its own then
-            return self._with_one_inside(best, rest)
-        names += [self._name(self.items.flat(b)) for b in rest]
+            return self._with_one_inside(group, best, rest)
+        names += [self._name(group.flat(b)) for b in rest]
         if needs_one:
-            names.append(self._constant(ONE))
+            names.append(self._constant(np.ones((*group.lead, 1))))
         made = self._fresh()
-        self._raw("Concat", names, {"axis": 0}, [made])
-        self.vectors.append((made, order, one))
-        return self.vectors[-1]
+        self._raw("Concat", names, {"axis": len(group.lead)}, [made])
+        self.vectors[group.lead].append((made, order, one))
+        return self.vectors[group.lead][-1]
 
-    def _with_one_inside(self, best: tuple[str, list[int], bool], rest: list[int]) -> tuple[str, list[int], bool]:
+    def _with_one_inside(self, group: Group, best: Vector, rest: list[int]) -> Vector:
         """The new blocks before an older vector, whose last element is a one."""
         made = self._fresh()
-        self._raw("Concat", [*(self._name(self.items.flat(b)) for b in rest), best[0]], {"axis": 0}, [made])
-        self.vectors.append((made, [*rest, *best[1]], True))
-        return self.vectors[-1]
+        self._raw("Concat", [*(self._name(group.flat(b)) for b in rest), best[0]], {"axis": len(group.lead)}, [made])
+        self.vectors[group.lead].append((made, [*rest, *best[1]], True))
+        return self.vectors[group.lead][-1]
 
     # ------------------------------------------------------------------ names
     def _fresh(self) -> str:

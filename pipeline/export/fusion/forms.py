@@ -33,6 +33,7 @@ def forms_of(items: Items, value: Value) -> dict[str, Item]:
         "squares": _squares(items, value),
         "recipe": _recipe(items, value),
         "group": _group(items, value, affine),
+        "row": _group(items, value, affine, (1,)) if value.shape[:-1] == (1,) else None,
     }
     kept = {kind: item for kind, item in found.items() if item is not None}
     return kept or {"product": items.member(value, alone=True)}
@@ -162,11 +163,11 @@ def _before(operand: Operand, value: Value) -> bool:
     return not isinstance(operand, Value) or (operand.level <= value.level and operand.number < value.number)
 
 
-def _group(items: Items, value: Value, affine: Affine) -> Item | None:
+def _group(items: Items, value: Value, affine: Affine, lead: Shape = ()) -> Item | None:
     """A piece of the product of its level. Not where a block may be no number, which would spread to all pieces."""
     if sum(map(len, affine.parts.values())) * prod(value.shape) > DENSE or items.reading.risky(value):
         return None
-    return items.member(value) if np.isfinite(affine.constant).all() else None
+    return items.member(value, lead=lead) if np.isfinite(affine.constant).all() else None
 
 
 def _run(origin: Origin, shape: Shape) -> tuple[int, int] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from math import prod
 from typing import Any
 
@@ -39,7 +40,7 @@ class Items:
         self._steps: dict[Any, Step] = {}
         self._splits: dict[Any, Several] = {}
         self._selections: dict[int, Selection] = {}
-        self._groups: dict[int, Group] = {}
+        self._groups: dict[tuple[int, Shape], Group] = {}
 
     def of(self, operand: Operand) -> Input:
         """An operator's operand: an item, or a constant."""
@@ -70,10 +71,10 @@ class Items:
             self._blocks[block.number] = self._of_block(block)
         return self._blocks[block.number]
 
-    def flat(self, number: int) -> Item:
-        """A block as a vector."""
+    def flat(self, number: int, lead: Shape = ()) -> Item:
+        """A block as a vector, or with ``lead`` (1,) as a row."""
         block = self.reading.blocks[number]
-        return self.reshaped(self.block(block), (prod(block.shape),))
+        return self.reshaped(self.block(block), (*lead, prod(block.shape)))
 
     def _of_block(self, block: Block) -> Item:
         if not block.op:
@@ -126,15 +127,16 @@ class Items:
             self._selections[id(source)] = Selection(source)
         return self._selections[id(source)].piece(start, stop)
 
-    def member(self, value: Value, *, alone: bool = False) -> Item:
-        """A value as a piece of the product of its level, or of one of its own."""
+    def member(self, value: Value, *, lead: Shape = (), alone: bool = False) -> Item:
+        """A value as a piece of the product of its level, or of one of its own; ``lead`` (1,) of rows."""
         assert value.affine is not None
         for number in value.affine.parts:
-            self.flat(number)  # made now, while there is still time for its forms
-        if alone:
-            group = Group(value.level, self.reading.blocks, self.flat)
-        else:
-            group = self._groups.setdefault(value.level, Group(value.level, self.reading.blocks, self.flat))
+            self.flat(number, lead)  # made now, while there is still time for its forms
+        group = None if alone else self._groups.get((value.level, lead))
+        if group is None:
+            group = Group(value.level, lead, self.reading.blocks, partial(self.flat, lead=lead))
+        if not alone:
+            self._groups[value.level, lead] = group
         return self.reshaped(group.piece(value), value.shape)
 
 

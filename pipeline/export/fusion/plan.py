@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import prod
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from pipeline.export.fusion.affine import Array, Attributes, Shape
 from pipeline.export.fusion.prices import FIXED, INPUT, OUTPUT, price, product
@@ -151,18 +151,21 @@ def _picking(n: int) -> float:
 
 
 class Group(Pool):
-    """Affine functions of blocks of one level and below as one product: [Concat ->] MatMul [-> Add] [-> Split]."""
+    """Affine functions of blocks of one level and below as one product: [Concat ->] MatMul [-> Add] [-> Split].
 
-    __slots__ = ("blocks", "flat", "level", "values")
+    ``lead``: () for vectors, (1,) for single rows. ``flat`` gives a block's item in that form.
+    """
 
-    def __init__(self, level: int, blocks: Sequence[Block], flat: Any) -> None:
+    __slots__ = ("blocks", "flat", "lead", "level", "values")
+
+    def __init__(self, level: int, lead: Shape, blocks: Sequence[Block], flat: Callable[[int], Item]) -> None:
         super().__init__()
-        self.level, self.blocks, self.flat = level, blocks, flat
+        self.level, self.lead, self.blocks, self.flat = level, lead, blocks, flat
         self.values: dict[int, Value] = {}  # by the member's id
 
     def piece(self, value: Value) -> Member:
-        """A value as a vector."""
-        member = Member((prod(value.shape),), self)
+        """A value as a vector or a row."""
+        member = Member((*self.lead, prod(value.shape)), self)
         self.values[id(member)] = value
         return member
 
