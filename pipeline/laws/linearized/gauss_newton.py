@@ -57,7 +57,6 @@ class GaussNewtonPid(NnarxPid):
     def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         super().__init__(signals, model, params, info=("linearization_error",))
         self.search = GaussNewton(self.model, params.relinearize, self.params.penalty, self.params.slope_min)
-
         self.turned = bool(self.gains.unit < 0)
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
