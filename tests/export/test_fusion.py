@@ -20,7 +20,8 @@ from onnx import TensorProto, helper, numpy_helper
 from pipeline.export import fusion
 from pipeline.export.fusion import emission, fused, reading
 from pipeline.export.fusion.affine import Affine
-from pipeline.export.fusion.plan import Choice, Group, Item, Selection
+from pipeline.export.fusion.plan import Choice, Item
+from pipeline.export.fusion.pools import Group, Selection
 from pipeline.export.fusion.reading import Reading
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"

@@ -12,7 +12,8 @@ from onnx import helper, numpy_helper
 
 from pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
 from pipeline.export.fusion.items import Items
-from pipeline.export.fusion.plan import Choice, Given, Group, Input, Item, Member, Output, Selection, Several, Step
+from pipeline.export.fusion.plan import Choice, Given, Input, Item, Member, Output, Several, Step
+from pipeline.export.fusion.pools import Group, Selection
 
 Outputs: TypeAlias = Sequence[tuple[str, Input]]
 """The graph's outputs by their names."""
