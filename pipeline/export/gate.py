@@ -12,7 +12,9 @@ import torch
 from pipeline.engine import progress
 from pipeline.errors import ExportError
 from pipeline.export.controller_file import assembled, write_sidecar
+from pipeline.export.fusion import fused
 from pipeline.export.graph import example_inputs, law_graph
+from pipeline.export.operators import check_operators
 from pipeline.files import draft_of
 from pipeline.laws.base import ControlLaw
 from pipeline.plants.simulator import Array
@@ -38,8 +40,9 @@ def export(
 ) -> Manifest:
     """Write ``law`` as one ONNX graph with its manifest, and the manifest again as .json beside it.
 
-    The file is written to a draft, loaded by the runtime that will serve it, and renamed only
-    after a closed loop of 1,000 steps agrees with the torch module, see ``parity_gate``.
+    The graph is fused, see ``pipeline.export.fusion``, and written to a draft. The draft is loaded by the
+    runtime that will serve it, and renamed only after a closed loop of 1,000 steps agrees with the torch
+    module, see ``parity_gate``.
 
     Parameters
     ----------
@@ -64,7 +67,9 @@ def export(
     path = Path(path)
     law = law.eval()
     _check_shapes(law)
-    model, inputs = law_graph(law)
+    written, inputs = law_graph(law)
+    model = fused(written)
+    check_operators(law, model)
     manifest = Manifest(
         **{name: getattr(law.signals, name) for name in ("period_s", "sp", "pv", "dv", "mv")},
         case=case,

@@ -18,19 +18,17 @@ from onnx_ir.passes import common as passes
 from onnxscript import optimizer
 
 from pipeline.errors import ExportError
+from pipeline.export.operators import check_operators
 from pipeline.laws.base import ControlLaw
-from serving.errors import ArtifactError
-from serving.graph_audit import MAX_IR, audit
+from serving.graph_audit import MAX_IR
 from serving.manifest import INPUTS
 
 OPSET = 18  # the exporter's own: no version conversion, and older runtimes read it
 OUTPUTS = ("mv", "state_next", "info")
-# Behind these a value is no longer a transposed matrix.
-RESHAPING = frozenset({"Flatten", "Gather", "Gemm", "MatMul", "Reshape", "Squeeze"})
 
 
 def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
-    """The graph of one step, and the inputs that it uses, in the order of the contract.
+    """The graph of one step as the law is written, and the inputs that it uses, in the order of the contract.
 
     Inputs ``sp, pv, dv, mv_applied, state`` and outputs ``mv, state_next, info``, all float64 of
     rank 1; an input that the law does not use and an output of size zero are left out.
@@ -194,46 +192,13 @@ def _simplify(model: ir.Model) -> None:
 
 
 def _check(law: ControlLaw, proto: onnx.ModelProto) -> None:
-    """ExportError for an operator off the list, a transposed product, a float32 value, or a changed buffer."""
-    try:
-        audit(proto.SerializeToString())
-    except ArtifactError as error:
-        raise ExportError(f"law {law.name!r}: {error}") from error
-    products = _transposed_products(proto.graph)
-    if products:
-        raise ExportError(
-            f"law {law.name!r}: {products[0]} multiplies a transposed matrix, which onnxruntime below 1.26 refuses; "
-            "write the product as a sum, (a * b).sum(-1), or keep the matrix transposed in a buffer"
-        )
-    narrow = {onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16}
-    casts = [a.i for n in proto.graph.node if n.op_type == "Cast" for a in n.attribute if a.name == "to"]
-    if narrow & {*casts, *(t.data_type for t in proto.graph.initializer)}:
-        raise ExportError(f"law {law.name!r} computes in float32 somewhere; make its constants and casts float64")
+    """ExportError for what ``check_operators`` refuses, or a changed buffer."""
+    check_operators(law, proto)
     buffers = law.state_dict()
     for tensor in proto.graph.initializer:
         value = onnx.numpy_helper.to_array(tensor)
         if tensor.name in buffers and not np.array_equal(value, buffers[tensor.name].numpy(), equal_nan=True):
             raise ExportError(f"law {law.name!r}: buffer {tensor.name!r} changed on its way into the graph")
-
-
-def _transposed_products(graph: onnx.GraphProto) -> list[str]:
-    """Names of the matrix products that onnxruntime may fuse with a Transpose into its own FusedMatMul.
-
-    The Transpose need not stand beside the product: onnxruntime moves it behind operators that have
-    transposed operands alone.
-    """
-    transposed: set[str] = set()
-    constants = {tensor.name for tensor in graph.initializer}
-    products = []
-    for node in graph.node:  # in the order of computation
-        operands = set(node.input) - constants - {""}
-        if node.op_type == "MatMul" and not transposed.isdisjoint(node.input):
-            products.append(node.name)
-        drops_axis = any(a.name == "keepdims" and a.i == 0 for a in node.attribute)
-        passes_on = operands and operands <= transposed and node.op_type not in RESHAPING and not drops_axis
-        if node.op_type == "Transpose" or passes_on:
-            transposed.update(node.output)
-    return products
 
 
 def _cause(error: Exception) -> str:

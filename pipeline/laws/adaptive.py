@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -15,7 +14,7 @@ from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
 from pipeline.laws.gain_update import PidForm, gain_update
 from pipeline.laws.ranges import OfRange, ascend, in_units
-from pipeline.models.memory import Memory, Named, Slot, Stage, constant
+from pipeline.models.memory import Memory, Named, Slot
 from pipeline.plants.signals import Signals
 
 Three = tuple[float, float, float]
@@ -145,9 +144,8 @@ class AdaptiveGains(nn.Module):
     e1 = e2 = e, so a start at the set point and a transfer from manual are bumpless. The law adds
     its move to the applied MV, which is the anti-windup.
 
-    A law gives ``slots`` to its Memory and ``terms`` to its Stage, and then calls ``free``, ``update``,
-    ``settled`` and ``step`` with the stage's results. ``unit`` is one unit of move [mv] with its sign, see
-    ``signed_unit``; ``start`` the gains without a past.
+    A law gives ``slots`` to its Memory and hands on what that recalls, ``p``. ``unit`` is one unit of
+    move [mv] with its sign, see ``signed_unit``; ``start`` the gains without a past.
 
     Source: [chen2004, eqs 2-4, 19-28].
     """
@@ -190,58 +188,47 @@ class AdaptiveGains(nn.Module):
         self.slots = {
             "e1": Slot(1, _error, _error),
             "e2": Slot(1, _error, lambda p: p["e1"]),
-            "gains": Slot(3, constant(first)),
+            "gains": Slot(3, first),
         }
         if self.filtered:
-            self.slots["change"] = Slot(3, constant(torch.zeros(3, dtype=torch.float64)))
+            self.slots["change"] = Slot(3, torch.zeros(3, dtype=torch.float64))
         if m > 1:  # squared errors, the newest first; without a past there were none
-            nothing = constant(torch.zeros(m - 2, dtype=torch.float64))
+            nothing = torch.zeros(m - 2, dtype=torch.float64)
             self.slots["squares"] = Slot(m - 2, nothing, lambda p: torch.cat([p["square"], p["squares"]], -1)[..., :-1])
-            self.slots["square"] = Slot(1, constant(torch.zeros(1, dtype=torch.float64)))
+            self.slots["square"] = Slot(1, torch.zeros(1, dtype=torch.float64))
 
-    def terms(self, p: Named) -> dict[str, Tensor]:
-        """The terms that the gains need from the memory and the sample."""
-        e = _error(p)
-        terms = {
-            "rho": torch.cat([e - p["e1"], (e + p["e1"]) / 2, e - 2 * p["e1"] + p["e2"]], dim=-1),
-            "gains": p["gains"],
-            "mv": p["u"],
-        }
-        if self.filtered:
-            terms["change"] = self.gamma * p["change"]
-        if self.window:
-            terms["error"] = e
-        if self.window > 1:
-            terms["quiet"] = self.threshold - p["square"] - p["squares"].sum(dim=-1, keepdim=True)
-        return terms
+    def errors(self, p: Named) -> Tensor:
+        """What the gains are multiplied with to give the move: rho (..., 3)."""
+        e, e1, e2 = _error(p), p["e1"], p["e2"]
+        return torch.cat([e - e1, (e + e1) / 2, e - 2 * e1 + e2], dim=-1)
 
-    def update(self, now: Named, v: Tensor, c: Tensor) -> Tensor:
-        """Gains (..., 3) for a desired move v and its curvature c, (..., 1) each."""
-        return gain_update(now["gains"], now["rho"], v, c, self.lam, self.weights, self.lo, self.hi)
-
-    def free(self, now: Named, slope: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def free(self, p: Named, slope: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Whether the gains may change (..., 1), for a slope [pv] in the plant's sign; and the next memory."""
         clear = slope > self.slope_min
         if not self.window:
             return clear, {}
-        square = now["error"] * now["error"]
-        loud = square > (now["quiet"] if self.window > 1 else self.threshold)
-        return clear & loud, {"square": square} if self.window > 1 else {}
+        square = _error(p) * _error(p)
+        if self.window == 1:
+            return clear & (square > self.threshold), {}
+        total = square + p["square"]
+        if self.window > 2:
+            total = total + p["squares"].sum(dim=-1, keepdim=True)
+        return clear & (total > self.threshold), {"square": square}
 
-    def settled(self, now: Named, z: Tensor, free: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def update(self, p: Named, rho: Tensor, v: Tensor, c: Tensor) -> Tensor:
+        """Gains (..., 3) for a desired move v and its curvature c, (..., 1) each."""
+        return gain_update(p["gains"], rho, v, c, self.lam, self.weights, self.lo, self.hi)
+
+    def settled(self, p: Named, z: Tensor, free: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The gains (..., 3) after filter and guard, and the next memory."""
         if not self.filtered:
-            z = torch.where(free, z, now["gains"])
+            z = torch.where(free, z, p["gains"])
             return z, {"gains": z}
-        change = now["change"] + self.fresh_share * (z - now["gains"])
+        change = self.gamma * p["change"] + self.fresh_share * (z - p["gains"])
         change = torch.where(free, change, torch.zeros_like(change))
         # A filtered change can leave the bounds even if both gains are within them.
-        z = torch.minimum(torch.maximum(now["gains"] + change, self.lo), self.hi)
+        z = torch.minimum(torch.maximum(p["gains"] + change, self.lo), self.hi)
         return z, {"gains": z, "change": change}
-
-    def step(self, now: Named, z: Tensor) -> Tensor:
-        """The move du = rho'z in units, (..., 1), of gains (..., 3)."""
-        return (now["rho"] * z).sum(dim=-1, keepdim=True)
 
     def info_of(self, z: Tensor, slope: Tensor, free: Tensor) -> Tensor:
         """``info``: kc [mv/pv], tau_i and tau_d [s], the slope [pv/mv], and whether the gains were free to change."""
@@ -249,7 +236,7 @@ class AdaptiveGains(nn.Module):
 
 
 class AdaptivePid(ControlLaw):
-    """A PID law whose gains follow a model: the memory and the formulas of both. ``forward`` is the law's.
+    """A PID law whose gains follow a model: the memory of both. ``forward`` is the law's.
 
     Parameters
     ----------
@@ -282,15 +269,13 @@ class AdaptivePid(ControlLaw):
         self.params, self.model = params, model(unit)
         self.gains = AdaptiveGains(params, signals, unit, params.gains or minimum_variance_gains(a, b * unit, params))
         self.memory = Memory({**target_slots(params.preview), **self.model.slots, **self.gains.slots, **more})
-        self.stage = Stage(
-            self.memory.layout, lambda p: {"known": self.memory.then(p), **self.gains.terms(p), **self.formulas(p)}
-        )
         self.n_state = self.memory.n_state
         self.info = (*AdaptiveGains.info, *info)
 
-    @abstractmethod
-    def formulas(self, p: Named) -> Named:
-        """The terms that the law needs from the memory and the sample, beside those of its gains."""
+
+def move(rho: Tensor, z: Tensor) -> Tensor:
+    """The PID's move du = rho'z in units, (..., 1), of gains (..., 3)."""
+    return (rho * z).sum(dim=-1, keepdim=True)
 
 
 def _error(p: Named) -> Tensor:

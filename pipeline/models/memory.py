@@ -1,4 +1,4 @@
-"""The memory of a law, by name; and everything that is affine in it, computed as one matrix product."""
+"""The memory of a law, by name; and affine functions of named tensors, computed as one matrix product."""
 
 from __future__ import annotations
 
@@ -15,20 +15,15 @@ Formula = Callable[[Named], Tensor]
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One remembered vector: what it is without a past, and (where that is affine) what it is next.
+    """One remembered vector: what it is without a past, and what it is next.
 
-    ``start`` is affine in y, r and u of the first sample; ``then`` in those of any sample and in all
-    that is remembered. Without ``then`` the law gives the next value itself.
+    ``start`` is numbers (size,), or a function of y, r and u of the first sample; ``then`` a function of
+    those of any sample and of all that is remembered. Without ``then`` the law gives the next value itself.
     """
 
     size: int
-    start: Formula
+    start: Formula | Tensor
     then: Formula | None = None
-
-
-def constant(values: Tensor) -> Formula:
-    """The formula of numbers that depend on nothing, values (n,)."""
-    return lambda p: values.expand(*p["y"].shape[:-1], len(values))
 
 
 def lag_slots(n_y: int, n_u: int, *, measured: bool = True) -> dict[str, Slot]:
@@ -95,32 +90,38 @@ class Memory(nn.Module):
 
     def __init__(self, slots: Mapping[str, Slot]) -> None:
         super().__init__()
-        self.affine = {name: slot for name, slot in slots.items() if slot.then is not None}
+        self.known = {name: slot for name, slot in slots.items() if slot.then is not None}
         self.given = {name: slot for name, slot in slots.items() if slot.then is None}
-        sizes = {name: slot.size for name, slot in (self.affine | self.given).items()}
+        sizes = {name: slot.size for name, slot in (self.known | self.given).items()}
         self.n_state = 1 + sum(sizes.values())
         self.layout = {"started": 1, **sizes, "y": 1, "r": 1, "u": 1}
-        self.fresh = Stage(self.layout, self._fresh)
+        for name, slot in slots.items():
+            if isinstance(slot.start, Tensor):
+                self.register_buffer(f"first_{name}", slot.start)
 
-    def _fresh(self, p: Named) -> Named:
-        slots = self.affine | self.given
-        same = {name: p[name] for name in ("started", "y", "r", "u")}
-        found = {**same, **{name: slot.start(p) for name, slot in slots.items()}}
-        return {"all": torch.cat([found[name] for name in self.layout], dim=-1)}
+    def recall(self, sp: Tensor, pv: Tensor, mv_applied: Tensor, state: Tensor) -> dict[str, Tensor]:
+        """The past and the sample by name, (..., size) each; where there is no past, a still one.
 
-    def recall(self, sp: Tensor, pv: Tensor, mv_applied: Tensor, state: Tensor) -> Tensor:
-        """The past and the sample as one vector of ``layout``, shape (..., n); where there is no past, a still one.
-
-        ``started`` in it stays 0 at the first sample.
+        ``started`` is 0 at the first sample, y the first PV, r the set point, u the applied MV.
         """
         x = torch.cat([state, pv[..., :1], sp, mv_applied], dim=-1)
-        return torch.where(state[..., :1] > 0, x, self.fresh(x)["all"])
+        p = self._named(x)
+        first = [self._first(name, slot, p) for name, slot in (self.known | self.given).items()]
+        still = torch.cat([p["started"], *first, p["y"], p["r"], p["u"]], dim=-1)
+        return self._named(torch.where(p["started"] > 0, x, still))
 
-    def then(self, p: Named) -> Tensor:
-        """The formula of the state's first part, which ``stored`` takes as ``known``."""
+    def stored(self, p: Named, given: Named) -> Tensor:
+        """The next state (..., n_state), from the past and the slots that the law computes."""
         one = torch.ones_like(p["y"])
-        return torch.cat([one, *(slot.then(p) for slot in self.affine.values() if slot.then is not None)], dim=-1)
+        known = [slot.then(p) for slot in self.known.values() if slot.then is not None]
+        return torch.cat([one, *known, *(given[name] for name in self.given)], dim=-1)
 
-    def stored(self, known: Tensor, given: Named) -> Tensor:
-        """The next state from ``then`` and the slots that the law computes."""
-        return torch.cat([known, *(given[name] for name in self.given)], dim=-1)
+    def _first(self, name: str, slot: Slot, p: Named) -> Tensor:
+        """A slot without a past."""
+        if not isinstance(slot.start, Tensor):
+            return slot.start(p)
+        numbers: Tensor = getattr(self, f"first_{name}")
+        return numbers.expand(*p["y"].shape[:-1], slot.size)
+
+    def _named(self, x: Tensor) -> dict[str, Tensor]:
+        return dict(zip(self.layout, torch.split(x, list(self.layout.values()), dim=-1), strict=True))

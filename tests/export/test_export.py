@@ -17,6 +17,7 @@ from torch import Tensor
 from pipeline.errors import ExportError
 from pipeline.export.controller_file import with_evidence
 from pipeline.export.gate import GATE_TOLERANCE, export, parity_gate
+from pipeline.export.graph import law_graph
 from pipeline.laws import ControlLaw
 from pipeline.plants.signals import Signals
 from serving import Controller, Signal
@@ -44,6 +45,11 @@ def test_true_plant_may_drive_the_gate(pi_law: ControlLaw, pi_file: Path) -> Non
     assert parity_gate(pi_law, Controller(pi_file), drive=drive) <= GATE_TOLERANCE
     assert len(seen) == 1_000
     assert np.ptp(seen) > 1
+
+
+def test_the_file_holds_the_fused_graph(pi_law: ControlLaw, pi_file: Path) -> None:
+    written, _ = law_graph(pi_law)
+    assert Controller(pi_file).summary.nodes < len(written.graph.node)
 
 
 def test_python_floats_keep_their_53_bits(make_formula: MakeFormula, tmp_path: Path) -> None:

@@ -122,29 +122,32 @@ def test_batch_profile_in_noise(name: str) -> None:
     assert np.mean([sse(t, test.late_from) for t in tracks]) <= 15
 
 
-def ahead_of(model: NNARX, unit: float, y: np.ndarray, u: np.ndarray, gap: np.ndarray) -> tuple[NextOutput, Ahead]:
-    """The prediction at measured lags and a resting MV, (n, 1) each, ``gap`` short of its set point."""
+def ahead_of(model: NNARX, unit: float, y: np.ndarray, u: np.ndarray) -> tuple[NextOutput, Ahead]:
+    """The forecast at measured lags and a resting MV, (n, 1) each, without an offset."""
     predictor = NextOutput(model, unit)
-    lags = [torch.from_numpy(v) for v in (y, y, u, u)]
-    at = predictor.along.preactivation(torch.cat(lags, dim=-1))
-    rest, slope = predictor.along.rest_and_slope(at)
-    return predictor, Ahead(torch.from_numpy(gap), slope, rest, at, 0 * rest, {})
+    phi = torch.from_numpy(np.hstack([y] * model.n_y + [u] * model.n_u))
+    value, slope = predictor.along.value_and_slope(phi)
+    return predictor, Ahead(phi, value, slope, 0 * value, {})
 
 
 def test_search_finds_the_best_move(model: NNARX) -> None:
     rng = np.random.default_rng(1)
     y, u, gap = rng.uniform(6, 10, (300, 1)), rng.uniform(850, 1050, (300, 1)), rng.uniform(-2, 2, (300, 1))
-    predictor, ahead = ahead_of(model, 100.0, y, u, gap)
+    predictor, ahead = ahead_of(model, 100.0, y, u)
+    goal = ahead.y + torch.from_numpy(gap)
     down, up = (torch.from_numpy((end - u) / 100.0) for end in (850.0, 1050.0))
     moves = down + (up - down) * torch.linspace(0, 1, 2001, dtype=torch.float64)
 
     def cost(move: torch.Tensor) -> torch.Tensor:
-        added = predictor.moved(Ahead(*(t[:, None] for t in ahead[:5]), {}), move[..., None])[..., 0]
-        return (ahead.gap - added) ** 2 + 0.05 * move**2
+        reached, _ = predictor.moved(Ahead(*(t[:, None] for t in ahead[:4]), {}), move[..., None])
+        return (goal - reached[..., 0]) ** 2 + 0.05 * move**2
+
+    def found(times: int) -> torch.Tensor:
+        return GaussNewton(predictor, times, 0.05, 1e-3)(ahead, goal, down, up)[0]
 
     with torch.no_grad():
         best = cost(moves).amin(dim=-1)
-        left = {n: cost(GaussNewton(predictor, n, 0.05, 1e-3)(ahead, down, up)[0])[:, 0] - best for n in (1, 3, 5, 12)}
+        left = {n: cost(found(n))[:, 0] - best for n in (1, 3, 5, 12)}
     assert left[12].max() < 1e-3
     # Each linearization brings it nearer, and few are enough.
     assert left[1].mean() > 10 * left[3].mean() > 10 * left[5].mean()
@@ -158,21 +161,18 @@ def test_search_does_not_jump_where_newton_would() -> None:
         for parameter, value in zip(model.net.parameters(), ([[0.0], [1.0]], [[1.0]], [0.0], [0.0]), strict=True):
             parameter.copy_(torch.tensor(value))
     u, r = -1.5, 0.1
-    predictor = NextOutput(model, 1.0)
-    at = predictor.along.preactivation(torch.tensor([[0.0, u]], dtype=torch.float64))
-    rest, slope = predictor.along.rest_and_slope(at)
-    gap = r - rest
-    ahead = Ahead(gap, slope, rest, at, 0 * rest, {})
+    predictor, ahead = ahead_of(model, 1.0, np.zeros((1, 1)), np.full((1, 1), u))
+    goal = torch.full((1, 1), r, dtype=torch.float64)
     down, up = (torch.tensor([[end - u]], dtype=torch.float64) for end in (-3.0, 3.0))
     with torch.no_grad():
-        found = [float(GaussNewton(predictor, n, 1e-9, 1e-3)(ahead, down, up)[0]) + u for n in range(1, 9)]
+        found = [float(GaussNewton(predictor, n, 1e-9, 1e-3)(ahead, goal, down, up)[0]) + u for n in range(1, 9)]
     assert found[0] == pytest.approx(3.0)  # the first step leaves the range
     assert found[-1] == pytest.approx(np.arctanh(r), abs=1e-6)
     with torch.no_grad():  # what Newton's own steps do, limited to the range alone
-        move, ends = torch.zeros_like(gap), []
+        move, ends = torch.zeros_like(goal), []
         for _ in range(8):
-            rest_there, slope_there = predictor.relinearized(ahead, move)
-            move = torch.clamp(move + (gap - rest_there + rest) / slope_there, down, up)
+            y, slope = predictor.moved(ahead, move)
+            move = torch.clamp(move + (goal - y) / slope, down, up)
             ends.append(float(move) + u)
     assert set(np.round(ends, 6)) == {-3.0, 3.0}
 

@@ -74,17 +74,16 @@ def test_arx_in_the_signs_of_equation_9(model: NNARX) -> None:
 def test_along_the_newest_mv(model: NNARX, unit: float) -> None:
     phi = points(model, 40)
     ray = AlongMv(model, unit)
-    m, base = ray.preactivation(phi), ray.base(phi)
-    rest, slope = ray.rest_and_slope(m)
+    value, slope = ray.value_and_slope(phi)
     size = autograd(model, phi).abs().max().item() * max(1.0, abs(unit))
-    torch.testing.assert_close(base + rest, model(phi).detach(), rtol=1e-12, atol=1e-12 * size)
-    torch.testing.assert_close(rest, ray.rest(m), rtol=0, atol=0)
+    torch.testing.assert_close(value, model(phi).detach(), rtol=1e-12, atol=1e-12 * size)
+    torch.testing.assert_close(value, ray.value(phi), rtol=0, atol=0)
     column = autograd(model, phi)[:, model.n_y : model.n_y + 1]
     torch.testing.assert_close(slope, unit * column, rtol=1e-12, atol=1e-12 * size)
     step = torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None]
     further = phi.clone()
     further[:, model.n_y] += unit * step[:, 0]
-    torch.testing.assert_close(base + ray.rest(ray.moved(m, step)), model(further).detach(), rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(ray.value(phi + step * ray.newest), model(further).detach(), rtol=1e-11, atol=1e-11)
 
 
 def test_a_newest_mv_that_does_not_act_at_once_is_refused() -> None:

@@ -9,22 +9,22 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.adaptive import signed_unit, target, target_slots
+from pipeline.laws.adaptive import move, signed_unit, target, target_slots
 from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
 from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid, central_model, next_output
 from pipeline.laws.ranges import OfRange, in_units
 from pipeline.models.base import Model
 from pipeline.models.lagged.next_output import GaussNewton
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Memory, Named, Stage
+from pipeline.models.memory import Memory
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
 
-def room(p: Named, low: Tensor, high: Tensor, unit: float) -> dict[str, Tensor]:
-    """Formulas of the least and the largest move that the actuator can make, in units."""
-    ends = [(low - p["u"]) / unit, (high - p["u"]) / unit]
-    return dict(zip(("down", "up"), ends if unit > 0 else reversed(ends), strict=True))
+def room(law: ControlLaw, u: Tensor, unit: Tensor, *, turned: bool) -> tuple[Tensor, Tensor]:
+    """The least and the largest move from u that the actuator can make, in units; ``turned``: the unit is negative."""
+    to_low, to_high = (law.low - u) / unit, (law.high - u) / unit
+    return (to_high, to_low) if turned else (to_low, to_high)
 
 
 class GaussNewtonPid(NnarxPid):
@@ -57,22 +57,23 @@ class GaussNewtonPid(NnarxPid):
     def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         super().__init__(signals, model, params, info=("linearization_error",))
         self.search = GaussNewton(self.model, params.relinearize, self.params.penalty, self.params.slope_min)
-
-    def formulas(self, p: Named) -> Named:
-        """Those of the model, and the moves that the actuator can make."""
-        return {**super().formulas(p), **room(p, self.low, self.high, float(self.gains.unit))}
+        self.turned = bool(self.gains.unit < 0)
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
-        ahead = self.model(now)
-        free, loud = self.gains.free(now, ahead.slope)
-        move, curvature = self.search(ahead, now["down"], now["up"])
-        z, changed = self.gains.settled(now, self.gains.update(now, move, curvature), free)
-        mv, moved = self.commanded(now, self.gains.step(now, z))
+        p = self.memory.recall(sp, pv, mv_applied, state)
+        # The network's forecast without a move, and the move that would be best.
+        ahead = self.model(p)
+        down, up = room(self, p["u"], self.gains.unit, turned=self.turned)
+        best, curvature = self.search(ahead, target(p, self.params.preview), down, up)
+        # The gains that come nearest to it, if they are free to change.
+        rho = self.gains.errors(p)
+        free, loud = self.gains.free(p, ahead.slope)
+        z, changed = self.gains.settled(p, self.gains.update(p, rho, best, curvature), free)
+        # The PID's own move, within the limits.
+        mv, moved = self.commanded(p, move(rho, z))
         info = [self.gains.info_of(z, ahead.slope, free), ahead.offset, self.linearization_error(ahead, moved)]
-        state_next = self.memory.stored(now["known"], {**ahead.kept, **loud, **changed})
-        return mv, state_next, torch.cat(info, dim=-1)
+        return mv, self.memory.stored(p, {**ahead.kept, **loud, **changed}), torch.cat(info, dim=-1)
 
 
 class MinimumVariance(ControlLaw):
@@ -129,15 +130,7 @@ class MinimumVariance(ControlLaw):
         self.search = GaussNewton(self.model, params.relinearize, params.penalty, params.slope_min)
         hold_numbers(self, unit=unit, by_unit=1 / unit)
         self.memory = Memory({**target_slots(params.preview), **self.model.slots})
-        self.stage = Stage(
-            self.memory.layout,
-            lambda p: {
-                "known": self.memory.then(p),
-                "mv": p["u"],
-                **room(p, self.low, self.high, unit),
-                **self.model.terms(p, target(p, params.preview)),
-            },
-        )
+        self.preview, self.turned = params.preview, unit < 0
         self.n_state = self.memory.n_state
         self.info = ("b1", "offset", "mv_requested")
 
@@ -148,9 +141,10 @@ class MinimumVariance(ControlLaw):
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
-        ahead = self.model(now)
-        move, _ = self.search(ahead, now["down"], now["up"])
-        requested = now["mv"] + move * self.unit
+        p = self.memory.recall(sp, pv, mv_applied, state)
+        ahead = self.model(p)
+        down, up = room(self, p["u"], self.unit, turned=self.turned)
+        best, _ = self.search(ahead, target(p, self.preview), down, up)
+        requested = p["u"] + best * self.unit
         info = torch.cat([ahead.slope * self.by_unit, ahead.offset, requested], dim=-1)
-        return self.limited(requested, now["mv"]), self.memory.stored(now["known"], ahead.kept), info
+        return self.limited(requested, p["u"]), self.memory.stored(p, ahead.kept), info

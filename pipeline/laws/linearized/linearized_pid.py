@@ -9,12 +9,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from pipeline.laws.adaptive import move, target
 from pipeline.laws.base import Stepped, hold_numbers
 from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
 from pipeline.laws.ranges import ascend, in_units
 from pipeline.models.lagged.next_output import Ahead
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Named, Slot, constant
+from pipeline.models.memory import Named, Slot
 from pipeline.plants.signals import Signals
 
 DOUBLINGS = 12
@@ -78,7 +79,7 @@ class LinearizedPid(NnarxPid):
     def __init__(self, signals: Signals, model: NNARX, params: Params) -> None:
         params = in_units(params, signals, self.name)
         start, low = params.penalties
-        more = {"penalty": Slot(1, constant(torch.tensor([start], dtype=torch.float64)))} if params.adaptive else {}
+        more = {"penalty": Slot(1, torch.tensor([start], dtype=torch.float64))} if params.adaptive else {}
         super().__init__(signals, model, params, more, ("linearization_error", *more))
         self.adaptive = params.adaptive
         hold_numbers(
@@ -91,49 +92,47 @@ class LinearizedPid(NnarxPid):
             none=math.inf,
         )
 
-    def formulas(self, p: Named) -> Named:
-        """Those of the model, and the penalty so far where it adapts."""
-        return {**super().formulas(p), **({"penalty": p["penalty"]} if self.params.adaptive else {})}
-
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        past = self.memory.recall(sp, pv, mv_applied, state)
+        p = self.memory.recall(sp, pv, mv_applied, state)
         if self.adaptive:
-            past = past.unsqueeze(-2)  # candidates are rows
-        now = self.stage(past)
-        ahead = self.model(now)
-        free, loud = self.gains.free(now, ahead.slope)
+            p = {name: value.unsqueeze(-2) for name, value in p.items()}  # candidates are rows
+        ahead, rho = self.model(p), self.gains.errors(p)
+        gap = target(p, self.params.preview) - ahead.y
+        free, loud = self.gains.free(p, ahead.slope)
         if self.adaptive:
-            z, error, penalty, following = self._searched(now, ahead, free)
+            z, error, penalty, following = self._searched(p, rho, ahead, gap, free)
         else:
-            z = self._gains(now, ahead, self.penalty)
-        z, changed = self.gains.settled(now, z, free)
-        mv, moved = self.commanded(now, self.gains.step(now, z))
+            z = self._gains(p, rho, ahead.slope, gap, self.penalty)
+        z, changed = self.gains.settled(p, z, free)
+        mv, moved = self.commanded(p, move(rho, z))
         shown = [self.gains.info_of(z, ahead.slope, free), ahead.offset]
         given = {**ahead.kept, **loud, **changed}
         if self.adaptive:
             shown, given = [*shown, error, penalty], {**given, "penalty": following}
         else:
             shown.append(self.linearization_error(ahead, moved))
-        state_next, info = self.memory.stored(now["known"], given), torch.cat(shown, dim=-1)
+        state_next, info = self.memory.stored(p, given), torch.cat(shown, dim=-1)
         if self.adaptive:
             return mv.squeeze(-2), state_next.squeeze(-2), info.squeeze(-2)
         return mv, state_next, info
 
-    def _gains(self, now: Named, ahead: Ahead, penalty: Tensor) -> Tensor:
+    def _gains(self, p: Named, rho: Tensor, slope: Tensor, gap: Tensor, penalty: Tensor) -> Tensor:
         """Gains (..., 3) for a penalty (..., 1)."""
-        c = ahead.slope * ahead.slope + penalty
-        return self.gains.update(now, ahead.slope * ahead.gap / c, c)
+        c = slope * slope + penalty
+        return self.gains.update(p, rho, slope * gap / c, c)
 
-    def _searched(self, now: Named, ahead: Ahead, free: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _searched(
+        self, p: Named, rho: Tensor, ahead: Ahead, gap: Tensor, free: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gains, linearization error and penalty of the first candidate that agrees, and the next sample's penalty."""
-        penalties = now["penalty"] * self.doubled
-        z = self._gains(now, ahead, penalties)
-        error = self.linearization_error(ahead, self.gains.step(now, z))
+        penalties = p["penalty"] * self.doubled
+        z = self._gains(p, rho, ahead.slope, gap, penalties)
+        error = self.linearization_error(ahead, move(rho, z))
         penalty = torch.where(error <= self.allowed, penalties, self.none).amin(dim=-2, keepdim=True)
         first, nothing = penalties == penalty, torch.zeros_like(penalty)
         z, error = (torch.where(first, t, nothing).sum(dim=-2, keepdim=True) for t in (z, error))
-        penalty = torch.where(free, penalty, now["penalty"])
+        penalty = torch.where(free, penalty, p["penalty"])
         easy = free & (error < self.eps_low)
         following = torch.where(easy, torch.maximum(0.5 * penalty, self.penalty_low), penalty)
         return z, error, penalty, following

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 from torch import Tensor
 
 from pipeline.errors import LawError, ModelError
-from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, target
+from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid
 from pipeline.laws.base import require_kind
 from pipeline.models.base import Model
 from pipeline.models.lagged.instantaneous import Arx, arx
@@ -75,16 +75,12 @@ class NnarxPid(AdaptivePid):
         """The law over part ``nnarx``; raises LawError."""
         return cls(signals, require_kind(models, NNARX, cls.name), params)
 
-    def formulas(self, p: Named) -> Named:
-        """Those of the model."""
-        terms: Named = self.model.terms(p, target(p, self.params.preview))
-        return terms
+    def commanded(self, p: Named, move: Tensor) -> tuple[Tensor, Tensor]:
+        """The MV (..., 1) after a move in units, within its limits, and the move that they leave, in units."""
+        mv = self.limited(p["u"] + move * self.gains.unit, p["u"])
+        return mv, (mv - p["u"]) * self.gains.by_unit
 
-    def commanded(self, now: Named, step: Tensor) -> tuple[Tensor, Tensor]:
-        """The MV (..., 1) after a move of ``step`` units, within its limits, and the move that they leave, in units."""
-        mv = self.limited(now["mv"] + step * self.gains.unit, now["mv"])
-        return mv, (mv - now["mv"]) * self.gains.by_unit
-
-    def linearization_error(self, ahead: Ahead, step: Tensor) -> Tensor:
-        """|NN - linear| of y(t+1), (..., 1), at a move of ``step`` units."""
-        return (self.model.moved(ahead, step) - ahead.slope * step).abs()
+    def linearization_error(self, ahead: Ahead, move: Tensor) -> Tensor:
+        """|NN - linear| of y(t+1), (..., 1), at a move in units."""
+        y, _ = self.model.moved(ahead, move)
+        return (y - ahead.y - ahead.slope * move).abs()

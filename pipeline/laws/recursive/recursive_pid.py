@@ -9,13 +9,13 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, target
+from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, move, target
 from pipeline.laws.base import Stepped, hold_numbers
 from pipeline.laws.recursive.arx_law import estimator, require_arx
 from pipeline.models.base import Model
 from pipeline.models.lagged.arx import ARX
 from pipeline.models.lagged.recursive_arx import RecursiveArx
-from pipeline.models.memory import Named, Slot, constant
+from pipeline.models.memory import Slot
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
@@ -62,16 +62,10 @@ class RecursivePid(AdaptivePid):
         def model_for(unit: float) -> RecursiveArx:
             return estimator(self.name, signals, model, unit, params)
 
-        more = {"offset": Slot(1, constant(torch.zeros(1, dtype=torch.float64)))}
+        more = {"offset": Slot(1, torch.zeros(1, dtype=torch.float64))}
         slopes = model.weight[: model.n_y], float(model.weight[model.n_y])
         super().__init__(signals, params, -slopes[0], slopes[1], model_for, more, ("offset",))
         hold_numbers(self, penalty=self.params.penalty, alpha=self.model.half_y * params.offset_filter)
-
-    def formulas(self, p: Named) -> Named:
-        """The model's terms, r(t+1) less the known part of y(t+1), and (1 - alpha) d1."""
-        kept = (1 - self.params.offset_filter) * p["offset"]
-        goal = target(p, self.params.preview) - self.model.middle_y - kept
-        return {**self.model.terms(p), "goal": goal, "kept": kept}
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
@@ -80,17 +74,21 @@ class RecursivePid(AdaptivePid):
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
-        estimate = self.model(now)
-        theta = estimate.theta
-        missed = self.alpha * (now["psi"] - (now["x"] * theta).sum(dim=-1, keepdim=True))
-        gap = now["goal"] - missed - self.model.pv_unit * (now["x_ahead"] * theta).sum(dim=-1, keepdim=True)
+        p = self.memory.recall(sp, pv, mv_applied, state)
+        # What this sample teaches, and how far the model was off it.
+        sample = self.model.sample(p)
+        estimate = self.model(p, sample)
+        missed = sample.psi - self.model.output(sample.x, estimate.theta)
+        offset = (1 - self.params.offset_filter) * p["offset"] + self.alpha * missed
+        # The forecast without a move, and the move that brings it to the set point.
+        y = self.model.middle_y + self.model.pv_unit * self.model.output(sample.x_ahead, estimate.theta) + offset
         slope = estimate.slope
         c = slope * slope + self.penalty
-        free, loud = self.gains.free(now, slope)
-        z, changed = self.gains.settled(now, self.gains.update(now, slope * gap / c, c), free)
-        mv = self.limited(now["mv"] + self.gains.step(now, z) * self.gains.unit, now["mv"])
-        offset = now["kept"] + missed
+        best = slope * (target(p, self.params.preview) - y) / c
+        # The gains that come nearest to it, if they are free to change.
+        rho = self.gains.errors(p)
+        free, loud = self.gains.free(p, slope)
+        z, changed = self.gains.settled(p, self.gains.update(p, rho, best, c), free)
+        mv = self.limited(p["u"] + move(rho, z) * self.gains.unit, p["u"])
         kept = {**estimate.kept, **loud, **changed, "offset": offset}
-        state_next = self.memory.stored(now["known"], kept)
-        return mv, state_next, torch.cat([self.gains.info_of(z, slope, free), offset], dim=-1)
+        return mv, self.memory.stored(p, kept), torch.cat([self.gains.info_of(z, slope, free), offset], dim=-1)

@@ -16,7 +16,7 @@ from pipeline.laws.ranges import OfRange, in_units
 from pipeline.laws.recursive.arx_law import estimator, require_arx
 from pipeline.models.base import Model
 from pipeline.models.lagged.arx import ARX
-from pipeline.models.memory import Memory, Slot, Stage, constant
+from pipeline.models.memory import Memory, Slot
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
@@ -108,17 +108,7 @@ class SelfTuningPid(ControlLaw):
             by_unit=1 / unit,
         )
         start = self._limited_gains(self.model.first)
-        self.memory = Memory({**self.model.slots, "gains": Slot(3, constant(start))})
-        self.stage = Stage(
-            self.memory.layout,
-            lambda p: {
-                "known": self.memory.then(p),
-                **self.model.terms(p),
-                "rho": torch.cat([p["y1"] - p["y"], p["r"] - p["y"], 2 * p["y1"] - p["y"] - p["ys"][..., :1]], dim=-1),
-                "gains": p["gains"],
-                "mv": p["u"],
-            },
-        )
+        self.memory = Memory({**self.model.slots, "gains": Slot(3, start)})
         self.n_state = self.memory.n_state
         self.info = ("kc", "tau_i_s", "tau_d_s", "b1", "updated")
 
@@ -132,12 +122,13 @@ class SelfTuningPid(ControlLaw):
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        now = self.stage(self.memory.recall(sp, pv, mv_applied, state))
-        estimate = self.model(now)
+        p = self.memory.recall(sp, pv, mv_applied, state)
+        estimate = self.model(p, self.model.sample(p))
         slope = estimate.slope
         clear = slope > self.slope_min
-        z = torch.where(clear, self._limited_gains(estimate.theta), now["gains"])
-        move = (now["rho"] * z).sum(dim=-1, keepdim=True)
-        mv = self.limited(now["mv"] + move * self.unit, now["mv"])
+        z = torch.where(clear, self._limited_gains(estimate.theta), p["gains"])
+        y, y1, y2 = p["y"], p["y1"], p["ys"][..., :1]
+        rho = torch.cat([y1 - y, p["r"] - y, 2 * y1 - y - y2], dim=-1)
+        mv = self.limited(p["u"] + (rho * z).sum(dim=-1, keepdim=True) * self.unit, p["u"])
         info = torch.cat([self.form(z), slope * self.by_unit, clear.to(z.dtype)], dim=-1)
-        return mv, self.memory.stored(now["known"], {**estimate.kept, "gains": z}), info
+        return mv, self.memory.stored(p, {**estimate.kept, "gains": z}), info

@@ -56,24 +56,22 @@ def arx(model: NNARX, phi: Tensor) -> Arx:
 
 
 class AlongMv(nn.Module):
-    """An NNARX along its newest MV: the little of it that a law evaluates at every sample.
+    """An NNARX and its slope along its newest MV.
 
-        NN(phi) = base(phi) + g(m(phi)),   NN(phi + step e_u) = base(phi) + g(m(phi) + step d)
+        NN(phi),   dNN/ds of NN(phi + s e_u) at s = 0
 
-    ``m`` is the first layer's preactivation, ``base`` the output's offset and residual column: both
-    are affine in phi, so that a law can fold them into its own arithmetic. g is the rest of the
-    network. The slope comes forward through the layers along d alone, a fraction of all slopes.
-
-    ``unit`` is what one unit of ``step`` means [mv]; its sign too. Raises ModelError for a model of several MVs,
-    or of a delay above 1: its newest MV would not act on y(t).
+    The slope comes forward through the layers along e_u alone, a fraction of all slopes. ``unit`` is
+    the length of e_u [mv]; its sign too. Raises ModelError for a model of several MVs, or of a delay
+    above 1: its newest MV would not act on y(t).
     """
 
+    newest: Tensor  # (n_phi,) e_u
     first: Tensor  # (n_phi, H)
     first_bias: Tensor  # (H,)
-    direction: Tensor  # (H,) change of m per unit of step
+    direction: Tensor  # (H,) e_u through the first layer
     out: Tensor  # (H_last, 1)
-    base_slope: Tensor  # (n_phi, 1)
-    base_offset: Tensor  # (1,)
+    residual: Tensor  # (n_phi, 1)
+    offset: Tensor  # (1,)
 
     @torch.no_grad()
     def __init__(self, model: NNARX, unit: float = 1.0) -> None:
@@ -84,44 +82,33 @@ class AlongMv(nn.Module):
                 "alone; take one MV and delay 1 (more MV lags n_u stand for a dead time)"
             )
         (first, first_bias), *hidden, (out, offset) = scaled_layers(model.net)
-        base = torch.zeros(len(first), 1, dtype=torch.float64)
+        residual, newest = torch.zeros(len(first), 1, dtype=torch.float64), torch.zeros(len(first), dtype=torch.float64)
         for column in model.net.residual:
-            base[column] = 1.0
+            residual[column] = 1.0
+        newest[model.n_y] = unit
         self.depth = len(hidden)
-        buffers = {"first": first, "first_bias": first_bias, "direction": unit * first[model.n_y]}
+        buffers = {"newest": newest, "first": first, "first_bias": first_bias, "direction": newest @ first}
         for i, (weight, bias) in enumerate(hidden, start=1):
             buffers |= {f"weight{i}": weight, f"bias{i}": bias}
-        for name, value in {**buffers, "out": out, "base_slope": base, "base_offset": offset}.items():
+        for name, value in {**buffers, "out": out, "residual": residual, "offset": offset}.items():
             self.register_buffer(name, value)
 
-    def preactivation(self, phi: Tensor) -> Tensor:
-        """The preactivation m, shape (..., H), at phi (..., n_phi)."""
-        return phi @ self.first + self.first_bias
-
-    def base(self, phi: Tensor) -> Tensor:
-        """Shape (..., 1), at phi (..., n_phi)."""
-        return phi @ self.base_slope + self.base_offset
-
-    def moved(self, m: Tensor, step: Tensor) -> Tensor:
-        """The preactivation after a step (..., 1) of the newest MV."""
-        return m + step * self.direction
-
-    def _hidden(self) -> Iterator[tuple[Tensor, Tensor]]:
-        """Weight (H, H') and bias (H',) of each hidden layer after the first."""
-        return ((getattr(self, f"weight{i}"), getattr(self, f"bias{i}")) for i in range(1, self.depth + 1))
-
-    def rest(self, m: Tensor) -> Tensor:
-        """The rest of the network g(m), shape (..., 1)."""
-        a = torch.tanh(m)
+    def value(self, phi: Tensor) -> Tensor:
+        """NN(phi), shape (..., 1), at phi (..., n_phi)."""
+        a = torch.tanh(phi @ self.first + self.first_bias)
         for weight, bias in self._hidden():
             a = torch.tanh(a @ weight + bias)
-        return a @ self.out
+        return a @ self.out + phi @ self.residual + self.offset
 
-    def rest_and_slope(self, m: Tensor) -> tuple[Tensor, Tensor]:
-        """The rest of the network g(m) and its derivative by the step, (..., 1) each."""
-        a = torch.tanh(m)
+    def value_and_slope(self, phi: Tensor) -> tuple[Tensor, Tensor]:
+        """NN(phi) and its slope along e_u, (..., 1) each. The newest MV is no column of the residual."""
+        a = torch.tanh(phi @ self.first + self.first_bias)
         tangent = (1 - a * a) * self.direction
         for weight, bias in self._hidden():
             a = torch.tanh(a @ weight + bias)
             tangent = (1 - a * a) * (tangent @ weight)
-        return a @ self.out, tangent @ self.out
+        return a @ self.out + phi @ self.residual + self.offset, tangent @ self.out
+
+    def _hidden(self) -> Iterator[tuple[Tensor, Tensor]]:
+        """Weight (H, H') and bias (H',) of each hidden layer after the first."""
+        return ((getattr(self, f"weight{i}"), getattr(self, f"bias{i}")) for i in range(1, self.depth + 1))

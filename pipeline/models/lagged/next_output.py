@@ -9,20 +9,19 @@ from torch import Tensor, nn
 
 from pipeline.models.lagged.instantaneous import AlongMv
 from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Named, Slot, constant, lag_slots, regressors
+from pipeline.models.memory import Named, Slot, lag_slots, regressors
 
 
 class Ahead(NamedTuple):
-    """Forecast of y(t+1): ``gap`` = r(t+1) - y0(t+1) and its slope over the move, (..., 1) each.
+    """Forecast of y(t+1) without a move.
 
-    ``at`` is the network's preactivation without a move, ``rest`` its output there less what is
-    affine; ``offset`` is y(t) - NN(phi(t)), filtered; ``kept`` is what the law remembers.
+    ``phi`` (..., n_phi) is phi(t+1) with u(t) = u(t-1); ``y`` the forecast, offset included, ``slope`` its slope over
+    the move, ``offset`` d(t), (..., 1) each; ``kept`` is what the law remembers.
     """
 
-    gap: Tensor
+    phi: Tensor
+    y: Tensor
     slope: Tensor
-    rest: Tensor
-    at: Tensor
     offset: Tensor
     kept: dict[str, Tensor]
 
@@ -41,69 +40,39 @@ class NextOutput(nn.Module):
     observer of the output. The first sample is believed as it is.
 
     ``model`` has one MV and delay 1, or ModelError is raised; ``unit`` [mv] is one unit of move, with its sign; alpha
-    and ``trust`` lie in (0, 1]. A law gives ``slots`` to its Memory and ``terms`` to its Stage.
+    and ``trust`` lie in (0, 1]. A law gives ``slots`` to its Memory.
 
     Source: [chen2004, eqs 9 and 18], which linearize at phi(t) and have no filter.
     """
-
-    doubt: Tensor  # (1,) 1 - trust
-    kept_share: Tensor  # (1,) 1 - alpha
-    newest: Tensor  # (H,) change of the preactivation by y(t)
-    newest_base: Tensor  # (1,) change of the base by y(t)
 
     def __init__(self, model: NNARX, unit: float, offset_filter: float = 1.0, trust: float = 1.0) -> None:
         super().__init__()
         self.along = AlongMv(model, unit)
         self.n_y, self.n_u = model.n_y, model.n_u
-        self.filtered, self.doubted = offset_filter < 1, trust < 1
-        self.register_buffer("doubt", torch.tensor([1 - trust], dtype=torch.float64))
-        self.register_buffer("kept_share", torch.tensor([1 - offset_filter], dtype=torch.float64))
-        self.register_buffer("newest", self.doubt * self.along.first[0])
-        self.register_buffer("newest_base", self.doubt * self.along.base_slope[0])
-        self.slots = lag_slots(self.n_y, self.n_u, measured=not self.doubted)
-        if self.filtered:
-            self.slots["offset"] = Slot(1, constant(torch.zeros(1, dtype=torch.float64)))
+        self.offset_filter, self.trust = offset_filter, trust
+        self.slots = lag_slots(self.n_y, self.n_u, measured=trust == 1)
+        if offset_filter < 1:
+            self.slots["offset"] = Slot(1, torch.zeros(1, dtype=torch.float64))
 
-    def terms(self, p: Named, target: Tensor) -> dict[str, Tensor]:
-        """Formulas of what the prediction needs of the past and the sample; ``target`` is that of r(t+1)."""
+    def forward(self, p: Named) -> Ahead:
+        """The forecast, from the past and the sample by name."""
         now, ahead = regressors(p, self.n_y, self.n_u)
-        found = {
-            "now": self.along.preactivation(now),
-            "ahead": self.along.preactivation(ahead),
-            "measured": p["y"] - self.along.base(now),
-            "goal": target - self.along.base(ahead),
-        }
-        if self.filtered or self.doubted:
-            found["started"] = p["started"]
-        if self.filtered:
-            found["offset"] = self.kept_share * p["offset"]
-        if self.doubted:
-            found["y"] = p["y"]
-        return found
+        surprise = p["y"] - self.along.value(now)
+        offset, kept = surprise, {}
+        if self.offset_filter < 1:
+            # At the first sample all of the surprise is believed.
+            share = 1 - (1 - self.offset_filter) * p["started"]
+            offset = kept["offset"] = (1 - self.offset_filter) * p["offset"] + share * surprise
+        if self.trust < 1:
+            y = kept["y1"] = p["y"] - (1 - self.trust) * p["started"] * surprise
+            _, ahead = regressors({**p, "y": y}, self.n_y, self.n_u)
+        value, slope = self.along.value_and_slope(ahead)
+        return Ahead(ahead, value + offset, slope, offset, kept)
 
-    def forward(self, now: Named) -> Ahead:
-        """The prediction from the results of ``terms``."""
-        surprise = now["measured"] - self.along.rest(now["now"])
-        offset, at, goal, kept = surprise, now["ahead"], now["goal"], {}
-        if self.filtered or self.doubted:
-            known = now["started"] * surprise
-        if self.filtered:
-            offset = surprise - self.kept_share * known + now["offset"]
-            kept["offset"] = offset
-        if self.doubted:
-            at = at - known * self.newest
-            goal = goal + known * self.newest_base
-            kept["y1"] = now["y"] - known * self.doubt
-        rest, slope = self.along.rest_and_slope(at)
-        return Ahead(goal - rest - offset, slope, rest, at, offset, kept)
-
-    def moved(self, ahead: Ahead, step: Tensor) -> Tensor:
-        """Change of y(t+1) by a move of ``step`` units, as the network says, (..., 1)."""
-        return self.along.rest(self.along.moved(ahead.at, step)) - ahead.rest
-
-    def relinearized(self, ahead: Ahead, step: Tensor) -> tuple[Tensor, Tensor]:
-        """``rest`` and ``slope`` at a move of ``step`` units, (..., 1) each."""
-        return self.along.rest_and_slope(self.along.moved(ahead.at, step))
+    def moved(self, ahead: Ahead, move: Tensor) -> tuple[Tensor, Tensor]:
+        """The forecast of y(t+1) and its slope after a move (..., 1) in units, (..., 1) each."""
+        value, slope = self.along.value_and_slope(ahead.phi + move * self.along.newest)
+        return value + ahead.offset, slope
 
 
 class GaussNewton(nn.Module):
@@ -130,20 +99,19 @@ class GaussNewton(nn.Module):
         for name, value in (("penalty", penalty), ("slope_min", slope_min)):
             self.register_buffer(name, torch.tensor([value], dtype=torch.float64))
 
-    def forward(self, ahead: Ahead, down: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
-        """Within the room ``down`` <= move <= ``up``, (..., 1) each, in units."""
+    def forward(self, ahead: Ahead, goal: Tensor, down: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
+        """Towards ``goal`` = r(t+1), within the room ``down`` <= move <= ``up``, (..., 1) each, moves in units."""
         slope = torch.maximum(ahead.slope, self.slope_min)
         curvature = slope * slope + self.penalty
-        push = slope * ahead.gap
+        push = slope * (goal - ahead.y)
         move = torch.minimum(torch.maximum(push / curvature, down), up)
-        nothing, goal = torch.zeros_like(move), ahead.gap + ahead.rest
-        more = push > 0
+        more, nothing = push > 0, torch.zeros_like(move)
         low, high = torch.where(more, nothing, down), torch.where(more, up, nothing)
         for _ in range(self.times - 1):
-            rest, slope = self.model.relinearized(ahead, move)
+            y, slope = self.model.moved(ahead, move)
             slope = torch.maximum(slope, self.slope_min)
             curvature = slope * slope + self.penalty
-            push = slope * (goal - rest) - self.penalty * move
+            push = slope * (goal - y) - self.penalty * move
             more = push > 0
             low, high = torch.where(more, move, low), torch.where(more, high, move)
             newton = move + push / curvature

@@ -10,8 +10,16 @@ from torch import Tensor, nn
 
 from pipeline.models.lagged.arx import ARX
 from pipeline.models.lagged.recursive import RecursiveLeastSquares
-from pipeline.models.memory import Named, Slot, constant, lag_slots, regressors
+from pipeline.models.memory import Named, Slot, lag_slots, regressors
 from serving.manifest import Signal
+
+
+class Sample(NamedTuple):
+    """x(t), x(t+1) with u(t) = u(t-1), (..., n) each, and psi(t) (..., 1)."""
+
+    x: Tensor
+    x_ahead: Tensor
+    psi: Tensor
 
 
 class Estimate(NamedTuple):
@@ -36,7 +44,7 @@ class RecursiveArx(nn.Module):
     a prefilter p this is the ARX model itself. A sample whose lags are not all measured teaches
     nothing.
 
-    A law gives ``slots`` to its Memory and ``terms`` to its Stage.
+    A law gives ``slots`` to its Memory.
 
     Parameters
     ----------
@@ -85,37 +93,34 @@ class RecursiveArx(nn.Module):
         none = torch.zeros(lags, dtype=torch.float64)
         self.slots = {
             **lag_slots(self.n_y, self.n_u),
-            "seen": Slot(lags, constant(none), lambda p: torch.cat([torch.ones_like(p["y"]), p["seen"]], -1)[..., :-1]),
-            "theta": Slot(self.size, constant(start)),
-            "root": Slot(self.size**2, constant(rls.start(self.size).flatten())),
+            "seen": Slot(lags, none, lambda p: torch.cat([torch.ones_like(p["y"]), p["seen"]], -1)[..., :-1]),
+            "theta": Slot(self.size, start),
+            "root": Slot(self.size**2, rls.start(self.size).flatten()),
         }
 
-    def terms(self, p: Named) -> dict[str, Tensor]:
-        """Formulas of x(t), of x(t+1) with u(t) = u(t-1), of psi(t), and of what is remembered."""
+    def sample(self, p: Named) -> Sample:
+        """What the past and the sample say of the model, scaled."""
         now, ahead = (self._scaled(x) for x in regressors(p, self.n_y, self.n_u))
         eta = (p["y"] - self.middle_y) / self.half_y
         for i, weight in enumerate(self.prefilter):
             eta = eta + weight * now[..., i : i + 1]
-        return {
-            "x": now,
-            "x_ahead": ahead,
-            "psi": eta,
-            "theta": p["theta"],
-            "root": p["root"],
-            "complete": p["seen"][..., -1:],
-        }
+        return Sample(now, ahead, eta)
+
+    def output(self, x: Tensor, theta: Tensor) -> Tensor:
+        """theta'x, shape (..., 1), of x and theta (..., n)."""
+        return (x * theta).sum(dim=-1, keepdim=True)
 
     def _scaled(self, phi: Tensor) -> Tensor:
         y, u = phi[..., : self.n_y], phi[..., self.n_y :]
         one = torch.ones_like(phi[..., :1])
         return torch.cat([(y - self.middle_y) / self.half_y, (u - self.middle_u) / self.unit, one], dim=-1)
 
-    def forward(self, now: Named) -> Estimate:
-        """The parameters after this sample, from the results of ``terms``."""
-        theta, flat = now["theta"], now["root"]
+    def forward(self, p: Named, sample: Sample) -> Estimate:
+        """The parameters after this sample."""
+        theta, flat = p["theta"], p["root"]
         root = flat.reshape(*flat.shape[:-1], self.size, self.size)
-        learnt, spread, _ = self.rls(theta, root, now["x"], now["psi"])
-        complete = now["complete"] > 0
+        learnt, spread, _ = self.rls(theta, root, sample.x, sample.psi)
+        complete = p["seen"][..., -1:] > 0
         theta = torch.where(complete, learnt, theta)
         slope = theta[..., self.n_y : self.n_y + 1] * self.pv_unit
         return Estimate(theta, slope, {"theta": theta, "root": torch.where(complete, spread.flatten(-2), flat)})

@@ -1,0 +1,44 @@
+"""Affine fusion: the affine parts of a graph as few matrix products, so that a law may be written as its formulas."""
+
+from __future__ import annotations
+
+import onnx
+
+from pipeline.export.fusion.choice import choose
+from pipeline.export.fusion.emission import Outputs, emitted
+from pipeline.export.fusion.forms import forms_of
+from pipeline.export.fusion.items import Items
+from pipeline.export.fusion.plan import Item
+from pipeline.export.fusion.reading import Reading
+
+LEAST_SHARE = 0.002
+"""Of its price a graph must save so much; else it stays as it is."""
+
+
+def fused(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The same function with fewer operators; the model itself where nothing is gained.
+
+    What is affine in the inputs and in the results of nonlinear operators is computed by few
+    products, never by one that is dearer than what it replaces. Equal to the given graph but for
+    the rounding. The graph must have static shapes and operators that a controller may have.
+    """
+    candidates = []
+    for factors in (True, False):
+        reading = Reading(model, factors=factors)
+        items, outputs = listed(reading)
+        after = choose(items.choices, [item for _, item in outputs if isinstance(item, Item)])
+        candidates.append((after, items, outputs))
+    after, items, outputs = min(candidates, key=lambda c: c[0])
+    if after > (1 - LEAST_SHARE) * reading.price_before:
+        return model
+    return emitted(items, outputs, model)
+
+
+def listed(reading: Reading) -> tuple[Items, Outputs]:
+    """All that the graph may be made of, and its outputs."""
+    items = Items(reading)
+    outputs = [(name, items.of(operand)) for name, operand in reading.outputs]
+    while items.undecided:
+        choice, value = items.undecided.pop()
+        choice.forms = forms_of(items, value)
+    return items, outputs
