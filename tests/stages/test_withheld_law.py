@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from identified_models import first_order, scaled_model
 from own_cases import case_of, section
 from rich.console import Console
 
+from pipeline.cases import all_cases
+from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import LawEvidence, LawMetrics
 from pipeline.report.results import show_results
 from pipeline.stages.check import notes
@@ -119,7 +122,12 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     page = Path("artifacts/it/report.md").read_text()
     assert f"**`one_step` was not designed**, because {found}" in page
     # Each absolute error has its unit, in the page, the terminal's table and the file.
-    assert re.search(r"its MAE over .* is the lowest: \S+ m\.", page)
+    assert "It is the best because no other law is shipped." in page
+    pid = LawMetrics.read(Path("work/it/validation/pid/metrics.json"))
+    (error,) = pid.development.values()
+    worse = replace(pid, development=dict.fromkeys(pid.development, 2 * error))
+    two = Evidence(all_cases()["it"], {}, {"pid": LawEvidence(pid, Path()), "worse": LawEvidence(worse, Path())}, {})
+    assert two.why_best.endswith(f"is the lowest: {error:.3g} m (others: worse {2 * error:.3g})")
     assert "Mean absolute error in m: the median" in page
     assert re.search(r"counts as the floor: \S+ m \(the measurement noise\)", page)
     terminal = io.StringIO()
