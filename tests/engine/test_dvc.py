@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import site
 import subprocess
 import sys
 from pathlib import Path
@@ -34,7 +35,8 @@ def test_python_is_this_python_even_behind_a_link(tmp_path: Path) -> None:
     link.parent.mkdir()
     link.symlink_to(sys.executable)
     asked = "from pipeline.engine.dvc import environment; print(environment()['PATH'])"
-    bare = {**os.environ, "PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)}
+    # The other folder's Python has no packages of its own.
+    bare = {**os.environ, "PATH": "/usr/bin:/bin", "PYTHONPATH": os.pathsep.join([str(ROOT), *site.getsitepackages()])}
     done = subprocess.run([link, "-c", asked], env=bare, capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout == f"{link.parent}:/usr/bin:/bin\n"
 
