@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from threading import Event
 
+from distributed import get_worker
+
 from pipeline.errors import PipelineError
 
 
@@ -30,3 +32,8 @@ def pid_of(folder: Path, item: int) -> int:
 def process_of(_: int) -> int:
     Event().wait(0.05)
     return os.getpid()
+
+
+def watched(_: int) -> bool:
+    """Whether Dask's profiler looks into the frames of this process's tasks."""
+    return "profile" in get_worker().periodic_callbacks

@@ -6,23 +6,20 @@ Pieces are values in and bytes out. Which worker does one, and how many there ar
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import pickle
-import traceback
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import cloudpickle
-from threadpoolctl import threadpool_limits
 
 from pipeline.engine.cluster import address, connected
-from pipeline.engine.fingerprint import difference, fingerprint
-from pipeline.engine.folder import Changes, Files, apply, changes_since, within_folder
+from pipeline.engine.fingerprint import fingerprint
+from pipeline.engine.folder import Changes, Files, apply
+from pipeline.engine.pieces import alone, on_worker, within_piece
 from pipeline.engine.progress import piece, progress_bar, within
 from pipeline.errors import PipelineError
 
@@ -44,7 +41,6 @@ class Stage:
 
 
 _stage: ContextVar[Stage | None] = ContextVar("stage", default=None)
-_in_piece: ContextVar[bool] = ContextVar("in_piece", default=False)
 
 
 class NotWantedError(PipelineError):
@@ -99,10 +95,9 @@ def as_done(
     A client has each result as it ends; a stage on a worker has them once all have ended.
     """
     work, stage, at = list(items), _stage.get(), address()
-    # A piece is the smallest unit: it does by itself whatever it could share.
-    if len(work) < 2 or _in_piece.get() or (stage is None and at is None):
+    if len(work) < 2 or within_piece() or (stage is None and at is None):
         for i, item in enumerate(work):
-            yield i, _alone(function, item)
+            yield i, alone(function, item)
             show(i)
         return
     if stage is None:
@@ -119,8 +114,8 @@ def as_done(
     here = os.getcwd()
     try:
         with worker_client() as client:
-            for i, answer in _answers(client, function, work, stage.files if in_folder else None, stage):
-                answers[i] = answer
+            for i, ended in _answers(client, function, work, stage.files if in_folder else None, stage):
+                answers[i] = ended
                 show(i)
     finally:
         os.chdir(here)
@@ -151,7 +146,6 @@ def lost(error: Exception, what: str) -> PipelineError:
     return PipelineError(f"{what}: the cluster gave it up ({' '.join(str(error).split())}); run it again")
 
 
-# ---------------------------------------------------------------------- the client's side
 def _answers(
     client: Client, function: Callable[[Any], Any], work: list[Any], files: Files | None, stage: Stage | None = None
 ) -> Iterator[tuple[int, tuple[Any, Changes]]]:
@@ -163,7 +157,9 @@ def _answers(
         shared = client.scatter(shared, hash=False)
     name, ours = f"piece-{uuid.uuid4().hex[:12]}", dict(fingerprint())
     futures = {
-        client.submit(_piece, shared, cloudpickle.dumps(item), ours, key=f"{name}-{i}", pure=False, retries=RETRIES): i
+        client.submit(
+            on_worker, shared, cloudpickle.dumps(item), ours, key=f"{name}-{i}", pure=False, retries=RETRIES
+        ): i
         for i, item in enumerate(work)
     }
     try:
@@ -171,75 +167,13 @@ def _answers(
             if stage is not None and not stage.wanted():
                 raise NotWantedError("nobody waits for this stage any more")
             try:
-                answer = future.result()
+                ended = future.result()
             except Exception as error:
                 raise lost(error, f"piece {futures[future] + 1} of {len(work)}") from None
-            failed, result, changes = pickle.loads(answer)
+            failed, result, changes = pickle.loads(ended)
             if failed is not None:
                 raise failed
             yield futures[future], (result, changes)
             future.release()
     finally:
         client.cancel([f for f in futures if not f.done()])
-
-
-# ---------------------------------------------------------------------- the worker's side
-def _piece(shared: bytes, item: bytes, theirs: Mapping[str, str]) -> bytes:
-    """(error, result, changed files), pickled; the error or the other two are None or empty."""
-    token = _in_piece.set(True)
-    try:
-        if other := difference(theirs, fingerprint()):
-            raise mixture(other)
-        function, files = _opened(hashlib.sha256(shared).digest(), _Content(shared))
-        if files is None:
-            return pickle.dumps((None, _alone(function, pickle.loads(item)), {}))
-        with within_folder(files):
-            result = _alone(function, pickle.loads(item))
-            return pickle.dumps((None, result, changes_since(files)))
-    except Exception as error:
-        error.add_note(f"on a worker:\n{traceback.format_exc()}")
-        return _as_bytes(error)
-    finally:
-        _in_piece.reset(token)
-
-
-def mixture(other: str) -> PipelineError:
-    """The line for a worker that runs other code or other versions than who asks it."""
-    return PipelineError(
-        f"a worker runs something else than this run: {other}; results of a mixture are of no use: "
-        "install the same on both and start the workers again (sources that were edited meanwhile count, too)"
-    )
-
-
-class _Content:
-    """Bytes that are no part of a key."""
-
-    def __init__(self, content: bytes) -> None:
-        self.content = content
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Content)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@lru_cache(maxsize=4)
-def _opened(_digest: bytes, shared: _Content) -> Any:
-    """Made once for all pieces: what a function computes on first use and keeps (a plant's functions) is kept."""
-    return pickle.loads(shared.content)
-
-
-def _alone(function: Callable[[Item], Result], item: Item) -> Result:
-    # Processes that each start a thread per core only fight over the cores.
-    with threadpool_limits(1):
-        return function(item)
-
-
-def _as_bytes(error: Exception) -> bytes:
-    try:
-        answer = pickle.dumps((error, None, {}))
-        pickle.loads(answer)
-    except Exception:  # not every error survives the way
-        return pickle.dumps((PipelineError(f"{type(error).__name__}: {error}"), None, {}))
-    return answer

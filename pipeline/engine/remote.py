@@ -66,11 +66,14 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     from distributed import get_worker
 
     from pipeline.engine.command import run_stage
-    from pipeline.engine.parallel import Stage, conducting, mixture
+    from pipeline.engine.parallel import Stage, conducting
+    from pipeline.engine.pieces import mixture
+    from pipeline.engine.preload import unwatched
     from pipeline.engine.progress import lines_anew
     from pipeline.engine.spoken import spoken_to
 
     worker, files = get_worker(), pickle.loads(read)
+    unwatched(worker)
     kind, *names = arguments
     said = list[tuple[str, str]]()
 

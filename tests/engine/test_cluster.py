@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from engine_pieces import process_of, refuse, squares
+from engine_pieces import process_of, refuse, squares, watched
 from own_cases import controllers_of_a_lag
 from processes import within
 
@@ -51,8 +51,8 @@ class Cluster:
                 subprocess.Popen(command, cwd=empty, env=environment, stdout=out, stderr=out, start_new_session=True)
             )
 
-    def worker(self) -> None:
-        options = ("--nthreads", "1", "--no-dashboard", "--memory-limit", "0")
+    def worker(self, *further: str) -> None:
+        options = ("--nthreads", "1", "--no-dashboard", "--memory-limit", "0", *further)
         self.start("worker", "--scheduler-file", self.file, *options)
 
     def end(self) -> None:
@@ -66,7 +66,7 @@ class Cluster:
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     made = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
-        made.worker()
+        made.worker("--preload", "pipeline.engine.preload")
         made.worker()
         yield made
     finally:
@@ -85,6 +85,10 @@ def address(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 def test_pieces_on_the_cluster_are_those_made_here(address: str) -> None:
     assert parallel_map(squares, range(20), "squares") == [i**2 for i in range(20)]
+
+
+def test_no_profiler_watches_a_task_however_its_worker_was_started(address: str) -> None:
+    assert not any(parallel_map(watched, range(8), "watched"))
 
 
 def test_the_error_of_a_piece_is_raised_here(address: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.engine import parallel
+from pipeline.engine import pieces
 from pipeline.engine.fingerprint import difference, fingerprint
 from pipeline.engine.folder import apply, changes_since, read_files, within_folder
 from pipeline.engine.parallel import as_done, parallel_map
@@ -51,7 +51,7 @@ def fail(kind: str, item: int) -> object:
 
 def answer(function: object, item: object, files: dict[str, bytes] | None = None) -> tuple[Exception, object, dict]:
     shared = pickle.dumps((function, files))
-    return pickle.loads(parallel._piece(shared, pickle.dumps(item), fingerprint()))
+    return pickle.loads(pieces.answer(shared, pickle.dumps(item), fingerprint()))
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_what_a_worker_raises_arrives(
 
 def test_a_worker_with_other_code_refuses_and_names_both() -> None:
     theirs = {**fingerprint(), "torch": "9.9", "code": "f" * 64}
-    failed, _, _ = pickle.loads(parallel._piece(pickle.dumps((math.sqrt, None)), pickle.dumps(1.0), theirs))
+    failed, _, _ = pickle.loads(pieces.answer(pickle.dumps((math.sqrt, None)), pickle.dumps(1.0), theirs))
     own = fingerprint()
     assert f"code ffffffffffff here and {own['code'][:12]} there, torch 9.9 here and {own['torch'][:12]}" in str(failed)
     assert isinstance(failed, PipelineError)
