@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from threading import Event
 
 from distributed import get_worker
 
+from pipeline.engine.parallel import parallel_map
 from pipeline.errors import PipelineError
 
 
@@ -37,3 +39,24 @@ def process_of(_: int) -> int:
 def watched(_: int) -> bool:
     """Whether Dask's profiler looks into the frames of this process's tasks."""
     return "profile" in get_worker().periodic_callbacks
+
+
+def sums_of_squares(item: int) -> int:
+    """Of a piece that shares its work in turn, in its folder."""
+    here = os.getcwd()
+    found = parallel_map(squares, range(item), "of a piece")
+    assert os.getcwd() == here
+    return sum(found) + int(Path("given.txt").read_text())
+
+
+def folder_of(item: int) -> str:
+    """The working folder; the piece 2 leaves a file there."""
+    if item == 2:
+        Path("left.txt").touch()
+    return os.getcwd()
+
+
+def fatal(item: int) -> int:
+    if item == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item

@@ -6,12 +6,11 @@ only the client writes: what a piece left half-written is never seen.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
+from typing import Self
 
 from pipeline.files import write_bytes
 
@@ -30,28 +29,45 @@ def read_files(paths: Iterable[Path]) -> dict[str, bytes]:
     return found
 
 
-@contextlib.contextmanager
-def within_folder(files: Files) -> Iterator[None]:
-    """A new folder with ``files`` in it as the working folder; it is gone afterwards."""
-    before = os.getcwd()
-    folder = tempfile.mkdtemp(prefix="loopwright-")
-    try:
-        os.chdir(folder)
+class Folder:
+    """A new folder with ``files`` in it; as a context, the working folder.
+
+    It is made in ``parent`` (None: where temporary files go), and removed with ``remove`` or with this object.
+    """
+
+    def __init__(self, files: Files, parent: str | None = None) -> None:
+        self._made = tempfile.TemporaryDirectory(prefix="loopwright-", dir=parent, ignore_cleanup_errors=True)
+        self.path, self._before = Path(self._made.name), list[str]()
         for name, content in files.items():
-            path = Path(name)
+            path = self.path / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
-        yield
-    finally:
+            os.utime(path, (0, 0))  # whatever is written again has another time, however soon it is
+        self._files = self._stamps()
+
+    def __enter__(self) -> Self:
+        self._before.append(os.getcwd())
+        os.chdir(self.path)
+        return self
+
+    def __exit__(self, *_: object) -> None:
         # Of a worker that holds several stages, the folder of before may be another's, and gone.
+        before = self._before.pop()
         os.chdir(before if os.path.isdir(before) else tempfile.gettempdir())
-        shutil.rmtree(folder, ignore_errors=True)
 
+    def changes(self) -> dict[str, bytes | None]:
+        """Name -> new content of the files that were written since, None for those that were removed."""
+        now = self._stamps()
+        gone = dict.fromkeys(sorted(self._files.keys() - now.keys()))
+        return {**gone, **{n: (self.path / n).read_bytes() for n, of in now.items() if self._files.get(n) != of}}
 
-def changes_since(files: Files) -> dict[str, bytes | None]:
-    """What of the working folder differs from ``files``, which it began with."""
-    now = {p.as_posix(): p.read_bytes() for p in sorted(Path().rglob("*")) if p.is_file()}
-    return {**dict.fromkeys(sorted(files.keys() - now.keys())), **{n: c for n, c in now.items() if files.get(n) != c}}
+    def remove(self) -> None:
+        """Remove the folder and what is in it."""
+        self._made.cleanup()
+
+    def _stamps(self) -> dict[str, tuple[int, int, int]]:
+        found = ((p, p.stat()) for p in sorted(self.path.rglob("*")) if p.is_file())
+        return {p.relative_to(self.path).as_posix(): (s.st_size, s.st_mtime_ns, s.st_ino) for p, s in found}
 
 
 def apply(changes: Changes) -> None:

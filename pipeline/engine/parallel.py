@@ -5,13 +5,10 @@ Pieces are values in and bytes out. Which worker does one, and how many there ar
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextvars import ContextVar
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import cloudpickle
@@ -19,7 +16,7 @@ import cloudpickle
 from pipeline.engine.cluster import address, connected
 from pipeline.engine.fingerprint import fingerprint
 from pipeline.engine.folder import Changes, Files, apply
-from pipeline.engine.pieces import alone, on_worker, within_piece
+from pipeline.engine.pieces import Task, alone, current_task, on_worker
 from pipeline.engine.progress import piece, progress_bar, within
 from pipeline.errors import PipelineError
 
@@ -28,23 +25,13 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+BATCH = 500  # pieces that the scheduler is told of at a time
 RETRIES = 2  # of a piece whose worker was lost
 LARGE = 50_000  # bytes of a function, from which on it is sent once and not with every piece
 
 
-@dataclass(frozen=True)
-class Stage:
-    """The stage that this thread of a worker runs: the files that it began with, and whether it is still wanted."""
-
-    files: Files
-    wanted: Callable[[], bool]
-
-
-_stage: ContextVar[Stage | None] = ContextVar("stage", default=None)
-
-
 class NotWantedError(PipelineError):
-    """Nobody waits for the stage any more."""
+    """Nobody waits for the task any more."""
 
 
 def parallel_map(
@@ -92,15 +79,15 @@ def as_done(
 ) -> Iterator[tuple[int, Result]]:
     """(place, result) of each item, see ``parallel_map``; ``show`` is told the place of each as it ends.
 
-    A client has each result as it ends; a stage on a worker has them once all have ended.
+    A client has each result as it ends; a task on a worker has them once all have ended.
     """
-    work, stage, at = list(items), _stage.get(), address()
-    if len(work) < 2 or within_piece() or (stage is None and at is None):
+    work, task, at = list(items), current_task(), address()
+    if len(work) < 2 or (task is None and at is None):
         for i, item in enumerate(work):
             yield i, alone(function, item)
             show(i)
         return
-    if stage is None:
+    if task is None:
         assert at is not None
         for i, (result, changes) in _answers(connected(at), function, work, {} if in_folder else None):
             apply(changes)
@@ -110,11 +97,11 @@ def as_done(
     from distributed import worker_client
 
     answers = dict[int, tuple[Any, Changes]]()
-    # While this thread waits, pieces of this and other stages run in its process, and change its working folder.
+    # While this thread waits, other tasks run in its process, and change its working folder.
     here = os.getcwd()
     try:
         with worker_client() as client:
-            for i, ended in _answers(client, function, work, stage.files if in_folder else None, stage):
+            for i, ended in _answers(client, function, work, task.files if in_folder else None, task):
                 answers[i] = ended
                 show(i)
     finally:
@@ -123,16 +110,6 @@ def as_done(
         result, changes = answers[i]
         apply(changes)
         yield i, result
-
-
-@contextlib.contextmanager
-def conducting(stage: Stage) -> Iterator[None]:
-    """Within, this thread runs a stage, whose pieces go to the cluster."""
-    token = _stage.set(stage)
-    try:
-        yield
-    finally:
-        _stage.reset(token)
 
 
 def lost(error: Exception, what: str) -> PipelineError:
@@ -147,7 +124,7 @@ def lost(error: Exception, what: str) -> PipelineError:
 
 
 def _answers(
-    client: Client, function: Callable[[Any], Any], work: list[Any], files: Files | None, stage: Stage | None = None
+    client: Client, function: Callable[[Any], Any], work: list[Any], files: Files | None, task: Task | None = None
 ) -> Iterator[tuple[int, tuple[Any, Changes]]]:
     """(place, (result, changed files)) of each item as it ends; raises what the first to fail raised."""
     from distributed import as_completed
@@ -155,25 +132,23 @@ def _answers(
     shared: Any = cloudpickle.dumps((function, files))
     if len(shared) > LARGE:
         shared = client.scatter(shared, hash=False)
-    name, ours = f"piece-{uuid.uuid4().hex[:12]}", dict(fingerprint())
-    futures = {
-        client.submit(
-            on_worker, shared, cloudpickle.dumps(item), ours, key=f"{name}-{i}", pure=False, retries=RETRIES
-        ): i
-        for i, item in enumerate(work)
-    }
+    name, depth = f"piece-{uuid.uuid4().hex[:12]}", task.depth + 1 if task else 0
+    keys = [f"{name}-{i}" for i in range(len(work))]
+    # Pieces of pieces come first: who waits for them holds memory.
+    options = {"key": keys, "pure": False, "retries": RETRIES, "priority": depth, "batch_size": BATCH}
+    given = {"shared": shared, "theirs": dict(fingerprint()), "depth": depth}
+    futures = client.map(on_worker, [cloudpickle.dumps(item) for item in work], keys, **options, **given)
+    places = {key: i for i, key in enumerate(keys)}
     try:
-        for future in as_completed(list(futures), loop=client.loop):
-            if stage is not None and not stage.wanted():
-                raise NotWantedError("nobody waits for this stage any more")
-            try:
-                ended = future.result()
-            except Exception as error:
-                raise lost(error, f"piece {futures[future] + 1} of {len(work)}") from None
+        for future, ended in as_completed(futures, loop=client.loop, with_results=True, raise_errors=False):
+            if task is not None and not task.wanted():
+                raise NotWantedError("nobody waits for this any more")
+            place = places[future.key]
+            if future.status != "finished":
+                raise lost(ended[1], f"piece {place + 1} of {len(work)}")
             failed, result, changes = pickle.loads(ended)
             if failed is not None:
                 raise failed
-            yield futures[future], (result, changes)
-            future.release()
+            yield place, (result, changes)
     finally:
         client.cancel([f for f in futures if not f.done()])

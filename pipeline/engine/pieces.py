@@ -5,56 +5,101 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import math
 import pickle
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
 from pipeline.engine.fingerprint import difference, fingerprint
-from pipeline.engine.folder import changes_since, within_folder
+from pipeline.engine.folder import Files, Folder
 from pipeline.engine.preload import unwatched
+from pipeline.engine.progress import lines_anew
 from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from distributed import Worker
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-_inside: ContextVar[bool] = ContextVar("inside", default=False)
 
 
-def within_piece() -> bool:
-    """Whether this thread does a piece, which is the smallest unit: it does by itself whatever it could share."""
-    return _inside.get()
+@dataclass(frozen=True)
+class Task:
+    """What this thread of a worker does: the files that it began with, who waits for it, and in how many others.
+
+    ``wanted`` says whether somebody still waits.
+    """
+
+    files: Files
+    wanted: Callable[[], bool]
+    depth: int = 0
 
 
-def on_worker(shared: bytes, item: bytes, theirs: Mapping[str, str]) -> bytes:
-    """``answer``, as the task that it is on a worker."""
+_task: ContextVar[Task | None] = ContextVar("task", default=None)
+
+
+def current_task() -> Task | None:
+    """The task that this thread of a worker does; None on a client."""
+    return _task.get()
+
+
+@contextlib.contextmanager
+def doing(task: Task) -> Iterator[None]:
+    """Within, this thread of a worker does ``task``, whose pieces go to the cluster."""
+    token = _task.set(task)
+    try:
+        yield
+    finally:
+        _task.reset(token)
+
+
+def still_wanted(worker: Worker, key: str) -> bool:
+    """Whether somebody waits for the task of this key, which the worker does."""
+    task = worker.state.tasks.get(key)
+    return task is not None and task.state not in {"cancelled", "released", "forgotten"}
+
+
+def on_worker(item: bytes, key: str, *, shared: bytes, theirs: Mapping[str, str], depth: int) -> bytes:
+    """``answer``, as the task ``key`` that it is on a worker."""
     from distributed import get_worker
 
-    unwatched(get_worker())
-    return answer(shared, item, theirs)
+    worker = get_worker()
+    unwatched(worker)
+    with lines_anew(math.inf):
+        return answer(shared, item, theirs, worker.local_directory, lambda: still_wanted(worker, key), depth)
 
 
-def answer(shared: bytes, item: bytes, theirs: Mapping[str, str]) -> bytes:
-    """(error, result, changed files) of a piece, pickled; the error or the other two are None or empty."""
-    token = _inside.set(True)
+def answer(
+    shared: bytes,
+    item: bytes,
+    theirs: Mapping[str, str],
+    parent: str | None = None,
+    wanted: Callable[[], bool] = lambda: True,
+    depth: int = 0,
+) -> bytes:
+    """(error, result, changed files) of a piece, pickled; the error or the other two are None or empty.
+
+    Folders are made in ``parent``; ``wanted`` and ``depth`` are those of ``Task``.
+    """
     try:
         if other := difference(theirs, fingerprint()):
             raise mixture(other)
-        function, files = _opened(hashlib.sha256(shared).digest(), _Content(shared))
-        if files is None:
-            return pickle.dumps((None, alone(function, pickle.loads(item)), {}))
-        with within_folder(files):
-            result = alone(function, pickle.loads(item))
-            return pickle.dumps((None, result, changes_since(files)))
+        opened = _opened(hashlib.sha256(shared).digest(), _Content(shared))
+        with doing(Task(opened.files or {}, wanted, depth)), contextlib.ExitStack() as stack:
+            folder = None if opened.files is None else stack.enter_context(opened.folder(parent))
+            result = alone(opened.function, pickle.loads(item))
+            return pickle.dumps((None, result, folder.changes() if folder else {}))
     except Exception as error:
         error.add_note(f"on a worker:\n{traceback.format_exc()}")
         return _as_bytes(error)
-    finally:
-        _inside.reset(token)
 
 
 def mixture(other: str) -> PipelineError:
@@ -78,10 +123,32 @@ class _Content:
         return 0
 
 
+@dataclass
+class _Opened:
+    """What the pieces of a call share, on one worker."""
+
+    function: Callable[[Any], Any]
+    files: Files | None
+    kept: list[Folder] = field(default_factory=list)  # folders that nobody uses or has changed
+
+    @contextlib.contextmanager
+    def folder(self, parent: str | None) -> Iterator[Folder]:
+        """A folder with the files as the working folder; it is kept for the next piece if nothing was changed."""
+        folder = self.kept.pop() if self.kept else Folder(self.files or {}, parent)
+        try:
+            with folder:
+                yield folder
+        finally:
+            if folder.changes():
+                folder.remove()
+            else:
+                self.kept.append(folder)
+
+
 @lru_cache(maxsize=4)
-def _opened(_digest: bytes, shared: _Content) -> Any:
+def _opened(_digest: bytes, shared: _Content) -> _Opened:
     """Made once for all pieces: what a function computes on first use and keeps (a plant's functions) is kept."""
-    return pickle.loads(shared.content)
+    return _Opened(*pickle.loads(shared.content))
 
 
 def alone(function: Callable[[Item], Result], item: Item) -> Result:

@@ -27,6 +27,7 @@ class Lines:
     """Lines of progress of this process."""
 
     clock: Callable[[], float] = time.monotonic
+    every: float = EVERY_S
     last: float = field(init=False)  # when the last line was due; the start of the process before the first
     lock: Lock = field(default_factory=Lock, init=False)
 
@@ -37,7 +38,7 @@ class Lines:
         """Write a line unless one was written a short while ago."""
         with self.lock:
             now = self.clock()
-            if now - self.last < EVERY_S:
+            if now - self.last < self.every:
                 return
             self.last = now
         print(text, file=sys.stderr, flush=True)
@@ -65,9 +66,9 @@ _label: ContextVar[str] = ContextVar("label", default="")  # of the work that th
 
 
 @contextmanager
-def lines_anew() -> Iterator[None]:
-    """Within, a stage begins: its lines wait for no others."""
-    token = _lines.set(Lines())
+def lines_anew(every: float = EVERY_S) -> Iterator[None]:
+    """Within, a stage begins: its lines wait for no others. ``every`` seconds there is one; infinity: none."""
+    token = _lines.set(Lines(every=every))
     try:
         yield
     finally:

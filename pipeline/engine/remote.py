@@ -17,7 +17,7 @@ from typing import Any
 
 from pipeline.engine.cluster import connected
 from pipeline.engine.fingerprint import difference, fingerprint
-from pipeline.engine.folder import apply, changes_since, read_files, within_folder
+from pipeline.engine.folder import Folder, apply, read_files
 from pipeline.engine.origin import commit, told
 from pipeline.engine.stage_files import StageFiles
 
@@ -66,8 +66,7 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     from distributed import get_worker
 
     from pipeline.engine.command import run_stage
-    from pipeline.engine.parallel import Stage, conducting
-    from pipeline.engine.pieces import mixture
+    from pipeline.engine.pieces import Task, doing, mixture, still_wanted
     from pipeline.engine.preload import unwatched
     from pipeline.engine.progress import lines_anew
     from pipeline.engine.spoken import spoken_to
@@ -77,20 +76,16 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     kind, *names = arguments
     said = list[tuple[str, str]]()
 
-    def wanted() -> bool:
-        task = worker.state.tasks.get(topic)
-        return task is not None and task.state not in {"cancelled", "released", "forgotten"}
-
     def say(stream: str, text: str) -> None:
         worker.log_event(topic, (stream, text))
 
     with spoken_to(say), told(of), lines_anew():
         if other := difference(theirs, fingerprint()):
             return pickle.dumps((FAILED, {}, [("stderr", f"{' '.join(arguments)}: {mixture(other)}\n")]))
-        with within_folder(files), conducting(Stage(files, wanted)):
+        with Folder(files, worker.local_directory) as folder, doing(Task(files, lambda: still_wanted(worker, topic))):
             try:
                 stage = getattr(importlib.import_module(f"pipeline.stages.{kind}"), kind)
                 code = run_stage(stage, [kind, *names], "NAME" if names else "")
             except Exception:
                 return pickle.dumps((1, {}, [("stderr", traceback.format_exc())]))
-            return pickle.dumps((code, changes_since(files), said))
+            return pickle.dumps((code, folder.changes(), said))

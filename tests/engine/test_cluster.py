@@ -11,14 +11,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from engine_pieces import process_of, refuse, squares, watched
+from engine_pieces import fatal, process_of, refuse, squares, sums_of_squares, watched
 from own_cases import controllers_of_a_lag
 from processes import within
 
 from pipeline.engine import parallel
 from pipeline.engine.cluster import ADDRESS, connected, local_cluster
 from pipeline.engine.folder import read_files
-from pipeline.engine.parallel import parallel_map
+from pipeline.engine.parallel import _answers, parallel_map
+from pipeline.engine.pieces import Task
 from pipeline.engine.stage_files import DATA
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
@@ -91,6 +92,22 @@ def test_no_profiler_watches_a_task_however_its_worker_was_started(address: str)
     assert not any(parallel_map(watched, range(8), "watched"))
 
 
+def test_a_piece_shares_its_work_in_turn_and_stays_in_its_folder(address: str) -> None:
+    """More pieces at a time than there are workers: each waits for its own."""
+    given = Task({"given.txt": b"7"}, lambda: True)
+    items = range(12)
+    alone = [sum(k**2 for k in range(i)) + 7 for i in items]
+    client = connected(address)
+    found = dict(_answers(client, sums_of_squares, list(items), given.files, given))
+    assert [found[i] for i in items] == [(result, {}) for result in alone]
+
+
+def test_a_piece_that_kills_its_workers_is_given_up_in_one_line(address: str) -> None:
+    with pytest.raises(PipelineError, match=r"piece 2 of 3: 3 workers died of it \(often the memory was not enough\)"):
+        parallel_map(fatal, range(3), "fatal")
+    connected(address).wait_for_workers(2, timeout=60)
+
+
 def test_the_error_of_a_piece_is_raised_here(address: str) -> None:
     with pytest.raises(PipelineError) as error:
         parallel_map(refuse, range(4), "refusals")
@@ -104,7 +121,7 @@ sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / "tests")!r}]
 from functools import partial
 from pathlib import Path
 from engine_pieces import pid_of
-from pipeline.engine.parallel import parallel_map
+from pipeline.engine.parallel import _answers, parallel_map
 print(parallel_map(partial(pid_of, Path({str(tmp_path)!r})), range(6), "squares"))
 """
     process = subprocess.Popen([sys.executable, "-c", asked], stdout=subprocess.PIPE, text=True)

@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from engine_pieces import folder_of
 
 from pipeline.engine import pieces
 from pipeline.engine.fingerprint import difference, fingerprint
-from pipeline.engine.folder import apply, changes_since, read_files, within_folder
+from pipeline.engine.folder import Folder, apply, read_files
 from pipeline.engine.parallel import as_done, parallel_map
 from pipeline.errors import PipelineError
 
@@ -95,16 +96,29 @@ def test_a_piece_has_its_files_around_it_and_gives_back_what_changed(tmp_path: P
     assert os.getcwd() == here
 
 
+def test_a_folder_serves_piece_after_piece_until_one_changes_it(tmp_path: Path) -> None:
+    files = {"a/read.txt": b"given"}
+    first, second, third, fourth = (answer(folder_of, i, files)[1:] for i in range(4))
+    assert first == second == (first[0], {})
+    assert third == (first[0], {"left.txt": b""})
+    assert fourth[0] != first[0]
+    assert not Path(str(first[0])).exists()
+
+
 # ---------------------------------------------------------------------- files as values
 def test_files_come_back_as_they_were_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     apply({"deep/in/a.txt": b"1", "b.txt": b"2"})
     files = read_files([Path("deep"), Path("b.txt"), Path("missing"), Path("/etc/hostname"), Path("../b.txt")])
     assert files == {"deep/in/a.txt": b"1", "b.txt": b"2"}
-    with within_folder(files):
-        assert changes_since(files) == {}
-        Path("b.txt").write_bytes(b"3")
-        assert changes_since(files) == {"b.txt": b"3"}
+    with Folder(files) as folder:
+        assert folder.changes() == {}
+        Path("b.txt").write_bytes(b"3")  # as long as it was
+        assert folder.changes() == {"b.txt": b"3"}
+        Path("deep/in/a.txt").unlink()
+        assert folder.changes() == {"b.txt": b"3", "deep/in/a.txt": None}
+    folder.remove()
+    assert not folder.path.exists()
     assert Path("b.txt").read_bytes() == b"2"
 
 
