@@ -1,22 +1,18 @@
-"""The trial of one exported file: its closed loops over every test of the case, and their figures."""
+"""The closed loops of one exported file over a test, and what a trial of all tests finds."""
 
 from __future__ import annotations
 
-import statistics
 import time
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from pipeline.engine.progress import steps
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import left_limits, locked_up
-from pipeline.evaluation.law_evidence import BASE
-from pipeline.evaluation.metric import mean_of_draws, together
-from pipeline.evaluation.reached import reached_by, widest
+from pipeline.evaluation.metric import mean_of_draws
 from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import Trajectory, simulate_closed
 from serving.controller import Controller
 from serving.errors import LoopwrightError
@@ -25,7 +21,7 @@ Metrics = dict[str, float]
 ROUNDS = 8  # of timing a step
 TIMED = 1_000  # samples of a round
 DRAW = 1_000  # added to the noise's seed for every further draw of it
-DEVELOPED = "development"  # stands for all development sequences among the names of tests
+DEVELOPED: Final = "development"  # stands for all development sequences among the names of tests
 DEVELOPMENT = 100_000  # added to the noise's seed over the development sequences
 
 
@@ -61,48 +57,6 @@ class Repeated:
     metrics: Metrics
     first: Trajectory
     lock_ups: int
-
-
-def try_file(case: Case, noise_seed: int, item: tuple[str, int, Path]) -> Trial:
-    """Run the file of one form and data seed over the case's tests; the shipped form also runs the development tests.
-
-    Variants run the tests in ``variants_run``, with noise only if development has noise too.
-    """
-    form, seed, path = item
-    controller = Controller(path)
-    metrics: dict[str, Metrics] = {}
-    sequences: dict[str, dict[str, Metrics]] = {}
-    curves: dict[str, Trajectory] = {}
-    locked_up: dict[str, int] = {}
-    reached: list[dict[str, tuple[float, float]]] = []
-    noisy = (False, True) if form == BASE or case.development_noise else (False,)
-    scored = {name: tests for name, tests in case.scenarios().items() if form == BASE or case.variants_run(tests)}
-    show = steps("tests in closed loop", len(noisy) * len(scored))
-    for name, tests in scored.items():
-        for noise in noisy:
-            runs = [repeated(controller, case, test, noise, noise_seed + i) for i, test in enumerate(tests)]
-            key = name + (NOISE_SUFFIX if noise else "")
-            metrics[key] = together((one.metrics for one in runs), case.metrics)
-            curves[key] = runs[0].first
-            locked_up[key] = sum(one.lock_ups for one in runs)
-            reached += [reached_by([one.first for one in runs], case)] if case.on_models and not noise else []
-            if len(tests) > 1 and not noise:
-                sequences[name] = {str(test.seed): one.metrics for test, one in zip(tests, runs, strict=True)}
-            show(len(metrics))
-    development = [
-        repeated(controller, case, test, case.development_noise, noise_seed + DEVELOPMENT + i)
-        for i, test in enumerate(case.development() if form == BASE else ())
-    ]
-    for name, test in case.unscored().items():
-        one = repeated(controller, case, test, False, noise_seed)
-        curves[name], locked_up[name] = one.first, one.lock_ups
-    mean = statistics.fmean(one.metrics[case.metric] for one in development) if development else float("nan")
-    locked_up[DEVELOPED] = sum(one.lock_ups for one in development)
-    locked_up = {name: count for name, count in locked_up.items() if count}
-    trajectories = {key: replace(c, info=c.info[:, :-1]) for key, c in curves.items()}
-    return Trial(
-        form, seed, controller.manifest.info, metrics, sequences, mean, locked_up, trajectories, widest(reached)
-    )
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:

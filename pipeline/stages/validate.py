@@ -7,7 +7,6 @@ import statistics
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +15,6 @@ import numpy as np
 from pipeline.cases import all_cases
 from pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section
 from pipeline.engine.command import run_stage
-from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.evidence import WITHHELD
@@ -25,7 +23,8 @@ from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, O
 from pipeline.evaluation.model_evidence import identified_part
 from pipeline.evaluation.reached import grounds_of, widest
 from pipeline.evaluation.replay import replay
-from pipeline.evaluation.trial import Metrics, Trial, step_us, try_file
+from pipeline.evaluation.trial import Metrics, Trial, step_us
+from pipeline.evaluation.trials import try_files
 from pipeline.export.controller_file import with_evidence, withhold
 from pipeline.files import read_json, write_json
 from pipeline.stages.paths import (
@@ -70,7 +69,7 @@ def validate(name: str) -> None:
     forms = (BASE, *params.variants)
     work = [(form, seed, controller_file(params.case, params.name, form, seed)) for form in forms for seed in seeds]
     label = f"validate {name}: files in closed loop"
-    trials = parallel_map(partial(try_file, case, choices.noise_seed), work, label, in_folder=True)
+    trials = try_files(case, choices.noise_seed, work, label)
     base = [t for t in trials if t.form == BASE]
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.cases import CASES
-from pipeline.evaluation import trial
+from pipeline.evaluation import trial, trials
 from pipeline.evaluation.case import Case, Curve, Figure
-from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck, try_file
+from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck
+from pipeline.evaluation.trials import try_files
 from serving.errors import OutputError
 
 
@@ -102,13 +103,13 @@ def test_a_loop_at_its_limit_is_locked_up_and_a_start_up_is_not(case: Case) -> N
 
 
 def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trial, "Controller", lambda path: Proportional())
+    monkeypatch.setattr(trials, "Controller", lambda path: Proportional())
     monkeypatch.setattr(type(case), "noise_draws", 2)
-    base = try_file(case, 0, ("base", 3, Path("p.onnx")))
+    base = try_files(case, 0, [("base", 3, Path("p.onnx"))], "try")[0]
     fixed = ["trajectory", "trajectory_noise", "fouling", "fouling_noise"]
     assert list(base.metrics) == [*fixed, "held_out", "held_out_noise"]
     assert list(base.sequences["held_out"]) == [str(s) for s in case.held_out_seeds]
-    variant = try_file(case, 0, ("gain=1", 3, Path("p.onnx")))
+    variant = try_files(case, 0, [("gain=1", 3, Path("p.onnx"))], "try")[0]
     assert list(variant.metrics) == fixed  # with noise, because the plant has no other measurements
     assert np.isnan(variant.development)
     assert base.locked_up == {}
@@ -127,13 +128,13 @@ def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: p
 def test_a_case_says_what_variants_run_and_figures_of_a_paper_add_no_test(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trial, "Controller", lambda path: Proportional(gain=-1.0))  # full cooling for ever
+    monkeypatch.setattr(trials, "Controller", lambda path: Proportional(gain=-1.0))  # full cooling for ever
     monkeypatch.setattr(type(case), "noise_draws", 1)
     monkeypatch.setattr(type(case), "figures", (Figure(9, "x", (Curve("p"),), "fouling"),))
     monkeypatch.setattr(type(case), "variants_run", lambda self, tests: tests[0].name == "fouling")
     test = case.scenarios()["trajectory"][0]
     monkeypatch.setattr(type(case), "unscored", lambda self: {"longer": test})
-    found = try_file(case, 0, ("gain=1", 3, Path("p.onnx")))
+    found = try_files(case, 0, [("gain=1", 3, Path("p.onnx"))], "try")[0]
     assert list(found.metrics) == ["fouling", "fouling_noise"]
     assert list(found.curves) == ["fouling", "fouling_noise", "longer"]
     # Every run that got stuck counts, the one that is not scored too.
@@ -143,7 +144,7 @@ def test_a_case_says_what_variants_run_and_figures_of_a_paper_add_no_test(
 
 def test_variants_run_without_noise_where_the_plant_does(monkeypatch: pytest.MonkeyPatch) -> None:
     case = CASES["ph_neutralization"]
-    monkeypatch.setattr(trial, "Controller", lambda path: Proportional(0.0))
+    monkeypatch.setattr(trials, "Controller", lambda path: Proportional(0.0))
     monkeypatch.setattr(Proportional, "step", lambda self, **kw: (kw["mv_applied"], kw["state"], np.zeros(2)))
-    found = try_file(case, 0, ("penalty=20", 0, Path("p.onnx")))
+    found = try_files(case, 0, [("penalty=20", 0, Path("p.onnx"))], "try")[0]
     assert list(found.metrics) == ["set_point", "disturbance", "buffer", "base"]

@@ -15,7 +15,8 @@ from pipeline.__main__ import main
 from pipeline.cases import PLANTS
 from pipeline.errors import PlantError
 from pipeline.evaluation.case import Case
-from pipeline.evaluation.trial import BASE, try_file
+from pipeline.evaluation.law_evidence import BASE
+from pipeline.evaluation.trials import try_files
 from pipeline.excitation import EXCITATIONS
 from pipeline.export.gate import export
 from pipeline.laws import LAWS
@@ -106,7 +107,7 @@ def test_a_users_own_simulator_from_tuning_to_trial(
     plant, path = Tanks(), tmp_path / "pid.onnx"
     law = PID.design(PID.Params(**QUICK), {}, plant.signals, plant)
     export(law, path, case="tanks", provenance={})
-    trial = try_file(TanksCase(), 0, (BASE, 0, path))
+    trial = try_files(TanksCase(), 0, [(BASE, 0, path)], "try")[0]
     assert trial.lock_ups == 0
     curves = trial.curves
     for name in ("steps", "clogged"):
