@@ -1,4 +1,4 @@
-"""Closed loops side by side: over development set points for tuning, and from anywhere until they hold theirs."""
+"""Closed loops side by side over development set points, for tuning."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ LOAD = 0.08  # of an MV's range: the steps of a load that acts with it
 RESTING = 1000  # samples to come to rest
 MOVING = 0.01  # of the set point's range, over the last fifth of them: not at rest
 DRAWN = 8  # rests that are looked for, for each set point
-CHECK = 25  # samples between two looks at who has arrived
 
 
 class BatchLoops:
@@ -177,94 +176,3 @@ def _reachable(plant: Simulator, set_points: int, rng: np.random.Generator) -> A
     wanted = rng.uniform(ends.min(axis=0), ends.max(axis=0), (set_points, len(low)))
     apart = np.abs((wanted[:, None] - ends) / (high - low)).sum(axis=2)
     return np.asarray(ends[apart.argmin(axis=1)])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Starts:
-    """Where loops begin: states, set points and MVs, a row each."""
-
-    x: Array  # (n, n_x)
-    sp: Array  # (n, n_sp)
-    mv: Array  # (n, n_mv) applied before the first sample
-
-    def __post_init__(self) -> None:
-        if not len(self.x) == len(self.sp) == len(self.mv) or not len(self.x):
-            raise PlantError(
-                f"starts have {len(self.x)} states, {len(self.sp)} set points and {len(self.mv)} MVs; one of each"
-            )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Recovery:
-    """How loops ended."""
-
-    arrived: NDArray[np.bool_]  # (n,) within the band for the whole of the holding time
-    samples: Array  # (n,) from the start until the band was entered for good; all of them where not arrived
-    end: Array  # (n, n_x) last state seen
-    courses: Array  # (watched, samples / every, n_x) of the first loops; NaN after they arrived
-
-
-def recover(
-    plant: Simulator,
-    law: LawStep,
-    n_state: int,
-    starts: Starts,
-    *,
-    samples: int,
-    band: float,
-    holding: int,
-    watched: int = 0,
-    every: int = 5,
-) -> Recovery:
-    """Run a law from many starts, all in one batch, without noise, until they hold their set points.
-
-    A loop has arrived when its controlled variable stays within ``band`` [CV] of the set point for
-    ``holding`` samples, and is then no longer simulated: a linear loop's stability says the rest.
-    What has not arrived after ``samples`` has not arrived. The first ``watched`` loops keep their
-    courses, one state in ``every``. A state that is not finite never arrives.
-    """
-    n, n_x = starts.x.shape
-    arrived, taken, end = np.zeros(n, dtype=bool), np.full(n, float(samples)), starts.x.copy()
-    courses = np.full((watched, -(-samples // every), n_x), np.nan)
-    at, sp, inside = np.arange(n), torch.from_numpy(starts.sp), np.zeros(n)  # of the loops that still run
-    loops = BatchLoops(plant, law, n_state, (n,), starts.x.copy(), starts.mv)
-    for k in range(samples):
-        if k % every == 0:
-            courses[at[at < watched], k // every] = loops.x[at < watched]
-        pv = loops.measured()
-        inside = np.where(np.abs(pv[:, 0] - sp[:, 0].numpy()) <= band, inside + 1, 0)
-        done = inside >= holding
-        if k % CHECK == 0 and done.any():
-            arrived[at[done]], taken[at[done]] = True, k + 1 - inside[done]
-            end[at[done]] = loops.x[done]
-            stay = ~done & np.isfinite(loops.x).all(axis=1)
-            at, sp, inside, pv = at[stay], sp[stay], inside[stay], pv[stay]
-            loops.keep(stay)
-            if not len(at):
-                break
-        loops.step(sp, pv)
-    end[at] = loops.x
-    return Recovery(arrived, taken, end, courses)
-
-
-def other_rests(plant: EquationPlant, samples: int = 1_500, moving: float = 1e-9) -> Array:
-    """States (n, n_x) at which the plant rests, the MV at one of its ends, outside the range of its set point.
-
-    They are looked for from the corners of the states' ranges: a reactor that has gone out, or run away. Empty
-    where the plant has none.
-    """
-    low, high = (np.array([getattr(s, end) for s in plant.state_signals]) for end in ("low", "high"))
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(len(low), -1).T
-    sp, mv = plant.sp_signals[0], plant.mv_signals[0]
-    rests: list[Array] = []
-    advance = plant.many(len(corners))
-    for end in (mv.low, mv.high):
-        x, before = corners, corners
-        for _ in range(samples):
-            before, x = x, advance(x, np.full((len(x), 1), end))
-        cv = plant.measured(x)[:, 0]
-        still = np.isfinite(x).all(axis=1) & (np.abs(x - before).max(axis=1) <= moving * np.abs(x).max(axis=1))
-        for state in x[still & ~((cv >= sp.low) & (cv <= sp.high))]:
-            if all(np.abs(state - known).max() > 1e-6 * np.abs(state).max() for known in rests):
-                rests.append(state)
-    return np.array(rests).reshape(-1, len(low))

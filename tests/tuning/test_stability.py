@@ -8,7 +8,7 @@ import pytest
 from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from pipeline.errors import LawError, PlantError
 from pipeline.laws.pid.pid import PID
-from pipeline.tuning.development import Starts, other_rests, recover
+from pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
 from pipeline.tuning.rules import PidSettings, sampled_loop
 from pipeline.tuning.stability import (
     LARGEST_MARGIN,
@@ -140,6 +140,20 @@ def test_recoveries_in_a_batch_equal_single_ones(plant, pid):
         alone = recover(plant, pid, pid.n_state, one, **options)
         assert alone.samples[0] == together.samples[i]
         assert alone.end[0] == pytest.approx(together.end[i], rel=1e-9)
+
+
+def test_recoveries_of_batches_are_those_of_all(plant, pid):
+    rng = np.random.default_rng(3)
+    starts = Starts(rng.uniform([0.02, 440.0], [0.12, 480.0], (7, 2)), np.full((7, 1), 0.06), np.full((7, 1), 90.0))
+    options = {"samples": 200, "band": 1e-3, "holding": 50}
+    batches = starts.batches(3)
+    assert [len(batch.x) for batch in batches] == [3, 3, 1]
+    found = [recover(plant, pid, pid.n_state, b, watched=2 * (i == 0), **options) for i, b in enumerate(batches)]
+    joined, whole = Recovery.together(found), recover(plant, pid, pid.n_state, starts, watched=2, **options)
+    assert np.array_equal(joined.arrived, whole.arrived)
+    assert np.array_equal(joined.samples, whole.samples)
+    assert joined.end == pytest.approx(whole.end, rel=1e-9)
+    assert joined.courses == pytest.approx(whole.courses, rel=1e-9, nan_ok=True)
 
 
 def test_what_holds_its_set_point_arrives_at_once_and_what_is_off_never(plant):

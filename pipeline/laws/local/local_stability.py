@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
+from pipeline.engine.parallel import parallel_map
 from pipeline.laws.base import Analysis, ControlLaw
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.simulator import Array
-from pipeline.tuning.development import Starts, other_rests, recover
+from pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
 from pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
 
+BATCH = 500  # loops that run side by side in one piece
 SAME = 1e-3  # relative difference of two states that count as one
 
 
@@ -104,6 +106,11 @@ def _lyapunov_note(edges: Array, proven: Array) -> str:
     return words + (f" None was found from {', '.join(missing)}." if missing else "")
 
 
+def _batch(run: Callable[..., Recovery], item: tuple[Starts, int]) -> Recovery:
+    starts, watched = item
+    return run(starts, watched=watched)
+
+
 def _recoveries(law: ControlLaw, plant: EquationPlant, edges: Array, test: StabilityTest) -> Analysis:
     rng, sp, mv = np.random.default_rng(test.seed), plant.sp_signals[0], plant.mv_signals[0]
     n, (low, high) = test.starts, test.box(plant)
@@ -115,7 +122,10 @@ def _recoveries(law: ControlLaw, plant: EquationPlant, edges: Array, test: Stabi
     )
 
     run = partial(recover, plant, law, law.n_state, samples=test.samples, band=band, holding=test.holding)
-    ended = run(starts, watched=test.watched)
+    # The first batch has all whose courses are kept.
+    batches = starts.batches(max(BATCH, test.watched))
+    work = [(batch, test.watched if i == 0 else 0) for i, batch in enumerate(batches)]
+    ended = Recovery.together(parallel_map(partial(_batch, run), work, f"{law.name}: loops from many starts"))
     minutes = plant.period_s / 60.0
     out = plant.measured(ended.end)[:, 0] > sp.high + 0.5 * (sp.high - sp.low)
     figures = {

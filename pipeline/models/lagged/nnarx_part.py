@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
 
+from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ModelError
 from pipeline.metrics import fit_percent, rmse
 from pipeline.models.base import Model
@@ -46,6 +48,9 @@ class Candidate:
     parameters: int
     rmse: float
     free_run_rmse: float
+
+
+Trial = tuple[NNARX, FitHistory, dict[str, LongRun], Candidate]
 
 
 def parsimonious(candidates: Sequence[Candidate], slack: float = SLACK) -> int:
@@ -115,7 +120,8 @@ class NnarxPart(Part):
         train, validation = split_in_time(source.data(self.model.kind), self.train_fraction)
         sizes = [self._sized(size) for size in self.search or (Size(),)]
         back = max(max(s.n_y - 1, s.n_u + s.delay - 2) for s in sizes)
-        trials = [size._trial(train, validation, target, back, source.seed) for size in sizes]
+        given = (train, validation, target, back, source.seed)
+        trials = parallel_map(partial(_trial_of, given), sizes, "fit: networks of each size")
         best = parsimonious([candidate for *_, candidate in trials], self.slack)
         model, history, runs, candidate = trials[best]
         pairs = model.pairs(validation, target)
@@ -143,9 +149,7 @@ class NnarxPart(Part):
     def _sized(self, size: Size) -> NnarxPart:
         return replace(self, search=(), **{k: v for k, v in asdict(size).items() if v is not None})
 
-    def _trial(
-        self, train: Record, validation: Record, target: int, back: int, seed: int
-    ) -> tuple[NNARX, FitHistory, dict[str, LongRun], Candidate]:
+    def _trial(self, train: Record, validation: Record, target: int, back: int, seed: int) -> Trial:
         lags = {"n_y": self.n_y, "n_u": self.n_u, "delay": self.delay}
         fitted, held = (nnarx_pairs(r, target=target, **lags) for r in (train, validation))
         model = NNARX.scaled_to(fitted.x, fitted.y, hidden=self.hidden, residual=self.residual, **lags)
@@ -174,3 +178,7 @@ class NnarxPart(Part):
         size = sum(p.numel() for p in model.parameters())
         one_step_error = rmse(held.y, predict(model, held.x))
         return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step_error, error)
+
+
+def _trial_of(given: tuple[Record, Record, int, int, int], size: NnarxPart) -> Trial:
+    return size._trial(*given)
