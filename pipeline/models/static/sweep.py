@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.engine.progress import progress_bar
+from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ModelError
 from pipeline.files import write_json
 from pipeline.metrics import per_region, r2, rmse
@@ -22,6 +24,7 @@ from pipeline.models.static.rbf import CHUNK, Basis, design_matrix
 from pipeline.plants.simulator import Array
 
 Regions = Mapping[str, tuple[float, float]]
+SHARES = 12  # pieces of a sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +89,7 @@ def sweep(
 
     The weights come from ``solve_iterative``, whose predictions differ from those of the full QR by
     1e-5 of the residual: far below what tells two partitions apart. All large arrays are written
-    into two buffers that are allocated once. Fit the chosen network again with ``FuzzyMeansRBF``.
+    into two buffers that a share of the numbers allocates once. Fit the chosen network again with ``FuzzyMeansRBF``.
 
     A bar shows the progress on a terminal; elsewhere one line says that it is done and how long it took.
     The result holds no duration: equal data give an equal result, byte for byte.
@@ -103,38 +106,63 @@ def sweep(
             f"inputs and outputs differ in length: {len(x_train)} and {len(y_train)} rows for training, "
             f"{len(x_val)} and {len(y_val)} for validation; give one output row for every input row"
         )
+    begun = time.perf_counter()
     low, span = scaling(x_train)
     u_train, u_val = (2.0 * (x - low) / span - 1.0 for x in (x_train, x_val))
-    y = torch.from_numpy(y_train)
-
-    def score(x: Array, target: Array, prediction: Array) -> Score:
-        limited = prediction if limits is None else prediction.clip(*limits)
-        by_region = per_region(rmse, target, limited, x[:, 0], regions or {})
-        return Score(rmse(target, limited), r2(target, limited), by_region)
-
-    begun = time.perf_counter()
-    selected: list[NDArray[np.int64]] = []
-    rows: list[SweepRow] = []
-    with progress_bar() as bar:
-        for c in bar.track(counts, description="choosing centres"):
-            selected.append(select_centres(u_train, c))  # noqa: PERF401  # the bar follows a loop
-        largest = max(len(index) for index in selected)
-        buffer = torch.empty(max(len(u_train), len(u_val)) * largest, dtype=torch.float64)
-        work = torch.empty(CHUNK * largest, dtype=torch.float64)
-        for c, index in zip(bar.track(counts, description="fitting networks"), selected, strict=True):
-            centres = torch.from_numpy(grid_points(index, c))
-            z = design_matrix(torch.from_numpy(u_train), centres, basis, width, out=buffer, work=work)
-            w = solve_iterative(z, y, _cells(to_grid(u_train, c)[1]), ridge)
-            train = score(x_train, y_train, torch.mm(z, w).numpy())
-            z = design_matrix(torch.from_numpy(u_val), centres, basis, width, out=buffer, work=work)
-            validation = score(x_val, y_val, torch.mm(z, w).numpy())
-            rows.append(SweepRow(c, len(index), train, validation))
+    data = (_Half(x_train, u_train, y_train), _Half(x_val, u_val, y_val))
+    # Small and large networks in each share, so that shares take about as long.
+    shares = [counts[i::SHARES] for i in range(min(SHARES, len(counts)))]
+    fit = partial(_rows, data, limits=limits, regions=regions or {}, basis=basis, width=width, ridge=ridge)
+    found = [row for rows in parallel_map(fit, shares, "sweep: networks of every number of partitions") for row in rows]
+    rows = sorted(found, key=lambda row: row.partitions)
     result = SweepResult(tuple(rows), unit)
-    if not bar.console.is_terminal:
-        best = result.best
-        took = f"{time.perf_counter() - begun:.0f} s"
-        bar.console.print(f"sweep: {len(rows)} networks, best c = {best.partitions}, {best.centres} centres ({took})")
+    if not sys.stderr.isatty():
+        best, took = result.best, f"{time.perf_counter() - begun:.0f} s"
+        found_best = f"sweep: {len(rows)} networks, best c = {best.partitions}, {best.centres} centres ({took})"
+        print(found_best, file=sys.stderr, flush=True)
     return result
+
+
+@dataclass(frozen=True)
+class _Half:
+    """Training or validation data: inputs (K, n_in) as they are and scaled to [-1, 1], outputs (K, n_out)."""
+
+    x: Array
+    u: Array
+    y: Array
+
+
+def _rows(
+    data: tuple[_Half, _Half],
+    counts: Sequence[int],
+    *,
+    limits: tuple[float, float] | None,
+    regions: Regions,
+    basis: Basis,
+    width: float,
+    ridge: float,
+) -> list[SweepRow]:
+    """The rows of some numbers of partitions."""
+    train, validation = data
+
+    def score(half: _Half, prediction: Array) -> Score:
+        limited = prediction if limits is None else prediction.clip(*limits)
+        by_region = per_region(rmse, half.y, limited, half.x[:, 0], regions)
+        return Score(rmse(half.y, limited), r2(half.y, limited), by_region)
+
+    selected = [select_centres(train.u, c) for c in counts]
+    largest = max(len(index) for index in selected)
+    buffer = torch.empty(max(len(train.u), len(validation.u)) * largest, dtype=torch.float64)
+    work = torch.empty(CHUNK * largest, dtype=torch.float64)
+    rows = list[SweepRow]()
+    for c, index in zip(counts, selected, strict=True):
+        centres = torch.from_numpy(grid_points(index, c))
+        z = design_matrix(torch.from_numpy(train.u), centres, basis, width, out=buffer, work=work)
+        w = solve_iterative(z, torch.from_numpy(train.y), _cells(to_grid(train.u, c)[1]), ridge)
+        fitted = score(train, torch.mm(z, w).numpy())
+        z = design_matrix(torch.from_numpy(validation.u), centres, basis, width, out=buffer, work=work)
+        rows.append(SweepRow(c, len(index), fitted, score(validation, torch.mm(z, w).numpy())))
+    return rows
 
 
 def _table(values: Array) -> Array:
