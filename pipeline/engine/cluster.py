@@ -9,8 +9,8 @@ import contextlib
 import functools
 import os
 import tempfile
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
 
@@ -30,8 +30,10 @@ CONFIG = {
 
 
 @contextlib.contextmanager
-def local_cluster(workers: int | None = None) -> Iterator[str]:
+def local_cluster(workers: int | None = None, say: Callable[[str], object] = lambda _: None) -> Iterator[str]:
     """Workers on this machine (None: one a core), of one thread each, until the block ends; its scheduler's address.
+
+    ``say`` is told where a browser shows the work, where the package bokeh, which draws it, is installed.
 
     The address stands in the environment meanwhile, where whatever is started looks for it. The workers come in their
     own time: work that comes before them waits.
@@ -56,6 +58,8 @@ def local_cluster(workers: int | None = None) -> Iterator[str]:
             try:
                 os.environ[ADDRESS] = cluster.scheduler_address
                 cluster.scale(workers or os.cpu_count() or 1)
+                if _dashboard():
+                    say(f"the work at a glance, in a browser: {cluster.dashboard_link}")
                 yield cluster.scheduler_address
             finally:
                 os.environ.pop(ADDRESS, None)
@@ -86,11 +90,6 @@ def connected(to: str) -> Client:
             f"no scheduler answers at {to} ({text}); start it (`dask scheduler`), correct {ADDRESS}, "
             "or unset it to use this machine's cores"
         ) from None
-
-
-def dashboard(of: Any) -> str:
-    """The address of a cluster's page for people; empty where the package bokeh, which draws it, is missing."""
-    return of.dashboard_link if _dashboard() else ""
 
 
 def _dashboard() -> str | None:

@@ -28,9 +28,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rich.console import Console
+
 from pipeline.engine.announcements import Announcements, words_of
+from pipeline.engine.bars import Bars
 from pipeline.engine.dvc import COMMAND, environment
 from pipeline.engine.lifeline import end_with_parent
+from pipeline.engine.spoken import BARS
 from pipeline.engine.start import DOOR
 
 LANES = 2  # more fill no core further: a stage's pieces already go to every worker
@@ -68,6 +72,7 @@ class _Lanes:
 
     def __init__(self, announcements: Announcements) -> None:
         self.announcements = announcements
+        self.bars = Bars(Console())
         self.stopped, self.patience_ends = 0, float("inf")  # the signal that ended the run; when DVC is ended, too
         self.running = dict[subprocess.Popen[bytes], _Lane]()
         for asked in (signal.SIGINT, signal.SIGTERM):
@@ -77,7 +82,7 @@ class _Lanes:
     def run(self, work: list[list[str]]) -> int:
         """Do all of ``work``; the exit status of the first failure, or 0."""
         left, first = list(work), 0
-        with selectors.DefaultSelector() as waiting:
+        with selectors.DefaultSelector() as waiting, self.bars:
             while self.running or (left and not self.stopped and not first):
                 while left and len(self.running) < LANES and not self.stopped and not first:
                     process = self._begun(left.pop(0))
@@ -96,7 +101,7 @@ class _Lanes:
         own = os.getpid()
         process = subprocess.Popen(
             [*COMMAND, *arguments],
-            env=environment(),
+            env={**environment(), **({BARS: "1"} if self.bars.shown else {})},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             bufsize=0,
@@ -115,18 +120,25 @@ class _Lanes:
         *lines, rest = bytes(lane.line).split(b"\n") if found else [bytes(lane.line), b""]
         lane.line[:] = rest
         for line in lines:
-            before = self.announcements.begun
-            words = self.announcements.of(line.decode(errors="replace"))
-            lane.ran |= self.announcements.begun > before
+            text, before = line.decode(errors="replace"), self.announcements.begun
+            if not self.stopped and self.bars.takes(process.pid, text):
+                continue
+            words = self.announcements.of(text)
+            if self.announcements.begun > before:
+                lane.ran = True
+                self.bars.ended(process.pid)
             if self.stopped:
                 if b"failed to" in line:  # nothing more is written down: with --keep-going it would try the others
                     self._end([process])
+            elif words is not None and self.bars.shown:
+                self.bars.write(words)
             elif words is not None:
                 os.write(1, words.encode() + b"\n")
         return bool(found)
 
     def _ended(self, process: subprocess.Popen[bytes]) -> int:
         del self.running[process]
+        self.bars.ended(process.pid)
         assert process.stdout is not None
         process.stdout.close()
         code = process.wait()
@@ -136,6 +148,7 @@ class _Lanes:
         """Begin no further stage, and have those that run end."""
         if self.stopped:
             return
+        self.bars = Bars(Console())
         self.stopped, self.patience_ends = number, time.monotonic() + GRACE_S
         served = DOOR in os.environ  # by a process that ends the stages
         self._end([process for process, lane in self.running.items() if not (served and lane.ran)])

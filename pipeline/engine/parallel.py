@@ -117,8 +117,9 @@ def lost(error: Exception, what: str) -> PipelineError:
     from distributed import KilledWorker
 
     if isinstance(error, KilledWorker):
+        # Dask counts the deaths of a worker for all that waits there, so no single piece can be named.
         return PipelineError(
-            f"{what}: {RETRIES + 1} workers died of it (often the memory was not enough); start fewer, and run it again"
+            "workers died one after the other (often the memory was not enough); start fewer, and run it again"
         )
     return PipelineError(f"{what}: the cluster gave it up ({' '.join(str(error).split())}); run it again")
 

@@ -1,11 +1,14 @@
 """How far a piece of work is: a bar on a terminal, elsewhere a line now and then.
 
-A run of several stages shows lines. They come when something ends, and at most one every ``EVERY_S`` seconds, so that
-a run of minutes stays readable; short work says nothing.
+A run of several stages shows lines, or draws bars from marked ones (``bars``), which it asks for by BARS in the
+environment. Lines come when something ends, and at most one every ``EVERY_S`` seconds, so that a run of minutes stays
+readable; short work says nothing.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,30 +20,42 @@ from threading import Lock
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-EVERY_S = 10.0
+from pipeline.engine.spoken import BARS, MARK
+
+EVERY_S, MARKED_EVERY_S = 10.0, 0.5
 KNOWN = 0.2  # share of a piece after which its speed says how long the rest takes
 SOON_S = 5.0  # time left that is not worth a word
 
 
 @dataclass
 class Lines:
-    """Lines of progress of this process."""
+    """Lines of progress of this process; ``marked`` ones are for a program that draws bars."""
 
     clock: Callable[[], float] = time.monotonic
-    every: float = EVERY_S
+    every: float | None = None  # [s] between two lines
+    marked: bool = field(default_factory=lambda: bool(os.environ.get(BARS)))
     last: float = field(init=False)  # when the last line was due; the start of the process before the first
     lock: Lock = field(default_factory=Lock, init=False)
 
     def __post_init__(self) -> None:
+        if self.every is None:
+            self.every = MARKED_EVERY_S if self.marked else EVERY_S
         self.last = self.clock()
 
-    def show(self, text: str) -> None:
-        """Write a line unless one was written a short while ago."""
+    def show(self, label: str, share: float | None = None, count: str = "", left: float = 0.0) -> None:
+        """Say how far ``label`` is, unless a line was written a short while ago; ``left`` [s] where it is known."""
+        assert self.every is not None
         with self.lock:
             now = self.clock()
             if now - self.last < self.every:
                 return
             self.last = now
+        rest = f"about {_rounded(left)} left" if left >= SOON_S else ""
+        if self.marked:
+            text = MARK + json.dumps({"label": label, "share": share or 0.0, "left": rest})
+        else:
+            words = (count, "" if share is None else f"{100 * share:.0f} % done", rest)
+            text = label + ": " * any(words) + ", ".join(filter(None, words))
         print(text, file=sys.stderr, flush=True)
 
 
@@ -56,8 +71,7 @@ class Piece:
         """Say how much is done, and about how long the rest takes once that can be known."""
         share = min(done / self.total, 1.0) if self.total > 0 else 1.0
         left = (self.lines.clock() - self.begun) * (1 - share) / share if share >= KNOWN else 0.0
-        words = f"{self.label}: {count + ', ' if count else ''}{100 * share:.0f} % done"
-        self.lines.show(words + (f", about {_rounded(left)} left" if left >= SOON_S else ""))
+        self.lines.show(self.label, share, count, left)
 
 
 # Of a thread and not of a process: a worker's process holds several stages at a time.
@@ -66,9 +80,9 @@ _label: ContextVar[str] = ContextVar("label", default="")  # of the work that th
 
 
 @contextmanager
-def lines_anew(every: float = EVERY_S) -> Iterator[None]:
+def lines_anew(every: float | None = None, *, marked: bool = False) -> Iterator[None]:
     """Within, a stage begins: its lines wait for no others. ``every`` seconds there is one; infinity: none."""
-    token = _lines.set(Lines(every=every))
+    token = _lines.set(Lines(every=every, marked=marked))
     try:
         yield
     finally:

@@ -7,6 +7,7 @@ of the pipeline. A stage that fails leaves the client's files as they were.
 from __future__ import annotations
 
 import importlib
+import os
 import pickle
 import shutil
 import sys
@@ -19,6 +20,7 @@ from pipeline.engine.cluster import connected
 from pipeline.engine.fingerprint import difference, fingerprint
 from pipeline.engine.folder import Folder, apply, read_files
 from pipeline.engine.origin import commit, told
+from pipeline.engine.spoken import BARS
 from pipeline.engine.stage_files import StageFiles
 
 FAILED = 2
@@ -37,9 +39,9 @@ def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
         print(text, end="", file=getattr(sys, stream), flush=True)
 
     client.subscribe_topic(topic, say)
-    ours = dict(fingerprint())
+    ours, bars = dict(fingerprint()), bool(os.environ.get(BARS))
     future = client.submit(
-        _run, list(arguments), pickle.dumps(read), ours, topic, commit(), key=topic, pure=False, retries=1
+        _run, list(arguments), pickle.dumps(read), ours, topic, commit(), bars, key=topic, pure=False, retries=1
     )
     try:
         answer = future.result()
@@ -61,7 +63,7 @@ def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
     return int(code)
 
 
-def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: str, of: str) -> bytes:
+def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: str, of: str, bars: bool) -> bytes:
     """(exit status, changed files, what was said last), pickled; on a worker."""
     from distributed import get_worker
 
@@ -79,7 +81,7 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     def say(stream: str, text: str) -> None:
         worker.log_event(topic, (stream, text))
 
-    with spoken_to(say), told(of), lines_anew():
+    with spoken_to(say), told(of), lines_anew(marked=bars):
         if other := difference(theirs, fingerprint()):
             return pickle.dumps((FAILED, {}, [("stderr", f"{' '.join(arguments)}: {mixture(other)}\n")]))
         with Folder(files, worker.local_directory) as folder, doing(Task(files, lambda: still_wanted(worker, topic))):

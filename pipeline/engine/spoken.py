@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import TextIO
 
+BARS = "LOOPWRIGHT_BARS"  # in the environment: somebody draws bars from marked lines of progress
+MARK = "\x02"  # begins such a line
 Listener = Callable[[str, str], None]  # (stdout or stderr, text)
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 

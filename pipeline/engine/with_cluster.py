@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -44,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
 
         signal.signal(signal.SIGTERM, stop)
         if address() is None:
-            stack.enter_context(local_cluster())
+            stack.enter_context(local_cluster(say=partial(print, flush=True)))
         process = subprocess.Popen(
             command, env={**os.environ, **door.environment}, preexec_fn=lambda: end_with_parent(own)
         )

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 from engine_pieces import fatal, process_of, refuse, squares, sums_of_squares, watched
@@ -103,7 +104,7 @@ def test_a_piece_shares_its_work_in_turn_and_stays_in_its_folder(address: str) -
 
 
 def test_a_piece_that_kills_its_workers_is_given_up_in_one_line(address: str) -> None:
-    with pytest.raises(PipelineError, match=r"piece 2 of 3: 3 workers died of it \(often the memory was not enough\)"):
+    with pytest.raises(PipelineError, match=r"^workers died one after the other \(often the memory was not enough\)"):
         parallel_map(fatal, range(3), "fatal")
     connected(address).wait_for_workers(2, timeout=60)
 
@@ -210,8 +211,12 @@ def test_a_client_that_is_killed_leaves_nothing_half_written_and_idle_workers(ad
 def test_a_cluster_of_this_machine_ends_with_its_block(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(ADDRESS, raising=False)
     monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])  # which takes seconds
-    with local_cluster(2) as at:
+    said = list[str]()
+    with local_cluster(2, said.append) as at:
         assert os.environ[ADDRESS] == at
+        (line,) = said
+        with urlopen(line.split()[-1], timeout=20) as page:
+            assert b"Dask" in page.read()
         pids = set(parallel_map(process_of, range(8), "processes"))
         assert os.getpid() not in pids
     assert ADDRESS not in os.environ
