@@ -30,10 +30,6 @@ RETRIES = 2  # of a piece whose worker was lost
 LARGE = 50_000  # bytes of a function, from which on it is sent once and not with every piece
 
 
-class NotWantedError(PipelineError):
-    """Nobody waits for the task any more."""
-
-
 def parallel_map(
     function: Callable[[Item], Result],
     items: Iterable[Item],
@@ -143,7 +139,7 @@ def _answers(
     try:
         for future, ended in as_completed(futures, loop=client.loop, with_results=True, raise_errors=False):
             if task is not None and not task.wanted():
-                raise NotWantedError("nobody waits for this any more")
+                raise PipelineError("nobody waits for this any more")
             place = places[future.key]
             if future.status != "finished":
                 raise lost(ended[1], f"piece {place + 1} of {len(work)}")

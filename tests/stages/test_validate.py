@@ -55,7 +55,6 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
     def make(hard: bool, **section: Any) -> None:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setitem(CASES, CASE, ShortCase(hard=hard))
-        monkeypatch.setattr(stage, "parallel_map", lambda run, work, _: list(map(run, work)))
         designed = tmp_path / "work" / CASE / "controllers" / LAW
         for form in ("base", *section.get("variants", {})):
             (designed / form).mkdir(parents=True)

@@ -22,7 +22,7 @@ from mlflow.entities import Run
 import pipeline
 from pipeline.__main__ import main as loopwright
 from pipeline.commands.registry import CHAMPIONS
-from pipeline.engine.start import VARIABLE, receipt_path
+from pipeline.engine.start import DOOR, receipt_path
 from pipeline.errors import TrackingError
 from pipeline.evaluation.validation import Validation
 from pipeline.files import sha256
@@ -373,7 +373,8 @@ def test_a_stage_under_dvc_leaves_a_receipt_that_fits_its_files(tmp_path):
         (package / room).mkdir(parents=True)
         (package / room / "__init__.py").touch()
     (package / "__init__.py").touch()
-    shutil.copy(sources / "engine" / "start.py", package / "engine")
+    for name in ("start.py", "stage_files.py"):
+        shutil.copy(sources / "engine" / name, package / "engine")
     probe = (
         "from pathlib import Path\nimport sys\nPath(sys.argv[1]).write_text('made')\nsys.exit(sys.argv[1] == 'bad')\n"
     )
@@ -381,7 +382,7 @@ def test_a_stage_under_dvc_leaves_a_receipt_that_fits_its_files(tmp_path):
     command = f'"{sys.executable}" -m pipeline.engine.start probe'
     stages = {out: {"cmd": f"{command} {out}", "outs": [out]} for out in ("good", "bad")}
     (tmp_path / "dvc.yaml").write_text(json.dumps({"stages": stages}))
-    environment = {k: v for k, v in os.environ.items() if k not in {VARIABLE, "PYTHONPATH"}}
+    environment = {k: v for k, v in os.environ.items() if k not in {DOOR, "PYTHONPATH"}}
     before = time.time()
     for argv, status in ((["init", "-q", "--no-scm"], 0), (["repro", "-q", "good"], 0), (["repro", "-q", "bad"], 255)):
         done = subprocess.run([sys.executable, "-m", "dvc", *argv], cwd=tmp_path, env=environment, timeout=120)

@@ -34,10 +34,12 @@ def interval(operand: Operand, blocks: Sequence[Block]) -> Interval:
     if operand.affine is None:
         return ALL if operand.block is None else (operand.block.low, operand.block.high)
     low, high = operand.affine.constant, operand.affine.constant
-    for number, matrix in operand.affine.parts.items():
-        up, down = np.maximum(matrix, 0).sum(axis=0), np.minimum(matrix, 0).sum(axis=0)
-        low = low + _times(up, blocks[number].low) + _times(down, blocks[number].high)
-        high = high + _times(up, blocks[number].high) + _times(down, blocks[number].low)
+    with np.errstate(invalid="ignore"):  # of an infinite constant and a block without bounds
+        for number, matrix in operand.affine.parts.items():
+            up, down = np.maximum(matrix, 0).sum(axis=0), np.minimum(matrix, 0).sum(axis=0)
+            low = low + _times(up, blocks[number].low) + _times(down, blocks[number].high)
+            high = high + _times(up, blocks[number].high) + _times(down, blocks[number].low)
+    low, high = np.where(np.isnan(low), -inf, low), np.where(np.isnan(high), inf, high)
     return float(np.min(low, initial=inf)), float(np.max(high, initial=-inf))
 
 
