@@ -56,7 +56,7 @@ class ControllerRows:
             if given[name].shape != wanted:
                 raise ContractError(f"{name} has the shape {given[name].shape}; {self.n} rows need {wanted}")
             self._given[:, place] = given[name]
-        fit = np.isfinite(self._given).all(axis=1)
+        fit: NDArray[np.bool_] = np.all(np.isfinite(self._given), axis=1)
         with c._lock:
             run, binding, buffer, result = c._session.run_with_iobinding, c._binding, c._in, c._out
             for row, out, good in zip(self._given, self._taken, fit.tolist(), strict=True):
@@ -71,9 +71,9 @@ class ControllerRows:
                 out[:] = result
         n_mv, a, b, *_ = c._cuts
         mv = self._taken[:, :n_mv].copy()
-        allowed = ((mv >= self._low) & (mv <= self._high)).all(axis=1)
+        allowed: NDArray[np.bool_] = np.all((mv >= self._low) & (mv <= self._high), axis=1)
         for i, signal in enumerate(c.manifest.mv):
             if signal.values is not None:
                 allowed &= np.isin(mv[:, i], signal.values)
-        refused = ~(fit & allowed & np.isfinite(self._taken).all(axis=1))
-        return StepRows(mv, self._taken[:, a:b].copy(), refused)
+        allowed &= fit & np.all(np.isfinite(self._taken), axis=1)
+        return StepRows(mv, self._taken[:, a:b].copy(), np.logical_not(allowed))

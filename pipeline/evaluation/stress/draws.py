@@ -92,8 +92,8 @@ class Drawing:
                 found[name] = (float(value - width), float(value + width))
         if not found and not self.disturbed:
             raise PlantError(
-                f"plant {plant.name!r} has no parameters, so no other plant can be drawn; give its class numeric fields "
-                'with metadata={"unit": ...}, or state ranges in the case'
+                f"plant {plant.name!r} has no parameters, so no other plant can be drawn; give its class numeric "
+                'fields with metadata={"unit": ...}, or state ranges in the case'
             )
         return found
 

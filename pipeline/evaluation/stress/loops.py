@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.evaluation.closed_loop import left_limits, locked_up
 from pipeline.evaluation.stress.draws import Draw, Drawing
@@ -18,6 +19,7 @@ from pipeline.plants.side_by_side import advance_rows
 from pipeline.plants.simulator import Array
 from pipeline.simulation.simulate import Trajectory
 from serving.controller import Controller
+from serving.manifest import Manifest
 from serving.rows import ControllerRows
 
 
@@ -100,7 +102,7 @@ class Stress:
             readback = mvs[k]
             p = np.stack([table[k] for table in known])
             ahead = advance(x, acting, dv[k], p)
-            fine = np.isfinite(ahead).all(axis=1)
+            fine: NDArray[np.bool_] = np.all(np.isfinite(ahead), axis=1)
             broke |= ~fine
             x = np.where(fine[:, None], ahead, x)
         time_s = np.arange(samples, dtype=np.float64) * plant.period_s
@@ -137,3 +139,8 @@ class Stress:
 def figures_of(outcomes: Sequence[Outcome], name: str) -> Array:
     """One figure of all loops, (n,); NaN of a loop whose test has no such figure."""
     return np.array([one.figures.get(name, np.nan) for one in outcomes])
+
+
+def opened(path: Path) -> tuple[Manifest, bytes]:
+    """The manifest of a controller file, and the bytes to send; ArtifactError where it is none."""
+    return Controller(path).manifest, path.read_bytes()
