@@ -62,7 +62,8 @@ def local_cluster(workers: int | None = None) -> Iterator[str]:
                 if before is not None:
                     os.environ[ADDRESS] = before
                 connected.cache_clear()
-                cluster.close(timeout=5)
+                with contextlib.suppress(TimeoutError):  # of workers that are still starting, which end with us
+                    cluster.close(timeout=5)
 
 
 def address() -> str | None:
