@@ -1,21 +1,25 @@
 """Loops a second of ``loopwright stress``, and how they grow with workers.
 
-``python benchmarks/stress.py [FILE.onnx ...]``: loops a second of one process for each file; where the time goes; then,
-for the first file, one and two workers by turns in ``--rounds`` rounds, whose median ratio is the figure. At last a
-model: the makespan of ``--plants`` loops on 2 to 128 workers by a simulated clock. Its task times are those measured
-here; its scheduler hands out one task at a time and takes the measured time of an empty task for it; its workers are
-alike and never wait for the network. It takes about ``--seconds`` a measured point.
+``python benchmarks/stress.py [FILE.onnx ...]``: loops a second of one process for each file, and the law's share of the
+time. Then, for the first file, in ``--rounds`` rounds by turns: one worker, two workers, and two processes side by side
+without the engine. Two workers over twice one worker say what two cores give here and now, other programs included; two
+workers over the two processes say what the engine costs. At last a model: the makespan of ``--plants`` loops on 2 to
+128 workers by a simulated clock. Its task times are those measured here; its scheduler hands out one task at a time and
+takes the measured time of an empty task for it; its workers are alike and never wait for the network. A measured point
+takes about ``--seconds``.
 """
 
 from __future__ import annotations
 
 import argparse
 import heapq
+import multiprocessing
 import statistics
 import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -91,6 +95,29 @@ def on_workers(stress: Stress, workers: int, plants: int) -> float:
         return plants / (time.perf_counter() - begun)
 
 
+def side_by_side(file: Path, plants: int) -> float:
+    """Loops a second, together, of two processes that know nothing of each other."""
+    context = multiprocessing.get_context("spawn")
+    gate, rates = context.Barrier(2), context.SimpleQueue()
+    processes = [context.Process(target=_by_itself, args=(file, plants // 2, gate, rates)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    total = sum(rates.get() for _ in processes)
+    for process in processes:
+        process.join()
+    return total
+
+
+def _by_itself(file: Path, plants: int, gate: Any, rates: Any) -> None:
+    stress = Stress(Drawing(CASES[file.parent.name]), file.read_bytes())
+    seconds_of(stress, range(2 * BATCH))
+    gate.wait()
+    begun = time.perf_counter()
+    for piece in pieces(plants, BATCH):
+        stress.outcomes(piece)
+    rates.put(plants / (time.perf_counter() - begun))
+
+
 def empty_task_s() -> float:
     """Time of an empty task through client, scheduler and worker, many at once [s]."""
     with local_cluster(1) as at:
@@ -132,11 +159,14 @@ def main() -> None:
     stress, rate = compared
     shares = []
     for _ in range(options.rounds):
-        one, two = (on_workers(stress, n, int(n * rate * options.seconds)) for n in (1, 2))
-        shares.append(two / (2 * one))
-        print(f"one worker {one:.1f} loops/s, two workers {two:.1f}: {100 * shares[-1]:.0f} % of two alone", flush=True)
-    share = statistics.median(shares)
-    print(f"two workers: {100 * share:.0f} % of two alone (median; {100 * BAR:.0f} % is asked)")
+        count = int(2 * rate * options.seconds)
+        one, two = on_workers(stress, 1, count // 2), on_workers(stress, 2, count)
+        plain = side_by_side(options.files[0], count)
+        shares.append((two / (2 * one), two / plain))
+        print(f"loops/s: one worker {one:.1f}, two workers {two:.1f}, two plain processes {plain:.1f}", flush=True)
+    twice, plainly = (100 * statistics.median(column) for column in zip(*shares, strict=True))
+    print(f"two workers: {twice:.0f} % of twice one worker, {plainly:.0f} % of two plain processes")
+    print(f"({100 * BAR:.0f} % is asked; medians)")
     overhead = empty_task_s()
     print(f"an empty task: {1e3 * overhead:.2f} ms")
     for batch in (20, 100):

@@ -87,7 +87,7 @@ class Drawing:
             plant.parameters({name: stated[name][0]})  # raises for a name that the plant has not
         found = dict(stated)
         for name, value in zip(names, plant.parameters(), strict=True):
-            if name not in stated and name not in self.disturbed and value and not self.case.on_models:
+            if name not in stated and name not in self.disturbed and value:
                 width = self.spread * abs(value)
                 found[name] = (float(value - width), float(value + width))
         if not found and not self.disturbed:
