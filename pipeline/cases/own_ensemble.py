@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.cases.own_model import Doubts, OwnPlant, suits
+from pipeline.cases.own_model import Doubts, OwnPlant, doubted, suits
 from pipeline.cases.reach import Reach, visited_mv
 from pipeline.config.exports import is_exported
 from pipeline.errors import PlantError, RecordError
@@ -95,6 +95,10 @@ class OwnEnsemble(Case):
         """What the record leaves open, by the law's own model: with it tests go wrong on all models."""
         with np.load(self._law_file, allow_pickle=False) as file:
             return Doubts.of(file)
+
+    def ranges_of(self, plant: Simulator) -> Mapping[str, tuple[float, float]]:
+        """What the record leaves open, of a plant that is a model of it: errors of gain, speed and dead time."""
+        return doubted(plant, self._doubts) if isinstance(plant, OwnPlant) else self.ranges
 
     def _resting(self, plant: OwnPlant) -> OwnPlant:
         """The plant, begun where it rests within the record; most do so already."""

@@ -90,6 +90,12 @@ def errors_of(plant: OwnPlant) -> list[dict[str, float]]:
     ]
 
 
+def doubted(plant: OwnPlant, doubts: Doubts) -> dict[str, tuple[float, float]]:
+    """Parameter -> range within which the plant may lie: from 1 / (1 + error) to 1 + error, dead time from 0 on."""
+    gains = {f"gain_{s.name}": (1 / (1 + e), 1 + e) for s, e in zip(plant.mv_signals, doubts.gain, strict=True)}
+    return {**gains, "time_constant": (1 / (1 + doubts.pace), 1 + doubts.pace), "dead_time": (0.0, doubts.dead)}
+
+
 def suits(file: Path, signals: Signals) -> bool:
     """Whether a trained model is there and has as many outputs and inputs as the plant has signals."""
     if not file.exists():

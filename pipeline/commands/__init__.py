@@ -14,6 +14,7 @@ COMMANDS = {
     "check": "read every section of params.yaml and list its mistakes",
     "results": "show the figures of every controller, and where to look",
     "simulate": "close the loop of a controller file over its plant",
+    "stress": "close the loops of a controller file over many plants drawn at random",
     "inspect": "show what a controller file is and how its validation went",
     "bench": "measure how long a step of a controller file takes here",
     "laws": "list the control laws, or the parameters of one",

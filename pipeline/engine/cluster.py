@@ -40,32 +40,34 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] = lam
     """
     import dask
 
-    with dask.config.set(CONFIG):
-        from distributed import LocalCluster
+    # For good: undone at the end, it would take the settings of distributed, which is imported within, with it.
+    dask.config.set(CONFIG)
+    from distributed import LocalCluster
 
-        with tempfile.TemporaryDirectory(prefix="loopwright-workers-", ignore_cleanup_errors=True) as folder:
-            cluster = LocalCluster(
-                n_workers=0,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=_dashboard(),
-                memory_limit=0,
-                local_directory=folder,
-                preload=PRELOAD,
-            )
-            before = os.environ.get(ADDRESS)
-            try:
-                os.environ[ADDRESS] = cluster.scheduler_address
-                cluster.scale(workers or os.cpu_count() or 1)
-                if _dashboard():
-                    say(f"the work at a glance, in a browser: {cluster.dashboard_link}")
-                yield cluster.scheduler_address
-            finally:
-                os.environ.pop(ADDRESS, None)
-                if before is not None:
-                    os.environ[ADDRESS] = before
-                connected.cache_clear()
+    with tempfile.TemporaryDirectory(prefix="loopwright-workers-", ignore_cleanup_errors=True) as folder:
+        cluster = LocalCluster(
+            n_workers=0,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=_dashboard(),
+            memory_limit=0,
+            local_directory=folder,
+            preload=PRELOAD,
+        )
+        before = os.environ.get(ADDRESS)
+        try:
+            os.environ[ADDRESS] = cluster.scheduler_address
+            cluster.scale(workers or os.cpu_count() or 1)
+            if _dashboard():
+                say(f"the work at a glance, in a browser: {cluster.dashboard_link}")
+            yield cluster.scheduler_address
+        finally:
+            os.environ.pop(ADDRESS, None)
+            if before is not None:
+                os.environ[ADDRESS] = before
+            connected.cache_clear()
+            with contextlib.suppress(TimeoutError):  # of workers that are still starting, which end with us
                 cluster.close(timeout=5)
 
 

@@ -122,6 +122,7 @@ class Case(ABC):
     stand_in: ClassVar[str] = "identified"  # what they run on in the plant's place: such models, or a simulator
     reads: ClassVar[tuple[Path, ...]] = ()  # files, beside the code, that the tests run
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # plant parameter -> where that of a real plant may lie
 
     def __post_init__(self) -> None:
         both = sorted(set(self.held_out_seeds) & set(self.development_seeds))
@@ -166,6 +167,10 @@ class Case(ABC):
     def regions(self) -> Mapping[str, tuple[float, float]]:
         """Operating regions, name -> [low, high) of the CV; by default the plant's regions."""
         return self.plant.regions
+
+    def ranges_of(self, plant: Simulator) -> Mapping[str, tuple[float, float]]:
+        """Stated ranges of the parameters of one of the case's plants, from which other plants are drawn."""
+        return self.ranges
 
     @property
     def noise_std(self) -> Array:

@@ -98,12 +98,17 @@ class IdentifiedPlant(Simulator):
         self._mv = np.array([s.middle for s in signals.mv]) if mv is None else np.asarray(mv, dtype=np.float64)
         self._dv = arrays.v_center[n_mv:] if dv is None else np.asarray(dv, dtype=np.float64)
         self._v0 = self._scaled(self._mv, self._dv)
-        self._remembers = shift_rows(arrays)
+        self.remembers = shift_rows(arrays)
         self._x0 = self._rest()
 
     def _scaled(self, mv: Array, dv: Array) -> Array:
         v = np.concatenate([mv, np.broadcast_to(dv, (*mv.shape[:-1], len(self.dv_signals)))], axis=-1)
         return (v - self.arrays.v_center) / self.arrays.v_scale
+
+    @property
+    def start_inputs(self) -> Array:
+        """The inputs (n_v,) at the start, scaled: errors of gain turn about them."""
+        return self._v0
 
     def _rest(self) -> Array:
         seen = np.zeros(len(self.arrays.y_scale))
@@ -151,10 +156,10 @@ class IdentifiedPlant(Simulator):
         inputs = np.concatenate([spoilt, v[..., m:]], axis=-1)
         ahead = f.advance(x[..., :n], inputs)
         if tau > 1.0:
-            ahead = np.where(self._remembers, ahead, x[..., :n] + (ahead - x[..., :n]) / tau)
+            ahead = np.where(self.remembers, ahead, x[..., :n] + (ahead - x[..., :n]) / tau)
         elif tau < 1.0:
-            second = f.advance(np.where(self._remembers, x[..., :n], ahead), inputs)
-            ahead = np.where(self._remembers, ahead, ahead + (1 / tau - 1) * (second - ahead))
+            second = f.advance(np.where(self.remembers, x[..., :n], ahead), inputs)
+            ahead = np.where(self.remembers, ahead, ahead + (1 / tau - 1) * (second - ahead))
         ahead[..., : len(load)] += load / f.y_scale
         return np.concatenate([ahead, held[..., : self.most_dead_time * m]], axis=-1)
 

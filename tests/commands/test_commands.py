@@ -18,7 +18,7 @@ from pipeline.models import MODELS
 
 ROOT = Path(__file__).parents[2]
 COMMANDS_OF_TODAY = {
-    "new", "run", "check", "results", "simulate", "inspect", "bench", "laws", "models", "bounds", "registry",
+    "new", "run", "check", "results", "simulate", "stress", "inspect", "bench", "laws", "models", "bounds", "registry",
 }  # fmt: skip
 
 

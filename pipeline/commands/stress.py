@@ -1,0 +1,148 @@
+"""``loopwright stress``: closed loops of a controller file over plants drawn at random."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+import time
+from functools import partial
+from pathlib import Path
+
+from pipeline.cases import all_cases
+from pipeline.engine.cluster import address, local_cluster
+from pipeline.engine.parallel import parallel_map
+from pipeline.errors import ParamsError, nearest
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.stress.draws import Drawing
+from pipeline.evaluation.stress.loops import Outcome, Stress, opened
+from pipeline.evaluation.stress.summary import Summary
+from pipeline.pictures.drawing import save
+from pipeline.pictures.numbers import number
+from pipeline.pictures.stress_pictures import loop_canvas
+from pipeline.report.stress import StressRun, drawn_words, failed_words, write_stress
+from serving.manifest import Manifest
+
+PLANTS, SEED, SPREAD, FAULTS, BATCH = 1000, 0, 2.0, 50.0, 100
+FEW = 500  # loops that are done before workers have started
+PIECES = 4  # a worker at least, so that none waits long for the last
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    add, whole, percent = parser.add_argument, partial(_whole, least=0), _percent
+    add("file", metavar="CONTROLLER", type=Path, help="a controller's .onnx file")
+    add("--plants", metavar="N", type=partial(_whole, least=1), default=PLANTS, help=f"closed loops ({PLANTS})")
+    add("--seed", metavar="N", type=whole, default=SEED, help=f"of all draws ({SEED})")
+    add("--spread", metavar="PERCENT", type=percent, default=SPREAD,
+        help=f"of parameters for which the case states no range ({SPREAD:g})")  # fmt: skip
+    add("--faults", metavar="PERCENT", type=percent, default=FAULTS,
+        help=f"share of the loops with a fault of an actuator ({FAULTS:g})")  # fmt: skip
+    add("--workers", metavar="N", type=partial(_whole, least=1), help="processes side by side (one a core)")
+    add(
+        "--batch", metavar="N", type=partial(_whole, least=1), default=BATCH, help=f"loops of a piece of work ({BATCH})"
+    )
+    add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
+    add("--replay", metavar="INDEX", type=whole, help="run one loop again, and draw it")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the loops and write their report; or one of them again."""
+    manifest, content = opened(options.file)
+    case = _case_of(manifest)
+    drawing = Drawing(case, options.seed, options.spread / 100, options.faults / 100)
+    stress = Stress(drawing, content)
+    for tests in drawing.tests.values():
+        for test in tests:
+            drawing.ranges(drawing.plant_of(test))
+    if options.replay is not None:
+        _replay(stress, options)
+        return
+    begun = time.perf_counter()
+    outcomes = outcomes_of(stress, options.plants, options.batch, options.workers)
+    taken = time.perf_counter() - begun
+    summary = Summary(case, options.file.stem, drawing.draws(range(options.plants)), outcomes)
+    out = options.out or Path(f"{case.name}-{options.file.stem}-stress")
+    write_stress(StressRun(options.file, stress, summary, _options(options)), out)
+    (spread, *_) = [s for s in summary.spreads() if not s.test and s.metric == case.metric]
+    low, median, *_, worst = spread.values
+    print(f"{options.plants} loops in {taken:.1f} s ({options.plants / taken:.3g} a second)")
+    print(f"{case.label(case.metric)}: median {number(median)}, 5 % below {number(low)}, worst {number(worst)}")
+    for words, count in summary.counts.items():
+        print(f"{words}: {count} ({100 * count / options.plants:.3g} %)")
+    print(f"report: {out / 'report.html'}")
+
+
+def outcomes_of(stress: Stress, plants: int, batch: int = BATCH, workers: int | None = None) -> list[Outcome]:
+    """Outcomes of the loops 0 to ``plants`` - 1, in order, on the engine."""
+    at = address()
+    wanted = workers or (os.cpu_count() or 1)
+    size = max(min(batch, plants // (PIECES * wanted)), 1) if at is None and wanted > 1 else batch
+    pieces = [range(i, min(i + size, plants)) for i in range(0, plants, size)]
+    alone = at is not None or wanted == 1 or (workers is None and plants <= FEW)
+    with contextlib.nullcontext() if alone else local_cluster(wanted):
+        found = parallel_map(stress.outcomes, pieces, "stress: closed loops", [len(p) for p in pieces])
+    return [one for piece in found for one in piece]
+
+
+def _replay(stress: Stress, options: argparse.Namespace) -> None:
+    """Run one loop, say what was drawn and how it went, and draw it."""
+    drawing = stress.drawing
+    draw, loop, outcome = stress.loop(options.replay)
+    case, plant = drawing.case, drawing.plant_of(draw.scenario)
+    print(f"loop {draw.index} of seed {drawing.seed}, test {draw.test}: {draw.scenario.title}")
+    print(f"drawn: {drawn_words(draw, plant.mv_signals)}")
+    width = max(len(case.label(name)) for name in outcome.figures)
+    for name, value in outcome.figures.items():
+        print(f"  {case.label(name):{width}}  {value:.6g}")
+    print(f"failed: {failed_words(outcome) or 'no'}")
+    picture = (options.out or Path()) / f"{case.name}-{options.file.stem}-stress-{draw.index}.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    save(loop_canvas(plant, draw, loop, f"Loop {draw.index}: {draw.test}"), picture)
+    print(f"picture: {picture}")
+
+
+def _case_of(manifest: Manifest) -> Case:
+    """The case that the controller was made for; ParamsError where there is none, or its plant has other signals."""
+    cases = all_cases()
+    if manifest.case not in cases:
+        raise ParamsError(
+            f"the controller is for {manifest.case!r}, which is no case here{nearest(manifest.case, cases)}"
+        )
+    case = cases[manifest.case]
+    if not case.ready:
+        raise ParamsError(f"{case.name} has no models yet; `loopwright run {case.name}` trains them")
+    plant = case.plant
+    for name in ("sp", "pv", "dv", "mv"):
+        ours = [(s.name, s.unit) for s in getattr(plant, f"{name}_signals")]
+        theirs = [(s.name, s.unit) for s in manifest.signals(name)]
+        if ours != theirs:
+            raise ParamsError(f"the controller's {name} are {theirs}, but plant {plant.name!r} has {ours}")
+    if manifest.period_s != plant.period_s:
+        raise ParamsError(
+            f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
+        )
+    return case
+
+
+def _options(options: argparse.Namespace) -> str:
+    """The options of a draw that differ from their defaults, as a replay needs them."""
+    given = {"seed": (options.seed, SEED), "spread": (options.spread, SPREAD), "faults": (options.faults, FAULTS)}
+    return "".join(f" --{name} {value!r}" for name, (value, default) in given.items() if value != default)
+
+
+def _whole(text: str, least: int) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; give a whole number of at least {least}")
+    return int(text)
+
+
+def _percent(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 100:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; give a percentage from 0 to 100")
+    return value

@@ -1,0 +1,1 @@
+"""Closed loops of one controller file over many plants drawn at random."""

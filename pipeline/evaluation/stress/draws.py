@@ -1,0 +1,138 @@
+"""What is drawn for one loop: the plant, the test, the noise and the actuator's fault."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.errors import PlantError
+from pipeline.evaluation.case import Case
+from pipeline.evaluation.stress.faults import Fault, draw_fault
+from pipeline.plants.simulator import Array, Simulator
+from pipeline.simulation.scenario import Scenario
+from pipeline.simulation.simulate import noise_draws
+
+NOISE = (0.5, 2.0)  # times the case's measurement noise
+LATE = 0.5  # share of the loops with one more sample of dead time
+MOST_LEVELS = 2  # of a test, of which a random set point is a mixture
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One loop. ``parameters`` differ from the plant's for the whole loop; ``load`` scales the test's disturbances."""
+
+    index: int
+    test: str
+    scenario: Scenario
+    parameters: Mapping[str, float]
+    load: float
+    noise: float
+    late: bool
+    fault: Fault | None
+    noise_seed: tuple[int, int, int]
+
+    def deviation(self, plant: Simulator, std: Array) -> Array:
+        """The measurement noise (n, n_pv)."""
+        rng = np.random.default_rng(self.noise_seed)
+        return noise_draws(plant, self.scenario.samples, self.noise * std, rng)
+
+    def quantities(self) -> dict[str, float]:
+        """All that was drawn as numbers, by the words of the report."""
+        return {
+            **self.parameters,
+            "load": self.load,
+            "noise": self.noise,
+            "one more sample of dead time": float(self.late),
+        }
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How loops are drawn: of a case, from ``seed``, parameters without a stated range within +-``spread`` of theirs.
+
+    ``faults`` is the share of the loops with a fault of an actuator. Each loop is a function of (seed, index) alone.
+    """
+
+    case: Case
+    seed: int = 0
+    spread: float = 0.02
+    faults: float = 0.5
+
+    @cached_property
+    def tests(self) -> Mapping[str, tuple[Scenario, ...]]:
+        """The case's tests, from which courses of set points and disturbances are drawn."""
+        return self.case.tests()
+
+    def plant_of(self, test: Scenario) -> Simulator:
+        """The plant of a test."""
+        return test.plant or self.case.plant
+
+    @cached_property
+    def disturbed(self) -> frozenset[str]:
+        """Parameters that the case's own tests move: disturbances, which a draw scales."""
+        return frozenset(name for tests in self.tests.values() for test in tests for name in test.changes)
+
+    def ranges(self, plant: Simulator) -> dict[str, Range]:
+        """Parameter -> range that it is drawn from: as the case states it, else +-``spread`` of a value that is not 0.
+
+        PlantError for a plant without any.
+        """
+        stated, names = self.case.ranges_of(plant), plant.parameter_names()
+        for name in stated:
+            plant.parameters({name: stated[name][0]})  # raises for a name that the plant has not
+        found = dict(stated)
+        for name, value in zip(names, plant.parameters(), strict=True):
+            if name not in stated and name not in self.disturbed and value:
+                width = self.spread * abs(value)
+                found[name] = (float(value - width), float(value + width))
+        if not found and not self.disturbed:
+            raise PlantError(
+                f"plant {plant.name!r} has no parameters, so no other plant can be drawn; give its class numeric "
+                'fields with metadata={"unit": ...}, or state ranges in the case'
+            )
+        return found
+
+    def draw(self, index: int) -> Draw:
+        """The loop with this number."""
+        rng = np.random.default_rng((self.seed, index))
+        name = list(self.tests)[int(rng.integers(len(self.tests)))]
+        test = self.tests[name][int(rng.integers(len(self.tests[name])))]
+        plant, share = self.plant_of(test), float(rng.uniform())
+        parameters = {key: float(rng.uniform(*ends)) for key, ends in self.ranges(plant).items()}
+        noise, late = float(rng.uniform(*NOISE)), bool(rng.uniform() < LATE)
+        faulty = bool(rng.uniform() < self.faults)
+        fault = draw_fault(rng, plant.mv_signals, test.samples)
+        nominal = dict(zip(plant.parameter_names(), plant.parameters(), strict=True))
+        loads = {k: nominal[k] + share * (v - nominal[k]) for k, v in test.changes.items() if k not in parameters}
+        held = {k: np.full(test.samples, value) for k, value in parameters.items()}
+        scenario = replace(test, sp=_set_points(rng, test), changes={**held, **loads}, plant=plant)
+        return Draw(
+            index, name, scenario, parameters, share, noise, late, fault if faulty else None, (self.seed, index, 1)
+        )
+
+    def draws(self, indices: Sequence[int]) -> list[Draw]:
+        """The loops with these numbers."""
+        return [self.draw(i) for i in indices]
+
+
+def _set_points(rng: np.random.Generator, test: Scenario) -> Array:
+    """Set points (n, n_sp): those of every hold but the first are mixtures of two of the test's.
+
+    A plant that can hold two set points can most often hold what lies between. A set point that does not move, or
+    that follows a course of its own (a recipe), stays; so does one that a reference belongs to.
+    """
+    if not test.hold or test.reference is not None:
+        return test.sp
+    levels = test.sp[:: test.hold]
+    if not np.any(levels != levels[0]):
+        return test.sp
+    pairs = rng.integers(len(levels), size=(len(levels), MOST_LEVELS))
+    weight = rng.uniform(size=(len(levels), 1))
+    drawn = weight * levels[pairs[:, 0]] + (1 - weight) * levels[pairs[:, 1]]
+    drawn[0] = levels[0]  # where the plant rests
+    return np.repeat(drawn, test.hold, axis=0)[: test.samples]

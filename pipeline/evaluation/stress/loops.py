@@ -1,0 +1,146 @@
+"""Closed loops of one controller file over drawn plants, all of a batch side by side."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.evaluation.closed_loop import left_limits, locked_up
+from pipeline.evaluation.stress.draws import Draw, Drawing
+from pipeline.evaluation.stress.faults import Actuators
+from pipeline.plants.side_by_side import advance_rows
+from pipeline.plants.simulator import Array
+from pipeline.simulation.simulate import Trajectory
+from serving.controller import Controller
+from serving.manifest import Manifest
+from serving.rows import ControllerRows
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Figures of one loop. One that left what the plant can compute has infinite figures."""
+
+    index: int
+    figures: dict[str, float]
+    locked_up: bool
+    left_limits: bool
+    refused: int  # samples
+    broke: bool
+
+    @property
+    def failed(self) -> bool:
+        """Whether the loop is lost, whatever its figures."""
+        return self.locked_up or self.left_limits or self.refused > 0 or self.broke
+
+
+@dataclass(frozen=True)
+class Stress:
+    """What a worker needs for a batch of loops: how they are drawn, and the bytes of the controller file."""
+
+    drawing: Drawing
+    content: bytes
+
+    @cached_property
+    def controller(self) -> Controller:
+        """The controller, from its bytes: a worker sees no files of the client."""
+        with tempfile.TemporaryDirectory(prefix="loopwright-stress-") as folder:
+            path = Path(folder) / "controller.onnx"
+            path.write_bytes(self.content)
+            return Controller(path)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # a session stays where it was made
+
+    def outcomes(self, indices: Sequence[int]) -> list[Outcome]:
+        """Figures of the loops with these numbers, in order."""
+        return [self._outcome(draw, *loop) for draw, loop in self.loops(self.drawing.draws(indices))]
+
+    def loop(self, index: int) -> tuple[Draw, Trajectory, Outcome]:
+        """One loop with its course."""
+        ((draw, loop),) = self.loops([self.drawing.draw(index)])
+        return draw, loop[0], self._outcome(draw, *loop)
+
+    def loops(self, draws: Sequence[Draw]) -> list[tuple[Draw, tuple[Trajectory, bool]]]:
+        """(draw, (course, whether the plant left what it can compute)) in order; info of a course: step refused."""
+        groups = dict[tuple[int, int], list[int]]()
+        for i, draw in enumerate(draws):
+            key = (id(self.drawing.plant_of(draw.scenario)), draw.scenario.samples)
+            groups.setdefault(key, []).append(i)
+        found = dict[int, tuple[Trajectory, bool]]()
+        for places in groups.values():
+            found.update(zip(places, self._together([draws[i] for i in places]), strict=True))
+        return [(draw, found[i]) for i, draw in enumerate(draws)]
+
+    def _together(self, draws: Sequence[Draw]) -> list[tuple[Trajectory, bool]]:
+        """Loops over plants of one kind and tests of one length."""
+        plant, tests = self.drawing.plant_of(draws[0].scenario), [draw.scenario for draw in draws]
+        n, samples, std = len(draws), tests[0].samples, self.drawing.case.noise_std
+        sp = np.stack([t.sp for t in tests], axis=1)
+        dv = np.stack([t.disturbances(plant) for t in tests], axis=1)
+        noise = np.stack([d.deviation(plant, std) for d in draws], axis=1)
+        known = [t.parameters(plant) for t in tests]
+        mv0, x = np.stack([t.mv0 for t in tests]), np.stack([t.x0 for t in tests])
+        law, advance = ControllerRows(self.controller, n), advance_rows(plant, n)
+        actuators = Actuators(plant.mv_signals, [d.fault for d in draws], mv0, [d.late for d in draws])
+        state, readback, broke = law.cold_state(), mv0.copy(), np.zeros(n, dtype=bool)
+        pvs, mvs = np.empty((samples, n, noise.shape[2])), np.empty((samples, *mv0.shape))
+        xs, refused = np.empty((samples, *x.shape)), np.zeros((samples, n), dtype=bool)
+        for k in range(samples):
+            xs[k], pvs[k] = x, plant.measured(x)
+            step = law.step(sp=sp[k], pv=pvs[k] + noise[k], dv=dv[k], mv_applied=readback, state=state)
+            refused[k] = step.refused
+            command = np.where(step.refused[:, None], readback, step.mv)
+            state = np.where(step.refused[:, None], 0.0, step.state)
+            mvs[k], acting = actuators.move(k, command)
+            readback = mvs[k]
+            p = np.stack([table[k] for table in known])
+            ahead = advance(x, acting, dv[k], p)
+            fine: NDArray[np.bool_] = np.all(np.isfinite(ahead), axis=1)
+            broke |= ~fine
+            x = np.where(fine[:, None], ahead, x)
+        time_s = np.arange(samples, dtype=np.float64) * plant.period_s
+        return [
+            (
+                Trajectory(
+                    time_s, sp[:, i], pvs[:, i], pvs[:, i] + noise[:, i], mvs[:, i], xs[:, i],
+                    refused[:, i, None].astype(np.float64),
+                ),
+                bool(broke[i]),
+            )
+            for i in range(n)
+        ]  # fmt: skip
+
+    def _outcome(self, draw: Draw, loop: Trajectory, broke: bool) -> Outcome:
+        case, plant, test = self.drawing.case, self.drawing.plant_of(draw.scenario), draw.scenario
+        n_cv = test.sp.shape[1]
+        mvs, cvs = plant.mv_signals[:n_cv], plant.sp_signals
+        spans = [s.high - s.low for s in cvs]
+        limits: dict[str, list[float]] = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
+        ends: dict[str, list[float]] = {end: [getattr(s, end) for s in cvs] for end in ("low", "high")}
+        # A loop that is broken has no figures of worth; as infinite ones they count as worst.
+        figures = case.score(test, loop.pv, loop.mv)
+        return Outcome(
+            draw.index,
+            dict.fromkeys(figures, float("inf")) if broke else figures,
+            locked_up(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=spans),
+            left_limits(loop.pv[:, :n_cv], **ends),
+            int(loop.info.sum()),
+            broke,
+        )
+
+
+def figures_of(outcomes: Sequence[Outcome], name: str) -> Array:
+    """One figure of all loops, (n,); NaN of a loop whose test has no such figure."""
+    return np.array([one.figures.get(name, np.nan) for one in outcomes])
+
+
+def opened(path: Path) -> tuple[Manifest, bytes]:
+    """The manifest of a controller file, and the bytes to send; ArtifactError where it is none."""
+    return Controller(path).manifest, path.read_bytes()

@@ -1,0 +1,79 @@
+"""``loopwright stress``: its report, its replay, and what it refuses in one line."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.__main__ import main
+
+ROOT = Path(__file__).parents[2]
+PH = ROOT / "artifacts/ph_neutralization/pid.onnx"
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_the_report_names_the_worst_and_how_to_run_them_again(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stress", str(PH), "--plants", "30", "--seed", "5", "--workers", "1", "--out", "out"]) == 0
+    page = Path("out/report.md").read_text(encoding="utf-8")
+    rows = pq.read_table("out/plants.parquet")
+    assert rows.num_rows == 30
+    commands = [line for line in page.splitlines() if line.startswith("loopwright stress")]
+    assert len(commands) == 10
+    assert all(line.endswith(" --seed 5") for line in commands)
+    capsys.readouterr()
+    assert main([*commands[0].split()[1:], "--out", "again"]) == 0
+    index = int(commands[0].split()[4])
+    said = capsys.readouterr().out
+    sse = rows.to_pylist()[index]["figure.sse"]
+    assert f"SSE                {sse:.6g}" in said
+    assert f"loop {index} of seed 5" in said
+    assert Path(f"again/ph_neutralization-pid-stress-{index}.png").exists()
+    assert Path(f"out/figures/loop_{index}.png").exists()
+    html = Path("out/report.html").read_text(encoding="utf-8")
+    assert "{{" not in html
+    assert html.count("loopwright stress") == 10
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--plants", "0"], "'0' is not allowed; give a whole number of at least 1"),
+        (["--plants", "many"], "'many' is not allowed"),
+        (["--seed", "-1"], "'-1' is not allowed"),
+        (["--faults", "101"], "'101' is not allowed; give a percentage from 0 to 100"),
+        (["--spread", "nan"], "'nan' is not allowed"),
+    ],
+)
+def test_what_is_no_number_is_refused(options: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["stress", str(PH), *options])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+
+
+def test_a_file_that_is_no_controller_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("foreign.onnx").write_bytes(b"not a graph")
+    assert main(["stress", "foreign.onnx"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("loopwright stress: foreign.onnx: ")
+    assert said.count("\n") == 1
+    assert main(["stress", "nowhere.onnx"]) == 2
+    assert "nowhere.onnx: the file cannot be read" in capsys.readouterr().err
+
+
+def test_a_controller_of_no_case_is_refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(PH, "pid.onnx")
+    monkeypatch.setattr("pipeline.commands.stress.all_cases", dict)
+    assert main(["stress", "pid.onnx"]) == 2
+    assert "the controller is for 'ph_neutralization', which is no case here" in capsys.readouterr().err
