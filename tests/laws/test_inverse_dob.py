@@ -5,16 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from shipped import required
 from torch import Tensor
 
 from pipeline.errors import LawError
 from pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob, ObserverLaw
 from pipeline.models.base import Model
-from pipeline.models.static.mlp import MLP
-from pipeline.models.static.pair import Layout, Pair, candidates
+from pipeline.models.static.candidates import candidates
 from pipeline.plants.signals import Signals
 from serving.manifest import Signal
 
@@ -169,32 +166,6 @@ def test_a_model_that_knows_nothing_pushes_the_right_way(kind: str) -> None:
     with torch.no_grad():
         mv, _, _ = law(torch.tensor([1.0], dtype=torch.float64), torch.tensor([-8.0, 0.0]).double(), DVZ, zero, state)
     assert float(mv) == 1.0
-
-
-@given(seed=st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
-def test_fused_products_equal_the_formulas(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    hidden = tuple(int(h) for h in rng.integers(2, 6, rng.integers(1, 4)))
-    nets = []
-    for column in (0, 1):
-        x = rng.uniform(-1, 1, (30, 3)) * [1.0, 100.0, 500.0]
-        net = MLP.scaled_to(x, rng.normal(5, 3, (30, 1)), hidden=hidden, residual=(column,) if seed % 2 else ())
-        net.reset(torch.Generator().manual_seed(seed + column))
-        nets.append(net.eval())
-    grid = torch.linspace(0, 500, 4, dtype=torch.float64)
-
-    def combine(f: Tensor, g: Tensor, z: Tensor) -> Tensor:
-        return torch.cat([f[..., :1] - z[..., 1:2], 0.3 * (g[..., -1:] - f[..., 1:2]), z[..., 4:5], g], dim=-1)
-
-    pair = Pair(nets[0], nets[1], grid, Layout(n_z=5, n=2, first=0, second=2, mv=4), combine)
-    assert pair.fused is not None
-    z = torch.from_numpy(rng.uniform(-1, 1, (7, 5)) * [1.0, 100.0, 1.0, 100.0, 500.0])
-    with torch.no_grad():
-        fused, plain = pair(z), pair.plain(z, *nets)
-        rows = torch.stack([pair(row) for row in z])
-    assert torch.allclose(fused, plain, rtol=0, atol=1e-9)
-    assert torch.allclose(fused, rows, rtol=0, atol=1e-9)
 
 
 def test_candidates_of_any_model() -> None:

@@ -25,7 +25,7 @@ from pipeline.laws.inverse.self_chosen import LONGEST, Choice
 from pipeline.laws.ranges import OfRange, in_units
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
-from pipeline.models.static.pair import Layout, Pair, candidates
+from pipeline.models.static.candidates import candidates
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
@@ -113,6 +113,7 @@ class ObserverLaw(ControlLaw):
     parts: ClassVar[Mapping[str, str]] = {"forward": "a network of task forward", "observer": ONE_PERIOD}
     span: Tensor
     band: Tensor
+    grid: Tensor  # (n_grid,) [mv] over the whole range
     least: Tensor  # (1,) share of the set point's range below which a reach is nothing but the models' errors
 
     def __init__(self, signals: Signals, forward: Model, observer: Model, params: Params, sections: int = 1) -> None:
@@ -129,35 +130,8 @@ class ObserverLaw(ControlLaw):
         hold_numbers(self, band=params.band)
         self.register_buffer("least", 1e-3 * (signals.sp[0].high - signals.sp[0].low) / self.span)
         grid = self.low + self.span * torch.linspace(0, 1, sections + 1, dtype=torch.float64)
-        layout = Layout(n_z=2 * n + 6, n=n, first=1, second=n + 4, mv=2 * n + 4)
-        self.models = Pair(observer, forward, grid, layout, self._combine)
-
-    def _combine(self, f: Tensor, g: Tensor, z: Tensor) -> Tensor:
-        """All that a step needs of the one-step model f at x(k-1) and the forward model g at x(k), linear in both.
-
-        f and g stand for [mv_applied, grid], z is [state, pv, mv_applied, sp].
-        """
-        sizes = [1, self.n_pv, 1, 1, 1, self.n_pv, 1, 1]
-        started, _, d, integral, last_mv, pv, mv_applied, sp = torch.split(z, sizes, dim=-1)
-        surprise = pv[..., self.observed : self.observed + 1] - f[..., :1]
-        w_min, w_max = (g[..., 1:2], g[..., -1:]) if self.rising else (g[..., -1:], g[..., 1:2])
-        error = sp - pv[..., :1]
-        rows = [
-            started,
-            (1 - self.params.observer_gain) * d,
-            self.params.observer_gain * surprise,
-            (f[..., -1:] - f[..., 1:2]) / self.span,
-            w_min,
-            w_max,
-            (w_max - w_min) / self.span,
-            sp + integral,
-            error / self.params.band,
-            (mv_applied - last_mv) / (FOLLOWED * self.span),
-            integral,
-            integral + self.params.integral_gain * error,
-            g[..., 1:],
-        ]
-        return torch.cat(rows, dim=-1)
+        self.register_buffer("grid", grid)
+        self.reach, self.observer = forward, observer
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
@@ -195,24 +169,36 @@ class ObserverLaw(ControlLaw):
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        rows = self.models(torch.cat([state, pv, mv_applied, sp], dim=-1))
-        parts = torch.split(rows, [1, 1, 1, 1, 1, 1, 1, 1, 2, 1, 1, rows.shape[-1] - 12], dim=-1)
-        started, kept, surprise, slope, w_min, w_max, width, request, acts, integral, moved, g = parts
+        started, x1, d1, integral, mv1 = torch.split(state, [1, self.n_pv, 1, 1, 1], dim=-1)
+        params, i = self.params, self.observed
+        # What the last period's disturbance was, as an MV: what the observer did not expect, by its slope.
+        ends = torch.cat([self.low, self.high]).expand(*mv_applied.shape[:-1], 2)
+        f = candidates(self.observer, x1, torch.cat([mv_applied, ends], dim=-1))
+        surprise = pv[..., i : i + 1] - f[..., :1]
+        slope = (f[..., 2:] - f[..., 1:2]) / self.span
+        d = (1 - params.observer_gain) * d1 + params.observer_gain * surprise / slope
         # More than the whole actuator can never be acted on, and a bad sample must not be remembered for long.
-        disturbance = torch.minimum(torch.maximum(kept + surprise / slope, -self.span), self.span)
-        disturbance = started * disturbance
+        d = started * torch.minimum(torch.maximum(d, -self.span), self.span)
+        # What the MV can reach, and the request within it.
+        g = candidates(self.reach, pv, self.grid.expand(*pv.shape[:-1], len(self.grid)))
+        w_min, w_max = (g[..., :1], g[..., -1:]) if self.rising else (g[..., -1:], g[..., :1])
+        request = sp + integral
         within = torch.minimum(torch.maximum(request, w_min), w_max)
         # Where the plant hardly answers, the reach is the model's error and may have the wrong sign: the way to
         # go on comes from the plant as a whole, or the loop would lock at the wrong end.
-        beyond = (request - within if self.rising else within - request) / torch.maximum(width, self.least)
-        requested = self.invert(pv, within, g) + beyond - disturbance
+        width = torch.maximum((w_max - w_min) / self.span, self.least)
+        beyond = (request - within if self.rising else within - request) / width
+        requested = self.invert(pv, within, g) + beyond - d
         mv = self.limited(requested, mv_applied)
         # Acting on an error that someone else's MV leaves would be winding up, in manual as at a limit.
+        error = sp - pv[..., :1]
+        acts = torch.cat([error / params.band, (mv_applied - mv1) / (FOLLOWED * self.span)], dim=-1)
         free = (mv == requested) & (acts.abs().amax(dim=-1, keepdim=True) < 1)
         # The integral takes what the observer leaves: no more than the band in which it acts.
+        moved = integral + params.integral_gain * error
         integral_next = torch.where(free, torch.minimum(torch.maximum(moved, -self.band), self.band), integral)
-        state_next = torch.cat([torch.ones_like(integral), pv, disturbance, integral_next, mv], dim=-1)
-        return mv, state_next, torch.cat([within, w_min, w_max, disturbance, integral], dim=-1)
+        state_next = torch.cat([torch.ones_like(integral), pv, d, integral_next, mv], dim=-1)
+        return mv, state_next, torch.cat([within, w_min, w_max, d, integral], dim=-1)
 
 
 class InverseDob(ObserverLaw):
