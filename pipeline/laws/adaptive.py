@@ -203,36 +203,34 @@ class AdaptiveGains(nn.Module):
         return torch.cat([e - e1, (e + e1) / 2, e - 2 * e1 + e2], dim=-1)
 
     def free(self, p: Named, slope: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Whether the gains may change (..., 1), for a slope [pv] in the plant's sign; and the next memory."""
+        """1 where the gains may change, else 0, (..., 1), for a slope [pv] in the plant's sign; and the next memory."""
         clear = slope > self.slope_min
         if not self.window:
-            return clear, {}
+            return clear.to(slope.dtype), {}
         square = _error(p) * _error(p)
         if self.window == 1:
-            return clear & (square > self.threshold), {}
+            return (clear & (square > self.threshold)).to(slope.dtype), {}
         total = square + p["square"]
         if self.window > 2:
             total = total + p["squares"].sum(dim=-1, keepdim=True)
-        return clear & (total > self.threshold), {"square": square}
+        return (clear & (total > self.threshold)).to(slope.dtype), {"square": square}
 
-    def update(self, p: Named, rho: Tensor, v: Tensor, c: Tensor) -> Tensor:
-        """Gains (..., 3) for a desired move v and its curvature c, (..., 1) each."""
-        return gain_update(p["gains"], rho, v, c, self.lam, self.weights, self.lo, self.hi)
+    def update(self, p: Named, rho: Tensor, v: Tensor, c: Tensor, free: Tensor) -> Tensor:
+        """Gains (..., 3) for a desired move v and its curvature c, (..., 1) each; the last ones where not ``free``."""
+        return gain_update(p["gains"], rho, v, c, self.lam, self.weights, self.lo, self.hi, free)
 
     def settled(self, p: Named, z: Tensor, free: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The gains (..., 3) after filter and guard, and the next memory."""
+        """The gains (..., 3) after the filter, and the next memory."""
         if not self.filtered:
-            z = torch.where(free, z, p["gains"])
             return z, {"gains": z}
-        change = self.gamma * p["change"] + self.fresh_share * (z - p["gains"])
-        change = torch.where(free, change, torch.zeros_like(change))
+        change = free * (self.gamma * p["change"] + self.fresh_share * (z - p["gains"]))
         # A filtered change can leave the bounds even if both gains are within them.
         z = torch.minimum(torch.maximum(p["gains"] + change, self.lo), self.hi)
         return z, {"gains": z, "change": change}
 
     def info_of(self, z: Tensor, slope: Tensor, free: Tensor) -> Tensor:
-        """``info``: kc [mv/pv], tau_i and tau_d [s], the slope [pv/mv], and whether the gains were free to change."""
-        return torch.cat([self.form(z), slope * self.by_unit, free.to(z.dtype)], dim=-1)
+        """``info``: kc [mv/pv], tau_i and tau_d [s], the slope [pv/mv], and 1 where the gains were free to change."""
+        return torch.cat([self.form(z), slope * self.by_unit, free], dim=-1)
 
 
 class AdaptivePid(ControlLaw):

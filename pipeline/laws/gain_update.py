@@ -14,15 +14,15 @@ NEXT_TO_NOTHING = 1e-8  # share of its bound at which a gain counts as none
 
 
 def gain_update(
-    z_prev: Tensor, rho: Tensor, v: Tensor, c: Tensor, lam: Tensor, w: Tensor, lo: Tensor, hi: Tensor
+    z_prev: Tensor, rho: Tensor, v: Tensor, c: Tensor, lam: Tensor, w: Tensor, lo: Tensor, hi: Tensor, free: Tensor
 ) -> Tensor:
     """The gains z (..., 3) nearest to the last ones whose move rho'z is nearest to v.
 
-        min  c/2 (rho'z - v)^2 + lambda/2 sum_i (z_i - z_prev_i)^2 / w_i   subject to   lo <= z <= hi
+        min  1/2 (rho'z - v)^2 + s/2 sum_i (z_i - z_prev_i)^2 / w_i   subject to   lo <= z <= hi,   s = lambda/c
 
     The optimum is z = clip(z_prev + nu w rho, lo, hi), with nu the root of
 
-        lambda nu + c sum_i min(q_i |nu|, B_i) sign(nu) = c T sign(nu),   q = w rho^2,   T = |v - rho'z_prev|
+        s nu + sum_i min(q_i |nu|, B_i) sign(nu) = T sign(nu),   q = w rho^2,   T = |v - rho'z_prev|
 
     where B_i >= 0 is how far gain i can push the move the wanted way before it meets its bound. The
     left side grows with nu and is linear between the three breakpoints B_i/q_i: a gain is at its
@@ -31,23 +31,24 @@ def gain_update(
 
     ``z_prev`` (..., 3): the last gains, within their bounds ``lo`` and ``hi`` (3,). ``rho`` (..., 3): what each gain
     is multiplied with to give the move. ``v``, ``c`` (..., 1): the wanted move, and the curvature c >= 0 of the
-    objective along it. ``lam`` (1,): stiffness lambda > 0; ``w`` (3,) > 0: how easily each gain gives way.
+    law's objective along it. ``lam`` (1,): stiffness lambda > 0; ``w`` (3,) > 0: how easily each gain gives way.
+    ``free`` (..., 1): 1, or 0 where the gains stay as they are.
 
     Source: [chen2004, eqs 20-26]. The matrix of eq. 22 has rank one and is never
     inverted; the stiffness, not in the paper, makes the optimum unique.
     """
-    short = v - (rho * z_prev).sum(dim=-1, keepdim=True)
+    stiffness = lam / c  # s
+    short = free * (v - (rho * z_prev).sum(dim=-1, keepdim=True))
     push = torch.sign(short) * rho
+    ease = w * push
+    give = ease * push  # q
     room = torch.maximum(push * (lo - z_prev), push * (hi - z_prev))  # B
-    give = w * rho * rho  # q
-    wanted = c * torch.abs(short)
     cross = room.unsqueeze(-1) * give.unsqueeze(-2)
-    reached = c * torch.minimum(cross, cross.transpose(-1, -2)).sum(dim=-1)
-    full = lam * room + reached < wanted * give
-    nothing = torch.zeros_like(room)
-    left = wanted - c * torch.where(full, room, nothing).sum(dim=-1, keepdim=True)
-    nu = left / (lam + c * torch.where(full, nothing, give).sum(dim=-1, keepdim=True))
-    return torch.minimum(torch.maximum(z_prev + nu * w * push, lo), hi)
+    reached = torch.minimum(cross, cross.transpose(-1, -2)).sum(dim=-1)
+    full = (stiffness * room + reached < torch.abs(short) * give).to(rho.dtype)
+    left = torch.abs(short) - (full * room).sum(dim=-1, keepdim=True)
+    nu = left / (stiffness + ((1 - full) * give).sum(dim=-1, keepdim=True))
+    return torch.minimum(torch.maximum(z_prev + nu * ease, lo), hi)
 
 
 class PidForm(nn.Module):

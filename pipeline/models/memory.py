@@ -84,8 +84,7 @@ class Stage(nn.Module):
 class Memory(nn.Module):
     """The state of a law as named slots, in which zero means "no past".
 
-    The state is [started, slots with ``then``, slots without]; ``layout`` names its pieces and, after
-    them, those of the sample: y, r, u.
+    The state is [started, slots with ``then``, slots without]; ``layout`` has their sizes.
     """
 
     def __init__(self, slots: Mapping[str, Slot]) -> None:
@@ -94,7 +93,7 @@ class Memory(nn.Module):
         self.given = {name: slot for name, slot in slots.items() if slot.then is None}
         sizes = {name: slot.size for name, slot in (self.known | self.given).items()}
         self.n_state = 1 + sum(sizes.values())
-        self.layout = {"started": 1, **sizes, "y": 1, "r": 1, "u": 1}
+        self.layout = {"started": 1, **sizes}
         for name, slot in slots.items():
             if isinstance(slot.start, Tensor):
                 self.register_buffer(f"first_{name}", slot.start)
@@ -104,11 +103,13 @@ class Memory(nn.Module):
 
         ``started`` is 0 at the first sample, y the first PV, r the set point, u the applied MV.
         """
-        x = torch.cat([state, pv[..., :1], sp, mv_applied], dim=-1)
-        p = self._named(x)
-        first = [self._first(name, slot, p) for name, slot in (self.known | self.given).items()]
-        still = torch.cat([p["started"], *first, p["y"], p["r"], p["u"]], dim=-1)
-        return self._named(torch.where(p["started"] > 0, x, still))
+        sample = {"y": pv[..., :1], "r": sp, "u": mv_applied}
+        started = state[..., :1]
+        first = [self._first(slot, name, sample) for name, slot in (self.known | self.given).items()]
+        # Without a past the whole state is zero, so that the first values need only be added.
+        state = state + (1 - started) * torch.cat([torch.zeros_like(started), *first], dim=-1)
+        past = torch.split(state, list(self.layout.values()), dim=-1)
+        return {**dict(zip(self.layout, past, strict=True)), **sample, "started": started}
 
     def stored(self, p: Named, given: Named) -> Tensor:
         """The next state (..., n_state), from the past and the slots that the law computes."""
@@ -116,12 +117,9 @@ class Memory(nn.Module):
         known = [slot.then(p) for slot in self.known.values() if slot.then is not None]
         return torch.cat([one, *known, *(given[name] for name in self.given)], dim=-1)
 
-    def _first(self, name: str, slot: Slot, p: Named) -> Tensor:
+    def _first(self, slot: Slot, name: str, sample: Named) -> Tensor:
         """A slot without a past."""
         if not isinstance(slot.start, Tensor):
-            return slot.start(p)
+            return slot.start(sample)
         numbers: Tensor = getattr(self, f"first_{name}")
-        return numbers.expand(*p["y"].shape[:-1], slot.size)
-
-    def _named(self, x: Tensor) -> dict[str, Tensor]:
-        return dict(zip(self.layout, torch.split(x, list(self.layout.values()), dim=-1), strict=True))
+        return numbers.expand(*sample["y"].shape[:-1], slot.size)

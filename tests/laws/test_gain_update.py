@@ -32,7 +32,7 @@ class Problem(NamedTuple):
         return 0.5 * self.c[:, 0] * miss**2 + 0.5 * self.lam[:, 0] * ((z - self.z_prev) ** 2 / W).sum(axis=1)
 
     def solved(self) -> np.ndarray:
-        return gain_update(*map(torch.from_numpy, (*self, W, LO, HI))).numpy()
+        return gain_update(*map(torch.from_numpy, (*self, W, LO, HI, np.ones(1)))).numpy()
 
 
 def drawn(n: int, seed: int) -> Problem:
@@ -127,7 +127,7 @@ def test_candidates_broadcast() -> None:
     p = drawn(4, 1)
     v, c = (np.repeat(a[:, None, :], 13, axis=1) * np.linspace(0.1, 2, 13)[:, None] for a in (p.v, p.c))
     fixed = [torch.from_numpy(a[:, None, :]) for a in (p.z_prev, p.rho)]
-    rest = [torch.from_numpy(a) for a in (p.lam[:1], W, LO, HI)]
+    rest = [torch.from_numpy(a) for a in (p.lam[:1], W, LO, HI, np.ones(1))]
     one = [rest[0][0], *rest[1:]]
     together = gain_update(*fixed, torch.from_numpy(v), torch.from_numpy(c), *rest)
     assert together.shape == (4, 13, 3)

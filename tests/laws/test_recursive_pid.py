@@ -115,7 +115,7 @@ def test_equals_its_equations(arx: ARX) -> None:
             c = b * b + mu
             number = [torch.tensor([v], dtype=torch.float64) for v in (b * gap / c, c, 0.01)]
             ones = torch.ones(3, dtype=torch.float64)
-            z = gain_update(z, torch.tensor(rho, dtype=torch.float64), *number, ones, 0 * ones, 10 * ones)
+            z = gain_update(z, torch.tensor(rho, dtype=torch.float64), *number, ones, 0 * ones, 10 * ones, ones[:1])
         wanted = applied + half_u * float(z @ torch.tensor(rho, dtype=torch.float64))
         assert given.item() == pytest.approx(min(max(wanted, mv.low), mv.high), rel=1e-10)
         assert info[0].item() == pytest.approx(z[0].item() * half_u, rel=1e-8)

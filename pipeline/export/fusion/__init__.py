@@ -8,7 +8,9 @@ from pipeline.export.fusion.choice import choose
 from pipeline.export.fusion.emission import Outputs, emitted
 from pipeline.export.fusion.forms import forms_of
 from pipeline.export.fusion.items import Items
+from pipeline.export.fusion.joining import joined
 from pipeline.export.fusion.plan import Item
+from pipeline.export.fusion.postponing import postpone
 from pipeline.export.fusion.reading import Reading
 
 LEAST_SHARE = 0.002
@@ -23,13 +25,15 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
     the rounding. The graph must have static shapes and operators that a controller may have.
     """
     candidates = []
-    for factors in (True, False):
-        reading = Reading(model, factors=factors)
-        items, outputs = listed(reading)
-        after = choose(items.choices, [item for _, item in outputs if isinstance(item, Item)])
-        candidates.append((after, items, outputs))
-    after, items, outputs = min(candidates, key=lambda c: c[0])
-    if after > (1 - LEAST_SHARE) * reading.price_before:
+    together = joined(model)
+    for given in (model,) if together is None else (model, together):
+        for factors in (True, False):
+            reading = Reading(given, factors=factors)
+            items, outputs = listed(reading)
+            after = choose(items.choices, [item for _, item in outputs if isinstance(item, Item)])
+            candidates.append((after, items, outputs, reading))
+    after, items, outputs, _ = min(candidates, key=lambda c: c[0])
+    if after > (1 - LEAST_SHARE) * candidates[0][3].price_before:
         return model
     return emitted(items, outputs, model)
 
@@ -37,8 +41,13 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
 def listed(reading: Reading) -> tuple[Items, Outputs]:
     """All that the graph may be made of, and its outputs."""
     items = Items(reading)
+    for block in reading.blocks:  # each behind its operands: asked for from the end, a long chain would be a deep recursion
+        items.block(block)
     outputs = [(name, items.of(operand)) for name, operand in reading.outputs]
+    decided = []
     while items.undecided:
         choice, value = items.undecided.pop()
         choice.forms = forms_of(items, value)
+        decided.append((choice, value))
+    postpone(items, decided)
     return items, outputs

@@ -117,16 +117,20 @@ class Items:
             self._selections[id(source)] = Selection(source)
         return self._selections[id(source)].piece(start, stop)
 
-    def member(self, value: Value, *, lead: Shape = (), alone: bool = False) -> Item:
-        """A value as a piece of the product of its level, or of one of its own; ``lead`` (1,) of rows."""
+    def member(self, value: Value, *, lead: Shape = (), alone: bool = False, level: int | None = None) -> Item:
+        """A value as a piece of the product of a level, its own if not given, or of one for itself alone.
+
+        ``lead``: (1,) of rows.
+        """
+        level = value.level if level is None else level
         assert value.affine is not None
         for number in value.affine.parts:
             self.flat(number, lead)  # made now, while there is still time for its forms
-        group = None if alone else self._groups.get((value.level, lead))
+        group = None if alone else self._groups.get((level, lead))
         if group is None:
-            group = Group(value.level, lead, self.reading.blocks, partial(self.flat, lead=lead))
+            group = Group(level, lead, self.reading.blocks, partial(self.flat, lead=lead))
         if not alone:
-            self._groups[value.level, lead] = group
+            self._groups[level, lead] = group
         return self.reshaped(group.piece(value), value.shape)
 
 

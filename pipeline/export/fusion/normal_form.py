@@ -138,6 +138,32 @@ def _stripped(affine: Affine) -> tuple[Affine, Array] | None:
     return Affine(affine.constant, {block: marks.astype(np.float64)}), factor
 
 
+# ---------------------------------------------------------------------- MatMul
+def by_vector(reading: Reading, operands: list[Operand], shape: Shape) -> Value | None:
+    """The product of a matrix and a vector that was made a row or a column for it, by the vector itself."""
+    left, right = operands
+    if not isinstance(left, Value) or not isinstance(right, Value) or len(left.shape) != 2 or len(right.shape) != 2:
+        return None
+    row, column = _vector(left, (1, left.shape[1])), _vector(right, (right.shape[0], 1))
+    if (row is None) == (column is None):
+        return None
+    inner: list[Operand] = [left if row is None else row, right if column is None else column]
+    (product,) = reading.computed("MatMul", {}, inner, [""], [(max(shape),) if 1 in shape else shape])
+    if product.affine is None:
+        return None
+    (spread,) = applied("Reshape", {}, [product.affine, np.array(shape)], [shape]) or (None,)
+    return None if spread is None else reading.value(spread, Origin("Reshape", [product, np.array(shape)], {}, [shape]))
+
+
+def _vector(value: Value, shape: Shape) -> Value | None:
+    """The vector that stands behind a row or a column of this shape."""
+    origin = value.origin
+    if value.shape != shape or origin is None or origin.op not in ("Unsqueeze", "Reshape"):
+        return None
+    bare = origin.operands[0]
+    return bare if isinstance(bare, Value) and len(bare.shape) == 1 else None
+
+
 # ---------------------------------------------------------------------- Min
 def clipped(
     reading: Reading, operands: list[Operand], attributes: Attributes, shape: Shape

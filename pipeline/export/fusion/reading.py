@@ -118,6 +118,10 @@ class Reading:
         """The outputs of an operator that is computed as it stands, the same for equal ones."""
         factor: Array | None = None
         operands = normal_form.narrowed(self, op, operands, shapes[0])
+        if op == "MatMul":
+            found = normal_form.by_vector(self, operands, shapes[0])
+            if found is not None:
+                return [found]
         if self._factors and op in ("Mul", "Div"):
             operands, factor = normal_form.without_factors(self, op, operands, shapes[0])
         if op == "Min":

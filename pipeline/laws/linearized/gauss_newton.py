@@ -69,7 +69,7 @@ class GaussNewtonPid(NnarxPid):
         # The gains that come nearest to it, if they are free to change.
         rho = self.gains.errors(p)
         free, loud = self.gains.free(p, ahead.slope)
-        z, changed = self.gains.settled(p, self.gains.update(p, rho, best, curvature), free)
+        z, changed = self.gains.settled(p, self.gains.update(p, rho, best, curvature, free), free)
         # The PID's own move, within the limits.
         mv, moved = self.commanded(p, move(rho, z))
         info = [self.gains.info_of(z, ahead.slope, free), ahead.offset, self.linearization_error(ahead, moved)]

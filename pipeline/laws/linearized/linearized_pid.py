@@ -103,7 +103,7 @@ class LinearizedPid(NnarxPid):
         if self.adaptive:
             z, error, penalty, following = self._searched(p, rho, ahead, gap, free)
         else:
-            z = self._gains(p, rho, ahead.slope, gap, self.penalty)
+            z = self._gains(p, rho, ahead.slope, gap, self.penalty, free)
         z, changed = self.gains.settled(p, z, free)
         mv, moved = self.commanded(p, move(rho, z))
         shown = [self.gains.info_of(z, ahead.slope, free), ahead.offset]
@@ -117,22 +117,22 @@ class LinearizedPid(NnarxPid):
             return mv.squeeze(-2), state_next.squeeze(-2), info.squeeze(-2)
         return mv, state_next, info
 
-    def _gains(self, p: Named, rho: Tensor, slope: Tensor, gap: Tensor, penalty: Tensor) -> Tensor:
+    def _gains(self, p: Named, rho: Tensor, slope: Tensor, gap: Tensor, penalty: Tensor, free: Tensor) -> Tensor:
         """Gains (..., 3) for a penalty (..., 1)."""
         c = slope * slope + penalty
-        return self.gains.update(p, rho, slope * gap / c, c)
+        return self.gains.update(p, rho, slope * gap / c, c, free)
 
     def _searched(
         self, p: Named, rho: Tensor, ahead: Ahead, gap: Tensor, free: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Gains, linearization error and penalty of the first candidate that agrees, and the next sample's penalty."""
         penalties = p["penalty"] * self.doubled
-        z = self._gains(p, rho, ahead.slope, gap, penalties)
+        z = self._gains(p, rho, ahead.slope, gap, penalties, free)
         error = self.linearization_error(ahead, move(rho, z))
         penalty = torch.where(error <= self.allowed, penalties, self.none).amin(dim=-2, keepdim=True)
         first, nothing = penalties == penalty, torch.zeros_like(penalty)
         z, error = (torch.where(first, t, nothing).sum(dim=-2, keepdim=True) for t in (z, error))
-        penalty = torch.where(free, penalty, p["penalty"])
-        easy = free & (error < self.eps_low)
+        penalty = torch.where(free > 0, penalty, p["penalty"])
+        easy = (free > 0) & (error < self.eps_low)
         following = torch.where(easy, torch.maximum(0.5 * penalty, self.penalty_low), penalty)
         return z, error, penalty, following

@@ -149,7 +149,8 @@ class LocalControllers(ControlLaw):
         # What one unit of the integral is in the MV's.
         unit = ki if self.blending == "outputs" else torch.ones_like(y)
         fresh = torch.cat([(mv_applied - beside) / unit, beside, y, nothing, mv_applied, mv_applied, sp], dim=-1)
-        past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
+        # Without a past the whole state is zero.
+        past = state[..., 1:] + (1 - state[..., :1]) * fresh
         integral, beside1, y1, slope1, given, applied1, r1 = (past[..., i : i + 1] for i in range(7))
         followed = (mv_applied - given).abs() <= self.near
         # A derivative from the time when somebody else held the actuator would still fade in the MV.

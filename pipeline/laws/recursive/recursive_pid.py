@@ -88,7 +88,7 @@ class RecursivePid(AdaptivePid):
         # The gains that come nearest to it, if they are free to change.
         rho = self.gains.errors(p)
         free, loud = self.gains.free(p, slope)
-        z, changed = self.gains.settled(p, self.gains.update(p, rho, best, c), free)
+        z, changed = self.gains.settled(p, self.gains.update(p, rho, best, c, free), free)
         mv = self.limited(p["u"] + move(rho, z) * self.gains.unit, p["u"])
         kept = {**estimate.kept, **loud, **changed, "offset": offset}
         return mv, self.memory.stored(p, kept), torch.cat([self.gains.info_of(z, slope, free), offset], dim=-1)

@@ -81,11 +81,12 @@ class GaussNewton(nn.Module):
         du_0 = 0,   du_{i+1} = du_i + (b_i (r - y_i) - mu du_i) / (b_i^2 + mu)
 
     with y_i what the network predicts for du_i and b_i its slope there: the Gauss-Newton steps of
-    min (r - y)^2 + mu du^2. The numerator's sign tells on which side of du_i the minimum lies. Two
-    such moves enclose it (at first: what the actuator can do), and a step that leads out of them is
-    replaced by their middle; without that, a plant that is steep in the middle and flat at its
-    ends makes the steps, and then the loop, jump between two moves for ever. A slope below
-    ``slope_min`` is taken for that, so that a dip of the network is crossed.
+    min (r - y)^2 + mu du^2. The numerator's sign tells on which side of du_i the minimum lies. The
+    minimum lies between du_i and the nearest earlier move on that side (at first: what the actuator
+    can do), and a step beyond that is replaced by half of the way there; without that, a plant that
+    is steep in the middle and flat at its ends makes the steps, and then the loop, jump between two
+    moves for ever. A slope below ``slope_min`` is taken for that, so that a dip of the network is
+    crossed.
 
     ``forward`` gives the move (..., 1) in units and the last b^2 + mu.
     """
@@ -104,18 +105,16 @@ class GaussNewton(nn.Module):
         slope = torch.maximum(ahead.slope, self.slope_min)
         curvature = slope * slope + self.penalty
         push = slope * (goal - ahead.y)
-        move = torch.minimum(torch.maximum(push / curvature, down), up)
-        more, nothing = push > 0, torch.zeros_like(move)
-        low, high = torch.where(more, nothing, down), torch.where(more, up, nothing)
+        last, move = torch.zeros_like(push), torch.minimum(torch.maximum(push / curvature, down), up)
+        end = torch.where(push > 0, up, down)
         for _ in range(self.times - 1):
             y, slope = self.model.moved(ahead, move)
             slope = torch.maximum(slope, self.slope_min)
             curvature = slope * slope + self.penalty
-            push = slope * (goal - y) - self.penalty * move
-            more = push > 0
-            low, high = torch.where(more, move, low), torch.where(more, high, move)
-            newton = move + push / curvature
-            # At the minimum itself the step is zero and the move an end of what encloses it.
-            inside = (newton >= low) & (newton <= high)
-            move = torch.where(inside, newton, 0.5 * (low + high))
+            before, push = push, slope * (goal - y) - self.penalty * move
+            # On to the same end, or back: then the last move is the end.
+            end = torch.where(push * before > 0, end, last)
+            newton, way = push / curvature, end - move
+            step = torch.where(newton.abs() <= way.abs(), newton, 0.5 * way)
+            last, move = move, move + step
         return move, curvature

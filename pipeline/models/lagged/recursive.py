@@ -47,7 +47,7 @@ class RecursiveLeastSquares(nn.Module):
     """
 
     # float64 numbers in buffers: the exporter rounds plain floats to float32
-    forgetting: Tensor  # (1, 1)
+    forgetting: Tensor  # (1,)
     growth: Tensor  # (1, 1) sqrt(1/f)
     excess: Tensor  # (1, 1) (sqrt(1/f) - 1) / largest
 
@@ -62,7 +62,7 @@ class RecursiveLeastSquares(nn.Module):
                 f"the forgetting factor is {forgetting}; with a bounded covariance it must be {LEAST_BOUNDED} or above"
             )
         growth = forgetting**-0.5
-        self.register_buffer("forgetting", torch.tensor([[forgetting]], dtype=torch.float64))
+        self.register_buffer("forgetting", torch.tensor([forgetting], dtype=torch.float64))
         self.register_buffer("growth", torch.tensor([[growth]], dtype=torch.float64))
         excess = 0.0 if largest is None else (growth - 1) / largest
         self.register_buffer("excess", torch.tensor([[excess]], dtype=torch.float64))
@@ -81,18 +81,17 @@ class RecursiveLeastSquares(nn.Module):
     def forward(self, theta: Tensor, root: Tensor, phi: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """New theta (..., n), new root (..., n, n), e (..., 1); regressor phi (..., n), y (..., 1)."""
         error = y - (phi * theta).sum(-1, keepdim=True)
-        w = phi.unsqueeze(-2) @ root  # (..., 1, n)
-        beta = self.forgetting + (w * w).sum(-1, keepdim=True)  # (..., 1, 1)
-        # Sums of products, no transposed matrices: onnxruntime would fuse those, which its older versions cannot load.
-        gain = (root * w).sum(-1, keepdim=True) / beta  # (..., n, 1): S w / beta
-        theta = theta + gain.squeeze(-1) * error
+        w = (phi.unsqueeze(-2) @ root).squeeze(-2)
+        beta = self.forgetting + (w * w).sum(-1, keepdim=True)
+        gain = (root @ w.unsqueeze(-1)).squeeze(-1) / beta
+        theta = theta + gain * error
         # S w w' / (beta + sqrt(f beta)) = K w' / (1 + sqrt(f / beta))
-        root = root - gain / (1 + (self.forgetting / beta).sqrt()) * w
+        shrunk = gain / (1 + (self.forgetting / beta).sqrt())
+        root = root - shrunk.unsqueeze(-1) * w.unsqueeze(-2)
         if self.bounded:
-            # As many numbers as columns: onnxruntime takes a single one beside a MatMul into it, in float32.
-            excess = self.excess.expand(1, root.shape[-1])
+            # Sums of products, no transposed matrix: onnxruntime would fuse that, which its older versions cannot load.
             gram = (root.unsqueeze(-1) * root.unsqueeze(-2)).sum(-3)  # (..., n, n): S'S
-            return theta, self.growth * root - excess * (root @ gram), error
+            return theta, root @ (self.growth * torch.eye(root.shape[-1], dtype=root.dtype) - self.excess * gram), error
         return theta, self.growth * root, error
 
     @torch.no_grad()

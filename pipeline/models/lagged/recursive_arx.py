@@ -117,10 +117,9 @@ class RecursiveArx(nn.Module):
 
     def forward(self, p: Named, sample: Sample) -> Estimate:
         """The parameters after this sample."""
-        theta, flat = p["theta"], p["root"]
-        root = flat.reshape(*flat.shape[:-1], self.size, self.size)
-        learnt, spread, _ = self.rls(theta, root, sample.x, sample.psi)
-        complete = p["seen"][..., -1:] > 0
-        theta = torch.where(complete, learnt, theta)
+        theta, root = p["theta"], p["root"].unflatten(-1, (self.size, self.size))
+        # While lags are missing, x counts as nothing: theta stays, and so does a covariance that is the largest.
+        complete = p["seen"][..., -1:]
+        theta, root, _ = self.rls(theta, root, complete * sample.x, sample.psi)
         slope = theta[..., self.n_y : self.n_y + 1] * self.pv_unit
-        return Estimate(theta, slope, {"theta": theta, "root": torch.where(complete, spread.flatten(-2), flat)})
+        return Estimate(theta, slope, {"theta": theta, "root": root.flatten(-2)})
