@@ -56,7 +56,7 @@ class Plain:
 
     def gains(self, rho, v, c) -> np.ndarray:
         p = self.p
-        numbers = (self.z, rho, [v], [c], [p.stiffness], p.weights, p.gain_low, p.gain_high)
+        numbers = (self.z, rho, [v], [c], [p.stiffness], p.weights, p.gain_low, p.gain_high, [1.0])
         return gain_update(*(torch.tensor(np.asarray(n, dtype=float)) for n in numbers)).numpy()
 
     def __call__(self, r, y, u) -> dict[str, float]:

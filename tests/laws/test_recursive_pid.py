@@ -172,7 +172,7 @@ def test_a_long_rest_neither_winds_up_nor_lulls_the_estimate(arx: Model, law, pa
 
 def test_lags_that_were_not_measured_teach_nothing(arx: ARX) -> None:
     law = designed(RecursivePid, arx)
-    named = dict(zip(law.memory.layout, torch.split(torch.arange(law.n_state + 3), list(law.memory.layout.values())),
+    named = dict(zip(law.memory.layout, torch.split(torch.arange(law.n_state), list(law.memory.layout.values())),
                      strict=True))  # fmt: skip
     state = torch.zeros(law.n_state, dtype=torch.float64)
     thetas = []

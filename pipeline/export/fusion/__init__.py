@@ -41,7 +41,8 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
 def listed(reading: Reading) -> tuple[Items, Outputs]:
     """All that the graph may be made of, and its outputs."""
     items = Items(reading)
-    for block in reading.blocks:  # each behind its operands: asked for from the end, a long chain would be a deep recursion
+    # Each behind its operands: asked for from the end, a long chain of them would be a deep recursion.
+    for block in reading.blocks:
         items.block(block)
     outputs = [(name, items.of(operand)) for name, operand in reading.outputs]
     decided = []

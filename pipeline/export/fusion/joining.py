@@ -66,9 +66,7 @@ def _within(nodes: list[onnx.NodeProto], shapes: dict[str, Shape]) -> list[list[
     return [group for group in groups if len(group) > 1]
 
 
-def _side_by_side(
-    graph: onnx.GraphProto, name: str, group: list[tuple[onnx.NodeProto, Shape]]
-) -> list[onnx.NodeProto]:
+def _side_by_side(graph: onnx.GraphProto, name: str, group: list[tuple[onnx.NodeProto, Shape]]) -> list[onnx.NodeProto]:
     """One node for all, on a vector of all their elements; its constants go into the graph."""
 
     def constant(label: str, numbers: list[int]) -> str:

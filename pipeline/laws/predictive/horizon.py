@@ -15,8 +15,9 @@ from pipeline.laws.predictive.loads import Loads
 from pipeline.laws.predictive.moves import Moves
 from pipeline.laws.predictive.one_step import one_step
 from pipeline.laws.predictive.product import product
+from pipeline.models.affine_map import AffineMap
 from pipeline.models.identified.identified import Identified
-from pipeline.models.memory import Named, Stage
+from pipeline.models.memory import Named
 
 Scaling = Callable[[Tensor], Tensor]
 """The scaled MVs (..., n_mv) of a model for MVs (..., n_mv) within -1..1."""
@@ -51,7 +52,7 @@ class LinearHorizon(nn.Module):
                 y.append(x[..., :n_cv])
             return {"y": torch.cat(y, dim=-1)}
 
-        self.run = Stage(layout_of(model, loads, moves), run)
+        self.run = AffineMap(layout_of(model, loads, moves), run)
         slopes = self.run.matrix[-moves.count :].clone()
         self.register_buffer("slopes", slopes)
         self.register_buffer("slopes_t", slopes.T.contiguous())
@@ -91,7 +92,7 @@ class NetworkHorizon(nn.Module):
         super().__init__()
         n, m, n_x, n_mv = moves.horizon, moves.count, model.n_x, model.n_mv
         self.n, self.m, self.n_h, self.n_cv, self.n_s = n, m, model.n_hidden, n_cv, n_x + n_mv
-        self.run = Stage(
+        self.run = AffineMap(
             layout_of(model, loads, moves),
             lambda p: {f"p{i}": u for i, u in enumerate(_forced(model, loads, moves, mv_of, p))},
         )

@@ -12,8 +12,8 @@ from pipeline.laws.base import hold_numbers
 from pipeline.laws.predictive.loads import Loads
 from pipeline.laws.predictive.one_step import one_step
 from pipeline.laws.predictive.product import product
+from pipeline.models.affine_map import AffineMap
 from pipeline.models.identified.identified import Identified
-from pipeline.models.memory import Stage
 
 NOISE_FLOOR = (
     1e-2  # scaled; a model that claims less noise would believe rounding, and lose the digits of its covariance
@@ -106,7 +106,7 @@ class Observer(nn.Module):
         self.n_y, self.n_x, n_x = model.n_y, model.n_x, model.n_x
         self.n_a = n_a = n_x + loads.count
         self.layout = {"x": n_x, "d": loads.count, "v": model.n_mv + model.n_dv}
-        self.step = Stage(self.layout, lambda p: _with_loads(one_step(model, loads, p), p["d"]))
+        self.step = AffineMap(self.layout, lambda p: _with_loads(one_step(model, loads, p), p["d"]))
         self.nonlinear = model.n_hidden > 0
         f = torch.eye(n_a, dtype=torch.float64)
         f[:n_x, :n_x], f[:n_x, n_x:] = model.a, loads.into_x + model.b @ loads.into_v

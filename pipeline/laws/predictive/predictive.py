@@ -22,9 +22,10 @@ from pipeline.laws.predictive.sight import Sight
 from pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
 from pipeline.laws.predictive.trials import Trials
 from pipeline.laws.predictive.tuning import Candidate, in_words, tuned
+from pipeline.models.affine_map import AffineMap
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
-from pipeline.models.memory import Named, Stage
+from pipeline.models.memory import Named
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
@@ -152,7 +153,7 @@ class Predictive(ControlLaw):
 
         signals = self.signals
         self.layout = {n: len(getattr(signals, n)) for n in ("sp", "pv", "dv", "mv")}
-        self.inputs = Stage(self.layout, inputs)
+        self.inputs = AffineMap(self.layout, inputs)
         for name, values in {
             "upper": upper[0] * n_a + upper[1],
             "whole": whole.flatten(),

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import Analysis, Stepped
+from pipeline.laws.base import Analysis, Stepped, hold_numbers
 from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from pipeline.laws.reference.reference_networks import BEFORE, COURSE, IncrementalNetwork, R, TwoErrorNetwork, U, Y
 from pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
 from pipeline.models.base import Model
-from pipeline.models.memory import Named
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning.reference_model import ReferenceModel
@@ -29,17 +27,16 @@ class NetworkLaw(ReferenceLaw):
 
     Params: ClassVar[type[Any]] = ReferenceParams
     Network: ClassVar[type[Any]]
+    table: Tensor  # (features, hidden) W
+    bias: Tensor  # (hidden,) b
+    out: Tensor  # (hidden,) w
 
     def __init__(
         self, signals: Signals, model: ReferenceModel, network: Any, trained: Trained, mv_rate: float | None = None
     ) -> None:
         super().__init__(signals, model, mv_rate)
         self.network, self.trained = network, trained
-        self.stage = self.prepared(self.formulas(*network.weights(trained.theta)))
-
-    @abstractmethod
-    def formulas(self, *weights: Any) -> Callable[[Named], Named]:
-        """The stage's formulas up to the hidden units; keeps what follows them in buffers."""
+        hold_numbers(self, **dict(zip(("table", "bias", "out", "level"), network.weights(trained.theta), strict=False)))
 
     @classmethod
     def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
@@ -67,27 +64,15 @@ class ModelReference(NetworkLaw):
     incremental: ClassVar[bool] = True
 
     Network: ClassVar[type[Any]] = IncrementalNetwork
-    readout: Tensor  # (2 hidden, 1)
-
-    def formulas(self, *weights: Array) -> Callable[[Named], Named]:
-        """As in NetworkLaw; the units are those of g(z, E), then those of g(z, 0)."""
-        table, bias, out = (torch.from_numpy(a) for a in weights)
-        self.register_buffer("readout", torch.cat([out, -out])[:, None].contiguous())
-
-        def formulas(p: Named) -> Named:
-            f = self.network.features(p)
-            still = f[..., :2] @ table[:2] + bias
-            units = torch.cat([still + f[..., 2:] @ table[2:], still], dim=-1)
-            return {"units": units, "reach": self.network.reach(p)}
-
-        return formulas
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        x = self.recalled(sp, pv, mv_applied, state)
-        done = self.stage(x)
-        move = torch.tanh(done["units"]) @ self.readout
-        return self.stepped(x, done, self.limited(mv_applied + done["reach"] * move, mv_applied))
+        p = self.recalled(sp, pv, mv_applied, state)
+        features = self.network.features(p)
+        z, errors = features[..., :2], features[..., 2:]
+        still = z @ self.table[:2] + self.bias
+        g = (torch.tanh(still + errors @ self.table[2:]) - torch.tanh(still)) @ self.out.unsqueeze(-1)
+        return self.stepped(p, self.limited(mv_applied + self.network.reach(p) * g, mv_applied))
 
     def analysis(self, plant: Simulator | None) -> Analysis:
         """How the training went, and whether the move has another root than zero error anywhere in the law's domain."""
@@ -140,29 +125,22 @@ class ModelReferenceTwoError(NetworkLaw):
     name: ClassVar[str] = "model_reference_two_error"
     title: ClassVar[str] = "Model-reference network, two errors"
     Network: ClassVar[type[Any]] = TwoErrorNetwork
-    readout: Tensor  # (hidden, 1) [mv]
-    level: Tensor  # (1,) [mv]
-
-    def formulas(self, *weights: Any) -> Callable[[Named], Named]:
-        """As in NetworkLaw."""
-        table, bias, out = (torch.from_numpy(a) for a in weights[:3])
-        span = self.high - self.low
-        self.register_buffer("readout", out[:, None] * span)
-        self.register_buffer("level", self.low + span * weights[3])
-        return lambda p: {"units": self.network.features(p) @ table + bias}
+    level: Tensor  # (1,) d
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        x = self.recalled(sp, pv, mv_applied, state)
-        done = self.stage(x)
-        mv = torch.tanh(done["units"]) @ self.readout + self.level
-        return self.stepped(x, done, self.limited(mv, mv_applied))
+        p = self.recalled(sp, pv, mv_applied, state)
+        return self.stepped(p, self.limited(self.asked(self.network.features(p)), mv_applied))
+
+    def asked(self, errors: Tensor) -> Tensor:
+        """N of scaled errors (..., 2), the MV (..., 1) before its limits."""
+        units = torch.tanh(errors @ self.table + self.bias)
+        return self.low + (self.high - self.low) * (units @ self.out.unsqueeze(-1) + self.level)
 
     def analysis(self, plant: Simulator | None) -> Analysis:
         """How the training went, and the one set point that the law can hold without offset."""
         training = training_analysis(self.trained, self.signals)
-        units = self.stage(torch.zeros(sum(self.layout.values()), dtype=torch.float64))["units"]
-        at_rest = float(self.level + torch.tanh(units) @ self.readout)
+        at_rest = float(self.asked(torch.zeros(2, dtype=torch.float64)))
         note = (
             f"With both errors at zero the MV is {at_rest:.4g} {self.signals.mv[0].unit}, whatever the set point. The "
             "loop has an offset wherever the steady MV differs."

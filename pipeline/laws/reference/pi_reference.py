@@ -14,7 +14,6 @@ from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from pipeline.laws.reference.reference_networks import TrainablePi
 from pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
 from pipeline.models.base import Model
-from pipeline.models.memory import Named
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.tuning.reference_model import ReferenceModel
@@ -56,13 +55,7 @@ class PiReference(ReferenceLaw):
     ) -> None:
         super().__init__(signals, model, mv_rate)
         self.kc, self.ti_s, self.trained = kc, ti_s, trained
-        share = signals.period_s / ti_s
-
-        def formulas(p: Named) -> Named:
-            e = p["course"][..., :1] - p["y"]
-            return {"asked_for": p["u"] + kc * (e - p["before"] + share * e)}
-
-        self.stage = self.prepared(formulas)
+        self.share = signals.period_s / ti_s
 
     @classmethod
     def needs(cls, params: Any, given: Collection[str] = ()) -> tuple[str, ...]:
@@ -84,9 +77,11 @@ class PiReference(ReferenceLaw):
 
     def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
         """One step; shapes as in ControlLaw."""
-        x = self.recalled(sp, pv, mv_applied, state)
-        done = self.stage(x)
-        return self.stepped(x, done, self.limited(done["asked_for"], mv_applied))
+        p = self.recalled(sp, pv, mv_applied, state)
+        e = p["course"][..., :1] - p["y"]
+        # The set point acts one sample later, by the reference model; one that is no number must show at once.
+        move = self.kc * (e - p["before"] + self.share * e) + 0.0 * sp
+        return self.stepped(p, self.limited(mv_applied + move, mv_applied))
 
     def analysis(self, plant: Simulator | None) -> Analysis:
         """The two numbers, and how their training went."""

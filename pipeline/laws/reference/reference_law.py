@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw, Stepped, require_single_loop
 from pipeline.laws.reference.reference_loops import Training
-from pipeline.models.memory import Named, Stage
+from pipeline.models.memory import Named
 from pipeline.plants.signals import Signals
 from pipeline.tuning.reference_model import ReferenceModel
 
@@ -46,48 +46,37 @@ class ReferenceLaw(ControlLaw):
     The state is [started, x_m (n), e(k-1), the MV that was asked for], with e = y_m - y. The model starts at
     rest at the measured CV: without a past, and whenever the applied MV is not the one that was asked for
     (manual, another controller). So a transfer to automatic begins a new course from where the plant is.
-
-    A law gives ``formulas``, affine in the sample and the past, to ``prepared`` and computes its MV of their values.
     """
 
     parts: ClassVar[Mapping[str, str]] = {"state_space": "kind state_space"}
     looks_ahead: ClassVar[int | None] = 1  # its plant's network knows the PVs and the MV of now alone
     followed: Tensor  # (1,) [mv]
+    phi: Tensor  # (n, n) transposed
+    gamma: Tensor  # (1, n) transposed
 
     def __init__(self, signals: Signals, model: ReferenceModel, mv_rate: float | None = None) -> None:
         super().__init__(signals, mv_rate)
         require_single_loop(signals, self.name)
         self.model = model
-        self.layout = {"r": 1, "y": 1, "u": 1, "course": model.order, "before": 1, "asked": 1}
+        phi, gamma = model.sampled(signals.period_s)
+        self.register_buffer("phi", torch.from_numpy(phi.T.copy()))
+        self.register_buffer("gamma", torch.from_numpy(gamma.T.copy()))
         self.register_buffer("followed", FOLLOWED * (self.high - self.low))
         self.n_state = 3 + model.order
         self.info = ("reference",)
 
-    def prepared(self, formulas: Callable[[Named], Named]) -> Stage:
-        """The stage of the law's own formulas, the next state of the reference model, and e(k).
-
-        ``formulas`` takes r, y, u, course (n), before: all (..., 1) but the course.
-        """
-        phi, gamma = self.model.sampled(self.signals.period_s)
-        forward, pushed = torch.from_numpy(phi.T.copy()), torch.from_numpy(gamma.T.copy())
-        return Stage(
-            self.layout,
-            lambda p: {
-                **formulas(p),
-                "next": p["course"] @ forward + p["r"] @ pushed,
-                "error": p["course"][..., :1] - p["y"],
-            },
-        )
-
-    def recalled(self, sp: Tensor, pv: Tensor, mv_applied: Tensor, state: Tensor) -> Tensor:
-        """Sample and past as one vector of ``layout``, (..., n); where nobody followed the law, at rest."""
+    def recalled(self, sp: Tensor, pv: Tensor, mv_applied: Tensor, state: Tensor) -> dict[str, Tensor]:
+        """Sample and past by name: r, y, u, ``course`` x_m (..., n), ``before`` e(k-1); at rest where not obeyed."""
         y = pv[..., :1]
-        at_rest = torch.cat([y, torch.zeros_like(state[..., 2:])], dim=-1)
+        at_rest = torch.cat([y, torch.zeros_like(state[..., 2:-1])], dim=-1)
         # 1 less the distance from what was asked for: above 0 only where the law was started and followed.
         known = state[..., :1] - (mv_applied - state[..., -1:]).abs() / self.followed
-        return torch.cat([sp, y, mv_applied, torch.where(known > 0, state[..., 1:], at_rest)], dim=-1)
+        past = torch.where(known > 0, state[..., 1:-1], at_rest)
+        return {"r": sp, "y": y, "u": mv_applied, "course": past[..., :-1], "before": past[..., -1:]}
 
-    def stepped(self, x: Tensor, done: Named, mv: Tensor) -> Stepped:
-        """The results of ``forward``, from ``recalled``'s vector, the stage's results and the MV."""
-        state = torch.cat([torch.ones_like(mv), done["next"], done["error"], mv], dim=-1)
-        return mv, state, x[..., 3:4]
+    def stepped(self, p: Named, mv: Tensor) -> Stepped:
+        """The results of ``forward``, from what was recalled and the MV: the model and the error one step on."""
+        course, reference = p["course"], p["course"][..., :1]
+        following = course @ self.phi + p["r"] @ self.gamma
+        state = torch.cat([torch.ones_like(mv), following, reference - p["y"], mv], dim=-1)
+        return mv, state, reference

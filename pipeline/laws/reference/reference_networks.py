@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from pipeline.models.memory import Named, Stage
+from pipeline.models.affine_map import AffineMap
+from pipeline.models.memory import Named
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array
 
@@ -81,7 +82,7 @@ class Network(Trainable):
     def _scaling(self) -> tuple[Array, Array]:
         """(matrix (4 + order, k), offset (k,)) from the inputs to the features."""
         layout = {"r": 1, "y": 1, "u": 1, "before": 1, "course": self.order}
-        stage = Stage(layout, lambda p: {"all": self.features(p)})
+        stage = AffineMap(layout, lambda p: {"all": self.features(p)})
         return stage.matrix.numpy(), stage.offset.numpy()
 
 

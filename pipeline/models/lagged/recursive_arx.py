@@ -117,7 +117,8 @@ class RecursiveArx(nn.Module):
 
     def forward(self, p: Named, sample: Sample) -> Estimate:
         """The parameters after this sample."""
-        theta, root = p["theta"], p["root"].unflatten(-1, (self.size, self.size))
+        theta, flat = p["theta"], p["root"]
+        root = flat.reshape(*flat.shape[:-1], self.size, self.size)
         # While lags are missing, x counts as nothing: theta stays, and so does a covariance that is the largest.
         complete = p["seen"][..., -1:]
         theta, root, _ = self.rls(theta, root, complete * sample.x, sample.psi)
