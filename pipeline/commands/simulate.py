@@ -14,6 +14,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from pipeline.cases import PLANTS, all_cases
+from pipeline.commands.made_for import require_made_for
 from pipeline.config.params import choose
 from pipeline.errors import ParamsError, nearest
 from pipeline.evaluation.case import Case
@@ -178,15 +179,7 @@ def _plant_of(manifest: Manifest) -> tuple[Simulator, Case | None]:
             f"{nearest(manifest.case, {*cases, *PLANTS})}"
         )
     plant = PLANTS[manifest.case]() if case is None else case.plant
-    for name in ("sp", "pv", "dv", "mv"):
-        ours = [(s.name, s.unit) for s in getattr(plant, f"{name}_signals")]
-        theirs = [(s.name, s.unit) for s in manifest.signals(name)]
-        if ours != theirs:
-            raise ParamsError(f"the controller's {name} are {theirs}, but plant {plant.name!r} has {ours}")
-    if manifest.period_s != plant.period_s:
-        raise ParamsError(
-            f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
-        )
+    require_made_for(manifest, plant)
     return plant, case
 
 

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.cases import all_cases
+from pipeline.commands.made_for import require_made_for
 from pipeline.engine.cluster import address, local_cluster
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ParamsError, nearest
@@ -113,16 +114,7 @@ def _case_of(manifest: Manifest) -> Case:
     case = cases[manifest.case]
     if not case.ready:
         raise ParamsError(f"{case.name} has no models yet; `loopwright run {case.name}` trains them")
-    plant = case.plant
-    for name in ("sp", "pv", "dv", "mv"):
-        ours = [(s.name, s.unit) for s in getattr(plant, f"{name}_signals")]
-        theirs = [(s.name, s.unit) for s in manifest.signals(name)]
-        if ours != theirs:
-            raise ParamsError(f"the controller's {name} are {theirs}, but plant {plant.name!r} has {ours}")
-    if manifest.period_s != plant.period_s:
-        raise ParamsError(
-            f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
-        )
+    require_made_for(manifest, case.plant)
     return case
 
 
