@@ -27,6 +27,7 @@ from pipeline.evaluation.validation import Validation
 from pipeline.files import sha256, write_bytes
 from pipeline.tracking import card
 from pipeline.tracking.gate import Gate
+from pipeline.tracking.store import missing_file
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
 BY_HAND = "champion_by"
@@ -284,7 +285,6 @@ def _download(client: MlflowClient, version: ModelVersion, file: str, draft: str
         return Path(mlflow.artifacts.download_artifacts(artifact_uri=f"{place}/{file}", dst_path=draft))
     except (MlflowException, OSError) as error:
         raise TrackingError(
-            f"{version.name} version {version.version} is registered, but its file {file} is not in {place}; "
-            "if mlflow.db was moved or copied, put its folder mlruns beside it, "
-            "otherwise delete mlflow.db and run `make registry`"
+            f"{version.name} version {version.version} is registered, but its file {file} did not come from {place}: "
+            f"{missing_file(error)}"
         ) from error

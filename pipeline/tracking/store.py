@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -59,14 +60,35 @@ def store() -> Iterator[MlflowClient]:
         client.search_experiments(max_results=1)
         yield client
     except (MlflowException, SQLAlchemyError, sqlite3.Error, requests.RequestException) as error:
-        # mlflow quotes the whole stack of the HTTP library, several lines of it
-        reason = " ".join(str(error).split()).partition(" failed with exception")[0]
-        raise TrackingError(f"the tracking store {uri} refused: {reason[:300]}; {_remedy(uri)}") from error
+        raise TrackingError(f"the tracking store {uri} refused: {one_line(error)}; {_remedy(uri)}") from error
+
+
+def one_line(error: Exception) -> str:
+    """What mlflow says, without the stack of the HTTP library that it quotes in several lines."""
+    said, _, stack = " ".join(str(error).split()).partition(" failed with exception")
+    # It retries an answer of 500 and the like, and tells a server that does not answer from this one only in there.
+    own = re.search(r"too many (50\d) error responses", stack)
+    return f"{said[:300]}{f' was answered by error {own[1]}' if own else ''}"
+
+
+def missing_file(error: Exception) -> str:
+    """What to do about a file of a run that the store does not give, in words."""
+    if store_uri().startswith("http"):
+        return (
+            f"{one_line(error)}; see whether the store of files behind the server runs, and lets the server in "
+            "(its --artifacts-destination)"
+        )
+    return (
+        "it is not there; if mlflow.db was moved or copied, put its folder mlruns beside it, "
+        "otherwise delete mlflow.db and run `make registry`"
+    )
 
 
 def _remedy(uri: str) -> str:
     if uri.startswith("http"):
-        return "is its server running? Start it, or unset MLFLOW_TRACKING_URI to use mlflow.db"
+        return (
+            "is its server running, and the database behind it? Start it, or unset MLFLOW_TRACKING_URI to use mlflow.db"
+        )
     if uri.startswith("sqlite:"):
         return "if the file is damaged, move it away: `make registry` rebuilds it from the cached results"
     return "use a server's http address or sqlite:///FILE"

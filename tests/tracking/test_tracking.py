@@ -537,5 +537,5 @@ def test_a_store_whose_folder_was_moved_or_copied_still_gives_its_files(root, mo
     capsys.readouterr()
     assert main(["fetch", CASE, "out"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"its file inverse_dob.onnx is not in {moved.as_uri()}" in line
+    assert f"its file inverse_dob.onnx did not come from {moved.as_uri()}" in line
     assert "damaged" not in line
