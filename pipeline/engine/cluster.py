@@ -6,7 +6,6 @@ TLS and all else of the connection is set as Dask sets it (``DASK_DISTRIBUTED__C
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
 CONNECT_S = 20.0
+WORKERS_S = 120.0  # for the first worker, whose libraries take some seconds
 PRELOAD = ["pipeline.engine.preload"]
 # Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
 CONFIG = {
@@ -66,7 +66,7 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] = lam
             os.environ.pop(ADDRESS, None)
             if before is not None:
                 os.environ[ADDRESS] = before
-            connected.cache_clear()
+            disconnect()
             with contextlib.suppress(TimeoutError):  # of workers that are still starting, which end with us
                 cluster.close(timeout=5)
 
@@ -76,22 +76,46 @@ def address() -> str | None:
     return os.environ.get(ADDRESS) or None
 
 
-@functools.lru_cache(maxsize=1)
+_connections = dict[str, "Client"]()
+
+
+def disconnect() -> None:
+    """End the connections of this process, with the threads that serve them."""
+    while _connections:
+        _connections.popitem()[1].close(timeout=5)
+
+
 def connected(to: str) -> Client:
-    """The connection of this process to a scheduler. Raises PipelineError where none answers."""
+    """The connection of this process to a scheduler with workers. Raises PipelineError where none answers."""
+    if to not in _connections:
+        _connections[to] = _client(to)
+    return _connections[to]
+
+
+def _client(to: str) -> Client:
     import dask
 
     dask.config.set(CONFIG)
     from distributed import Client
 
     try:
-        return Client(to, timeout=CONNECT_S, set_as_default=False)
+        client = Client(to, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise PipelineError(
             f"no scheduler answers at {to} ({text}); start it (`dask scheduler`), correct {ADDRESS}, "
             "or unset it to use this machine's cores"
         ) from None
+    try:
+        if not client.scheduler_info()["workers"]:
+            client.wait_for_workers(1, timeout=WORKERS_S)
+    except TimeoutError:
+        client.close()
+        raise PipelineError(
+            f"the scheduler at {to} has had no worker for {WORKERS_S:.0f} s; start some "
+            f"(`dask worker {to} --nthreads 1 --preload {PRELOAD[0]}`), or unset {ADDRESS} to use this machine's cores"
+        ) from None
+    return client
 
 
 def _dashboard() -> str | None:

@@ -38,7 +38,7 @@ def difference(ours: Mapping[str, str], theirs: Mapping[str, str]) -> str:
     """What differs, in words: "torch 2.13.0 here and 2.12.1 there"; empty where nothing does."""
     names = sorted({*ours, *theirs})
     pairs = [(name, ours.get(name, "none"), theirs.get(name, "none")) for name in names]
-    return ", ".join(f"{name} {_short(a)} here and {_short(b)} there" for name, a, b in pairs if a != b)
+    return ", ".join(f"{name} {_short(name, a)} here and {_short(name, b)} there" for name, a, b in pairs if a != b)
 
 
 def _digest() -> str:
@@ -57,5 +57,5 @@ def _version(package: str) -> str:
         return "none"
 
 
-def _short(value: str) -> str:
-    return value[:12]
+def _short(name: str, value: str) -> str:
+    return value[:12] if name == CODE else value

@@ -128,7 +128,8 @@ def _answers(
 
     shared: Any = cloudpickle.dumps((function, files))
     if len(shared) > LARGE:
-        shared = client.scatter(shared, hash=False)
+        # A client's data on one worker alone would be lost with it; a stage's are on its own worker, and lost with it.
+        shared = client.scatter(shared, hash=False, broadcast=task is None)
     name, depth = f"piece-{uuid.uuid4().hex[:12]}", task.depth + 1 if task else 0
     keys = [f"{name}-{i}" for i in range(len(work))]
     # Pieces of pieces come first: who waits for them holds memory.
@@ -142,7 +143,8 @@ def _answers(
                 raise PipelineError("nobody waits for this any more")
             place = places[future.key]
             if future.status != "finished":
-                raise lost(ended[1], f"piece {place + 1} of {len(work)}")
+                # Of a piece that was given up with the connection Dask has the error alone.
+                raise lost(ended if isinstance(ended, Exception) else ended[1], f"piece {place + 1} of {len(work)}")
             failed, result, changes = pickle.loads(ended)
             if failed is not None:
                 raise failed

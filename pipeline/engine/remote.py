@@ -28,8 +28,6 @@ FAILED = 2
 
 def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
     """Run a stage on the cluster at an address; its exit status. What it says is said here, as it says it."""
-    from pipeline.engine.parallel import lost  # with what the pieces need, which a client does not
-
     client, topic = connected(at), f"stage-{uuid.uuid4().hex[:12]}"
     # Outputs of a run before are no inputs: DVC removes them, by hand they may be there.
     read = read_files(files.reads)
@@ -49,6 +47,8 @@ def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
         future.cancel()
         raise
     except Exception as error:
+        from pipeline.engine.parallel import lost  # with what the pieces need, which a client does not
+
         print(f"{' '.join(arguments)}: {lost(error, 'the stage')}", file=sys.stderr)
         return FAILED
     code, changes, said = pickle.loads(answer)

@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 
 from pipeline.engine.cluster import address, local_cluster
 from pipeline.engine.lifeline import end_with_parent
+from pipeline.engine.outlet import outlet
 from pipeline.engine.start import DOOR
 
 
@@ -44,10 +45,11 @@ def main(argv: Sequence[str]) -> int:
             door.shut()
 
         signal.signal(signal.SIGTERM, stop)
+        terminal = stack.enter_context(outlet(stopped))
         if address() is None:
             stack.enter_context(local_cluster(say=partial(print, flush=True)))
         process = subprocess.Popen(
-            command, env={**os.environ, **door.environment}, preexec_fn=lambda: end_with_parent(own)
+            command, stderr=terminal, env={**os.environ, **door.environment}, preexec_fn=lambda: end_with_parent(own)
         )
         running.append(process)
         if stopped.is_set():

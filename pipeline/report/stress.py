@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,7 @@ class StressRun:
 
     def replay(self, index: int) -> str:
         """The command that runs one loop again."""
-        return f"loopwright stress {self.file} --replay {index}{self.options}"
+        return f"loopwright stress {shlex.quote(str(self.file))} --replay {index}{self.options}"
 
 
 def write_stress(run: StressRun, out: Path) -> list[Path]:

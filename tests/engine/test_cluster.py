@@ -17,7 +17,7 @@ from own_cases import controllers_of_a_lag
 from processes import within
 
 from pipeline.engine import parallel
-from pipeline.engine.cluster import ADDRESS, connected, local_cluster
+from pipeline.engine.cluster import ADDRESS, connected, disconnect, local_cluster
 from pipeline.engine.folder import read_files
 from pipeline.engine.parallel import _answers, parallel_map
 from pipeline.engine.pieces import Task
@@ -81,8 +81,7 @@ def address(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv(ADDRESS, found)
     connected(found).wait_for_workers(2, timeout=60)
     yield found
-    connected(found).close()
-    connected.cache_clear()
+    disconnect()
 
 
 def test_pieces_on_the_cluster_are_those_made_here(address: str) -> None:

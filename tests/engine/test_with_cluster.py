@@ -28,7 +28,7 @@ from threading import Event
 Path("pid").write_text(str(os.getpid()))
 Event().wait(60)
 """
-FILES = ("__init__.py", "start.py", "with_cluster.py", "lifeline.py", "cluster.py", "stage_files.py")
+FILES = ("__init__.py", "start.py", "with_cluster.py", "lifeline.py", "outlet.py", "cluster.py", "stage_files.py")
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a process does not end with its parent")
 

@@ -109,7 +109,8 @@ class Drawing:
         fault = draw_fault(rng, plant.mv_signals, test.samples)
         nominal = dict(zip(plant.parameter_names(), plant.parameters(), strict=True))
         loads = {k: nominal[k] + share * (v - nominal[k]) for k, v in test.changes.items() if k not in parameters}
-        held = {k: np.full(test.samples, value) for k, value in parameters.items()}
+        # One number each, however long the test: ten thousand loops are drawn before the first one runs.
+        held = {k: np.broadcast_to(value, test.samples) for k, value in parameters.items()}
         scenario = replace(test, sp=_set_points(rng, test), changes={**held, **loads}, plant=plant)
         return Draw(
             index, name, scenario, parameters, share, noise, late, fault if faulty else None, (self.seed, index, 1)

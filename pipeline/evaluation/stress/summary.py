@@ -51,8 +51,9 @@ class Growth:
 
     @property
     def size(self) -> float:
-        """Largest over smallest median."""
-        return max(self.median) / max(min(self.median), 1e-300)
+        """Largest over smallest median; infinite where the loops of a share mostly broke, 1 where those of all did."""
+        low, high = min(self.median), max(self.median)
+        return 1.0 if low == high else high / max(low, 1e-300)
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,16 @@ class Summary:
 
     @cached_property
     def relative(self) -> Array:
-        """The error of each loop in the case's metric over the median of its test, (n,)."""
+        """The error of each loop in the case's metric over the median of its test, (n,).
+
+        Of a broken loop it is infinite. Where most loops of a test broke, its median is that of the others.
+        """
         errors, found = figures_of(self.outcomes, self.case.metric), np.empty(len(self.outcomes))
         for places in self.tests.values():
+            whole = errors[places][np.isfinite(errors[places])]
             middle = float(np.quantile(errors[places], 0.5, method="lower"))
+            if not np.isfinite(middle) and len(whole):
+                middle = float(np.quantile(whole, 0.5, method="lower"))
             found[places] = errors[places] / (middle if middle > 0 and np.isfinite(middle) else 1.0)
         return found
 

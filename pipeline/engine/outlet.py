@@ -1,0 +1,38 @@
+"""What workers write to the terminal, until a run is stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Iterator
+
+END = b"\0"
+
+
+@contextlib.contextmanager
+def outlet(stopped: threading.Event) -> Iterator[int]:
+    """Within, what this process and those that it starts write to stderr passes through here; the real one's number.
+
+    Once ``stopped``, no more comes out: workers that are ended while they start complain of what they did not get, at
+    a time of their own, and the last line of a stopped run is to be the one that says how to go on.
+    """
+    real, (source, into) = os.dup(2), os.pipe()
+    os.dup2(into, 2)
+    passing = threading.Thread(target=_pass_on, args=(source, real, stopped), daemon=True)
+    passing.start()
+    try:
+        yield real
+    finally:
+        os.dup2(real, 2)
+        os.write(into, END)  # behind all that was written; who still writes does so into nothing
+        passing.join()
+        os.close(into)
+
+
+def _pass_on(source: int, to: int, stopped: threading.Event) -> None:
+    text = b""
+    while not text.endswith(END):
+        text = os.read(source, 65_536)
+        if not stopped.is_set():
+            os.write(to, text.removesuffix(END))
