@@ -24,7 +24,8 @@ def outlet(stopped: threading.Event) -> Iterator[int]:
     try:
         yield real
     finally:
-        os.dup2(real, 2)
+        if not stopped.is_set():  # else a worker that is only now started would write to the terminal again
+            os.dup2(real, 2)
         os.write(into, END)  # behind all that was written; who still writes does so into nothing
         passing.join()
         os.close(into)

@@ -14,20 +14,22 @@ with outlet(stopped):
     if "stop" in sys.argv:
         stopped.set()
     subprocess.run([sys.executable, "-c", "import sys; print('later', file=sys.stderr)"])
-print("the last line", file=sys.stderr)
+subprocess.run([sys.executable, "-c", "import sys; print('too late', file=sys.stderr)"])
+print("the last line")
 """
 
 
 def said(*arguments: str) -> list[str]:
-    done = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=True)
-    return done.stderr.splitlines()
+    command, both = [sys.executable, "-c", PROGRAM, *arguments], subprocess.STDOUT
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=both, text=True, check=True)
+    return done.stdout.splitlines()
 
 
 def test_all_of_it_comes_in_order() -> None:
-    assert said() == ["from a worker", "later", "the last line"]
+    assert said() == ["from a worker", "later", "too late", "the last line"]
 
 
 def test_nothing_comes_of_a_stopped_run() -> None:
     lines = said("stop")
-    assert "later" not in lines
     assert lines[-1] == "the last line"
+    assert not {"later", "too late"} & set(lines)
