@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from processes import within
+
+from pipeline.engine.cluster import connected, disconnect
 
 ROOT = Path(__file__).parents[1]
 QUIET = {"DASK_DISTRIBUTED__WORKER__DAEMON": "True"}
@@ -43,3 +48,26 @@ class Cluster:
             os.killpg(process.pid, signal.SIGTERM)
         for process in self.processes:
             process.wait(20)
+
+
+@contextmanager
+def two_workers(folder: Path) -> Iterator[Cluster]:
+    """A scheduler with two workers, one of them without the preload."""
+    made = Cluster(folder)
+    try:
+        made.worker("--preload", "pipeline.engine.preload")
+        made.worker()
+        yield made
+    finally:
+        made.end()
+
+
+@contextmanager
+def joined(cluster: Cluster) -> Iterator[str]:
+    """The address of a cluster whose two workers are there; this process's connection ends with the block."""
+    found = str(json.loads(cluster.file.read_text())["address"])
+    connected(found).wait_for_workers(2, timeout=60)
+    try:
+        yield found
+    finally:
+        disconnect()
