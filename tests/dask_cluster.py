@@ -1,4 +1,4 @@
-"""Real processes of a Dask cluster, which see nothing of a client's files."""
+"""Real processes of a Dask cluster, which see nothing of a client's files; fixtures for whoever imports them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from processes import within
 
-from pipeline.engine.cluster import connected, disconnect
+from pipeline.engine.cluster import ADDRESS, connected, disconnect
 
 ROOT = Path(__file__).parents[1]
 QUIET = {"DASK_DISTRIBUTED__WORKER__DAEMON": "True"}
@@ -50,10 +50,10 @@ class Cluster:
             process.wait(20)
 
 
-@contextmanager
-def two_workers(folder: Path) -> Iterator[Cluster]:
+@pytest.fixture(scope="module", name="cluster")
+def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     """A scheduler with two workers, one of them without the preload."""
-    made = Cluster(folder)
+    made = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
         made.worker("--preload", "pipeline.engine.preload")
         made.worker()
@@ -62,10 +62,11 @@ def two_workers(folder: Path) -> Iterator[Cluster]:
         made.end()
 
 
-@contextmanager
-def joined(cluster: Cluster) -> Iterator[str]:
-    """The address of a cluster whose two workers are there; this process's connection ends with the block."""
+@pytest.fixture(name="address")
+def joined(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The address of ``cluster`` with its two workers, as the one that work goes to."""
     found = str(json.loads(cluster.file.read_text())["address"])
+    monkeypatch.setenv(ADDRESS, found)
     connected(found).wait_for_workers(2, timeout=60)
     try:
         yield found

@@ -6,14 +6,16 @@ import csv
 import io
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from rich.console import Console
 from rich.live import Live
 
+from pipeline import commands
 from pipeline.__main__ import main
 from pipeline.cases import CASES
 from pipeline.errors import PlantError
@@ -23,7 +25,7 @@ from pipeline.metrics import mae
 from pipeline.plants.equations import EquationPlant
 from pipeline.simulation.live import SimulatedPlant, TerminalView, sparkline
 from pipeline.simulation.simulate import simulate_closed
-from serving import Controller, Mode
+from serving import Controller, Mode, VirtualClock
 
 CASE = "thiosulfate_cstr"
 pytest_plugins = ["small_laws"]
@@ -114,14 +116,52 @@ def test_a_fault_is_shown_and_recovered_from(pid_file: Path, capsys: pytest.Capt
     assert f"{len(held)} scans with a fault, the last one: PV C_A" in capsys.readouterr().out
 
 
-def test_real_time_takes_its_time_and_gives_the_same(pid_file: Path) -> None:
-    """250 times real time: 25 s in 0.1 s, on the machine's clock."""
+class Watched(VirtualClock):
+    """The machine's clock in a test's hands: it keeps the speed, and sleeps for ``late_s`` [s] too long, once."""
+
+    made: ClassVar[list[Watched]] = []
+    late_s = 0.0
+
+    def __init__(self, speed: float) -> None:
+        super().__init__(100.0)
+        self.speed, self.late_at = speed, 104.0
+        self.made.append(self)
+
+    def sleep_until(self, time_s: float) -> None:
+        super().sleep_until(time_s)
+        if self.late_s and time_s >= self.late_at:
+            self.advance(self.late_s)
+            self.late_at = np.inf
+
+
+def test_real_time_takes_its_time_and_gives_the_same(pid_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands.simulate, "MonotonicClock", Watched)
+    monkeypatch.setattr(Watched, "made", [])
     asked = ("--sp", "0.6", "--duration", "25")
     fast = simulate(pid_file, *asked)
+    assert not Watched.made
+    assert simulate(pid_file, *asked, "--speed", "250") == fast
+    (clock,) = Watched.made
+    assert clock.speed == 250
+    assert clock.now() - 100.0 == pytest.approx(float(fast[-1]["time_s"]))  # seconds of the plant
+
+
+def test_the_plant_goes_on_in_periods_that_a_slow_machine_missed(
+    pid_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """0.5 s a period: a scan that comes 1.2 s late misses two, and finds the plant of its own time."""
+    monkeypatch.setattr(commands.simulate, "MonotonicClock", Watched)
+    asked = ("--sp", "0.6", "--duration", "25")
+    fast = simulate(pid_file, *asked)
+    monkeypatch.setattr(Watched, "late_s", 1.2)
     timed = simulate(pid_file, *asked, "--speed", "250")
-    by_time = {row["time_s"]: row for row in fast}
-    assert timed
-    assert timed[0] == by_time[timed[0]["time_s"]]  # a busy machine may miss periods later on, and says so
+    times = [float(row["time_s"]) for row in timed]
+    late = next(k for k, (last, now) in enumerate(pairwise(times), 1) if now - last > 0.6)
+    assert timed[:late] == fast[:late]
+    assert np.isclose(times[late] - times[late - 1], 1.5)
+    assert times[late:] == [float(row["time_s"]) for row in fast[late + 2 :]]
+    held = simulate(pid_file, *asked, "--manual", f"{times[late] - 1.0:g}..{times[late]:g}")
+    assert timed[late]["C_A [mol/l]"] == held[late + 2]["C_A [mol/l]"]  # the MV was held in the meantime
 
 
 @pytest.mark.parametrize(

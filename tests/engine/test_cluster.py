@@ -8,12 +8,11 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-from dask_cluster import ROOT, Cluster, joined, two_workers
+from dask_cluster import ROOT, Cluster, joined, two_workers  # noqa: F401
 from engine_pieces import fatal, process_of, refuse, squares, sums_of_squares, watched
 from processes import within
 
@@ -25,19 +24,6 @@ from pipeline.errors import PipelineError
 
 # Dask closes some of its sockets only as it is collected.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    with two_workers(tmp_path_factory.mktemp("cluster")) as made:
-        yield made
-
-
-@pytest.fixture
-def address(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    with joined(cluster) as found:
-        monkeypatch.setenv(ADDRESS, found)
-        yield found
 
 
 def test_pieces_on_the_cluster_are_those_made_here(address: str) -> None:

@@ -6,12 +6,11 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
-from dask_cluster import ROOT, Cluster, joined, two_workers
+from dask_cluster import ROOT, joined, two_workers  # noqa: F401
 from own_cases import controllers_of_a_lag
 from processes import within
 
@@ -27,19 +26,6 @@ from pipeline.stages.validate import validate
 # Dask closes some of its sockets only as it is collected.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 GIVEN = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    with two_workers(tmp_path_factory.mktemp("cluster")) as made:
-        yield made
-
-
-@pytest.fixture
-def address(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    with joined(cluster) as found:
-        monkeypatch.setenv(ADDRESS, found)
-        yield found
 
 
 @pytest.fixture

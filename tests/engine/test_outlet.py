@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -33,3 +34,27 @@ def test_nothing_comes_of_a_stopped_run() -> None:
     lines = said("stop")
     assert lines[-1] == "the last line"
     assert not {"later", "too late"} & set(lines)
+
+
+MANY = """
+import subprocess, sys, threading
+from pipeline.engine.outlet import outlet
+with outlet(threading.Event()):
+    subprocess.run([sys.executable, "-c", "import os; [os.write(2, b'0123456789' * 1000) for _ in range(50)]"])
+print("done", flush=True)
+"""
+
+
+def test_workers_go_on_where_nobody_reads() -> None:
+    """Half a megabyte, more than a pipe holds, to a terminal that was closed."""
+    source, into = os.pipe()
+    os.close(source)
+    done = subprocess.run([sys.executable, "-c", MANY], stdout=subprocess.PIPE, stderr=into, text=True, timeout=60)
+    os.close(into)
+    assert done.stdout == "done\n"
+
+
+def test_a_byte_of_zero_ends_nothing() -> None:
+    many = MANY.replace("0123456789", "abc\\\\0")
+    done = subprocess.run([sys.executable, "-c", many], capture_output=True, timeout=60)
+    assert done.stderr == b"abc\0" * 50_000
