@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import math
 import shutil
 import sys
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases.own_entries import entries_of
+from pipeline.commands.arguments import positive, whole
 from pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
 from pipeline.commands.new_exported import asked, given_tags, propose_tags
 from pipeline.commands.new_fmu import table_from, write_table
@@ -49,7 +49,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--anyway", action="store_true", help="add the plant even where the data cannot carry a model")
     add("--replace", action="store_true", help="put the plant in place of an own plant of this name and its entries")
     add("--simulator", metavar="FILE", type=Path, help="a Python class or an FMU, instead of exports")
-    add("--rows", metavar="N", type=_rows, default=8_000, help="of the experiment on a simulator (8000)")
+    add("--rows", metavar="N", type=whole(LEAST_ROWS, MOST_ROWS), default=8_000,
+        help="of the experiment on a simulator (8000)")  # fmt: skip
     for role in ROLES:
         form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"
         add(f"--{role}", metavar=form, action="append", default=[], help=f"{WORDS[role]}; may be given again")
@@ -58,9 +59,9 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--max-move", metavar="TAG=CHANGE", action="append", default=[],
         help="largest change of an MV in a minute that the controller may make, in the MV's unit")  # fmt: skip
     add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
-    add("--period", metavar="S", type=_positive,
+    add("--period", metavar="S", type=positive("s"),
         help="sampling period of the record (default: the export's step, longer for a slow plant)")  # fmt: skip
-    add("--hold", metavar="S", type=_positive, help="longest time that a reading is held or drawn on over")
+    add("--hold", metavar="S", type=positive("s"), help="longest time that a reading is held or drawn on over")
     add("--without-mode", metavar="MODE", action="append", default=[], help="leave rows of this mode out")
     add("--time", metavar="COLUMN", default="", help="the column of times (default: found by name and content)")
     add("--time-format", metavar="FORM", default="", help="of the times, as in '%%d/%%m/%%Y %%H:%%M:%%S'")
@@ -216,19 +217,3 @@ def signals_of(record: Record, tags: Sequence[Tag] = ()) -> dict[str, Any]:
         "period_s": record.period_s,
         **{role: [s.to_dict() | commands.get(s.name, {}) for s in signals] for role, signals in groups.items()},
     }
-
-
-def _rows(text: str) -> int:
-    if not text.isdigit() or not LEAST_ROWS <= int(text) <= MOST_ROWS:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of rows from {LEAST_ROWS} to {MOST_ROWS}")
-    return int(text)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no positive number of seconds")
-    return value

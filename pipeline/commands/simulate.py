@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from pipeline.cases import PLANTS, all_cases
+from pipeline.commands.arguments import positive, real, whole
 from pipeline.commands.made_for import require_made_for
 from pipeline.config.params import choose
 from pipeline.errors import ParamsError, nearest
@@ -43,19 +43,19 @@ def options(parser: argparse.ArgumentParser) -> None:
         parse = partial(_argument, partial(parse_event, form=form))
         add(option, metavar=form, type=parse, action="append", default=[], help=words)
 
-    positive = partial(_number, above=0)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
     events("--sp", "[NAME=]VALUE[@S]", "set point from time S on; of several set points with its name")
     add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
-    add("--from", metavar="CV", type=_number, dest="start", help="start at the steady state of this CV")
+    add("--from", metavar="CV", type=real("a finite number"), dest="start",
+        help="start at the steady state of this CV")  # fmt: skip
     events("--disturbance", "NAME=VALUE[@S]", "measured disturbance or plant parameter from time S on")
     events("--noise", "PV=STD", "standard deviation of a measurement's noise, over the whole run")
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
-    add("--duration", metavar="S", type=positive, help="length of the run")
-    add("--speed", metavar="X", type=positive, help="times real time, 1 is real time (default: as fast as possible)")
-    add("--seed", metavar="N", type=_seed, default=0, help="of the noise (0)")
+    add("--duration", metavar="S", type=positive("s"), help="length of the run")
+    add("--speed", metavar="X", type=positive(), help="times real time, 1 is real time (default: as fast as possible)")
+    add("--seed", metavar="N", type=whole(0), default=0, help="of the noise (0)")
     add("--picture", metavar="FILE", type=Path, help="where the picture goes (<law>-simulation.png)")
     add("--csv", metavar="FILE", type=Path, help="write every sample there")
 
@@ -189,21 +189,3 @@ def _argument(parse: Callable[[str], object], text: str) -> object:
         return parse(text)
     except ParamsError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _number(text: str, above: float = -math.inf) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
-    if not value > above:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above {above:g}")
-    return value
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is no seed; give a whole number of at least 0")
-    return int(text)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import math
 import os
 import time
-from functools import partial
 from pathlib import Path
 
 from pipeline.cases import all_cases
+from pipeline.commands.arguments import real, whole
 from pipeline.commands.made_for import require_made_for
-from pipeline.engine.cluster import address, local_cluster
+from pipeline.engine.cluster import address, workers_here
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ParamsError, nearest
 from pipeline.evaluation.case import Case
@@ -32,20 +30,19 @@ PIECES = 4  # a worker at least, so that none waits long for the last
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    add, whole, percent = parser.add_argument, partial(_whole, least=0), _percent
+    add = parser.add_argument
+    percent = real("a percentage from 0 to 100", lambda value: 0 <= value <= 100)
     add("file", metavar="CONTROLLER", type=Path, help="a controller's .onnx file")
-    add("--plants", metavar="N", type=partial(_whole, least=1), default=PLANTS, help=f"closed loops ({PLANTS})")
-    add("--seed", metavar="N", type=whole, default=SEED, help=f"of all draws ({SEED})")
+    add("--plants", metavar="N", type=whole(1), default=PLANTS, help=f"closed loops ({PLANTS})")
+    add("--seed", metavar="N", type=whole(0), default=SEED, help=f"of all draws ({SEED})")
     add("--spread", metavar="PERCENT", type=percent, default=SPREAD,
         help=f"of parameters for which the case states no range ({SPREAD:g})")  # fmt: skip
     add("--faults", metavar="PERCENT", type=percent, default=FAULTS,
         help=f"share of the loops with a fault of an actuator ({FAULTS:g})")  # fmt: skip
-    add("--workers", metavar="N", type=partial(_whole, least=1), help="processes side by side (one a core)")
-    add(
-        "--batch", metavar="N", type=partial(_whole, least=1), default=BATCH, help=f"loops of a piece of work ({BATCH})"
-    )
+    add("--workers", metavar="N", type=whole(1), help="processes side by side (one a core)")
+    add("--batch", metavar="N", type=whole(1), default=BATCH, help=f"loops of a piece of work ({BATCH})")
     add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
-    add("--replay", metavar="INDEX", type=whole, help="run one loop again, and draw it")
+    add("--replay", metavar="INDEX", type=whole(0), help="run one loop again, and draw it")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -77,12 +74,11 @@ def run(options: argparse.Namespace) -> None:
 
 def outcomes_of(stress: Stress, plants: int, batch: int = BATCH, workers: int | None = None) -> list[Outcome]:
     """Outcomes of the loops 0 to ``plants`` - 1, in order, on the engine."""
-    at = address()
-    wanted = workers or (os.cpu_count() or 1)
-    size = max(min(batch, plants // (PIECES * wanted)), 1) if at is None and wanted > 1 else batch
+    here = address() is None
+    wanted = workers or (1 if not here or plants <= FEW else os.cpu_count() or 1)
+    size = max(min(batch, plants // (PIECES * wanted)), 1) if wanted > 1 else batch
     pieces = [range(i, min(i + size, plants)) for i in range(0, plants, size)]
-    alone = at is not None or wanted == 1 or (workers is None and plants <= FEW)
-    with contextlib.nullcontext() if alone else local_cluster(wanted):
+    with workers_here(wanted if here else workers, "--workers"):
         found = parallel_map(stress.outcomes, pieces, "stress: closed loops", [len(p) for p in pieces])
     return [one for piece in found for one in piece]
 
@@ -122,19 +118,3 @@ def _options(options: argparse.Namespace) -> str:
     """The options of a draw that differ from their defaults, as a replay needs them."""
     given = {"seed": (options.seed, SEED), "spread": (options.spread, SPREAD), "faults": (options.faults, FAULTS)}
     return "".join(f" --{name} {value!r}" for name, (value, default) in given.items() if value != default)
-
-
-def _whole(text: str, least: int) -> int:
-    if not text.isdecimal() or int(text) < least:
-        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; give a whole number of at least {least}")
-    return int(text)
-
-
-def _percent(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= 100:
-        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; give a percentage from 0 to 100")
-    return value

@@ -71,6 +71,19 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] = lam
                 cluster.close(timeout=5)
 
 
+def workers_here(workers: int | None, option: str) -> contextlib.AbstractContextManager[object]:
+    """As many workers on this machine as ``option`` asks for (None: it was left out), until the block ends.
+
+    None for one alone, whose work is done in this process. Raises PipelineError where a cluster's address is set too.
+    """
+    if workers is not None and address() is not None:
+        raise PipelineError(
+            f"{option} is for this machine, but the work goes to the cluster at {address()}; "
+            f"leave {option} out, or unset {ADDRESS}"
+        )
+    return contextlib.nullcontext() if workers is None or workers == 1 else local_cluster(workers)
+
+
 def address() -> str | None:
     """The scheduler that work goes to; None where there is none, and work is done in place."""
     return os.environ.get(ADDRESS) or None

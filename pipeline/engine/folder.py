@@ -7,6 +7,7 @@ only the client writes: what a piece left half-written is never seen.
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
@@ -70,16 +71,22 @@ class Folder:
         return {p.relative_to(self.path).as_posix(): (s.st_size, s.st_mtime_ns, s.st_ino) for p, s in found}
 
 
-def apply(changes: Changes) -> None:
-    """Make the changes here, each file whole or not at all. ValueError for a name that leads out of the folder."""
-    for name, content in changes.items():
-        path = Path(name)
-        if _outside(path):
+def apply(changes: Changes, anew: Iterable[Path] = ()) -> None:
+    """Make the changes here, each file whole or not at all; the folders ``anew`` are emptied before.
+
+    Raises ValueError for a name that leads out of the folder; then nothing was changed.
+    """
+    for name in changes:
+        if _outside(Path(name)):
             raise ValueError(f"{name} leads out of the folder")
+    for folder in anew:
+        if folder.is_dir():
+            shutil.rmtree(folder)
+    for name, content in changes.items():
         if content is None:
-            path.unlink(missing_ok=True)
+            Path(name).unlink(missing_ok=True)
         else:
-            write_bytes(path, content)
+            write_bytes(Path(name), content)
 
 
 def _outside(path: Path) -> bool:

@@ -78,14 +78,15 @@ def as_done(
     A client has each result as it ends; a task on a worker has them once all have ended.
     """
     work, task, at = list(items), current_task(), address()
-    if len(work) < 2 or (task is None and at is None):
+    # Outside a stage nobody has said which files a piece reads: it finds them where this process is.
+    if len(work) < 2 or (task is None and (at is None or in_folder)):
         for i, item in enumerate(work):
             yield i, alone(function, item)
             show(i)
         return
     if task is None:
         assert at is not None
-        for i, (result, changes) in _answers(connected(at), function, work, {} if in_folder else None):
+        for i, (result, changes) in _answers(connected(at), function, work, None):
             apply(changes)
             show(i)
             yield i, result

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import os
 import pickle
-import shutil
 import sys
 import traceback
 import uuid
@@ -56,10 +55,7 @@ def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
     for stream, text in said:
         print(text, end="", file=getattr(sys, stream), flush=True)
     if not code:
-        for path in files.writes:
-            if path.is_dir():
-                shutil.rmtree(path)
-        apply(changes)
+        apply(changes, anew=files.writes)
     return int(code)
 
 

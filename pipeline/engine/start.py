@@ -80,7 +80,7 @@ def run(arguments: list[str]) -> int | str | None:
     if files is None:
         return run_here(arguments)
     from pipeline.engine.cluster import address, local_cluster
-    from pipeline.engine.remote import run_on
+    from pipeline.engine.remote import FAILED, run_on
     from pipeline.errors import PipelineError
 
     try:
@@ -90,7 +90,8 @@ def run(arguments: list[str]) -> int | str | None:
         with local_cluster() as own:
             return run_on(own, arguments, files)
     except PipelineError as error:
-        return f"{' '.join(arguments)}: {error}"
+        print(f"{' '.join(arguments)}: {error}", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         return STOPPED
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from engine_pieces import folder_of
 
-from pipeline.engine import pieces
+from pipeline.engine import pieces, start
+from pipeline.engine.cluster import address, workers_here
 from pipeline.engine.fingerprint import difference, fingerprint
 from pipeline.engine.folder import Folder, apply, read_files
 from pipeline.engine.parallel import as_done, parallel_map
@@ -34,6 +35,39 @@ def test_a_cluster_that_does_not_answer_is_one_clear_error(monkeypatch: pytest.M
     monkeypatch.setattr("pipeline.engine.cluster.CONNECT_S", 0.2)
     with pytest.raises(PipelineError, match=r"no scheduler answers at tcp://127.0.0.1:1 .*start it"):
         parallel_map(math.sqrt, [1.0, 4.0], "roots")
+
+
+def test_a_stage_whose_cluster_does_not_answer_ends_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:1")
+    monkeypatch.setattr("pipeline.engine.cluster.CONNECT_S", 0.2)
+    assert start.run(["excite", "thiosulfate_cstr-random_steps"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("excite thiosulfate_cstr-random_steps: no scheduler answers at tcp://127.0.0.1:1 ")
+    assert said.count("\n") == 1
+
+
+def test_workers_are_asked_for_here_or_on_the_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    with workers_here(1, "--workers"), workers_here(None, "--workers"):
+        assert address() is None
+    monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://host:1")
+    with workers_here(None, "--workers"):
+        assert address() == "tcp://host:1"
+    with pytest.raises(PipelineError, match=r"--workers is for this machine, .* at tcp://host:1; leave --workers out"):
+        workers_here(2, "--workers")
+
+
+def here(_: int) -> str:
+    return os.getcwd()
+
+
+def test_a_piece_that_reads_files_stays_with_them_where_no_stage_says_which(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:1")  # nobody answers there, and nobody is asked
+    assert parallel_map(here, range(2), "places", in_folder=True) == [str(tmp_path)] * 2
 
 
 # ---------------------------------------------------------------------- what a worker does, called here
@@ -125,5 +159,9 @@ def test_files_come_back_as_they_were_sent(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("name", ["../out.txt", "/out.txt", "a/../../out.txt"])
 def test_no_file_is_written_out_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.chdir(tmp_path)
+    apply({"out/kept.txt": b"1", "out/deep/other.txt": b"2"})
     with pytest.raises(ValueError, match="leads out of the folder"):
-        apply({name: b""})
+        apply({"out/kept.txt": b"3", name: b""}, anew=[Path("out")])
+    assert read_files([Path("out")]) == {"out/kept.txt": b"1", "out/deep/other.txt": b"2"}
+    apply({"out/new.txt": b"4"}, anew=[Path("out"), Path("missing")])
+    assert read_files([Path("out")]) == {"out/new.txt": b"4"}

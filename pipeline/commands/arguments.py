@@ -1,0 +1,39 @@
+"""Numbers of a command line, as argparse wants them: what is not allowed ends the command in one line."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+
+
+def whole(low: int, high: int | None = None) -> Callable[[str], int]:
+    """Reads a whole number from ``low`` to ``high``, both included."""
+    words = f"a whole number of at least {low}" if high is None else f"a whole number from {low} to {high}"
+
+    def read(text: str) -> int:
+        if not text.isdecimal() or int(text) < low or (high is not None and int(text) > high):
+            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; give {words}")
+        return int(text)
+
+    return read
+
+
+def real(words: str, allowed: Callable[[float], bool] = lambda _: True) -> Callable[[str], float]:
+    """Reads a finite number that is ``allowed``; ``words`` say what that is, with its unit."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or not allowed(value):
+            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; give {words}")
+        return value
+
+    return read
+
+
+def positive(unit: str = "") -> Callable[[str], float]:
+    """Reads a number above 0."""
+    return real("a number above 0" + (f" [{unit}]" if unit else ""), lambda value: value > 0)
