@@ -111,8 +111,18 @@ def _client(to: str) -> Client:
     dask.config.set(CONFIG)
     from distributed import Client
 
+    class Patient(Client):
+        """A client that connects anew where the scheduler's first word came together with news for all clients."""
+
+        async def _ensure_connected(self, timeout: float | None = None) -> None:
+            try:
+                await super()._ensure_connected(timeout=timeout)
+            except AssertionError:
+                self.id += "-again"  # the scheduler forgets the other one when its connection ends
+                await super()._ensure_connected(timeout=timeout)
+
     try:
-        client = Client(to, timeout=CONNECT_S, set_as_default=False)
+        client = Patient(to, timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise PipelineError(

@@ -151,4 +151,6 @@ def _answers(
                 raise failed
             yield place, (result, changes)
     finally:
-        client.cancel([f for f in futures if not f.done()])
+        # All clients hear of a cancellation, also of none; Dask takes it amiss as the first word to one that connects.
+        if waiting := [f for f in futures if not f.done()]:
+            client.cancel(waiting)

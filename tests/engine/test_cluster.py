@@ -9,8 +9,10 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 from urllib.request import urlopen
 
+import distributed.client
 import pytest
 from dask_cluster import ROOT, Cluster, joined, two_workers  # noqa: F401
 from engine_pieces import fatal, process_of, refuse, squares, sums_of_squares, watched
@@ -28,6 +30,40 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pyte
 
 def test_pieces_on_the_cluster_are_those_made_here(address: str) -> None:
     assert parallel_map(squares, range(20), "squares") == [i**2 for i in range(20)]
+
+
+def test_work_that_is_done_cancels_nothing(address: str) -> None:
+    """A scheduler tells all clients of a cancellation, and one that connects at that moment would fail."""
+    parallel_map(squares, range(20), "squares")
+    client = connected(address)
+    assert not [event for _, event in client.get_events(client.id) if event["action"] == "cancel"]
+
+
+def test_a_first_word_that_comes_with_another_is_no_error(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dask asserts that the first message to a client is alone."""
+    connect, talkative = distributed.client.connect, [True]
+
+    async def connected_once(*arguments: Any, **options: Any) -> Any:
+        comm = await connect(*arguments, **options)
+        read = comm.read
+
+        async def with_news() -> Any:
+            return [*await read(), {"op": "cancelled-keys", "keys": []}]
+
+        if talkative:
+            talkative.pop()
+            comm.read = with_news
+        return comm
+
+    monkeypatch.setattr(distributed.client, "connect", connected_once)
+    disconnect()
+    try:
+        client = connected(str(json.loads(cluster.file.read_text())["address"]))
+        assert not talkative
+        assert client.id.endswith("-again")
+        assert client.submit(pow, 2, 3, pure=False).result() == 8
+    finally:
+        disconnect()
 
 
 def test_no_profiler_watches_a_task_however_its_worker_was_started(address: str) -> None:
