@@ -1,7 +1,7 @@
-"""What a worker loads before its first task: ``dask worker ADDRESS --nthreads 1 --preload pipeline.engine.preload``.
+"""What a worker loads while nothing waits: ``dask worker ADDRESS --nthreads 1 --preload pipeline.engine.preload``.
 
-torch, casadi, pandas and the like take a stage longer to import than most take to work. All sources are imported at
-once, so that a worker's fingerprint is that of what it runs.
+torch, casadi, pandas and the like take a stage longer to import than most take to work. A worker begins with them as it
+starts and goes on whenever it is idle, so that a task waits for one of them at most.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import importlib
 import pkgutil
 import signal
 import threading
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from pipeline.engine.fingerprint import fingerprint
@@ -19,15 +20,16 @@ from pipeline.engine.spoken import listen
 if TYPE_CHECKING:
     from distributed import Worker
 
-# What stages import late and for long; one that is missing or broken costs time alone.
+# What stages import late and for long, the longest last; one that is missing or broken costs time alone.
 LIBRARIES = (
-    *("pandas", "pyarrow.parquet", "casadi", "jinja2", "matplotlib.figure", "torch._dynamo", "torch.export._trace"),
-    *("torch.onnx._internal.exporter._compat", "sklearn.linear_model", "onnx", "onnx_ir", "onnxruntime"),
-    *("onnxscript.optimizer", "onnxscript.function_libs.torch_lib.ops"),
+    *("onnxruntime", "casadi", "jinja2", "pandas", "pyarrow.parquet", "matplotlib.figure", "onnx", "onnx_ir"),
+    *("sklearn.linear_model", "torch", "torch._dynamo", "torch.export._trace"),
+    *("torch.onnx._internal.exporter._compat", "onnxscript.optimizer", "onnxscript.function_libs.torch_lib.ops"),
 )
+IDLE_S = 0.05  # until a worker that has a task looks again whether it may go on importing
 PROFILING = ("profile", "profile-cycle")
 # The ends of the pipeline that no worker runs.
-APART = ("pipeline.__main__", "pipeline.commands", "pipeline.tracking")
+APART = ("pipeline.__main__", "pipeline.commands", "pipeline.tracking", "pipeline.stages.publish")
 
 
 def dask_setup(worker: Worker) -> None:
@@ -36,7 +38,21 @@ def dask_setup(worker: Worker) -> None:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers in order
     listen()
-    load()
+    fingerprint()  # of the sources as they are now
+    steps, tasks = loading(), worker.executors["default"]
+
+    def go_on() -> None:
+        """The next import where nothing else is to be done; in the tasks' thread: two might wait for each other's."""
+        if worker.state.executing or worker.state.ready or worker.state.long_running:
+            worker.loop.call_later(IDLE_S, go_on)
+        else:
+            tasks.submit(load)
+
+    def load() -> None:
+        if next(steps, None) is not None:
+            worker.loop.add_callback(go_on)
+
+    worker.loop.add_callback(go_on)
 
 
 def unwatched(worker: Worker) -> None:
@@ -51,12 +67,12 @@ def unwatched(worker: Worker) -> None:
             worker.loop.add_callback(callback.stop)
 
 
-def load() -> None:
-    """Import the libraries and all sources that a task may need."""
-    fingerprint()
+def loading() -> Iterator[str]:
+    """Import the libraries and all sources that a task may need, a step each; their names."""
     for name in LIBRARIES:
         with contextlib.suppress(Exception):
             importlib.import_module(name)
+        yield name
     import pipeline
 
     for module in pkgutil.walk_packages(pipeline.__path__, "pipeline.", onerror=lambda _: None):
@@ -64,3 +80,4 @@ def load() -> None:
             # A broken source is the error of the task that needs it: a worker that did not start would be waited for.
             with contextlib.suppress(Exception):
                 importlib.import_module(module.name)
+            yield module.name

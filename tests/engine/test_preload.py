@@ -1,0 +1,66 @@
+"""A worker imports what tasks need whenever it is idle, and never in a task's way."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pipeline.engine import preload
+
+
+class Idle:
+    """A worker's loop and its thread for tasks, in the test's hands."""
+
+    def __init__(self) -> None:
+        self.state = SimpleNamespace(executing=set(), ready=set(), long_running=set())
+        self.waiting = deque[Callable[[], Any]]()
+        self.loop, self.executors = self, {"default": self}
+        self.periodic_callbacks: dict[str, Any] = {}
+
+    def add_callback(self, act: Callable[[], Any]) -> None:
+        self.waiting.append(act)
+
+    submit = add_callback
+
+    def call_later(self, _: float, act: Callable[[], Any]) -> None:
+        self.waiting.append(act)
+
+
+@pytest.mark.parametrize("busy", ["executing", "ready", "long_running"])
+def test_imports_go_on_while_nothing_else_is_to_be_done(monkeypatch: pytest.MonkeyPatch, busy: str) -> None:
+    imported: list[str] = []
+
+    def steps() -> Any:
+        for name in "abc":
+            imported.append(name)
+            yield name
+
+    monkeypatch.setattr(preload, "loading", steps)
+    monkeypatch.setattr(preload, "listen", lambda: None)
+    worker = Idle()
+    setting = threading.Thread(target=preload.dask_setup, args=(worker,))  # in the main one it would take over Ctrl-C
+    setting.start()
+    setting.join()
+    assert imported == []
+    for _ in range(2):  # may it go on, and a step
+        worker.waiting.popleft()()
+    assert imported == ["a"]
+    getattr(worker.state, busy).add("a task")
+    for _ in range(10):
+        worker.waiting.popleft()()
+    assert imported == ["a"]
+    getattr(worker.state, busy).clear()
+    while worker.waiting:
+        worker.waiting.popleft()()
+    assert imported == ["a", "b", "c"]
+
+
+def test_what_is_missing_or_broken_stops_no_import(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preload, "LIBRARIES", ("not_a_library_at_all", "json"))
+    monkeypatch.setattr(preload.pkgutil, "walk_packages", lambda *_, **__: [SimpleNamespace(name="pipeline.not_there")])
+    assert list(preload.loading()) == ["not_a_library_at_all", "json", "pipeline.not_there"]
