@@ -17,6 +17,7 @@ from pathlib import Path
 
 from pipeline.engine.cluster import connected, local_cluster
 from pipeline.engine.parallel import parallel_map
+from pipeline.engine.preload import load
 
 ROOT = Path(__file__).parents[1]
 CLIENT = """
@@ -43,6 +44,7 @@ def main() -> None:
     options = parser.parse_args()
     with local_cluster(options.workers) as at:
         connected(at).wait_for_workers(options.workers)
+        connected(at).run(load)
         parallel_map(nothing, range(50), "to warm up")
         each, taken = list[float](), list[float]()
         for _ in range(ROUNDS):

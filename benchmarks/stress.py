@@ -26,6 +26,7 @@ import numpy as np
 from pipeline.cases import CASES
 from pipeline.engine.cluster import connected, local_cluster
 from pipeline.engine.parallel import parallel_map
+from pipeline.engine.preload import load
 from pipeline.evaluation.stress.draws import Drawing
 from pipeline.evaluation.stress.loops import Stress
 
@@ -89,6 +90,7 @@ def on_workers(stress: Stress, workers: int, plants: int) -> float:
     """Loops a second of a warm cluster."""
     with local_cluster(workers) as at:
         connected(at).wait_for_workers(workers, timeout=120)
+        connected(at).run(load)
         parallel_map(partial(seconds_of, stress), pieces(2 * BATCH * workers, BATCH), "warm")
         begun = time.perf_counter()
         parallel_map(partial(seconds_of, stress), pieces(plants, BATCH), f"{workers} workers")
@@ -122,6 +124,7 @@ def empty_task_s() -> float:
     """Time of an empty task through client, scheduler and worker, many at once [s]."""
     with local_cluster(1) as at:
         connected(at).wait_for_workers(1, timeout=120)
+        connected(at).run(load)
         parallel_map(nothing, range(EMPTY), "warm")
         begun = time.perf_counter()
         parallel_map(nothing, range(EMPTY), "empty")

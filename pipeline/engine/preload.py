@@ -46,9 +46,10 @@ def dask_setup(worker: Worker) -> None:
         if worker.state.executing or worker.state.ready or worker.state.long_running:
             worker.loop.call_later(IDLE_S, go_on)
         else:
-            tasks.submit(load)
+            with contextlib.suppress(RuntimeError):  # the worker is ending
+                tasks.submit(one)
 
-    def load() -> None:
+    def one() -> None:
         if next(steps, None) is not None:
             worker.loop.add_callback(go_on)
 
@@ -65,6 +66,12 @@ def unwatched(worker: Worker) -> None:
         callback = worker.periodic_callbacks.pop(name, None)
         if callback is not None:
             worker.loop.add_callback(callback.stop)
+
+
+def load() -> None:
+    """Everything at once, for whoever measures what tasks take afterwards: ``Client.run(load)``."""
+    for _ in loading():
+        pass
 
 
 def loading() -> Iterator[str]:

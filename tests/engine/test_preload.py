@@ -60,6 +60,20 @@ def test_imports_go_on_while_nothing_else_is_to_be_done(monkeypatch: pytest.Monk
     assert imported == ["a", "b", "c"]
 
 
+def test_a_worker_that_ends_meanwhile_complains_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ended(_: Callable[[], Any]) -> None:
+        raise RuntimeError("cannot schedule new futures after shutdown")
+
+    monkeypatch.setattr(preload, "listen", lambda: None)
+    worker = Idle()
+    worker.executors = {"default": SimpleNamespace(submit=ended)}  # type: ignore[dict-item]
+    setting = threading.Thread(target=preload.dask_setup, args=(worker,))
+    setting.start()
+    setting.join()
+    worker.waiting.popleft()()
+    assert not worker.waiting
+
+
 def test_what_is_missing_or_broken_stops_no_import(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preload, "LIBRARIES", ("not_a_library_at_all", "json"))
     monkeypatch.setattr(preload.pkgutil, "walk_packages", lambda *_, **__: [SimpleNamespace(name="pipeline.not_there")])
