@@ -12,8 +12,10 @@ from serving.errors import (
     OutputError,
     SampleError,
 )
+from serving.fallback import Fallback
+from serving.grid import RunReport
 from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
-from serving.loop import Command, ControlLoop, Mode, RunReport
+from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "Controller",
     "Endpoint",
     "EndpointError",
+    "Fallback",
     "Fresh",
     "Frozen",
     "Guard",

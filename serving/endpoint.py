@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,14 @@ class Endpoint(Protocol):
 
     def write(self, mv: Array) -> None:
         """Send an MV, shape (n_mv,)."""
+
+
+@runtime_checkable
+class HandsBack(Protocol):
+    """An endpoint that can give the plant to the plant's own controller, for ``serving.fallback``."""
+
+    def hand_back(self) -> None:
+        """Give the plant back."""
 
 
 class SimulatedEndpoint:

@@ -23,13 +23,15 @@ class Sample:
     """Values of the plant's side at one scan, in engineering units.
 
     ``mv_applied`` is the MV that the plant really received over the last period, read back; None
-    where it cannot be read. ``age_s`` is the time since the PVs were measured.
+    where it cannot be read. ``age_s`` is the time since the PVs were measured. ``fault`` says why
+    the endpoint does not trust its own sample; empty: it does.
     """
 
     pv: Array  # shape: (n_pv,)
     mv_applied: Array | None = None  # shape: (n_mv,)
     dv: Array = field(default_factory=lambda: np.zeros(0))  # shape: (n_dv,)
     age_s: float = 0.0
+    fault: str = ""
 
 
 class Guard(Protocol):

@@ -2,44 +2,52 @@
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from math import isfinite
-from typing import TypeAlias, TypeVar
+from math import inf
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from serving.clock import Clock, MonotonicClock
 from serving.controller import Controller
-from serving.endpoint import Endpoint
+from serving.endpoint import Endpoint, HandsBack
 from serving.errors import ContractError, LoopError, SampleError
+from serving.fallback import Fallback
+from serving.grid import RunReport, run_on_grid
 from serving.guard import Guard, Sample, default_guards, implausible
 from serving.manifest import Signal
+from serving.successor import Successor, require_same_signals
+from serving.transfer import Transfer
+from serving.words import first_line
 
 Array: TypeAlias = NDArray[np.float64]
-T = TypeVar("T")
-
-_log = logging.getLogger(__name__)
 
 WARM_LEAD_S = 4e-4  # within the clock's spin, so that the processor does not sleep between warm-up and deadline
 
 
 class Mode(StrEnum):
-    """The source of the MV: MANUAL the operator, AUTO the law, HOLD the last applied MV."""
+    """The source of the MV: MANUAL the operator, AUTO the law, HOLD the last applied MV, SHADOW the plant's own side.
+
+    In SHADOW nothing is written.
+    """
 
     MANUAL = "MANUAL"
     AUTO = "AUTO"
     HOLD = "HOLD"
+    SHADOW = "SHADOW"
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """The result of one scan. ``reason`` names a fault; it is empty without one."""
+    """The result of one scan. ``reason`` names a fault; it is empty without one.
+
+    A host that runs the loop itself writes ``mv`` unless the mode is SHADOW. Where ``hand_back`` is true, it gives the
+    plant back to the plant's own controller, and then sets the mode to SHADOW.
+    """
 
     scan: int
     mode: Mode
@@ -48,31 +56,23 @@ class Command:
     law_mv: Array | None  # the law's MV, also in MANUAL; None if the law was not stepped or its step failed
     info: Array | None  # shape: (n_info,)
     reason: str = ""
+    successor_mv: Array | None = None  # shape: (n_mv,), of a controller that is tried beside the law; else None
+    hand_back: bool = False
 
-
-@dataclass(frozen=True, slots=True)
-class RunReport:
-    """Counts of a run: scans, periods missed because the machine was late, scans with a fault.
-
-    An exception in ``observe``, ``until`` or the warm-up does not affect the MV and is no fault.
-    ``errors`` counts these exceptions; ``first_errors`` has the first one of each.
-    """
-
-    scans: int
-    missed: int
-    faults: int
-    latest_s: float  # largest lateness of a scan against its place on the grid [s]
-    errors: int = 0
-    first_errors: tuple[str, ...] = ()
+    @property
+    def writes(self) -> bool:
+        """Whether ``mv`` is to be written."""
+        return self.mode is not Mode.SHADOW
 
 
 class ControlLoop:
     """One controller on one plant.
 
     AUTO commands the law's MV. MANUAL commands the operator's MV; the law is still stepped with
-    the applied MV, so the transfer to AUTO is bumpless. HOLD keeps the last applied MV. A fault in
-    AUTO changes the mode to HOLD, and the command names the reason; ``recover_after`` good samples
-    change it back. After a gap the law starts cold (state = 0).
+    the applied MV, so the transfer to AUTO is bumpless. HOLD keeps the last applied MV. SHADOW writes
+    nothing: the law is stepped on what others do with the plant. A fault in AUTO changes the mode to
+    HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
+    lasts is for ``fallback``. After a gap the law starts cold (state = 0).
 
     Every commanded MV lies in its range, in every mode and with any guards; a discrete MV has one
     of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
@@ -100,6 +100,11 @@ class ControlLoop:
         Lead time of the warm-up before each deadline [s]; 0: no warm-up.
     max_gap
         Missed periods in a row after which the law starts cold.
+    transfer_s
+        After a change to AUTO or of the controller, an MV crosses its range at most once in this time [s], until it
+        is where the law wants it; 0: at once. See ``serving.transfer``.
+    fallback
+        What to do when a fault lasts; None: the MV stays. See ``serving.fallback``.
 
     Raises
     ------
@@ -120,9 +125,13 @@ class ControlLoop:
         clock: Clock | None = None,
         warm_lead_s: float = WARM_LEAD_S,
         max_gap: int = 3,
+        transfer_s: float = 0.0,
+        fallback: Fallback | None = None,
     ) -> None:
         if recover_after is not None and recover_after < 1:
             raise LoopError(f"recover_after is {recover_after}; it must be at least 1, or None")
+        if not 0 <= transfer_s < inf:
+            raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
         self.controller = controller
         self.endpoint = endpoint
@@ -131,14 +140,26 @@ class ControlLoop:
         self.clock: Clock = clock or MonotonicClock()
         self.warm_lead_s = min(warm_lead_s, manifest.period_s / 4)
         self.max_gap = max_gap
+        self.fallback = fallback
+        if fallback is not None and fallback.hand_back and not isinstance(endpoint, HandsBack | None):
+            raise LoopError(f"{type(endpoint).__name__} cannot hand the plant back: it has no method hand_back")
+        if fallback is not None and fallback.mv is not None and fallback.rate is not None:
+            _within(fallback.mv, manifest.mv, "safe MV")
+            if len(fallback.rate) != len(manifest.mv):
+                raise LoopError(f"the fallback has {len(fallback.rate)} rates; it needs {len(manifest.mv)}, one an MV")
         self._sp = _within(sp, manifest.sp, "set point")
         self._mv = _within(mv, manifest.mv, "MV")
         self._ranges = [(s.low, s.high, s.values) for s in manifest.mv]
         self._mode = mode
         self._fault = ""  # the fault that changed the mode to HOLD; empty without one
         self._good = 0
+        self._held = 0  # scans since that fault began
         self._scan = 0
         self._state = controller.cold_state()
+        self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
+        self._transfer.begin()
+        self.successor: Successor | None = None  # tried beside the controller, see ``swap``
+        self.replaced: Controller | None = None  # the one that was in charge before the present one
         self._past: deque[Sample] = deque(maxlen=max((g.memory for g in self.guards), default=0))
 
     # ------------------------------------------------------------------ operator
@@ -164,7 +185,9 @@ class ControlLoop:
 
     def set_mode(self, mode: Mode) -> None:
         """Set the mode; it takes effect at the next scan."""
-        self._mode, self._fault, self._good = mode, "", 0
+        if mode is not self._mode:
+            self._transfer.begin()
+        self._mode, self._fault, self._good, self._held = mode, "", 0, 0
 
     def set_sp(self, sp: ArrayLike) -> None:
         """Change the set points (n_sp,); LoopError outside their ranges."""
@@ -175,6 +198,24 @@ class ControlLoop:
         if self._mode is not Mode.MANUAL:
             raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self._mode}")
         self._mv = _within(mv, self.controller.manifest.mv, "MV")
+
+    def hand_back(self) -> None:
+        """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
+        self.set_mode(Mode.SHADOW)
+
+    def swap(self, controller: Controller, trial: int) -> None:
+        """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.
+
+        Until then its MV stands in ``Command.successor_mv``. LoopError where its period or signals are others.
+        """
+        if trial < 1:
+            raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
+        require_same_signals(self.controller, controller)
+        self.successor = Successor(controller, trial)
+
+    def keep(self) -> None:
+        """End the trial of a successor; the controller in charge stays."""
+        self.successor = None
 
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
@@ -189,38 +230,90 @@ class ControlLoop:
             if self._past.maxlen:
                 self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
         except Exception as error:  # the plant needs an MV after any error
-            if self._mode is Mode.AUTO:
+            if self._mode in {Mode.AUTO, Mode.SHADOW}:
                 self._mv = applied
-            return self.miss(_text(error))
+            return self.miss(first_line(error))
         self._state = step.state
         if self._fault:
             self._good += 1
             if self.recover_after is not None and self._good >= self.recover_after:
                 self.set_mode(Mode.AUTO)
         if self._mode is Mode.AUTO:
-            self._mv = step.mv.copy()  # the host gets step.mv and may write into it
-        return self._command(step.mv, step.info, self._fault)
+            self._mv = np.array(self._transfer.limited(step.mv, applied))  # the host gets step.mv, may write into it
+        elif self._mode is Mode.SHADOW:
+            self._mv = applied.copy()
+        beside = self._beside(sample, applied)
+        self._lasting()
+        return self._command(step.mv, step.info, self._fault, beside)
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         reason = reason or "a fault without a reason"
+        self._lose(reason)
+        self._lasting()
+        return self._command(None, None, reason)
+
+    def unwritten(self, before: Array, reason: str) -> Command:
+        """The command in place of the last one, which never reached the plant: the MV ``before`` it (n_mv,) stays."""
+        if self._mode is not Mode.MANUAL:
+            self._mv = before
+        self._lose(reason)
+        self._scan -= 1
+        return self._command(None, None, reason)
+
+    def gap(self, periods: int) -> None:
+        """So many periods passed without a scan; the law starts cold after more than ``max_gap``."""
+        if periods > self.max_gap:
+            self._state = self.controller.cold_state()
+            if self.successor is not None:
+                self.successor.miss(f"{periods} periods were missed")
+
+    def _lose(self, reason: str) -> None:
+        """No past any more; in AUTO a fault."""
         self._state = self.controller.cold_state()
         self._past.clear()
         self._good = 0
+        if self.successor is not None:
+            self.successor.miss(reason)
         if self._mode is Mode.AUTO or self._fault:
             self._mode, self._fault = Mode.HOLD, reason
-        return self._command(None, None, reason)
+
+    def _lasting(self) -> None:
+        """Count the scans of a fault, and go where the fallback says once it has lasted."""
+        if self._fault:
+            self._held += 1
+            if self._overdue() and self.fallback is not None:
+                m = self.controller.manifest
+                self._mv = self.fallback.toward(self._mv, m.mv, m.period_s)
+
+    def _overdue(self) -> bool:
+        since = (self._held - 1) * self.controller.manifest.period_s
+        return bool(self._fault) and self.fallback is not None and since >= self.fallback.after_s
+
+    def _beside(self, sample: Sample, applied: Array) -> Array | None:
+        """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
+        if self.successor is None:
+            return None
+        new = self.successor
+        new.step(sample, self._sp, applied)
+        if new.ready:
+            self.replaced, self.successor = self.controller, None
+            self.controller, self._state = new.controller, new.state
+            self._transfer.begin()
+        return new.mv
 
     def _refusal(self, sample: Sample) -> str | None:
         if not isinstance(sample, Sample):
             return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
+        if sample.fault:
+            return str(sample.fault)
         for guard in self.guards:
             try:
                 reason = guard.check(sample, self._past)
                 if reason:
                     return str(reason)
             except Exception as error:  # a guard that fails refuses the sample
-                return f"{type(guard).__name__} failed: {_text(error)}"
+                return f"{type(guard).__name__} failed: {first_line(error)}"
         return None
 
     def _read_back(self, sample: Sample) -> Array:
@@ -244,9 +337,12 @@ class ControlLoop:
                 return np.clip(applied, lows, highs)
         return applied
 
-    def _command(self, law_mv: Array | None, info: Array | None, reason: str) -> Command:
+    def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
-        return Command(self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason)
+        hand_back = self._overdue() and self.fallback is not None and self.fallback.hand_back
+        return Command(
+            self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, hand_back
+        )
 
     # ------------------------------------------------------------------ running
     def run(
@@ -283,105 +379,7 @@ class ControlLoop:
         """
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")
-        period = self.controller.manifest.period_s
-        start = self.clock.now()
-        failures = _Failures()
-        k = scans = missed = faults = 0
-        latest = 0.0
-        while n is None or k < n:
-            reason, late, gap = "", 0.0, 0
-            try:
-                late = self._wait(start + k * period, failures)
-                gap = int(late // period)
-            except Exception as error:
-                reason = f"the clock failed: {_named(error)}"
-                spare = MonotonicClock()
-                spare.sleep_until(spare.now() + period)
-            if gap:
-                k, missed, late = k + gap, missed + gap, late - gap * period
-                if n is not None and k >= n:
-                    break
-                if gap > self.max_gap:
-                    self._state = self.controller.cold_state()
-            latest = max(latest, late)
-            if before is not None:
-                try:
-                    before(k)
-                except Exception as error:
-                    reason = reason or f"before failed: {_named(error)}"
-            sample, command = self._exchange(self.endpoint, reason)
-            scans += 1
-            faults += bool(command.reason)
-            if observe is not None:
-                failures.call("observe", observe, sample, command)
-            if until is not None and failures.call("until", lambda c: bool(until(c)), command):
-                break
-            k += 1
-        return RunReport(scans, missed, faults, latest, failures.count, tuple(failures.first.values()))
-
-    def _wait(self, deadline: float, failures: _Failures) -> float:
-        """Warm the controller, sleep until ``deadline`` [s], and return the lateness [s]."""
-        if self.warm_lead_s:
-            self.clock.sleep_until(deadline - self.warm_lead_s)
-            failures.call("warm", self.controller.warm)
-        self.clock.sleep_until(deadline)
-        late = self.clock.now() - deadline
-        if not isfinite(late):
-            raise LoopError(f"the lateness is {late} s; the clock must give finite seconds")
-        return max(0.0, late)
-
-    def _exchange(self, endpoint: Endpoint, reason: str) -> tuple[Sample | None, Command]:
-        """Read, scan, write; a ``reason`` or a failing endpoint gives a command that holds the MV."""
-        sample, last = None, self._mv
-        try:
-            sample = endpoint.read()
-        except Exception as error:
-            command = self.miss(reason or f"the endpoint cannot be read: {_named(error)}")
-        else:
-            command = self.miss(reason) if reason else self.scan(sample)
-        try:
-            endpoint.write(command.mv)
-        except Exception as error:
-            if self._mode is Mode.AUTO:
-                self._mv = last  # the new MV never reached the plant
-            self._scan -= 1
-            command = self.miss(f"the endpoint cannot be written: {_named(error)}")
-        return sample if isinstance(sample, Sample) else None, command
-
-
-class _Failures:
-    """Exceptions that do not affect the MV: their number, and by source the text of the first one."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.first: dict[str, str] = {}
-
-    def call(self, name: str, act: Callable[..., T], *arguments: object) -> T | None:
-        """``act(*arguments)``; an exception is counted and named, and gives None."""
-        try:
-            return act(*arguments)
-        except Exception as error:
-            self.count += 1
-            if name not in self.first:
-                self.first[name] = f"{name} failed: {_named(error)}"
-                with suppress(Exception):  # the host's log handler may fail too
-                    _log.error(self.first[name])
-            return None
-
-
-def _text(error: Exception) -> str:
-    """The first line of the error's text; its type if the text is empty."""
-    name = type(error).__name__
-    try:
-        return (str(error).strip().splitlines() or [name])[0]
-    except Exception:
-        return name
-
-
-def _named(error: Exception) -> str:
-    """The error's type and text in one line."""
-    name, text = type(error).__name__, _text(error)
-    return name if text == name else f"{name}: {text}"
+        return run_on_grid(self, self.endpoint, n, until=until, before=before, observe=observe)
 
 
 def _within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:

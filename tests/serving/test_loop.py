@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import serving.grid
 import serving.loop
 from serving import (
     Command,
@@ -20,6 +21,7 @@ from serving import (
     Controller,
     ControlLoop,
     EndpointError,
+    Fallback,
     LoopError,
     Mode,
     MonotonicClock,
@@ -469,7 +471,7 @@ def test_a_clock_that_fails_holds_and_the_machines_own_measures_the_period(
     make_loop: Callable[..., ControlLoop], monkeypatch: Any, where: str
 ) -> None:
     spare = VirtualClock()
-    monkeypatch.setattr(serving.loop, "MonotonicClock", lambda: spare)
+    monkeypatch.setattr(serving.grid, "MonotonicClock", lambda: spare)
     clock, tank, commands = VirtualClock(100.0), Tank(), []
 
     def raised(*_: Any) -> Any:
@@ -511,7 +513,7 @@ def test_a_person_can_still_end_the_run(make_loop: Callable[..., ControlLoop], w
 
 
 NUMBERS = st.floats(width=64) | st.sampled_from([math.nan, math.inf, -math.inf, 1.7e308, -1.7e308, 1e6])
-PLACES = ("read", "write", "before", "observe", "until", "warm", "step", "guard", "clock")
+PLACES = ("read", "write", "before", "observe", "until", "warm", "step", "guard", "clock", "hand_back")
 
 
 class Chaos:
@@ -523,6 +525,7 @@ class Chaos:
         self.data, self.m = data, controller.manifest
         self.raises: dict[str, Exception] = {}
         self.written: list[np.ndarray] = []
+        self.handed_back = self.shadowed = 0
         self.clock = VirtualClock()
         self.loop: ControlLoop | None = None
         self.inner_step, self.inner_warm = controller.step, controller.warm
@@ -548,6 +551,8 @@ class Chaos:
         mode = draw(st.sampled_from([None, None, *Mode]))
         if mode is not None:
             self.loop.set_mode(mode)
+        if draw(st.sampled_from([False, False, True])):
+            self.loop.swap(self.loop.controller, draw(st.sampled_from([1, 2])))
         if mode is Mode.MANUAL:
             self.loop.set_mv([draw(st.sampled_from(s.values or (s.low, s.middle, s.high))) for s in self.m.mv])
         self.at("before")
@@ -562,6 +567,10 @@ class Chaos:
         self.written.append(mv.copy())
         mv[:] = 1e9
         self.at("write")
+
+    def hand_back(self) -> None:
+        self.handed_back += 1
+        self.at("hand_back")
 
     def check(self, *_: Any) -> str | None:
         self.at("guard")
@@ -583,8 +592,10 @@ class Chaos:
         self.inner_warm()
 
     def observe(self, _: Sample | None, command: Command) -> None:
+        self.shadowed += command.mode is Mode.SHADOW
         assert command.law_mv is None or legal(command.law_mv, self.m.mv)
-        for array in (command.law_mv, command.info, command.sp):
+        assert command.successor_mv is None or legal(command.successor_mv, self.m.mv)
+        for array in (command.law_mv, command.info, command.sp, command.successor_mv):
             if array is not None:
                 array[:] = -1e9
         self.at("observe")
@@ -600,16 +611,23 @@ CHAOS_FILES += [p for p in SHIPPED if p.parent.name == "jacketed_batch_reactor"]
 
 @settings(deadline=None, max_examples=60)
 @given(
-    st.data(), st.sampled_from(CHAOS_FILES), st.sampled_from(["default", "none", "one"]), st.sampled_from([None, 1, 2])
+    st.data(),
+    st.sampled_from(CHAOS_FILES),
+    st.sampled_from(["default", "none", "one"]),
+    st.sampled_from([None, 1, 2]),
+    st.sampled_from([0.0, 0.5, 3.0, 1e3]),
+    st.sampled_from(["stay", "safe", "hand back"]),
 )
 def test_every_written_mv_lies_in_range_and_the_run_never_raises(
-    data: st.DataObject, path: Path, guards: str, recover_after: int | None
+    data: st.DataObject, path: Path, guards: str, recover_after: int | None, periods: float, fallback: str
 ) -> None:
     controller = shipped(path)
     m, chaos = controller.manifest, Chaos(data, controller)
+    safe = tuple(data.draw(st.sampled_from(s.values or (s.low, s.middle, s.high))) for s in m.mv)
+    rate = tuple(data.draw(st.floats(1e-9, 1e9)) for _ in m.mv)
     n = 8
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(serving.loop, "MonotonicClock", VirtualClock)
+        patch.setattr(serving.grid, "MonotonicClock", VirtualClock)
         patch.setattr(controller, "step", chaos.step)
         patch.setattr(controller, "warm", chaos.warm)
         chaos.loop = ControlLoop(
@@ -621,10 +639,16 @@ def test_every_written_mv_lies_in_range_and_the_run_never_raises(
             guards={"default": (*default_guards(m), chaos), "none": (), "one": (chaos,)}[guards],
             recover_after=recover_after,
             clock=chaos,
+            transfer_s=periods * m.period_s,
+            fallback={
+                "stay": None,
+                "safe": Fallback(m.period_s, safe, rate),
+                "hand back": Fallback(m.period_s, hand_back=True),
+            }[fallback],
         )
         report = chaos.loop.run(n, before=chaos.before, observe=chaos.observe, until=chaos.until)
     assert report.scans + report.missed == n
-    assert len(chaos.written) == report.scans
+    assert len(chaos.written) == report.scans - chaos.shadowed - chaos.handed_back
     assert [mv.tolist() for mv in chaos.written if not legal(mv, m.mv)] == []
     assert legal(chaos.loop.mv, m.mv)
     assert not any("AssertionError" in text for text in report.first_errors)

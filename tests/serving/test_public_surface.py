@@ -8,8 +8,8 @@ import serving
 
 SURFACE = {
     "Allowed", "ArtifactError", "Clock", "Command", "Complete", "ContractError", "ControlLoop", "Controller",
-    "Endpoint", "EndpointError", "Fresh", "Frozen", "Guard", "InRange", "LoopError", "LoopwrightError", "Manifest",
-    "Mode", "MonotonicClock", "OutputError", "Rate", "RunReport", "Sample", "SampleError", "Signal",
+    "Endpoint", "EndpointError", "Fallback", "Fresh", "Frozen", "Guard", "InRange", "LoopError", "LoopwrightError",
+    "Manifest", "Mode", "MonotonicClock", "OutputError", "Rate", "RunReport", "Sample", "SampleError", "Signal",
     "SimulatedEndpoint", "Step", "VirtualClock", "default_guards",
 }  # fmt: skip
 

@@ -1,0 +1,18 @@
+"""Errors in one line, for a command's reason and for a log."""
+
+from __future__ import annotations
+
+
+def first_line(error: Exception) -> str:
+    """The first line of the error's text; its type if the text is empty."""
+    name = type(error).__name__
+    try:
+        return (str(error).strip().splitlines() or [name])[0]
+    except Exception:
+        return name
+
+
+def named(error: Exception) -> str:
+    """The error's type and text in one line."""
+    name, text = type(error).__name__, first_line(error)
+    return name if text == name else f"{name}: {text}"
