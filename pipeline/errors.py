@@ -16,10 +16,22 @@ LoopwrightError (serving)
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
-
 from serving.errors import LoopwrightError
+from serving.fields import nearest
+
+__all__ = [
+    "ExportError",
+    "LawError",
+    "ModelError",
+    "ParamsError",
+    "PipelineError",
+    "PlantError",
+    "RecordError",
+    "ReportError",
+    "TrackingError",
+    "WithheldError",
+    "nearest",
+]
 
 
 class PipelineError(LoopwrightError):
@@ -60,11 +72,3 @@ class ReportError(PipelineError):
 
 class TrackingError(PipelineError):
     """The tracking store or the registry refused."""
-
-
-def nearest(word: object, known: Iterable[str]) -> str:
-    """The end of an error message: the nearest known word, or all of them."""
-    names = sorted(str(k) for k in known)
-    close = difflib.get_close_matches(str(word), names, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ";"
-    return f"{hint} known: {', '.join(names) or 'none'}"

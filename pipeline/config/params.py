@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import types
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
-from pipeline.errors import ParamsError, PipelineError, nearest
+from pipeline.errors import ParamsError, nearest
+from serving import fields
 
 T = TypeVar("T")
 PARAMS_FILE = Path("params.yaml")
@@ -85,73 +84,8 @@ def choose(table: Mapping[str, T], word: object, what: str, where: str) -> T:
 
 
 def parse(cls: type[T], values: Mapping[str, Any], where: str) -> T:
-    """``values`` as the dataclass ``cls``, types checked, nested dataclasses too.
-
-    Raises ParamsError that names ``where`` for an unknown or missing key, a wrong type, and what the
-    dataclass's own checks refuse.
-    """
-    if not isinstance(values, Mapping):
-        raise ParamsError(f"{where} is {values!r}; it must be a mapping")
-    hints = typing.get_type_hints(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
-    for key in values:
-        if key not in fields:
-            raise ParamsError(f"{where}: unknown key {key!r}{nearest(key, fields)}")
-    for name, field in fields.items():
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and name not in values:
-            raise ParamsError(f"{where}: {name!r} is missing")
-    read = {key: _convert(hints[key], value, f"{where}.{key}") for key, value in values.items()}
-    try:
-        return cls(**read)
-    except (ValueError, TypeError, PipelineError) as error:
-        raise ParamsError(f"{where}: {error}") from None
-
-
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in args:
-            return None
-        rest = [a for a in args if a is not type(None)]
-        for option in rest[:-1]:
-            try:
-                return _convert(option, value, where)
-            except ParamsError:
-                continue
-        return _convert(rest[-1], value, where)
-    if origin is typing.Literal:
-        if value not in args:
-            raise ParamsError(f"{where} is {value!r}{nearest(value, map(str, args))}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise ParamsError(f"{where} is {value!r}; it must be a list")
-        inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
-        if len(inner) != len(value):
-            raise ParamsError(f"{where} has {len(value)} entries; it must have {len(inner)}")
-        return tuple(_convert(h, v, f"{where}[{i}]") for i, (h, v) in enumerate(zip(inner, value, strict=True)))
-    if origin in (dict, Mapping) or (isinstance(origin, type) and issubclass(origin, Mapping)):
-        if not isinstance(value, Mapping):
-            raise ParamsError(f"{where} is {value!r}; it must be a mapping")
-        return {str(k): _convert(args[1], v, f"{where}.{k}") for k, v in value.items()}
-    if dataclasses.is_dataclass(hint):
-        return parse(hint, value, where)  # type: ignore[arg-type]
-    if hint is Any:
-        return value
-    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
-    if hint is float and isinstance(value, str):
-        # YAML 1.1 reads 5e-4 (no dot) as text.
-        try:
-            return float(value)
-        except ValueError:
-            raise ParamsError(f"{where} is {value!r}; it must be a number") from None
-    if hint is Path and isinstance(value, str):
-        return Path(value)
-    if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
-        raise ParamsError(f"{where} is {value!r}; it must be of type {hint.__name__}")
-    return value
+    """``values`` as the dataclass ``cls``; ParamsError, see ``serving.fields``."""
+    return fields.parse(cls, values, where, ParamsError)
 
 
 # ---------------------------------------------------------------- the sections

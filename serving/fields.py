@@ -1,0 +1,97 @@
+"""Settings that a person wrote, as frozen dataclasses; every mistake in them is one clear error."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from serving.errors import LoopwrightError
+
+T = TypeVar("T")
+
+
+def nearest(word: object, known: Iterable[str]) -> str:
+    """The end of an error message: the nearest known word, or all of them."""
+    names = sorted(str(k) for k in known)
+    close = difflib.get_close_matches(str(word), names, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ";"
+    return f"{hint} known: {', '.join(names) or 'none'}"
+
+
+def parse(cls: type[T], values: Any, where: str, error: type[Exception]) -> T:
+    """``values`` as the dataclass ``cls``, types checked, nested dataclasses too.
+
+    Raises ``error`` that names ``where`` for an unknown or missing key, a wrong type, and what the
+    dataclass's own checks refuse.
+    """
+    if not isinstance(values, Mapping):
+        raise error(f"{where} is {values!r}; it must be a mapping")
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    for key in values:
+        if key not in fields:
+            raise error(f"{where}: unknown key {key!r}{nearest(key, fields)}")
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in values:
+            raise error(f"{where}: {name!r} is missing")
+    read = {key: _convert(hints[key], value, f"{where}.{key}", error) for key, value in values.items()}
+    try:
+        return cls(**read)
+    except (ValueError, TypeError, LoopwrightError) as refused:
+        raise error(f"{where}: {refused}") from None
+
+
+def _convert(hint: Any, value: Any, where: str, error: type[Exception]) -> Any:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        rest = [a for a in args if a is not type(None)]
+        for option in rest[:-1]:
+            try:
+                return _convert(option, value, where, error)
+            except error:
+                continue
+        return _convert(rest[-1], value, where, error)
+    if origin is typing.Literal:
+        if value not in args:
+            raise error(f"{where} is {value!r}{nearest(value, map(str, args))}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise error(f"{where} is {value!r}; it must be a list")
+        inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+        if len(inner) != len(value):
+            raise error(f"{where} has {len(value)} entries; it must have {len(inner)}")
+        return tuple(_convert(h, v, f"{where}[{i}]", error) for i, (h, v) in enumerate(zip(inner, value, strict=True)))
+    if origin in (dict, Mapping) or (isinstance(origin, type) and issubclass(origin, Mapping)):
+        if not isinstance(value, Mapping):
+            raise error(f"{where} is {value!r}; it must be a mapping")
+        return {str(k): _convert(args[1], v, f"{where}.{k}", error) for k, v in value.items()}
+    if dataclasses.is_dataclass(hint):
+        return parse(hint, value, where, error)  # type: ignore[arg-type]
+    return _plain(hint, value, where, error)
+
+
+def _plain(hint: Any, value: Any, where: str, error: type[Exception]) -> Any:
+    if hint is Any:
+        return value
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if hint is float and isinstance(value, str):
+        # YAML 1.1 reads 5e-4 (no dot) as text.
+        try:
+            return float(value)
+        except ValueError:
+            raise error(f"{where} is {value!r}; it must be a number") from None
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
+        raise error(f"{where} is {value!r}; it must be of type {hint.__name__}")
+    return value
