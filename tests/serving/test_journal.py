@@ -1,0 +1,183 @@
+"""A journal holds what happened, whole, whatever happens to its process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from serving import Controller, LoopError
+from serving.journal import BLOCK, FRESH, Event, Journal, JournalReader, Scan, columns, packed, unpacked
+
+pytest_plugins = ["small_laws"]
+
+
+def scans(n: int, seed: int = 0, width: int = 9) -> list[Scan]:
+    rng = np.random.default_rng(seed)
+    found = []
+    for k in range(n):
+        numbers = tuple(np.where(rng.random(width) < 0.1, np.nan, rng.normal(size=width)).tolist())
+        quality = (0, 2147483648) if k % 50 == 3 else ()
+        found.append(Scan(1e9 + k, ("AUTO", "HOLD")[k % 97 > 90], numbers, quality, "PV level: bad" * (k % 50 == 3)))
+    return found
+
+
+def same(a: Scan, b: Scan) -> bool:
+    return np.array_equal(a.numbers, b.numbers, equal_nan=True) and (a.time_s, a.mode, a.quality, a.reason) == (
+        b.time_s, b.mode, b.quality, b.reason,
+    )  # fmt: skip
+
+
+def test_what_is_written_is_read_also_after_it_was_packed(tmp_path: Path, controller: Controller) -> None:
+    given = scans(FRESH + 3 * BLOCK + 7)
+    journal = Journal(tmp_path / "loop.journal")
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    for scan in given:
+        journal.scan(scan)
+    journal.event(Event(1e9, "change", "anna", "mode AUTO", "start of the shift"))
+    journal.close()
+    reader = JournalReader(tmp_path / "loop.journal")
+    found = list(reader.scans())
+    assert [id_ for id_, _, _ in found] == list(range(1, len(given) + 1))
+    assert all(same(a, b) for a, (_, _, b) in zip(given, found, strict=True))
+    assert reader.events() == [(1, Event(1e9, "change", "anna", "mode AUTO", "start of the shift"))]
+    (run,) = reader.runs()
+    assert run["columns"] == columns(controller.manifest)
+    assert run["columns"][:4] == ["sp level", "pv level", "pv T", "mv valve"]
+    # a part of it, by id and by time, within a block and across
+    assert [i for i, _, _ in reader.scans(after_id=595)] == list(range(596, len(given) + 1))
+    assert [s.time_s - 1e9 for _, _, s in reader.scans(begin_s=1e9 + 598.5, end_s=1e9 + 602)] == [599, 600, 601, 602]
+    reader.close()
+    base = sqlite3.connect(tmp_path / "loop.journal")
+    assert base.execute("select count(*) from block").fetchone() == (3,)
+
+
+def test_a_pack_is_smaller_than_its_rows() -> None:
+    rng = np.random.default_rng(0)
+    rows = [
+        (k, 1, 1e9 + k, "AUTO", np.array([0.5, rng.normal(300, 0.1), 40.0]).tobytes(), None, None) for k in range(600)
+    ]
+    assert len(packed(rows)) < 600 * 4 * 8 / 3
+    assert [s.time_s for s in unpacked(packed(rows))] == [1e9 + k for k in range(600)]
+
+
+def test_a_journal_goes_on_where_it_was(tmp_path: Path, controller: Controller) -> None:
+    path = tmp_path / "loop.journal"
+    for part in range(3):
+        journal = Journal(path)
+        journal.begin(controller.manifest, controller.sha256, 1e9 + part)
+        for scan in scans(10, part):
+            journal.scan(scan)
+        journal.close()
+    reader = JournalReader(path)
+    assert [(i, run) for i, run, _ in reader.scans()] == [(10 * r + k + 1, r + 1) for r in range(3) for k in range(10)]
+    reader.close()
+
+
+def test_the_oldest_go_where_it_would_grow_too_large(tmp_path: Path, controller: Controller) -> None:
+    path, sizes, n = tmp_path / "loop.journal", [], FRESH + 10 * BLOCK
+    for _ in range(4):
+        journal = Journal(path, max_mb=0.2)
+        journal.begin(controller.manifest, controller.sha256, 1e9)
+        for scan in scans(n):
+            journal.scan(scan)
+        journal.close()
+        sizes.append(path.stat().st_size)
+    reader = JournalReader(path)
+    ids = [i for i, _, _ in reader.scans()]
+    reader.close()
+    assert ids == list(range(ids[0], 4 * n + 1))  # no gap within
+    assert ids[0] > 3 * n - BLOCK
+    assert sizes[3] < 1.05 * sizes[1] < 1_500_000
+
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from serving import Manifest
+from serving.journal import Journal, Scan
+journal = Journal(Path(sys.argv[1]))
+journal.begin(Manifest.from_json(sys.argv[2]), "", time.time())
+k = 0
+while True:
+    journal.scan(Scan(time.time(), "AUTO", (float(k),) * 9))
+    k += 1
+    print(time.time(), flush=True)
+    time.sleep(0.001)
+"""
+
+
+def test_a_killed_process_loses_at_most_its_last_second(tmp_path: Path, controller: Controller) -> None:
+    """Fifty times, in the middle of writing, packing and rotating."""
+    path, rng, before = tmp_path / "loop.journal", np.random.default_rng(0), 0
+    for _ in range(50):
+        process = subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(path), controller.manifest.to_json()], stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        said = [process.stdout.readline() for _ in range(int(rng.integers(50, 500)))]
+        os.kill(process.pid, signal.SIGKILL)
+        said += process.stdout.readlines()
+        process.wait()
+        process.stdout.close()
+        base = sqlite3.connect(path)
+        assert base.execute("pragma integrity_check").fetchone() == ("ok",)
+        base.close()
+        reader = JournalReader(path)
+        found = list(reader.scans(after_id=before))
+        reader.close()
+        assert [i for i, _, _ in found] == list(range(before + 1, before + 1 + len(found)))
+        before += len(found)
+        last = float([line for line in said if line.endswith("\n")][-1])
+        assert last - found[-1][2].time_s < 1.0
+
+
+def test_what_is_no_journal_is_named(tmp_path: Path) -> None:
+    foreign = tmp_path / "other.db"
+    base = sqlite3.connect(foreign)
+    base.execute("create table t (a)")
+    base.commit()
+    base.close()
+    with pytest.raises(LoopError, match=r"other.db is no journal of this release"):
+        Journal(foreign)
+    (tmp_path / "text").write_text("not a database at all, and longer than a header of one" * 50)
+    with pytest.raises(LoopError, match="text is no journal, or cannot be written: file is not a database"):
+        Journal(tmp_path / "text")
+    with pytest.raises(LoopError, match="is not here"):
+        JournalReader(tmp_path / "nowhere")
+
+
+def test_a_disk_that_takes_nothing_loses_nothing(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    journal = Journal(tmp_path / "loop.journal", tell=told.append)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    write, full = journal._write, [True] * 3
+
+    def sometimes(run: int) -> int:
+        if full:
+            full.pop()
+            raise sqlite3.OperationalError("database or disk is full")
+        return write(run)
+
+    monkeypatch.setattr(journal, "_write", sometimes)
+    given = scans(5)
+    for scan in given:
+        journal.scan(scan)
+    while full:
+        journal._thread.join(0.05)
+    journal.close()
+    assert told == [
+        "the journal cannot be written: OperationalError: database or disk is full",
+        "the journal writes again",
+    ]
+    reader = JournalReader(tmp_path / "loop.journal")
+    assert all(same(a, b) for a, (_, _, b) in zip(given, reader.scans(), strict=True))
+    reader.close()
