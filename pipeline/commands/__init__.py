@@ -14,6 +14,8 @@ COMMANDS = {
     "check": "read every section of params.yaml and list its mistakes",
     "results": "show the figures of every controller, and where to look",
     "simulate": "close the loop of a controller file over its plant",
+    "loop": "run a controller on a plant over OPC UA: init, check, run, export",
+    "plant": "serve a simulated plant over OPC UA, to try a loop on",
     "stress": "close the loops of a controller file over many plants drawn at random",
     "inspect": "show what a controller file is and how its validation went",
     "bench": "measure how long a step of a controller file takes here",

@@ -1,0 +1,62 @@
+"""``loopwright plant serve``: a simulated plant behind a real OPC UA server, to try a loop on."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+from pathlib import Path
+
+from pipeline.cases import CASES
+from pipeline.commands.arguments import positive, whole
+from pipeline.config.params import choose
+from pipeline.errors import PipelineError
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    serve = commands.add_parser("serve", help="serve the plant of a case until Ctrl-C")
+    add = serve.add_argument
+    add("case", metavar="CASE", help=", ".join(sorted(CASES)))
+    add("--listen", metavar="HOST:PORT", default="127.0.0.1:4840", help="where to listen (127.0.0.1:4840)")
+    add("--speed", metavar="X", type=positive(), default=1.0, help="times real time (1)")
+    add("--types", choices=["LREAL", "REAL"], default="LREAL", help="of the nodes: 64 bits or 32 (LREAL)")
+    add("--noise", action="store_true", help="add the case's measurement noise")
+    add("--seed", metavar="N", type=whole(0), default=0, help="of the noise (0)")
+    add("--folder", metavar="FOLDER", type=Path, default=Path("plant-server"),
+        help="of its certificate (plant-server)")  # fmt: skip
+    add("--only-trusted", action="store_true",
+        help="refuse clients without a certificate in FOLDER/trusted, and connections in the clear")  # fmt: skip
+    add("--log", metavar="FILE", type=Path, help="write there what the actuator gets, a line of JSON each period")
+    add("--periods", metavar="N", type=whole(1), help="stop after so many")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Serve the plant until Ctrl-C."""
+    try:
+        from pipeline.simulation.opcua_server import PlantServer
+    except ModuleNotFoundError as error:
+        raise PipelineError(f"{error.name} is not installed; pip install 'loopwright[plant]' brings it") from None
+    case = choose(CASES, options.case, "case", "plant serve")
+    test = next(iter(case.scenarios().values()))[0]
+    server = PlantServer(
+        plant=case.plant,
+        endpoint=f"opc.tcp://{options.listen}",
+        x=test.x0.copy(),
+        mv=test.mv0.copy(),
+        noise_std=case.noise_std if options.noise else None,
+        seed=options.seed,
+        speed=options.speed,
+        types=options.types,
+        folder=options.folder,
+        trust_all=not options.only_trusted,
+        log=options.log,
+        tell=lambda line: print(line, flush=True),
+    )
+    try:
+        asyncio.run(server.run(options.periods))
+    except OSError as error:
+        raise PipelineError(f"nothing can listen at {options.listen}: {error.strerror or error}") from None
+    except KeyboardInterrupt:
+        print("plant: ended", file=sys.stderr)

@@ -1,0 +1,253 @@
+"""A simulated plant behind a real OPC UA server, with faults on request: for trying a loop before a plant has it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from asyncua import Server, ua
+from asyncua.crypto.cert_gen import setup_self_signed_certificate
+from asyncua.crypto.truststore import TrustStore
+from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from pipeline.errors import PlantError
+from pipeline.plants.simulator import Array, Simulator
+from serving.manifest import Signal
+
+NAMESPACE = "urn:loopwright:plant"
+APPLICATION = "urn:loopwright:plant:server"
+FAULTS = ("", "bad", "uncertain", "frozen", "text", "deleted", "int", "nan")
+LOCAL, REMOTE = 0, 1  # who has the plant: its own controller, or whoever writes the MVs
+ALIVE_PERIODS = 3
+KINDS = {"LREAL": ua.VariantType.Double, "REAL": ua.VariantType.Float}
+
+
+@dataclass
+class PlantServer:
+    """One plant, a step each period, ``speed`` times as fast as the clock.
+
+    Nodes ``PV.x``, ``MV.x`` (written by whoever controls), ``RB.x`` (the MV that the actuator has), ``DV.x``, ``SP.x``,
+    each with its unit and range; ``Control.Owner`` (0 its own controller, which holds the MVs; 1 the loop),
+    ``Control.Watchdog`` (counts periods), ``Control.Heartbeat`` (for the loop to count), ``Control.LoopAlive``,
+    ``Control.Lease``; and ``Faults.x`` for every PV, MV and DV, which takes one of FAULTS, and ``Faults.Clock``, by
+    how many seconds the source times are off.
+    """
+
+    plant: Simulator
+    endpoint: str
+    x: Array
+    mv: Array
+    noise_std: Array | None = None  # shape: (n_pv,)
+    seed: int = 0
+    speed: float = 1.0
+    types: str = "LREAL"
+    folder: Path = Path("plant-server")  # of its certificate, and of trusted ones
+    trust_all: bool = True
+    tell: Callable[[str], object] = lambda _: None
+    log: Path | None = None  # a line of JSON each period: what the MV nodes hold, what the actuator has
+
+    def __post_init__(self) -> None:
+        self.server = Server()
+        self.k = 0
+        self._rng = np.random.default_rng(self.seed)
+        self._beat: tuple[Any, int] = (None, 0)
+        self._frozen: dict[str, tuple[float, datetime]] = {}
+        self._kinds: dict[str, ua.VariantType] = {}
+        self._gone: set[str] = set()
+        self._kind = KINDS[self.types]
+        self._out = None if self.log is None else self.log.open("a", encoding="utf-8", buffering=1)
+
+    async def run(self, periods: int | None = None) -> None:
+        """Serve until cancelled, or for some periods."""
+        await self._prepare()
+        async with self.server:
+            self.tell(f"serving {self.plant.name} at {self.endpoint}")
+            start = time.monotonic()
+            while periods is None or self.k < periods:
+                await self._period()
+                self.k += 1
+                # On a grid; a machine that is late catches up.
+                await asyncio.sleep(max(0.0, start + self.k * self.plant.period_s / self.speed - time.monotonic()))
+
+    # ------------------------------------------------------------------ address space
+    async def _prepare(self) -> None:
+        server = self.server
+        await server.init()
+        server.set_endpoint(self.endpoint)
+        server.set_server_name(f"Loopwright: {self.plant.title}")
+        await server.set_application_uri(APPLICATION)
+        await self._secure()
+        self.index = await server.register_namespace(NAMESPACE)
+        objects = server.get_objects_node()
+        self.root = await objects.add_object(self._id("Plant"), f"{self.index}:Plant")
+        self.start = {
+            **{f"PV.{s.name}": v for s, v in zip(self.plant.pv_signals, self._measured(), strict=True)},
+            **{f"MV.{s.name}": v for s, v in zip(self.plant.mv_signals, self.mv, strict=True)},
+            **{f"RB.{s.name}": v for s, v in zip(self.plant.mv_signals, self.mv, strict=True)},
+            **{f"DV.{s.name}": v for s, v in zip(self.plant.dv_signals, self.plant.dv_nominal, strict=True)},
+            **{f"SP.{s.name}": v for s, v in zip(self.plant.sp_signals, self._measured(), strict=False)},
+        }
+        for tag in self.start:
+            await self._variable(tag)
+        control = {"Owner": REMOTE, "Watchdog": 0, "Heartbeat": 0}
+        for name, value in control.items():
+            node = await self.root.add_variable(
+                self._id(f"Control.{name}"), f"{self.index}:{name}", ua.Variant(value, ua.VariantType.Int32)
+            )
+            await node.set_writable(name != "Watchdog")
+        for name, start in (("LoopAlive", False), ("Lease", "")):
+            node = await self.root.add_variable(self._id(f"Control.{name}"), f"{self.index}:{name}", start)
+            await node.set_writable(name == "Lease")
+        for tag in self.start:
+            node = await self.root.add_variable(self._id(f"Faults.{tag}"), f"{self.index}:Faults.{tag}", "")
+            await node.set_writable()
+        node = await self.root.add_variable(self._id("Faults.Clock"), f"{self.index}:Faults.Clock", 0.0)
+        await node.set_writable()
+
+    async def _variable(self, tag: str, value: ua.Variant | None = None) -> None:
+        group, _, name = tag.partition(".")
+        value = value or ua.Variant(float(self.start[tag]), self._kind)
+        node = await self.root.add_variable(self._id(tag), f"{self.index}:{tag}", value)
+        self._kinds[tag] = value.VariantType
+        await node.set_writable(group in {"MV", "SP", "DV"})
+        signal = self._signal(group, name)
+        unit = ua.EUInformation(DisplayName=ua.LocalizedText(signal.unit))
+        await node.add_property(self.index, "EngineeringUnits", unit)
+        await node.add_property(self.index, "EURange", ua.Range(Low=signal.low, High=signal.high))
+
+    def _signal(self, group: str, name: str) -> Signal:
+        p = self.plant
+        of = {"PV": p.pv_signals, "MV": p.mv_signals, "RB": p.mv_signals, "DV": p.dv_signals, "SP": p.sp_signals}
+        return next(s for s in of[group] if s.name == name)
+
+    def _id(self, tag: str) -> ua.NodeId:
+        return ua.NodeId(ua.String(tag), ua.Int16(self.index))
+
+    async def _secure(self) -> None:
+        """Both None and Basic256Sha256, so that either can be tried; a certificate of its own, made once."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        trusted = self.folder / "trusted"
+        trusted.mkdir(exist_ok=True)
+        key, certificate = self.folder / "key.pem", self.folder / "certificate.der"
+        host = self.endpoint.removeprefix("opc.tcp://").partition(":")[0]
+        await setup_self_signed_certificate(
+            key, certificate, APPLICATION, host, [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH], {}
+        )
+        await self.server.load_certificate(str(certificate))
+        await self.server.load_private_key(str(key))
+        policies = [ua.SecurityPolicyType.NoSecurity, ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt]
+        if not self.trust_all:
+            policies = policies[1:]
+            store = TrustStore([trusted], [])
+            await store.load()
+            self.server.set_certificate_validator(
+                CertificateValidator(CertificateValidatorOptions.TRUSTED_VALIDATION, store)
+            )
+        self.server.set_security_policy(policies)
+
+    # ------------------------------------------------------------------ a period
+    async def _period(self) -> None:
+        """Take the MVs, advance the plant, publish."""
+        p = self.plant
+        asked = np.array([await self._number(f"MV.{s.name}", v) for s, v in self._with(p.mv_signals, self.mv)])
+        dv = np.array([await self._number(f"DV.{s.name}", v) for s, v in self._with(p.dv_signals, p.dv_nominal)])
+        if await self._value("Control.Owner") == REMOTE:
+            low, high = (np.array([getattr(s, end) for s in self.plant.mv_signals]) for end in ("low", "high"))
+            self.mv = np.clip(asked, low, high)
+        if self._out is not None:
+            row = {"k": self.k, "time": time.time(), "asked": asked.tolist(), "mv": self.mv.tolist()}
+            self._out.write(json.dumps(row) + "\n")
+        self.x = p.step(self.x, self.mv, dv, p.parameters())
+        if not np.isfinite(self.x).all():
+            raise PlantError(f"{self.plant.name} has left what it can compute, with MVs {self.mv.tolist()}")
+        await self._publish()
+
+    async def _publish(self) -> None:
+        now = datetime.now(UTC) + timedelta(seconds=float(await self._value("Faults.Clock")))
+        for s, value in self._with(self.plant.pv_signals, self._measured()):
+            await self._show(f"PV.{s.name}", float(value), now)
+        for s, value in self._with(self.plant.mv_signals, self.mv):
+            await self._show(f"RB.{s.name}", float(value), now)
+        for s in (*self.plant.mv_signals, *self.plant.dv_signals, *self.plant.sp_signals):
+            for group in ("MV", "DV", "SP"):
+                if f"{group}.{s.name}" in self.start:
+                    await self._spoil_alone(f"{group}.{s.name}")
+        await self._set("Control.Watchdog", ua.Variant(self.k % 30_000, ua.VariantType.Int32))
+        beat = await self._value("Control.Heartbeat")
+        last, age = self._beat
+        self._beat = (beat, 0 if beat != last else age + 1)
+        await self._set("Control.LoopAlive", ua.Variant(self._beat[1] < ALIVE_PERIODS, ua.VariantType.Boolean))
+
+    async def _show(self, tag: str, value: float, now: datetime) -> None:
+        """Publish a value, as its fault has it."""
+        fault = await self._fault(tag)
+        if fault == "frozen":
+            value, now = self._frozen.setdefault(tag, (value, now))
+        else:
+            self._frozen.pop(tag, None)
+        if tag in self._gone:
+            return
+        status = {"bad": ua.StatusCodes.BadSensorFailure, "uncertain": ua.StatusCodes.UncertainSensorNotAccurate}
+        variant = {
+            "text": ua.Variant("####", ua.VariantType.String),
+            "int": ua.Variant(round(value), ua.VariantType.Int32),
+            "nan": ua.Variant(float("nan"), self._kind),
+        }.get(fault, ua.Variant(value, self._kind))
+        await self._typed(tag, variant)
+        code = ua.StatusCode(status.get(fault, ua.StatusCodes.Good))
+        await self.server.write_attribute_value(self._id(tag), ua.DataValue(variant, code, SourceTimestamp=now))
+
+    async def _spoil_alone(self, tag: str) -> None:
+        """Of a node that others write: whether it is there, and of which type."""
+        fault = await self._fault(tag)
+        if tag not in self._gone:
+            value = float(await self._value(tag))
+            whole = ua.Variant(round(value), ua.VariantType.Int32)
+            await self._typed(tag, whole if fault == "int" else ua.Variant(value, self._kind))
+
+    async def _typed(self, tag: str, value: ua.Variant) -> None:
+        """Make a node anew where it is to be of another type: a server changes none."""
+        if self._kinds[tag] is not value.VariantType:
+            await self.server.delete_nodes([self.server.get_node(self._id(tag))])
+            await self._variable(tag, value)
+
+    async def _fault(self, tag: str) -> str:
+        """The fault that is asked for; a node goes and comes with ``deleted``."""
+        fault = str(await self._value(f"Faults.{tag}"))
+        if fault == "deleted" and tag not in self._gone:
+            self._gone.add(tag)
+            await self.server.delete_nodes([self.server.get_node(self._id(tag))])
+        elif fault != "deleted" and tag in self._gone:
+            self._gone.discard(tag)
+            await self._variable(tag)
+        return fault
+
+    # ------------------------------------------------------------------ small things
+    def _measured(self) -> Array:
+        pv = self.plant.measure(self.x)
+        return pv if self.noise_std is None else pv + self.noise_std * self._rng.standard_normal(len(pv))
+
+    @staticmethod
+    def _with(signals: tuple[Signal, ...], values: Array) -> list[tuple[Signal, float]]:
+        return list(zip(signals, values.tolist(), strict=True))
+
+    async def _value(self, tag: str) -> Any:
+        return self.server.read_attribute_value(self._id(tag)).Value.Value
+
+    async def _number(self, tag: str, otherwise: float) -> float:
+        """A node's number; what it was where the node is gone or holds none."""
+        if tag in self._gone:
+            return otherwise
+        value = await self._value(tag)
+        return float(value) if isinstance(value, int | float) and np.isfinite(value) else otherwise
+
+    async def _set(self, tag: str, value: ua.Variant) -> None:
+        await self.server.write_attribute_value(self._id(tag), ua.DataValue(value))

@@ -1,0 +1,316 @@
+"""A plant behind an OPC UA server as a loop's endpoint: no call waits for the network."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+from asyncua import ua
+from numpy.typing import NDArray
+
+from serving.errors import EndpointError, LoopError
+from serving.guard import Sample
+from serving.manifest import Manifest
+from serving.opcua.ages import Ages
+from serving.opcua.link import BAD, GOOD, UNCERTAIN, Link, Reading, variant, words
+from serving.opcua.plan import Plan
+from serving.opcua.settings import Nodes, Server
+from serving.words import first_line, named
+
+Array: TypeAlias = NDArray[np.float64]
+
+LEAD, LONGEST_LEAD_S = 0.3, 0.5  # of a period: so long before the scan values are asked for
+ANSWER, LONGEST_ANSWER_S = 0.8, 5.0  # of a period: so long an answer may take
+SILENT_SCANS = 3  # without any answer: the connection is broken off and made anew
+FIRST_RETRY_S, LAST_RETRY_S, GROWTH = 0.2, 10.0, 1.6
+
+
+@dataclass(frozen=True, slots=True)
+class Values:
+    """What one reading brought. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
+
+    arrived_s: float  # on the endpoint's clock
+    pv: Array  # shape: (n_pv,)
+    mv: Array  # shape: (n_mv,)
+    dv: Array  # shape: (n_dv,)
+    age_s: float
+    fault: str
+    quality: tuple[int, ...]
+    asked_sp: Mapping[str, float] = field(default_factory=dict)
+    asked_mode: str = ""
+
+
+_HAND_BACK = "hand back"
+
+
+class OpcUaEndpoint:
+    """Reads and writes a plant over OPC UA from a thread of its own.
+
+    Shortly before each scan is due, all values are read in one request; ``read`` gives the last ones with their age.
+    ``write`` passes the MV on and returns; whether the plant took it is known at the next scan. An answer that is late
+    is a fault and never waited for. After ``SILENT_SCANS`` without one the connection is broken off, and made anew with
+    growing pauses; types and namespaces are asked for again then.
+
+    Parameters
+    ----------
+    manifest
+        The controller's: its signals say which nodes are needed.
+    server, nodes
+        See ``serving.opcua.settings``.
+    max_age_s
+        Age [s] from which on values are none; ``read`` then says what became of the connection.
+    speed
+        Of the loop's clock beside the machine's.
+    tell
+        Called with a line for whoever watches: connected, lost, refused.
+    clock
+        Monotonic seconds.
+
+    Raises
+    ------
+    LoopError
+        A signal without a node, or a node without a signal.
+    """
+
+    def __init__(
+        self,
+        manifest: Manifest,
+        server: Server,
+        nodes: Nodes,
+        *,
+        max_age_s: float,
+        speed: float = 1.0,
+        tell: Callable[[str], None] = lambda _: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        nodes.check(manifest)
+        self.manifest, self.server, self.nodes = manifest, server, nodes
+        self.speed, self.tell, self.clock = speed, tell, clock
+        self.max_age_s, self.period_s = max_age_s / speed, manifest.period_s / speed  # of the machine's time
+        self.answer_s = min(ANSWER * self.period_s, LONGEST_ANSWER_S)
+        self.lead_s = min(LEAD * self.period_s, LONGEST_LEAD_S)
+        self.values: Values | None = None
+        self.trouble = "not connected yet"  # why there are no values; empty while there are
+        self.unwritten = ""  # why the last MV did not reach the plant
+        self.connections = 0
+        self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
+        self._beats, self._scans, self._next_s = 0, 0, 0.0
+        self._handed_back, self._watched = False, (float("nan"), 0)
+        self._wake: asyncio.Event | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="opcua", daemon=True)
+
+    # ------------------------------------------------------------------ the loop's side
+    def start(self) -> None:
+        """Begin to connect; returns at once."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Log off and end the thread."""
+        self._closed.set()
+        self._stir()
+        if self._thread.ident is not None:
+            self._thread.join(self.server.connect_s + 2)
+
+    def read(self) -> Sample:
+        """The last values; EndpointError where there are none that are young enough."""
+        now = self.clock()
+        self._scans += 1
+        self._next_s = now + self.period_s - self.lead_s
+        self._stir()
+        values = self.values
+        if values is None:
+            raise EndpointError(self.trouble or "no values yet")
+        age = now - values.arrived_s + values.age_s
+        if self.trouble and age > self.max_age_s:
+            raise EndpointError(self.trouble)
+        return Sample(values.pv, values.mv, values.dv, age * self.speed, values.fault)
+
+    def write(self, mv: Array) -> None:
+        """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection."""
+        refused = self.unwritten
+        if self._link is None:
+            raise EndpointError(self.trouble or "not connected")
+        if self._outbox:
+            refused = refused or "the MV of the scan before is still on its way"
+        self._outbox.append(np.array(mv))
+        self._stir()
+        if refused:
+            raise EndpointError(refused)
+
+    def hand_back(self) -> None:
+        """Ask the plant's own controller to take the plant; EndpointError until the server has confirmed it."""
+        if self.nodes.hand_back is None:
+            raise LoopError("nodes.hand_back is not set: the loop knows no node by which to hand the plant back")
+        if self._handed_back:
+            self._handed_back = False
+            return
+        if self._link is not None:
+            self._outbox.append(_HAND_BACK)
+        self._stir()
+        raise EndpointError(self.unwritten or self.trouble or "asked for, not confirmed yet")
+
+    # ------------------------------------------------------------------ the thread's side
+    _link: Link | None = None
+
+    def _stir(self) -> None:
+        loop, wake = self._loop, self._wake
+        if loop is not None and wake is not None:
+            with suppress(RuntimeError):  # the thread is ending
+                loop.call_soon_threadsafe(wake.set)
+
+    def _run(self) -> None:
+        with suppress(Exception):
+            asyncio.run(self._keep_connected())
+
+    async def _keep_connected(self) -> None:
+        self._loop, self._wake = asyncio.get_running_loop(), asyncio.Event()
+        pause = FIRST_RETRY_S
+        while not self._closed.is_set():
+            try:
+                link = await Link.opened(self.server)
+            except Exception as error:
+                self._lost(first_line(error))
+                await self._rest(pause)
+                pause = min(pause * GROWTH, LAST_RETRY_S)
+                continue
+            try:
+                plan = await Plan.made(link, self.manifest, self.nodes, max(self.answer_s, self.server.connect_s))
+                self.connections += 1
+                self._outbox.clear()  # what was to be written then is too old now
+                self.unwritten = ""
+                self._link = link
+                pause = FIRST_RETRY_S
+                self.tell(f"connected to {self.server.endpoint}")
+                await self._exchange(link, plan)
+            except Exception as error:
+                self._lost(first_line(error) if isinstance(error, LoopError) else named(error))
+            finally:
+                self._link = None
+                if self._closed.is_set():
+                    await link.close()
+                else:
+                    link.abort()
+            await self._rest(pause)
+            pause = min(pause * GROWTH, LAST_RETRY_S)
+
+    def _lost(self, why: str) -> None:
+        if why != self.trouble:
+            self.tell(why)
+        self.trouble = why
+
+    async def _rest(self, seconds: float) -> None:
+        """Wait; not longer than until the endpoint is closed."""
+        assert self._wake is not None
+        end = self.clock() + seconds
+        while not self._closed.is_set() and (left := end - self.clock()) > 0:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(left):
+                    await self._wake.wait()
+            self._wake.clear()
+
+    async def _exchange(self, link: Link, plan: Plan) -> None:
+        """Read and write until the connection is lost, which raises EndpointError, or the endpoint closed."""
+        assert self._wake is not None
+        ages, silent, read_at = Ages(len(plan.timed)), 0, -float("inf")
+        while not self._closed.is_set():
+            now = self.clock()
+            due = self._next_s if self._next_s > read_at else read_at + self.period_s
+            if self._outbox:
+                await self._send(link, plan)
+            elif now >= due:
+                read_at = now
+                try:
+                    await self._beat(link, plan)
+                    answers = await link.read(plan.asked, self.answer_s)
+                except EndpointError as error:
+                    silent += 1
+                    self.trouble = first_line(error)
+                    if silent >= SILENT_SCANS or link.client.uaclient.protocol is None:
+                        raise
+                    continue
+                silent = 0
+                self.values = self._valued(plan, answers, ages)
+                self.trouble = ""
+            else:
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(due - now):
+                        await self._wake.wait()
+                self._wake.clear()
+
+    async def _send(self, link: Link, plan: Plan) -> None:
+        """Write what waits. A server that refuses is a fault; one that does not answer loses the connection."""
+        last = self._outbox.popleft()
+        while self._outbox:
+            last = self._outbox.popleft()
+        handing = isinstance(last, str)
+        try:
+            rows = [plan.hand_back()] if isinstance(last, str) else plan.variants(last)
+        except EndpointError as error:
+            self.unwritten = first_line(error)
+            return
+        statuses = await link.write(rows, self.answer_s)
+        names = ["hand_back"] if handing else plan.mv_names
+        wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != GOOD]
+        self.unwritten = f"the server refuses {', '.join(wrong)}" if wrong else ""
+        self._handed_back = handing and not wrong
+        if ua.StatusCodes.BadTypeMismatch in statuses:
+            # With the next connection all types are asked for anew.
+            raise EndpointError(f"{self.unwritten}: a node's type has changed")
+
+    async def _beat(self, link: Link, plan: Plan) -> None:
+        """Count the scans on the server's side, while there are any."""
+        if plan.heartbeat is not None and self._scans != self._beats:
+            self._beats = self._scans
+            node, kind, most = plan.heartbeat
+            await link.write([(node, variant(float(self._scans % most), kind, 0.0, float(most)))], self.answer_s)
+
+    def _valued(self, plan: Plan, answers: list[Reading], ages: Ages) -> Values:
+        """The answers as values, with the first thing that is wrong with them."""
+        arrived, fault, found = self.clock(), "", dict[str, float]()
+        for (name, point, judged), answer in zip(plan.points, answers, strict=False):
+            found[name] = point.scale * answer.number + point.offset
+            if fault or not judged:
+                continue
+            if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
+                fault = f"{name}: {answer.words}"
+            elif answer.text:
+                fault = f"{name}: {answer.text}"
+        judge = self.server.source_time == "judge"
+        timed = ages.update(arrived, [answers[i].source_s if judge else None for i in plan.timed])
+        m = self.manifest
+        asked_sp = {s.name: found[f"SP {s.name}"] for s in m.sp if np.isfinite(found.get(f"SP {s.name}", np.nan))}
+        mode = ""
+        if self.nodes.mode is not None:
+            wanted = found["mode"]
+            mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
+        if self.nodes.watchdog and not fault:
+            fault = self._dead(found["watchdog"])
+        n = len(m.pv) + len(m.mv) + len(plan.dv_names)
+        return Values(
+            arrived,
+            np.array([found[f"PV {s.name}"] for s in m.pv]),
+            np.array([found[f"MV {s.name}"] for s in m.mv]),
+            np.array([found.get(f"DV {s.name}", 0.0) for s in m.dv]),
+            max(timed, default=0.0),
+            fault,
+            tuple(a.status for a in answers[:n]),
+            asked_sp,
+            mode,
+        )
+
+    def _dead(self, watchdog: float) -> str:
+        """Why the server's side counts as dead; empty while its watchdog moves."""
+        last, scans = self._watched
+        self._watched = (watchdog, 0 if watchdog != last else scans + 1)
+        if self._watched[1] < self.nodes.watchdog_scans:
+            return ""
+        return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"

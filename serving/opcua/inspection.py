@@ -1,0 +1,127 @@
+"""Every node of a loop, read once: what is there, and what would stop the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from dataclasses import dataclass
+
+from asyncua import ua
+
+from serving.errors import EndpointError
+from serving.manifest import Manifest
+from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, words
+from serving.opcua.plan import Plan
+from serving.opcua.settings import Nodes, Server
+from serving.words import first_line
+
+WRITABLE = 2  # the second bit of an access level
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One node. ``wrong`` says what would stop the loop, ``note`` what a person should know; empty: nothing."""
+
+    signal: str
+    node: str
+    kind: str = "-"
+    value: str = "-"
+    unit: str = "-"
+    quality: str = "-"
+    age: str = "-"
+    limits: str = "-"
+    writable: str = "-"
+    wrong: str = ""
+    note: str = ""
+
+
+def inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[Found]:
+    """A row for every node, and one for the connection. Raises LoopError where the settings do not fit."""
+    nodes.check(manifest)
+    return asyncio.run(_inspected(manifest, server, nodes))
+
+
+async def _inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[Found]:
+    link = await Link.opened(server)
+    try:
+        plan = Plan(nodes, manifest)
+        rows = [(name, p.read_back or p.node, p, judged) for name, p, judged in plan.points]
+        rows += [(f"MV {s.name}, written", p.node, p, True) for s, p in zip(manifest.mv, plan.mv_points, strict=True)]
+        found = []
+        for name, node, point, judged in rows:
+            found.append(await _one(link, manifest, server, name, node, point.scale, point.offset, judged))
+        for name, node in (
+            ("heartbeat", nodes.heartbeat),
+            ("hand_back", nodes.hand_back.node if nodes.hand_back else ""),
+        ):
+            if node:
+                found.append(await _one(link, manifest, server, f"{name}, written", node, 1.0, 0.0, True))
+        return found
+    finally:
+        await link.close()
+
+
+async def _one(
+    link: Link, manifest: Manifest, server: Server, name: str, node: str, scale: float, offset: float, judged: bool
+) -> Found:
+    try:
+        (at,) = await link.resolved([node], server.connect_s)
+        (reading,) = await link.read([at], server.connect_s)
+        (access,) = await link.values([at], server.connect_s, ua.AttributeIds.UserAccessLevel)
+    except EndpointError as error:
+        return Found(name, node, wrong=first_line(error))
+    kind = reading.kind.name if reading.kind is not None else "-"
+    level = access.Value.Value if access.Value is not None else None
+    writable = bool(level & WRITABLE) if isinstance(level, int) else None
+    number = scale * reading.number + offset
+    age = "-" if reading.source_s is None else f"{time.time() - reading.source_s:.3g} s"
+    signal = _signal(manifest, name)
+    wrong = ""
+    if reading.quality == BAD or (reading.quality == UNCERTAIN and server.uncertain == "fault"):
+        wrong = f"its quality is {words(reading.status)}"
+    elif reading.text:
+        wrong = f"it holds {reading.text}"
+    elif name.endswith(", written") and reading.kind not in {*FLOATS, *INTEGERS, ua.VariantType.Boolean}:
+        wrong = f"its type {kind} holds no number"
+    elif name.endswith(", written") and writable is False:
+        wrong = "it may not be written by this user"
+    elif signal is not None and not signal.low <= number <= signal.high:
+        wrong = f"{number:.6g} lies outside {signal.low:g} .. {signal.high:g} {signal.unit}; another unit?"
+    unit, limits, note = await _properties(link, server, at, signal, scale, offset)
+    quality = "Good" if reading.quality == GOOD else words(reading.status)
+    may = {True: "yes", False: "no", None: "?"}[writable]
+    if not judged:
+        wrong, note = "", "; ".join(filter(None, (wrong, note)))
+    shown = "-" if reading.text else f"{number:.6g}"
+    return Found(name, node, kind, shown, unit, quality, age, limits, may, wrong, note)
+
+
+def _signal(manifest: Manifest, name: str):  # type: ignore[no-untyped-def]
+    group, _, rest = name.partition(" ")
+    rest = rest.removesuffix(", written")
+    signals = {"PV": manifest.pv, "MV": manifest.mv, "DV": manifest.dv, "SP": manifest.sp}.get(group, ())
+    return next((s for s in signals if s.name == rest), None)
+
+
+async def _properties(link: Link, server: Server, at: ua.NodeId, signal, scale: float, offset: float):  # type: ignore[no-untyped-def]
+    """(unit, range, note) as the server tells them; "-" where it does not."""
+    unit = limits = "-"
+    notes = []
+    try:
+        node = link.client.get_node(at)
+        async with asyncio.timeout(server.connect_s):
+            for child in await node.get_properties():
+                name = (await child.read_browse_name()).Name
+                if name == "EngineeringUnits":
+                    unit = (await child.read_value()).DisplayName.Text or "-"
+                elif name == "EURange":
+                    value = await child.read_value()
+                    limits = f"{value.Low:g} .. {value.High:g}"
+    except Exception:  # properties are a courtesy of the server
+        return unit, limits, ""
+    if signal is not None and (scale, offset) == (1.0, 0.0):
+        if unit not in {"-", signal.unit}:
+            notes.append(f"the server says {unit}, the controller {signal.unit}")
+        if limits != "-" and limits != f"{signal.low:g} .. {signal.high:g}":
+            notes.append(f"the controller's range is {signal.low:g} .. {signal.high:g}")
+    return unit, limits, "; ".join(notes)

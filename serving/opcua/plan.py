@@ -1,0 +1,85 @@
+"""The nodes of one connection: what is asked at each reading, and what is written in which type."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from asyncua import ua
+from numpy.typing import NDArray
+
+from serving.errors import EndpointError
+from serving.manifest import Manifest
+from serving.opcua.link import Link, variant
+from serving.opcua.settings import Nodes, Point
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Plan:
+    """The nodes of one connection, with the types that they have in it."""
+
+    def __init__(self, nodes: Nodes, manifest: Manifest) -> None:
+        self.nodes, self.manifest = nodes, manifest
+        self.dv_names = [s.name for s in manifest.dv if s.name in nodes.dv]
+        pv, mv, dv, sp = (nodes.points(n) for n in ("pv", "mv", "dv", "sp"))
+        used = "dv" in manifest.inputs
+        # (name, how it is scaled, whether the sample is only as good as this value)
+        self.points: list[tuple[str, Point, bool]] = [
+            *((f"PV {s.name}", pv[s.name], True) for s in manifest.pv),
+            *((f"MV {s.name}", mv[s.name], True) for s in manifest.mv),
+            *((f"DV {name}", dv[name], used) for name in self.dv_names),
+            *((f"SP {name}", point, False) for name, point in sp.items()),
+        ]
+        # A value that somebody set is as old as it is: only measurements grow stale.
+        self.timed = [i for i, (name, _, judged) in enumerate(self.points) if judged and not name.startswith("MV ")]
+        if nodes.mode is not None:
+            self.points.append(("mode", Point(nodes.mode.node), False))
+        if nodes.watchdog:
+            self.points.append(("watchdog", Point(nodes.watchdog), False))
+        self.mv_names = [s.name for s in manifest.mv]
+        self.mv_points = [mv[s.name] for s in manifest.mv]
+        self.asked: list[ua.NodeId] = []
+        self.written: list[tuple[ua.NodeId, ua.VariantType]] = []
+        self.heartbeat: tuple[ua.NodeId, ua.VariantType, int] | None = None
+        self._hand_back: tuple[ua.NodeId, ua.VariantType] | None = None
+
+    @classmethod
+    async def made(cls, link: Link, manifest: Manifest, nodes: Nodes, timeout_s: float) -> Plan:
+        """Ask the server for ids and types."""
+        plan = cls(nodes, manifest)
+        texts = [p.read_back or p.node for _, p, _ in plan.points]
+        extra = [nodes.heartbeat] if nodes.heartbeat else []
+        extra += [nodes.hand_back.node] if nodes.hand_back is not None else []
+        ids = await link.resolved([*texts, *(p.node for p in plan.mv_points), *extra], timeout_s)
+        plan.asked = ids[: len(texts)]
+        kinds = [r.kind for r in await link.read(ids[len(texts) :], timeout_s)]
+        names = [*(f"MV {n}" for n in plan.mv_names), *extra]
+        for name, kind in zip(names, kinds, strict=True):
+            if kind is None:
+                raise EndpointError(f"{name}: the server gives no value, so its type is not known")
+        typed = [(i, k) for i, k in zip(ids[len(texts) :], kinds, strict=True) if k is not None]
+        plan.written, rest = typed[: len(plan.mv_points)], typed[len(plan.mv_points) :]
+        if nodes.heartbeat:
+            (node, kind), *rest = rest
+            plan.heartbeat = (node, kind, 2 if kind is ua.VariantType.Boolean else 100)
+        if nodes.hand_back is not None:
+            plan._hand_back = rest[0]
+        return plan
+
+    def variants(self, mv: Array) -> list[tuple[ua.NodeId, ua.Variant]]:
+        """What to write for an MV (n_mv,): raw numbers in the nodes' own types, within the range."""
+        rows = []
+        signals = zip(self.written, self.mv_points, self.manifest.mv, mv.tolist(), strict=True)
+        for (node, kind), point, s, value in signals:
+            low, high = sorted(((s.low - point.offset) / point.scale, (s.high - point.offset) / point.scale))
+            raw = min(max((value - point.offset) / point.scale, low), high)
+            rows.append((node, variant(raw, kind, low, high)))
+        return rows
+
+    def hand_back(self) -> tuple[ua.NodeId, ua.Variant]:
+        """What to write to hand the plant back."""
+        assert self._hand_back is not None
+        assert self.nodes.hand_back is not None
+        (node, kind), value = self._hand_back, self.nodes.hand_back.value
+        return node, variant(value, kind, value, value)

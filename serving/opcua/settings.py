@@ -1,0 +1,165 @@
+"""What an endpoint must be told: the server, how to speak to it, and the node of every signal."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import isfinite
+from pathlib import Path
+from typing import Literal
+
+from serving.errors import LoopError
+from serving.fields import nearest
+from serving.manifest import Manifest, Signal
+
+POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss", "None")
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A node, and how its number becomes the signal's: value = scale raw + offset, in the signal's unit.
+
+    ``node`` is a node id as OPC UA writes it (``ns=2;s=TIC101.PV``), or one with the namespace's own name
+    (``nsu=urn:plant;s=TIC101.PV``), which stays right when the server numbers its namespaces anew. ``read_back``, of
+    an MV alone, is the node of what the actuator really has; empty: ``node`` itself.
+    """
+
+    node: str
+    scale: float = 1.0
+    offset: float = 0.0
+    read_back: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.node:
+            raise LoopError("node is empty; it needs a node id such as 'ns=2;s=TIC101.PV'")
+        if not (isfinite(self.scale) and self.scale != 0 and isfinite(self.offset)):
+            raise LoopError(f"scale is {self.scale} and offset {self.offset}; scale must not be 0, both finite")
+
+
+@dataclass(frozen=True, slots=True)
+class ModeNode:
+    """A node by which the plant's own operator sets the mode: the number of each mode that it can ask for."""
+
+    node: str
+    values: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        unknown = [m for m in self.values if m not in {"MANUAL", "AUTO", "SHADOW", "HOLD"}]
+        if unknown or len(set(self.values.values())) < len(self.values):
+            raise LoopError(
+                f"values is {dict(self.values)}; it needs a number of its own for one or more of MANUAL, AUTO, SHADOW, "
+                "HOLD"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class HandBack:
+    """The node by which the plant's own controller takes the plant, and the number that asks it to."""
+
+    node: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """The node of each signal by its name, and of what else the two sides tell each other.
+
+    ``heartbeat`` counts the loop's scans. ``watchdog`` is a number that the server's side changes while it lives; it
+    counts as dead after ``watchdog_scans`` scans without a change. ``lease`` holds who controls this plant.
+    """
+
+    pv: Mapping[str, str | Point]
+    mv: Mapping[str, str | Point]
+    dv: Mapping[str, str | Point] = field(default_factory=dict)
+    sp: Mapping[str, str | Point] = field(default_factory=dict)
+    mode: ModeNode | None = None
+    heartbeat: str = ""
+    watchdog: str = ""
+    watchdog_scans: int = 3
+    lease: str = ""
+    hand_back: HandBack | None = None
+
+    def __post_init__(self) -> None:
+        if self.watchdog_scans < 1:
+            raise LoopError(f"watchdog_scans is {self.watchdog_scans}; it must be at least 1")
+
+    def points(self, name: Literal["pv", "dv", "mv", "sp"]) -> dict[str, Point]:
+        """The points of one group by signal name."""
+        return {n: Point(p) if isinstance(p, str) else p for n, p in getattr(self, name).items()}
+
+    def check(self, manifest: Manifest) -> None:
+        """LoopError where a signal that the law needs has no node, or a node no signal."""
+        groups: tuple[tuple[Literal["pv", "dv", "mv", "sp"], tuple[Signal, ...]], ...] = (
+            ("pv", manifest.pv), ("mv", manifest.mv), ("dv", manifest.dv), ("sp", manifest.sp),
+        )  # fmt: skip
+        for name, signals in groups:
+            points, known = self.points(name), [s.name for s in signals]
+            for given in points:
+                if given not in known:
+                    raise LoopError(f"nodes.{name} has {given!r}, which the controller has not{nearest(given, known)}")
+            missing = [s for s in known if s not in points]
+            if missing and (name in {"pv", "mv"} or (name == "dv" and "dv" in manifest.inputs)):
+                raise LoopError(f"nodes.{name} lacks {', '.join(missing)}; give each a node id")
+            if name != "mv" and any(p.read_back for p in points.values()):
+                raise LoopError(f"nodes.{name} has a read_back, which only an MV has")
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """How to reach a server, and what to believe of it.
+
+    ``security`` is signed and encrypted by ``certificate`` and ``private_key``; the policy None is refused unless
+    ``insecure``. ``server_certificate`` pins the server's own. The password comes from the environment variable
+    ``password_env`` or from ``password_file``. ``uncertain`` says whether a value of uncertain quality is used.
+    ``source_time`` says whether a value whose source time stands still grows old: ``ignore`` it for a server that
+    stamps a value only when it changes.
+    """
+
+    endpoint: str
+    security: Literal["Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss", "None"] = "Basic256Sha256"
+    insecure: bool = False
+    certificate: Path | None = None
+    private_key: Path | None = None
+    server_certificate: Path | None = None
+    user: str = ""
+    password_env: str = ""
+    password_file: Path | None = None
+    connect_s: float = 5.0
+    uncertain: Literal["fault", "use"] = "fault"
+    source_time: Literal["judge", "ignore"] = "judge"
+
+    def __post_init__(self) -> None:
+        if not self.endpoint.startswith("opc.tcp://"):
+            raise LoopError(f"endpoint is {self.endpoint!r}; it must begin with opc.tcp://")
+        if "@" in self.endpoint:
+            raise LoopError("endpoint holds a user name; give it as user, its password by password_env")
+        if self.security == "None" and not self.insecure:
+            raise LoopError(
+                "security is None: everyone on the network could read and change what is sent. Use Basic256Sha256, or "
+                "say insecure = true"
+            )
+        if self.security != "None" and (self.certificate is None or self.private_key is None):
+            raise LoopError(
+                f"security {self.security} needs certificate and private_key; `loopwright loop init` makes them"
+            )
+        if self.password_env and self.password_file is not None:
+            raise LoopError("give password_env or password_file, not both")
+        if self.user and not (self.password_env or self.password_file is not None):
+            raise LoopError("user needs a password: name an environment variable (password_env) or a file")
+        if not (isfinite(self.connect_s) and self.connect_s > 0):
+            raise LoopError(f"connect_s is {self.connect_s}; it must be above zero")
+
+    def password(self) -> str:
+        """The password; empty without a user. LoopError where it is not to be had."""
+        if not self.user:
+            return ""
+        if self.password_file is not None:
+            try:
+                return self.password_file.read_text(encoding="utf-8").strip()
+            except OSError as error:
+                raise LoopError(f"password_file cannot be read: {error.strerror}: {self.password_file}") from None
+        found = os.environ.get(self.password_env)
+        if not found:
+            raise LoopError(f"the environment variable {self.password_env}, which holds the password, is not set")
+        return found

@@ -1,0 +1,153 @@
+"""``loopwright loop``: write a loop.toml, try it, run it, and make training data of its journal."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+from serving.controller import Controller
+from serving.errors import LoopError
+from serving.guard import Sample
+from serving.loop import Command
+from serving.manifest import Manifest
+from serving.station.export import export
+from serving.station.settings import Settings
+from serving.station.template import template
+
+SETTINGS = Path("loop.toml")
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    init = commands.add_parser("init", help="write a commented loop.toml for a controller, and a certificate")
+    init.add_argument("file", metavar="CONTROLLER", type=Path, help="a controller's .onnx file")
+    init.add_argument("--endpoint", default="opc.tcp://127.0.0.1:4840", help="the plant's server (%(default)s)")
+    init.add_argument("--out", metavar="FILE", type=Path, default=SETTINGS, help="where it goes (%(default)s)")
+    check = commands.add_parser("check", help="connect, read every node once, and say what would stop the loop")
+    check.add_argument("file", metavar="LOOP.TOML", type=Path, nargs="?", default=SETTINGS)
+    run = commands.add_parser("run", help="run the loop until Ctrl-C")
+    run.add_argument("file", metavar="LOOP.TOML", type=Path, nargs="?", default=SETTINGS)
+    run.add_argument("--scans", metavar="N", type=int, help="stop after so many")
+    out = commands.add_parser("export", help="write a journal's scans as a CSV that `loopwright new` reads")
+    out.add_argument("file", metavar="JOURNAL", type=Path)
+    out.add_argument("--out", metavar="FILE", type=Path, help="where it goes (JOURNAL.csv)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do what was asked for; the exit status."""
+    return {"init": _init, "check": _check, "run": _run, "export": _export}[options.action](options)
+
+
+def _init(options: argparse.Namespace) -> int:
+    controller = Controller(options.file)
+    if options.out.exists():
+        raise LoopError(f"{options.out} is there already; name another file by --out, or remove it")
+    from serving.opcua.certificates import make
+
+    folder = options.out.absolute().parent
+    try:
+        path = options.file.absolute().relative_to(folder)
+    except ValueError:
+        path = options.file.absolute()
+    make(folder / "loop-certificate.der", folder / "loop-key.pem")
+    options.out.write_text(template(controller, path, options.endpoint), encoding="utf-8")
+    print(f"written: {options.out}, and beside it loop-certificate.der (for the server to trust) and loop-key.pem")
+    print(f"next: put the plant's node ids in, then `loopwright loop check {options.out}`")
+    return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    settings = Settings.read(options.file)
+    _quiet()
+    manifest = Controller(settings.controller, settings.sha256 or None).manifest
+    from serving.opcua.inspection import Found, inspected
+
+    settings.guards.of(manifest, settings.max_age_s(manifest.period_s))
+    settings.hold.fallback(manifest.mv)
+    rows = inspected(manifest, settings.server, settings.nodes)
+    names = [f.name for f in fields(Found) if f.name not in {"wrong", "note"}]
+    table = [names, *([getattr(row, name) for name in names] for row in rows)]
+    widths = [max(len(line[i]) for line in table) for i in range(len(names))]
+    for cells in table:
+        print("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
+    wrong = [f"{row.signal}: {row.wrong}" for row in rows if row.wrong]
+    for note in [f"{row.signal}: {row.note}" for row in rows if row.note] + _warnings(settings):
+        print(f"note: {note}")
+    for line in wrong:
+        print(f"would stop the loop: {line}", file=sys.stderr)
+    if not wrong:
+        print("nothing would stop the loop")
+    return 2 if wrong else 0
+
+
+def _warnings(settings: Settings) -> list[str]:
+    server = settings.server
+    return [
+        *["sha256 is not set: any controller in that file would run"] * (not settings.sha256),
+        *["security is None: what is sent can be read and changed on the way"] * (server.security == "None"),
+        *["server_certificate is not set: any server at that address is believed"]
+        * (server.security != "None" and server.server_certificate is None),
+        *["no heartbeat: the plant cannot know whether this loop lives"] * (not settings.nodes.heartbeat),
+        *["no watchdog: a server that shows old values is known by their source times alone"]
+        * (not settings.nodes.watchdog),
+    ]
+
+
+def _run(options: argparse.Namespace) -> int:
+    settings = Settings.read(options.file)
+    _quiet()
+    from serving.station.station import Station
+
+    def tell(line: str) -> None:
+        print(line, flush=True)
+
+    for line in _warnings(settings):
+        tell(f"note: {line}")
+    station = Station(settings, tell=tell)
+    station.watch(_Lines(station.manifest).show)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: station.end())
+    report = station.run(options.scans)
+    tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
+    tell(f"journal: {settings.journal.file}")
+    return 0
+
+
+class _Lines:
+    """A line for the first scan, for each change, and for one scan a minute."""
+
+    def __init__(self, manifest: Manifest) -> None:
+        self.manifest, self.every = manifest, max(1, round(60 / manifest.period_s))
+        self.last: tuple[str, tuple[float, ...], str] | None = None
+
+    def show(self, sample: Sample | None, command: Command) -> None:
+        """Print the scan if it is one of those."""
+        now = (command.mode.value, tuple(command.sp.tolist()), command.reason)
+        if now == self.last and command.scan % self.every:
+            return
+        self.last, m = now, self.manifest
+        parts = [f"SP {s.name} {v:.5g}" for s, v in zip(m.sp, command.sp.tolist(), strict=True)]
+        if sample is not None:
+            parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in zip(m.pv, sample.pv.tolist(), strict=True)]
+        parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in zip(m.mv, command.mv.tolist(), strict=True)]
+        if not command.writes and command.law_mv is not None:
+            parts += [f"(law {s.name} {v:.5g})" for s, v in zip(m.mv, command.law_mv.tolist(), strict=True)]
+        print(f"{command.mode:<6}  {'  '.join(parts)}  {command.reason}".rstrip(), flush=True)
+
+
+def _export(options: argparse.Namespace) -> int:
+    out = options.out or options.file.with_suffix(".csv")
+    rows = export(options.file, out)
+    print(f"{rows} scans: {out}")
+    print(f"next: `loopwright new NAME {out}` makes a record of it")
+    return 0
+
+
+def _quiet() -> None:
+    """What the library would say of a connection that is lost, the loop says itself."""
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)

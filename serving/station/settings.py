@@ -1,0 +1,161 @@
+"""loop.toml: everything that a running loop must be told, as frozen dataclasses."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from math import isfinite
+from pathlib import Path
+from typing import Literal
+
+from serving.errors import LoopError
+from serving.fallback import Fallback
+from serving.fields import nearest, parse
+from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate
+from serving.manifest import Manifest, Signal
+from serving.opcua.settings import Nodes, Server
+
+MAX_AGE = 1.5  # periods: one answer may be late, two may not
+TRANSFER = 20.0  # periods
+
+
+@dataclass(frozen=True, slots=True)
+class Guards:
+    """When a sample is refused. ``max_age_s`` None: after one and a half periods. ``frozen`` 0: never.
+
+    ``margin`` is the share of a PV's range by which it may exceed it, ``frozen`` the samples for which a PV may stand
+    still to the bit, ``rate`` the largest change of a PV from one sample to the next, in its unit.
+    """
+
+    max_age_s: float | None = None
+    margin: float = 0.05
+    frozen: int = 0
+    rate: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.max_age_s is not None and not (isfinite(self.max_age_s) and self.max_age_s > 0):
+            raise LoopError(f"max_age_s is {self.max_age_s}; it must be above zero")
+        if not 0 <= self.margin < 10:
+            raise LoopError(f"margin is {self.margin}; it must be a share of the range, 0 or more")
+        if self.frozen < 0 or self.frozen == 1:
+            raise LoopError(f"frozen is {self.frozen}; it must be 0 (never) or a number of samples of at least 2")
+        if not all(isfinite(r) and r > 0 for r in self.rate.values()):
+            raise LoopError(f"rate is {dict(self.rate)}; each must be above zero")
+
+    def of(self, manifest: Manifest, max_age_s: float) -> tuple[Guard, ...]:
+        """The guards for a controller."""
+        guards: list[Guard] = [
+            Complete(manifest), Allowed(manifest.mv), InRange(manifest.pv, self.margin), Fresh(max_age_s),
+        ]  # fmt: skip
+        if self.frozen:
+            guards.append(Frozen(manifest.pv, self.frozen))
+        if self.rate:
+            known = [s.name for s in manifest.pv]
+            for name in self.rate:
+                if name not in known:
+                    raise LoopError(f"guards.rate has {name!r}, which is no PV{nearest(name, known)}")
+            guards.append(Rate(manifest.pv, tuple(self.rate.get(name, float("inf")) for name in known)))
+        return tuple(guards)
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """What follows a fault.
+
+    ``recover_after`` good samples lead back to AUTO; 0: only the operator does. A fault of more than ``max_s`` is for
+    ``then``: ``stay`` with the last MV, go to the ``safe`` MVs at a ``rate`` [mv units/s], or ``hand back`` to the
+    plant's own controller (nodes.hand_back).
+    """
+
+    recover_after: int = 5
+    max_s: float = 60.0
+    then: Literal["stay", "safe", "hand back"] = "stay"
+    safe: Mapping[str, float] = field(default_factory=dict)
+    rate: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.recover_after < 0:
+            raise LoopError(f"recover_after is {self.recover_after}; it must be 0 or more good samples")
+        if (self.then == "safe") != bool(self.safe):
+            raise LoopError('safe MVs go with then = "safe", and it with them')
+
+    def fallback(self, mv: tuple[Signal, ...]) -> Fallback | None:
+        """What the loop is to do; LoopError where an MV has no safe value or rate."""
+        if self.then == "stay":
+            return None
+        if self.then == "hand back":
+            return Fallback(self.max_s, hand_back=True)
+        names = [s.name for s in mv]
+        for word, given in (("safe", self.safe), ("rate", self.rate)):
+            for name in given:
+                if name not in names:
+                    raise LoopError(f"hold.{word} has {name!r}, which is no MV{nearest(name, names)}")
+            if missing := [n for n in names if n not in given]:
+                raise LoopError(f"hold.{word} lacks {', '.join(missing)}")
+        return Fallback(self.max_s, tuple(self.safe[n] for n in names), tuple(self.rate[n] for n in names))
+
+
+@dataclass(frozen=True, slots=True)
+class JournalSettings:
+    """Where every scan is written down, how much of it is kept, and whether each write waits for the disk."""
+
+    file: Path = Path("loop.journal")
+    max_mb: float = 2000.0
+    fsync: Literal["power loss", "crash"] = "crash"
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.max_mb) and self.max_mb >= 1):
+            raise LoopError(f"max_mb is {self.max_mb}; it must be at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """A loop: controller, plant, guards, fallback, journal. Paths are relative to the file that names them."""
+
+    controller: Path
+    server: Server
+    nodes: Nodes
+    sha256: str = ""
+    start: Literal["SHADOW", "MANUAL", "AUTO"] = "SHADOW"
+    speed: float = 1.0
+    transfer_s: float | None = None
+    guards: Guards = Guards()
+    hold: Hold = Hold()
+    journal: JournalSettings = JournalSettings()
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.speed) and self.speed > 0):
+            raise LoopError(f"speed is {self.speed}; it must be above zero (1 is real time)")
+        if self.hold.then == "hand back" and self.nodes.hand_back is None:
+            raise LoopError('hold.then is "hand back", but nodes.hand_back does not say by which node')
+
+    @classmethod
+    def read(cls, path: Path) -> Settings:
+        """The settings in a file. LoopError for a file that is none, and for every mistake in it."""
+        try:
+            tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise LoopError(f"{path} cannot be read: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise LoopError(f"{path} is not TOML: {error}") from None
+        found = parse(cls, tree, str(path), LoopError)
+        at = path.parent
+        s = found.server
+        server = replace(
+            s,
+            certificate=_under(at, s.certificate),
+            private_key=_under(at, s.private_key),
+            server_certificate=_under(at, s.server_certificate),
+            password_file=_under(at, s.password_file),
+        )
+        journal = replace(found.journal, file=at / found.journal.file)
+        return replace(found, controller=at / found.controller, server=server, journal=journal)
+
+    def max_age_s(self, period_s: float) -> float:
+        """Age from which on a sample is refused."""
+        return MAX_AGE * period_s if self.guards.max_age_s is None else self.guards.max_age_s
+
+
+def _under(folder: Path, path: Path | None) -> Path | None:
+    return None if path is None else folder / path

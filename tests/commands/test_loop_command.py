@@ -1,0 +1,165 @@
+"""``loopwright loop`` as a person uses it: write a loop.toml, try it, run it, make data of its journal."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from plant_servers import Plant
+
+from pipeline.__main__ import main
+from serving import LoopError
+from serving.station.lease import Lease
+from serving.station.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+PID = ROOT / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
+    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", 5.0, "--types", "REAL")
+    made.start()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def settings(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A loop.toml for that plant, five times as fast as the clock."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["loop", "init", str(PID), "--endpoint", plant.endpoint]) == 0
+    path = tmp_path / "loop.toml"
+    path.write_text("speed = 5.0\n" + path.read_text())
+    return path
+
+
+def changed(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_the_way_from_a_controller_to_training_data(
+    settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Signed and encrypted, REAL nodes, AUTO."""
+    assert stat.S_IMODE(os.stat("loop-key.pem").st_mode) == 0o600
+    assert main(["loop", "check"]) == 0
+    said = capsys.readouterr().out
+    assert "nothing would stop the loop" in said
+    assert [line.split()[:2] for line in said.splitlines() if line.startswith("PV")] == [["PV", "C_A"], ["PV", "T"]]
+    assert "note: server_certificate is not set" in said
+    changed(settings, 'start = "SHADOW"', 'start = "AUTO"')
+    before = len(plant.actuator())
+    assert main(["loop", "run", "--scans", "25"]) == 0
+    said = capsys.readouterr().out
+    assert "loop.toml: started in AUTO" in said
+    assert "25 scans" in said or "missed" in said
+    for row in plant.actuator()[before:]:
+        assert row["asked"] == [float(np.float32(row["asked"][0]))]
+    assert main(["loop", "export", "loop.journal"]) == 0
+    table = pd.read_csv("loop.csv")
+    assert list(table.columns) == ["time", "C_A.PV", "T.PV", "T_j.OP", "C_A.SP", "MODE"]
+    assert set(table["MODE"]) <= {"AUTO", "HOLD"}
+    assert table["T.PV"].between(200, 600).all()
+    times = pd.to_datetime(table["time"])
+    assert times.is_monotonic_increasing
+
+
+def test_a_shadow_writes_nothing_but_its_heartbeat(
+    settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = len(plant.actuator())
+    assert main(["loop", "run", "--scans", "15"]) == 0
+    assert "(law T_j" in capsys.readouterr().out
+    assert len({row["asked"][0] for row in plant.actuator()[before:]}) == 1
+
+
+def test_check_names_what_would_stop_the_loop(settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]) -> None:
+    changed(settings, 's=PV.C_A"', 's=PV.nothing"')
+    changed(
+        settings,
+        'T = "nsu=urn:loopwright:plant;s=PV.T"',
+        'T = { node = "nsu=urn:loopwright:plant;s=PV.T", scale = 9.0 }',
+    )
+    changed(settings, 'node = "nsu=urn:loopwright:plant;s=MV.T_j"', 'node = "nsu=urn:loopwright:plant;s=RB.T_j"')
+    assert main(["loop", "check"]) == 2
+    said = capsys.readouterr().err
+    assert "would stop the loop: PV C_A: its quality is BadNodeIdUnknown" in said
+    assert "outside 200 .. 600 K; another unit?" in said
+    assert "would stop the loop: MV T_j, written: it may not be written by this user" in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("transfer_s = ", "transfer = ", "loop.toml: unknown key 'transfer'; did you mean 'transfer_s'?"),
+        ('security = "Basic256Sha256"', 'security = "None"', "security is None: everyone on the network"),
+        ("C_A = ", "C_B = ", "nodes.pv has 'C_B', which the controller has not; did you mean 'C_A'?"),
+        ('sha256 = "', 'sha256 = "00', "not the pinned 00"),
+        ('then = "stay"', 'then = "safe"', 'safe MVs go with then = "safe"'),
+        ("margin = 0.05", 'margin = "wide"', "guards.margin is 'wide'; it must be a number"),
+        ("frozen = 0", "frozen = 1", "frozen is 1; it must be 0 (never) or a number of samples of at least 2"),
+        ("opc.tcp://", "http://", "it must begin with opc.tcp://"),
+        ("opc.tcp://", "opc.tcp://user:secret@", "endpoint holds a user name"),
+        ('# user = "loopwright"', 'user = "loopwright"', "user needs a password"),
+        ("[journal]", "[journal", "is not TOML"),
+    ],
+)
+def test_mistakes_are_one_line(
+    settings: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, words: str
+) -> None:
+    changed(settings, old, new)
+    assert main(["loop", "check"]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert "secret" not in said
+
+
+def test_a_server_that_is_not_there_is_one_line(
+    settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed(settings, f":{plant.port}", ":1")
+    assert main(["loop", "check"]) == 2
+    assert capsys.readouterr().err.startswith("loopwright loop: opc.tcp://127.0.0.1:1 refuses: ")
+
+
+def test_a_password_comes_from_the_environment_or_a_file(settings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    changed(settings, '# user = "loopwright"', 'user = "loopwright"')
+    changed(settings, '# password_env = "LOOP_PASSWORD"', 'password_env = "LOOP_PASSWORD"')
+    server = Settings.read(settings).server
+    monkeypatch.delenv("LOOP_PASSWORD", raising=False)
+    with pytest.raises(LoopError, match="the environment variable LOOP_PASSWORD, which holds the password, is not set"):
+        server.password()
+    monkeypatch.setenv("LOOP_PASSWORD", "from the environment")
+    assert server.password() == "from the environment"
+    changed(settings, 'password_env = "LOOP_PASSWORD"', 'password_file = "secret.txt"')
+    (settings.parent / "secret.txt").write_text("from a file\n")
+    assert Settings.read(settings).server.password() == "from a file"
+
+
+def test_a_second_loop_on_the_same_mv_is_refused(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    read = Settings.read(settings)
+    first = Lease(read.server.endpoint, [p.node for p in read.nodes.points("mv").values()])
+    try:
+        assert main(["loop", "run", "--scans", "1"]) == 2
+        said = capsys.readouterr().err
+        assert f"is written by another loop (process {os.getpid()}); end that one first" in said
+    finally:
+        first.release()
+
+
+def test_what_is_there_is_not_written_over(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = settings.read_text()
+    assert main(["loop", "init", str(PID)]) == 2
+    assert "loop.toml is there already" in capsys.readouterr().err
+    assert settings.read_text() == before
+    assert main(["loop", "export", "nowhere.journal"]) == 2
+    assert "nowhere.journal is not here" in capsys.readouterr().err

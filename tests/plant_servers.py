@@ -1,0 +1,106 @@
+"""A real OPC UA server of a simulated plant as a process of its own, and a wire to it that can be cut."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from processes import within
+
+ROOT = Path(__file__).parents[1]
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+class Plant:
+    """``loopwright plant serve`` as a process. ``actuator`` tells what the MV nodes held, period by period."""
+
+    def __init__(self, folder: Path, case: str, speed: float, *options: str) -> None:
+        self.folder, self.port = folder, free_port()
+        self.endpoint, self.log = f"opc.tcp://127.0.0.1:{self.port}", folder / "mv.jsonl"
+        self._command = [
+            sys.executable, "-m", "pipeline", "plant", "serve", case, "--listen", f"127.0.0.1:{self.port}",
+            "--speed", f"{speed:g}", "--folder", str(folder / "server"), "--log", str(self.log), *options,
+        ]  # fmt: skip
+        self.process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        before = len(self.actuator())
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        with (self.folder / "server.log").open("a") as said:
+            self.process = subprocess.Popen(
+                self._command, cwd=self.folder, env=environment, stdout=said, stderr=said, text=True
+            )
+        assert within(60, lambda: len(self.actuator()) > before + 1), (self.folder / "server.log").read_text()
+
+    def send(self, number: signal.Signals) -> None:
+        assert self.process is not None
+        self.process.send_signal(number)
+
+    def end(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+
+    def actuator(self) -> list[dict[str, Any]]:
+        if not self.log.exists():
+            return []
+        return [json.loads(line) for line in self.log.read_text().splitlines() if line.endswith("}")]
+
+
+class Wire:
+    """Passes bytes on to a port, at once or late, until it is cut: then it neither passes on nor closes."""
+
+    def __init__(self, to: int) -> None:
+        self.to, self.delay_s, self.cut = to, 0.0, False
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._listening.getsockname()[1])
+        self._open: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        for s in [self._listening, *self._open]:
+            with suppress(OSError):
+                s.close()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listening.accept()
+                if self.cut:
+                    self._open.append(near)  # accepted, as by a switch on the way, and never answered
+                    continue
+                try:
+                    far = socket.create_connection(("127.0.0.1", self.to))
+                except OSError:
+                    near.close()  # refused, as it would be without this wire
+                    continue
+                self._open += [near, far]
+                for a, b in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass, args=(a, b), daemon=True).start()
+
+    def _pass(self, source: socket.socket, to: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(65_536):
+                if self.delay_s:
+                    time.sleep(self.delay_s)
+                if self.cut:
+                    return
+                to.sendall(data)
+        if not self.cut:
+            for s in (source, to):
+                with suppress(OSError):
+                    s.close()

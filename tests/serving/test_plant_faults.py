@@ -1,0 +1,228 @@
+"""A loop on a real OPC UA server, and everything that goes wrong between them.
+
+``pytest tests/serving/test_plant_faults.py -s`` prints for each fault how many periods it took until HOLD and, once it
+was over, until AUTO.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from asyncua import Client, ua
+from plant_servers import Plant, Wire
+from processes import within
+
+from serving import Mode, Sample
+from serving.journal import JournalReader, Scan
+from serving.loop import Command
+from serving.opcua.settings import Nodes, Point, Server
+from serving.station.settings import Hold, JournalSettings, Settings
+from serving.station.station import Change, Station
+
+ROOT = Path(__file__).parents[2]
+CASE, LAW = "thiosulfate_cstr", "pid"
+SPEED = 2.5  # 0.5 s periods in 0.2 s
+PERIOD_S = 0.5 / SPEED
+RECOVER = 3
+START = 250.0  # the MV of the plant's start
+SPACE = "nsu=urn:loopwright:plant;s="
+
+
+class Running:
+    """A station in a thread, with what it did."""
+
+    def __init__(self, folder: Path, port: int, **changed: Any) -> None:
+        nodes = {
+            "pv": {"C_A": f"{SPACE}PV.C_A", "T": f"{SPACE}PV.T"},
+            "mv": {"T_j": Point(f"{SPACE}MV.T_j", read_back=f"{SPACE}RB.T_j")},
+            "heartbeat": f"{SPACE}Control.Heartbeat",
+            "watchdog": f"{SPACE}Control.Watchdog",
+            **changed.pop("nodes", {}),
+        }
+        server = {"endpoint": f"opc.tcp://127.0.0.1:{port}", "security": "None", "insecure": True, "connect_s": 2.0}
+        self.journal = folder / "loop.journal"
+        self.told: list[str] = []
+        self.station = Station(
+            Settings(
+                controller=ROOT / "artifacts" / CASE / f"{LAW}.onnx",
+                server=Server(**{**server, **changed.pop("server", {})}),
+                nodes=Nodes(**nodes),
+                start=changed.pop("start", "AUTO"),
+                speed=SPEED,
+                hold=changed.pop("hold", Hold(recover_after=RECOVER)),
+                journal=JournalSettings(self.journal),
+                **changed,
+            ),
+            tell=self.told.append,
+        )
+        self.commands: list[Command] = []
+        self.station.watch(self._seen)
+        self.thread = threading.Thread(target=self.station.run, daemon=True)
+        self.thread.start()
+
+    def _seen(self, _: Sample | None, command: Command) -> None:
+        self.commands.append(command)
+
+    def ask(self, act: Callable[..., None], what: str) -> str:
+        """How a change went."""
+        said: list[str] = []
+        self.station.ask(Change(act, what, "test", done=said.append))
+        assert within(10, lambda: bool(said))
+        return said[0]
+
+    def becomes(self, mode: Mode, seconds: float = 30.0, scans: int = 1) -> int:
+        """Wait until so many scans in a row have a mode; the place of the first of them from now."""
+        start = len(self.commands)
+
+        def there() -> bool:
+            last = self.commands[start:][-scans:]
+            return len(last) == scans and all(c.mode is mode for c in last)
+
+        assert within(seconds, there), (mode, self.told, [(c.mode, c.reason) for c in self.commands[start:]][-10:])
+        return next(i for i, c in enumerate(self.commands[start:]) if c.mode is mode)
+
+    def end(self) -> list[Scan]:
+        self.station.end()
+        self.thread.join(30)
+        assert not self.thread.is_alive()
+        reader = JournalReader(self.journal)
+        found = [scan for _, _, scan in reader.scans()]
+        reader.close()
+        return found
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
+    made = Plant(tmp_path_factory.mktemp("plant"), CASE, SPEED)
+    made.start()
+    yield made
+    made.end()
+
+
+def write(plant: Plant, tag: str, value: Any, kind: ua.VariantType | None = None) -> None:
+    """As another client would."""
+
+    async def act() -> None:
+        async with Client(plant.endpoint) as client:
+            index = await client.get_namespace_index("urn:loopwright:plant")
+            await client.get_node(f"ns={index};s={tag}").write_value(ua.Variant(value, kind))
+
+    asyncio.run(act())
+
+
+def read(plant: Plant, tag: str) -> Any:
+    async def act() -> Any:
+        async with Client(plant.endpoint) as client:
+            index = await client.get_namespace_index("urn:loopwright:plant")
+            return await client.get_node(f"ns={index};s={tag}").read_value()
+
+    return asyncio.run(act())
+
+
+Fault = tuple[Callable[[Plant, Wire], None], Callable[[Plant, Wire], None]]
+
+
+def faulty(tag: str, fault: str) -> Fault:
+    return (lambda p, w: write(p, f"Faults.{tag}", fault)), (lambda p, w: write(p, f"Faults.{tag}", ""))
+
+
+def slow(plant: Plant, wire: Wire) -> None:
+    wire.delay_s = 2 * PERIOD_S
+
+
+def fast(plant: Plant, wire: Wire) -> None:
+    wire.delay_s = 0.0
+
+
+def cut(plant: Plant, wire: Wire) -> None:
+    wire.cut = True
+
+
+def mend(plant: Plant, wire: Wire) -> None:
+    wire.cut = False
+
+
+FAULTS: dict[str, tuple[Fault, str]] = {
+    "bad quality": (faulty("PV.C_A", "bad"), "PV C_A: BadSensorFailure"),
+    "uncertain quality": (faulty("PV.T", "uncertain"), "PV T: UncertainSensorNotAccurate"),
+    "a text instead of a number": (faulty("PV.C_A", "text"), "PV C_A: str instead of a number"),
+    "not a number": (faulty("PV.C_A", "nan"), "PV C_A: nan"),
+    "a value that stands still": (faulty("PV.C_A", "frozen"), "the sample is"),
+    "a node that is deleted": (faulty("PV.T", "deleted"), "PV T: BadNodeIdUnknown"),
+    "an MV node that is deleted": (faulty("MV.T_j", "deleted"), "the server refuses T_j: Bad"),
+    "slow answers": ((slow, fast), "does not answer within"),
+    "half-open connection": ((cut, mend), "does not answer within"),
+    "server frozen": (
+        (lambda p, w: p.send(signal.SIGSTOP), lambda p, w: p.send(signal.SIGCONT)), "does not answer within",
+    ),
+    "server killed": ((lambda p, w: p.end(), lambda p, w: p.start()), "opc.tcp"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def wire(plant: Plant) -> Iterator[Wire]:
+    made = Wire(plant.port)
+    yield made
+    made.close()
+
+
+def legal(found: list[Scan], plant: Plant, since: int) -> None:
+    """All that the MV node held since then was commanded by the loop, or was there before it, and lies in the range."""
+    mv = 1 + 2  # behind sp and pv
+    rows = plant.actuator()
+    known = {round(scan.numbers[mv], 9) for scan in found} | {
+        round(row["asked"][0], 9) for row in rows[since - 1 : since + 1]
+    }
+    for row in rows[since:]:
+        (asked,) = row["asked"]
+        assert 0 <= asked <= 500
+        assert round(asked, 9) in known or asked == START  # which a server that was started anew has
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_holds_and_is_recovered_from(
+    name: str, plant: Plant, wire: Wire, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (begin, end), words = FAULTS[name]
+    since = len(plant.actuator())
+    running = Running(tmp_path, wire.port)
+    assert running.ask(lambda loop: loop.set_sp([0.93]), "set point") == ""
+    running.becomes(Mode.AUTO, scans=8)
+    begin(plant, wire)
+    until_hold = running.becomes(Mode.HOLD, 10)
+    reason = running.commands[-1].reason
+    running.becomes(Mode.HOLD, scans=10)
+    reasons = {c.reason for c in running.commands if c.mode is Mode.HOLD}
+    held = {tuple(c.mv.tolist()) for c in running.commands[-8:]}
+    end(plant, wire)
+    until_auto = running.becomes(Mode.AUTO, 60)
+    running.becomes(Mode.AUTO, scans=5)
+    n = len(running.commands)
+    found = running.end()
+    assert any(words in r for r in reasons), reasons
+    assert len(held) == 1
+    legal(found, plant, since)
+    assert n <= len(found) <= n + 3  # every scan is in the journal
+    with capsys.disabled():
+        print(f"\n{name:28} HOLD after {until_hold:2} periods, AUTO {until_auto:3} after its end: {reason}")
+    assert until_hold <= 5
+
+
+def test_an_mv_node_of_another_type_is_written_in_that_type(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    """The server refuses, the loop holds and asks for the types anew, and goes on by itself."""
+    running = Running(tmp_path, wire.port)
+    running.becomes(Mode.AUTO, scans=8)
+    for kind in ("int", ""):
+        before = len(running.commands)
+        write(plant, "Faults.MV.T_j", kind)
+        assert within(20, lambda: any("BadTypeMismatch" in c.reason for c in running.commands[before:]))  # noqa: B023
+        running.becomes(Mode.AUTO, scans=8)
+        asked = [row["asked"][0] for row in plant.actuator()[-3:]]
+        assert all((value == round(value)) is (kind == "int") for value in asked)
+    running.end()
