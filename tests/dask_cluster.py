@@ -27,7 +27,8 @@ class Cluster:
         self.environment = {**QUIET, "PYTHONPATH": f"{sources}{os.pathsep}{ROOT / 'tests'}", "OMP_NUM_THREADS": "1"}
         self.file = folder / "scheduler.json"
         self.start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", self.file)
-        assert within(60, self.file.exists)
+        # The scheduler opens the file, and fills it a moment later.
+        assert within(60, lambda: self.file.exists() and self.file.read_text().rstrip().endswith("}"))
 
     def start(self, *arguments: object) -> None:
         empty = self.folder / f"empty{len(self.processes)}"

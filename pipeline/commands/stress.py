@@ -7,6 +7,8 @@ import os
 import time
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.cases import all_cases
 from pipeline.commands.arguments import real, whole
 from pipeline.commands.made_for import require_made_for
@@ -15,12 +17,12 @@ from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ParamsError, nearest
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.stress.draws import Drawing
-from pipeline.evaluation.stress.loops import Outcome, Stress, opened
+from pipeline.evaluation.stress.loops import Outcome, Stress, figures_of, opened
 from pipeline.evaluation.stress.summary import Summary
 from pipeline.pictures.drawing import save
 from pipeline.pictures.numbers import number
 from pipeline.pictures.stress_pictures import loop_canvas
-from pipeline.report.stress import StressRun, drawn_words, failed_words, write_stress
+from pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
 from serving.manifest import Manifest
 
 PLANTS, SEED, SPREAD, FAULTS, BATCH = 1000, 0, 2.0, 50.0, 100
@@ -57,16 +59,21 @@ def run(options: argparse.Namespace) -> None:
     if options.replay is not None:
         _replay(stress, options)
         return
+    out = options.out or Path(f"{case.name}-{options.file.stem}-stress")
+    _check_folder(out)
     begun = time.perf_counter()
     outcomes = outcomes_of(stress, options.plants, options.batch, options.workers)
     taken = time.perf_counter() - begun
     summary = Summary(case, options.file.stem, drawing.draws(range(options.plants)), outcomes)
-    out = options.out or Path(f"{case.name}-{options.file.stem}-stress")
     write_stress(StressRun(options.file, stress, summary, _options(options)), out)
     (spread, *_) = [s for s in summary.spreads() if not s.test and s.metric == case.metric]
     low, median, *_, worst = spread.values
     print(f"{options.plants} loops in {taken:.1f} s ({options.plants / taken:.3g} a second)")
-    print(f"{case.label(case.metric)}: median {number(median)}, 5 % below {number(low)}, worst {number(worst)}")
+    errors = figures_of(outcomes, case.metric)
+    print(
+        f"{case.label(case.metric)}: median {number(median)}, 5 % below {number(low)}, worst {number(worst)} "
+        f"(loop {outcomes[int(np.nanargmax(errors))].index})"
+    )
     for words, count in summary.counts.items():
         print(f"{words}: {count} ({100 * count / options.plants:.3g} %)")
     print(f"report: {out / 'report.html'}")
@@ -79,8 +86,16 @@ def outcomes_of(stress: Stress, plants: int, batch: int = BATCH, workers: int | 
     size = max(min(batch, plants // (PIECES * wanted)), 1) if wanted > 1 else batch
     pieces = [range(i, min(i + size, plants)) for i in range(0, plants, size)]
     with workers_here(wanted if here else workers, "--workers"):
-        found = parallel_map(stress.outcomes, pieces, "stress: closed loops", [len(p) for p in pieces])
+        found = parallel_map(stress.outcomes, pieces, "stress: batches of loops", [len(p) for p in pieces])
     return [one for piece in found for one in piece]
+
+
+def _check_folder(out: Path) -> None:
+    """ParamsError where a report would take the place of something else."""
+    if out.exists() and not out.is_dir():
+        raise ParamsError(f"{out} is no folder; name one by --out")
+    if (out / "report.html").exists() and not (out / TABLE).exists():
+        raise ParamsError(f"{out} holds a report of something else; name another folder by --out")
 
 
 def _replay(stress: Stress, options: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
@@ -131,6 +132,9 @@ def _client(to: str) -> Client:
         ) from None
     try:
         if not client.scheduler_info()["workers"]:
+            print(
+                f"the scheduler at {to} has no worker yet; waiting up to {WORKERS_S:.0f} s", file=sys.stderr, flush=True
+            )
             client.wait_for_workers(1, timeout=WORKERS_S)
     except TimeoutError:
         client.close()

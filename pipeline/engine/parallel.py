@@ -118,6 +118,10 @@ def lost(error: Exception, what: str) -> PipelineError:
         return PipelineError(
             "workers died one after the other (often the memory was not enough); start fewer, and run it again"
         )
+    if "scheduler-connection-lost" in str(error):
+        return PipelineError(
+            f"the connection to the scheduler at {address()} was lost; start it again, and run this again"
+        )
     return PipelineError(f"{what}: the cluster gave it up ({' '.join(str(error).split())}); run it again")
 
 

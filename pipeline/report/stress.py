@@ -41,6 +41,8 @@ def write_stress(run: StressRun, out: Path) -> list[Path]:
     summary, drawing = run.summary, run.stress.drawing
     case = summary.case
     (out / "figures").mkdir(parents=True, exist_ok=True)
+    for old in (out / "figures").glob("loop_*.png"):  # of a report that stood here before
+        old.unlink()
     written = [out / "figures" / "spread.png"]
     save(spread_canvas(summary, case.label(case.metric)), written[0])
     growths = summary.growths()

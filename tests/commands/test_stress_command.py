@@ -77,3 +77,17 @@ def test_a_controller_of_no_case_is_refused(
     monkeypatch.setattr("pipeline.commands.stress.all_cases", dict)
     assert main(["stress", "pid.onnx"]) == 2
     assert "the controller is for 'ph_neutralization', which is no case here" in capsys.readouterr().err
+
+
+def test_a_report_takes_the_place_of_another_one_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("taken").write_text("mine")
+    assert main(["stress", str(PH), "--plants", "2", "--out", "taken"]) == 2
+    assert capsys.readouterr().err == "loopwright stress: taken is no folder; name one by --out\n"
+    Path("mine").mkdir()
+    Path("mine/report.html").write_text("mine")
+    assert main(["stress", str(PH), "--plants", "2", "--out", "mine"]) == 2
+    assert "mine holds a report of something else; name another folder" in capsys.readouterr().err
+    assert Path("mine/report.html").read_text() == "mine"
+    for plants, seed in (("12", "1"), ("3", "2")):
+        assert main(["stress", str(PH), "--plants", plants, "--seed", seed, "--out", "out"]) == 0
+    assert {p.name for p in Path("out/figures").glob("loop_*.png")} == {f"loop_{i}.png" for i in range(3)}

@@ -15,7 +15,7 @@ from pipeline.engine import pieces, start
 from pipeline.engine.cluster import address, workers_here
 from pipeline.engine.fingerprint import difference, fingerprint
 from pipeline.engine.folder import Folder, apply, read_files
-from pipeline.engine.parallel import as_done, parallel_map
+from pipeline.engine.parallel import as_done, lost, parallel_map
 from pipeline.errors import PipelineError
 
 
@@ -68,6 +68,16 @@ def test_a_piece_that_reads_files_stays_with_them_where_no_stage_says_which(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:1")  # nobody answers there, and nobody is asked
     assert parallel_map(here, range(2), "places", in_folder=True) == [str(tmp_path)] * 2
+
+
+def test_a_scheduler_that_went_away_is_said_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://host:1")
+    error = RuntimeError("piece-7 cancelled for reason: scheduler-connection-lost.\nClient lost the connection")
+    words = "the connection to the scheduler at tcp://host:1 was lost; start it again, and run this again"
+    assert str(lost(error, "piece 3 of 5")) == words
+    assert str(lost(RuntimeError("no memory"), "piece 3 of 5")).startswith(
+        "piece 3 of 5: the cluster gave it up (no memory)"
+    )
 
 
 # ---------------------------------------------------------------------- what a worker does, called here

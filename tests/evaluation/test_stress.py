@@ -19,7 +19,7 @@ from pipeline.engine.cluster import connected, local_cluster
 from pipeline.errors import PlantError
 from pipeline.evaluation.stress.draws import LATE, NOISE, Draw, Drawing
 from pipeline.evaluation.stress.faults import KINDS, Actuators
-from pipeline.evaluation.stress.loops import Stress
+from pipeline.evaluation.stress.loops import Stress, swings
 from pipeline.evaluation.stress.summary import Summary, table
 from pipeline.export.gate import export
 from pipeline.laws import LAWS
@@ -249,3 +249,15 @@ def test_a_quantity_that_the_error_follows_stands_first(stress: Stress) -> None:
 
 def test_the_controller_of_a_stress_is_the_file(stress: Stress) -> None:
     assert stress.controller.sha256 == Controller(PH).sha256
+
+
+def test_a_loop_that_swings_about_its_last_set_point_is_told_from_one_that_follows() -> None:
+    k, span = np.arange(200), np.array([10.0, 10.0])
+    sp = np.where(k < 100, 2.0, 5.0)[:, None] * np.ones(2)
+    settles = sp[:, 0] + 1.0 * np.exp(-(k % 100) / 10) * np.cos(k)
+    swings_on = sp[:, 1] + 0.2 * np.cos(2 * np.pi * k / 12)
+    assert swings(sp, np.column_stack([settles, swings_on]), span).tolist() == [False, True]
+    small, once = sp[:, 0] + 0.05 * np.cos(k), sp[:, 1] + np.where(k < 180, 1.0, -1.0)
+    assert swings(sp, np.column_stack([small, once]), span).tolist() == [False, False]
+    moving = np.where(k // 5 % 2, 2.0, 5.0)[:, None]  # a set point that moves: the error's sides are its own
+    assert not swings(moving, np.roll(moving, 1, axis=0), span[:1]).any()

@@ -22,10 +22,16 @@ from serving.controller import Controller
 from serving.manifest import Manifest
 from serving.rows import ControllerRows
 
+SWING, CROSSINGS = 0.01, 3  # share of a controlled variable's range, changes of side
+
 
 @dataclass(frozen=True)
 class Outcome:
-    """Figures of one loop. One that left what the plant can compute has infinite figures."""
+    """Figures of one loop. One that left what the plant can compute has infinite figures.
+
+    ``swings`` says whether a controlled variable still swings about its set point as the test ends: no failure by
+    itself, but no loop to leave alone.
+    """
 
     index: int
     figures: dict[str, float]
@@ -33,6 +39,7 @@ class Outcome:
     left_limits: bool
     refused: int  # samples
     broke: bool
+    swings: bool = False
 
     @property
     def failed(self) -> bool:
@@ -133,7 +140,24 @@ class Stress:
             left_limits(loop.pv[:, :n_cv], **ends),
             int(loop.info.sum()),
             broke,
+            bool(np.any(swings(loop.sp, loop.pv[:, :n_cv], np.array(spans)))),
         )
+
+
+def swings(sp: Array, cv: Array, span: Array) -> NDArray[np.bool_]:
+    """Which controlled variables (n, n_cv) still swing about their set points as the course ends.
+
+    Over the last half of the last hold (the samples since a set point last moved) the error goes from one side to the
+    other at least CROSSINGS times, each time beyond SWING of the range ``span`` (n_cv,).
+    """
+    moved = np.flatnonzero(np.any(np.diff(sp, axis=0) != 0, axis=1))
+    start = int(moved[-1]) + 1 if len(moved) else 0
+    error = (cv - sp)[(start + len(sp)) // 2 :] / span
+    found = np.zeros(error.shape[1], dtype=bool)
+    for i, course in enumerate(error.T):
+        sides = np.sign(course[np.abs(course) > SWING])
+        found[i] = np.count_nonzero(np.diff(sides)) >= CROSSINGS
+    return found
 
 
 def figures_of(outcomes: Sequence[Outcome], name: str) -> Array:

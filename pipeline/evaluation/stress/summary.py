@@ -67,13 +67,14 @@ class Summary:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Loops that failed, by how; a loop may count several times."""
+        """Loops that failed, by how, and those that swing; a loop may count several times."""
         return {
             "locked up": sum(o.locked_up for o in self.outcomes),
             "left its limits": sum(o.left_limits for o in self.outcomes),
             "had a refused sample": sum(o.refused > 0 for o in self.outcomes),
             "left what the plant can compute": sum(o.broke for o in self.outcomes),
             "any of these": sum(o.failed for o in self.outcomes),
+            "swings to the end": sum(o.swings for o in self.outcomes),
         }
 
     @cached_property
@@ -91,9 +92,9 @@ class Summary:
         errors, found = figures_of(self.outcomes, self.case.metric), np.empty(len(self.outcomes))
         for places in self.tests.values():
             whole = errors[places][np.isfinite(errors[places])]
-            middle = float(np.quantile(errors[places], 0.5, method="lower"))
+            middle = float(np.median(errors[places]))
             if not np.isfinite(middle) and len(whole):
-                middle = float(np.quantile(whole, 0.5, method="lower"))
+                middle = float(np.median(whole))
             found[places] = errors[places] / (middle if middle > 0 and np.isfinite(middle) else 1.0)
         return found
 
@@ -109,7 +110,9 @@ class Summary:
     def _spread(self, metric: str, test: str, places: NDArray[np.int64]) -> Spread:
         values = figures_of(self.outcomes, metric)[places]
         values = values[~np.isnan(values)]
-        found = tuple(float(np.quantile(values, q, method="higher")) for q in QUANTILES)
+        found = tuple(
+            float(np.median(values) if q == 0.5 else np.quantile(values, q, method="higher")) for q in QUANTILES
+        )
         return Spread(metric, test, len(values), found)
 
     def requirements(self) -> list[Met]:
@@ -187,6 +190,7 @@ def table(draws: Sequence[Draw], outcomes: Sequence[Outcome]) -> Mapping[str, li
                 **{f"figure.{k}": v for k, v in one.figures.items()},
                 "locked_up": one.locked_up,
                 "left_limits": one.left_limits,
+                "swings": one.swings,
                 "refused_samples": one.refused,
                 "broke": one.broke,
             }
