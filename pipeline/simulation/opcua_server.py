@@ -36,9 +36,9 @@ class PlantServer:
 
     Nodes ``PV.x``, ``MV.x`` (written by whoever controls), ``RB.x`` (the MV that the actuator has), ``DV.x``, ``SP.x``,
     each with its unit and range; ``Control.Owner`` (0 its own controller, which holds the MVs; 1 the loop),
-    ``Control.Watchdog`` (counts periods), ``Control.Heartbeat`` (for the loop to count), ``Control.LoopAlive``,
-    ``Control.Lease``; and ``Faults.x`` for every PV, MV and DV, which takes one of FAULTS, and ``Faults.Clock``, by
-    how many seconds the source times are off.
+    ``Control.Mode`` (for an operator: 0 MANUAL, 1 AUTO, 2 SHADOW), ``Control.Watchdog`` (counts periods),
+    ``Control.Heartbeat`` (for the loop to count), ``Control.LoopAlive``, ``Control.Lease``; and ``Faults.x`` for every
+    PV, MV and DV, which takes one of FAULTS, and ``Faults.Clock``, by how many seconds the source times are off.
     """
 
     plant: Simulator
@@ -97,7 +97,7 @@ class PlantServer:
         }
         for tag in self.start:
             await self._variable(tag)
-        control = {"Owner": REMOTE, "Watchdog": 0, "Heartbeat": 0}
+        control = {"Owner": REMOTE, "Watchdog": 0, "Heartbeat": 0, "Mode": 2}
         for name, value in control.items():
             node = await self.root.add_variable(
                 self._id(f"Control.{name}"), f"{self.index}:{name}", ua.Variant(value, ua.VariantType.Int32)

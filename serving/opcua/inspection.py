@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from asyncua import ua
 
 from serving.errors import EndpointError
-from serving.manifest import Manifest
+from serving.manifest import Manifest, Signal
 from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, words
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
@@ -96,14 +96,16 @@ async def _one(
     return Found(name, node, kind, shown, unit, quality, age, limits, may, wrong, note)
 
 
-def _signal(manifest: Manifest, name: str):  # type: ignore[no-untyped-def]
+def _signal(manifest: Manifest, name: str) -> Signal | None:
     group, _, rest = name.partition(" ")
     rest = rest.removesuffix(", written")
     signals = {"PV": manifest.pv, "MV": manifest.mv, "DV": manifest.dv, "SP": manifest.sp}.get(group, ())
     return next((s for s in signals if s.name == rest), None)
 
 
-async def _properties(link: Link, server: Server, at: ua.NodeId, signal, scale: float, offset: float):  # type: ignore[no-untyped-def]
+async def _properties(
+    link: Link, server: Server, at: ua.NodeId, signal: Signal | None, scale: float, offset: float
+) -> tuple[str, str, str]:
     """(unit, range, note) as the server tells them; "-" where it does not."""
     unit = limits = "-"
     notes = []

@@ -75,7 +75,8 @@ class Station:
         self.ended = False
         self._watchers: list[Callable[[Sample | None, Command], None]] = []
         self._asked_sp: dict[str, float] = {}
-        self._asked_mode, self._fault = "", ""
+        self._asked_mode: str | None = None  # None: not read yet; what stands there at the start is no wish
+        self._fault = ""
 
     @property
     def manifest(self) -> Manifest:
@@ -161,8 +162,9 @@ class Station:
                 wanted[i] = values.asked_sp.get(s.name, wanted[i])
             self._from_plant(lambda: loop.set_sp(wanted), f"set point {_shown(wanted, self.manifest.sp)}")
         if values.asked_mode and values.asked_mode != self._asked_mode:
-            self._asked_mode = values.asked_mode
-            self._from_plant(lambda: loop.set_mode(Mode(self._asked_mode)), f"mode {self._asked_mode}")
+            wish, self._asked_mode = self._asked_mode is not None, values.asked_mode
+            if wish:
+                self._from_plant(lambda: loop.set_mode(Mode(values.asked_mode)), f"mode {values.asked_mode}")
 
     def _from_plant(self, act: Callable[[], None], what: str) -> None:
         try:

@@ -21,7 +21,7 @@ from processes import within
 from serving import Mode, Sample
 from serving.journal import JournalReader, Scan
 from serving.loop import Command
-from serving.opcua.settings import Nodes, Point, Server
+from serving.opcua.settings import HandBack, ModeNode, Nodes, Point, Server
 from serving.station.settings import Hold, JournalSettings, Settings
 from serving.station.station import Change, Station
 
@@ -225,4 +225,40 @@ def test_an_mv_node_of_another_type_is_written_in_that_type(plant: Plant, wire: 
         running.becomes(Mode.AUTO, scans=8)
         asked = [row["asked"][0] for row in plant.actuator()[-3:]]
         assert all((value == round(value)) is (kind == "int") for value in asked)
+    running.end()
+
+
+def test_the_plants_own_operator_sets_mode_and_set_point(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    write(plant, "Control.Mode", 1, ua.VariantType.Int32)  # from before; no wish of now
+    mode = ModeNode(f"{SPACE}Control.Mode", {"MANUAL": 0, "AUTO": 1, "SHADOW": 2})
+    running = Running(tmp_path, wire.port, start="SHADOW", nodes={"mode": mode, "sp": {"C_A": f"{SPACE}SP.C_A"}})
+    running.becomes(Mode.SHADOW, scans=6)
+    write(plant, "Control.Mode", 0, ua.VariantType.Int32)
+    running.becomes(Mode.MANUAL)
+    write(plant, "Control.Mode", 1, ua.VariantType.Int32)
+    running.becomes(Mode.AUTO)
+    write(plant, "SP.C_A", 0.9)
+    assert within(20, lambda: running.commands[-1].sp.tolist() == [0.9])
+    write(plant, "SP.C_A", 1.7)
+    assert within(20, lambda: any("refused: set point C_A 1.7" in line for line in running.told))
+    assert running.commands[-1].sp.tolist() == [0.9]
+    running.end()
+
+
+def test_a_plant_is_handed_back_and_asked_for_again(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    running = Running(
+        tmp_path,
+        wire.port,
+        nodes={"hand_back": HandBack(f"{SPACE}Control.Owner", 0)},
+        hold=Hold(recover_after=RECOVER, max_s=1.0, then="hand back"),
+    )
+    running.becomes(Mode.AUTO, scans=5)
+    write(plant, "Faults.PV.T", "bad")
+    running.becomes(Mode.SHADOW)
+    assert read(plant, "Control.Owner") == 0
+    write(plant, "Faults.PV.T", "")
+    running.becomes(Mode.SHADOW, scans=10)  # who has the plant now decides
+    write(plant, "Control.Owner", 1, ua.VariantType.Int32)
+    assert running.ask(lambda loop: loop.set_mode(Mode.AUTO), "mode AUTO") == ""
+    running.becomes(Mode.AUTO, scans=5)
     running.end()
