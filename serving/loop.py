@@ -144,11 +144,11 @@ class ControlLoop:
         if fallback is not None and fallback.hand_back and not isinstance(endpoint, HandsBack | None):
             raise LoopError(f"{type(endpoint).__name__} cannot hand the plant back: it has no method hand_back")
         if fallback is not None and fallback.mv is not None and fallback.rate is not None:
-            _within(fallback.mv, manifest.mv, "safe MV")
+            within(fallback.mv, manifest.mv, "safe MV")
             if len(fallback.rate) != len(manifest.mv):
                 raise LoopError(f"the fallback has {len(fallback.rate)} rates; it needs {len(manifest.mv)}, one an MV")
-        self._sp = _within(sp, manifest.sp, "set point")
-        self._mv = _within(mv, manifest.mv, "MV")
+        self._sp = within(sp, manifest.sp, "set point")
+        self._mv = within(mv, manifest.mv, "MV")
         self._ranges = [(s.low, s.high, s.values) for s in manifest.mv]
         self._mode = mode
         self._fault = ""  # the fault that changed the mode to HOLD; empty without one
@@ -191,13 +191,13 @@ class ControlLoop:
 
     def set_sp(self, sp: ArrayLike) -> None:
         """Change the set points (n_sp,); LoopError outside their ranges."""
-        self._sp = _within(sp, self.controller.manifest.sp, "set point")
+        self._sp = within(sp, self.controller.manifest.sp, "set point")
 
     def set_mv(self, mv: ArrayLike) -> None:
         """Set the MV (n_mv,) in MANUAL; LoopError outside its range or in another mode."""
         if self._mode is not Mode.MANUAL:
             raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self._mode}")
-        self._mv = _within(mv, self.controller.manifest.mv, "MV")
+        self._mv = within(mv, self.controller.manifest.mv, "MV")
 
     def hand_back(self) -> None:
         """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
@@ -210,7 +210,7 @@ class ControlLoop:
         """
         if trial < 1:
             raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
-        require_same_signals(self.controller, controller)
+        require_same_signals(self.controller.manifest, controller.manifest)
         self.successor = Successor(controller, trial)
 
     def keep(self) -> None:
@@ -382,7 +382,7 @@ class ControlLoop:
         return run_on_grid(self, self.endpoint, n, until=until, before=before, observe=observe)
 
 
-def _within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
+def within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
     """``values`` as (n,); LoopError outside the signals' ranges."""
     try:
         vector = np.array(values, dtype=np.float64, ndmin=1)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from serving.controller import Controller, Step
 from serving.errors import LoopError
 from serving.guard import Sample
-from serving.manifest import Signal
+from serving.manifest import Manifest, Signal
 from serving.words import named
 
 Array: TypeAlias = NDArray[np.float64]
@@ -32,6 +32,10 @@ class Successor:
 
     def step(self, sample: Sample, sp: Array, applied: Array) -> None:
         """One scan."""
+        for s, value in zip(self.controller.manifest.sp, sp.tolist(), strict=True):
+            if not s.low <= value <= s.high:
+                self.miss(f"the set point {s.name} = {value:g} is outside its range [{s.low:g}, {s.high:g}] {s.unit}")
+                return
         try:
             step: Step = self.controller.step(sp=sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self.state)
         except Exception as error:  # the controller in charge goes on, whatever this one does
@@ -50,22 +54,26 @@ class Successor:
         return self.good >= self.trial
 
 
-def require_same_signals(old: Controller, new: Controller) -> None:
-    """LoopError where ``new`` cannot take over from ``old``: another period, or other signals."""
-    a, b = old.manifest, new.manifest
+def require_same_signals(a: Manifest, b: Manifest) -> None:
+    """LoopError where a controller of ``b`` cannot take over from one of ``a``: another period, or other signals.
+
+    Names, units and order must be the same, and of the MVs also range and values: they belong to the actuator. The
+    ranges of set points and PVs say where a controller was proven, and may be others.
+    """
     if a.period_s != b.period_s:
         raise LoopError(f"the new controller has a period of {b.period_s:g} s; the loop runs at {a.period_s:g} s")
     for name, words in (("sp", "set points"), ("pv", "PVs"), ("dv", "measured disturbances"), ("mv", "MVs")):
-        now, then = a.signals(name), b.signals(name)
-        if list(map(_what, now)) != list(map(_what, then)):
+        now, then, ranged = a.signals(name), b.signals(name), name == "mv"
+        if [_what(s, ranged) for s in now] != [_what(s, ranged) for s in then]:
+            same = "name, unit, range and order" if ranged else "name, unit and order"
             raise LoopError(
                 f"the new controller's {words} are {_shown(then)}; the loop's are {_shown(now)}, and both must be the "
-                "same in name, unit, range and order"
+                f"same in {same}"
             )
 
 
-def _what(s: Signal) -> tuple[object, ...]:
-    return s.name, s.unit, s.low, s.high, s.values
+def _what(s: Signal, ranged: bool) -> tuple[object, ...]:
+    return (s.name, s.unit, s.low, s.high, s.values) if ranged else (s.name, s.unit)
 
 
 def _shown(signals: tuple[Signal, ...]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -10,11 +11,17 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
+from asyncua import Client
 from processes import within
+
+from serving.journal import JournalReader
+from serving.station.settings import Settings
+from serving.station.station import Station
 
 ROOT = Path(__file__).parents[1]
 
@@ -104,3 +111,37 @@ class Wire:
             for s in (source, to):
                 with suppress(OSError):
                     s.close()
+
+
+class RunningLoop:
+    """A station in a thread, as a loop.toml says."""
+
+    def __init__(self, path: Path) -> None:
+        self.settings = Settings.read(path)
+        self.told: list[str] = []
+        self.station = Station(self.settings, tell=self.told.append)
+        self.thread = threading.Thread(target=self.station.run, daemon=True)
+        self.thread.start()
+        assert within(30, lambda: self.station.scans > 2), self.told
+
+    def events(self) -> list[str]:
+        with closing(JournalReader(self.settings.journal.file)) as reader:
+            return [f"{e.kind} {e.who}: {e.what}" for _, e in reader.events()]
+
+    def end(self) -> None:
+        self.station.end()
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+
+
+def spoil(plant: Plant, tag: str, fault: str) -> None:
+    """Spoil a node of a served plant, or mend it with an empty text."""
+
+    async def write() -> None:
+        async with Client(plant.endpoint) as client:
+            index = await client.get_namespace_index("urn:loopwright:plant")
+            await client.get_node(f"ns={index};s=Faults.{tag}").write_value(fault)
+
+    # In a thread of its own: a browser that is driven has a loop in this one.
+    with ThreadPoolExecutor(1) as apart:
+        apart.submit(asyncio.run, write()).result()

@@ -146,6 +146,8 @@ class PlantServer:
         policies = [ua.SecurityPolicyType.NoSecurity, ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt]
         if not self.trust_all:
             policies = policies[1:]
+            # A store of asyncua is never empty: the server trusts itself.
+            (trusted / "this-server.der").write_bytes(certificate.read_bytes())
             store = TrustStore([trusted], [])
             await store.load()
             self.server.set_certificate_validator(

@@ -1,16 +1,20 @@
-"""A client's own certificate: what a server recognizes this loop by."""
+"""Certificates: what a server recognizes this loop by, and until when."""
 
 from __future__ import annotations
 
 import asyncio
 import os
 import socket
+from datetime import UTC, datetime
 from pathlib import Path
 
 from asyncua.crypto.cert_gen import setup_self_signed_certificate
+from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from serving.opcua.link import APPLICATION
+from serving.errors import LoopError
+
+APPLICATION = "urn:loopwright:client"
 
 
 def make(certificate: Path, key: Path) -> None:
@@ -26,3 +30,40 @@ def make(certificate: Path, key: Path) -> None:
     finally:
         os.umask(before)
     certificate.chmod(0o644)
+
+
+def valid_until(certificate: Path) -> str:
+    """The last day of a certificate, as YYYY-MM-DD. LoopError for a file that is none."""
+    return _read(certificate).not_valid_after_utc.date().isoformat()
+
+
+def last_day(der: bytes) -> str:
+    """The last day of a certificate that a server showed."""
+    try:
+        return x509.load_der_x509_certificate(der).not_valid_after_utc.date().isoformat()
+    except ValueError:
+        return "a day that cannot be read"
+
+
+def require_valid(certificate: Path) -> None:
+    """LoopError for a file that is no certificate, and for one whose time is over or has not come."""
+    found, now = _read(certificate), datetime.now(UTC)
+    if now > found.not_valid_after_utc:
+        raise LoopError(
+            f"{certificate} was valid until {valid_until(certificate)}; remove it and its key: `loopwright loop init` "
+            "makes a new one, which the server must trust again"
+        )
+    if now < found.not_valid_before_utc:
+        first = f"{found.not_valid_before_utc:%Y-%m-%d}"
+        raise LoopError(f"{certificate} is valid from {first} on; is this machine's clock right?")
+
+
+def _read(certificate: Path) -> x509.Certificate:
+    try:
+        data = certificate.read_bytes()
+    except OSError as error:
+        raise LoopError(f"{certificate} cannot be read: {error.strerror}") from None
+    try:
+        return x509.load_pem_x509_certificate(data) if b"-----BEGIN" in data else x509.load_der_x509_certificate(data)
+    except ValueError:
+        raise LoopError(f"{certificate} is no certificate (DER or PEM)") from None

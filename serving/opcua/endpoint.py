@@ -19,6 +19,7 @@ from serving.errors import EndpointError, LoopError
 from serving.guard import Sample
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
+from serving.opcua.lease import NodeLease
 from serving.opcua.link import BAD, GOOD, UNCERTAIN, Link, Reading, variant, words
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
@@ -101,7 +102,10 @@ class OpcUaEndpoint:
         self.unwritten = ""  # why the last MV did not reach the plant
         self.connections = 0
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
-        self._beats, self._scans, self._next_s = 0, 0, 0.0
+        self._beats, self._scans, self._next_s, self._wrote = 0, 0, 0.0, 0
+        self._written: tuple[Array, float] | None = None  # the last MV that was passed on, and when
+        self._called = 0  # the scan of the last call to write
+        self.lease = NodeLease()
         self._handed_back, self._watched = False, (float("nan"), 0)
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -122,11 +126,11 @@ class OpcUaEndpoint:
 
     def read(self) -> Sample:
         """The last values; EndpointError where there are none that are young enough."""
+        values = self.values  # before the time is taken: newer ones may arrive meanwhile, from the future as it were
         now = self.clock()
         self._scans += 1
         self._next_s = now + self.period_s - self.lead_s
         self._stir()
-        values = self.values
         if values is None:
             raise EndpointError(self.trouble or "no values yet")
         age = now - values.arrived_s + values.age_s
@@ -138,13 +142,27 @@ class OpcUaEndpoint:
         """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection."""
         refused = self.unwritten
         if self._link is None:
+            self._written = None
             raise EndpointError(self.trouble or "not connected")
+        if not refused and self._stands(mv):
+            return
         if self._outbox:
             refused = refused or "the MV of the scan before is still on its way"
         self._outbox.append(np.array(mv))
         self._stir()
         if refused:
             raise EndpointError(refused)
+
+    def _stands(self, mv: Array) -> bool:
+        """Whether this very MV was passed on less than ``rewrite_s`` ago, and at each scan since."""
+        now, last, mine = self.clock(), self._written, self._scans - self._called <= 1
+        self._called = self._scans
+        young = last is not None and now - last[1] < self.server.rewrite_s / self.speed
+        if mine and young and last is not None and np.array_equal(last[0], mv):
+            self._wrote = self._scans  # the lease is still needed
+            return True
+        self._written = np.array(mv), now
+        return False
 
     def hand_back(self) -> None:
         """Ask the plant's own controller to take the plant; EndpointError until the server has confirmed it."""
@@ -168,8 +186,13 @@ class OpcUaEndpoint:
                 loop.call_soon_threadsafe(wake.set)
 
     def _run(self) -> None:
-        with suppress(Exception):
-            asyncio.run(self._keep_connected())
+        while not self._closed.is_set():
+            try:
+                asyncio.run(self._keep_connected())
+            except BaseException as error:  # whatever a library lets through, the plant is to be reached again
+                self._link = None
+                self._lost(f"the connection's thread begins anew: {type(error).__name__}")
+                self._closed.wait(FIRST_RETRY_S)
 
     async def _keep_connected(self) -> None:
         self._loop, self._wake = asyncio.get_running_loop(), asyncio.Event()
@@ -182,11 +205,12 @@ class OpcUaEndpoint:
                 await self._rest(pause)
                 pause = min(pause * GROWTH, LAST_RETRY_S)
                 continue
+            plan = None
             try:
                 plan = await Plan.made(link, self.manifest, self.nodes, max(self.answer_s, self.server.connect_s))
                 self.connections += 1
                 self._outbox.clear()  # what was to be written then is too old now
-                self.unwritten = ""
+                self.unwritten, self._written = "", None
                 self._link = link
                 pause = FIRST_RETRY_S
                 self.tell(f"connected to {self.server.endpoint}")
@@ -196,6 +220,9 @@ class OpcUaEndpoint:
             finally:
                 self._link = None
                 if self._closed.is_set():
+                    with suppress(Exception):
+                        if plan is not None and plan.lease is not None:
+                            await self.lease.give_back(link, plan.lease, self.answer_s)
                     await link.close()
                 else:
                     link.abort()
@@ -231,6 +258,8 @@ class OpcUaEndpoint:
                 try:
                     await self._beat(link, plan)
                     answers = await link.read(plan.asked, self.answer_s)
+                    if plan.lease is not None:
+                        await self._lease(link, plan.lease, answers[-1])
                 except EndpointError as error:
                     silent += 1
                     self.trouble = first_line(error)
@@ -257,6 +286,13 @@ class OpcUaEndpoint:
         except EndpointError as error:
             self.unwritten = first_line(error)
             return
+        if plan.lease is not None:
+            try:
+                await self.lease.take(link, plan.lease, self.answer_s)
+            except EndpointError as error:
+                self.unwritten = first_line(error)
+                return
+        self._wrote = self._scans
         statuses = await link.write(rows, self.answer_s)
         names = ["hand_back"] if handing else plan.mv_names
         wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != GOOD]
@@ -265,6 +301,14 @@ class OpcUaEndpoint:
         if ua.StatusCodes.BadTypeMismatch in statuses:
             # With the next connection all types are asked for anew.
             raise EndpointError(f"{self.unwritten}: a node's type has changed")
+
+    async def _lease(self, link: Link, node: ua.NodeId, answer: Reading) -> None:
+        """Keep the lease while MVs are written, and let it go when they are not: a shadow needs none."""
+        self.lease.seen(answer.words_held)
+        if self.lease.held and self._scans - self._wrote > SILENT_SCANS:
+            await self.lease.give_back(link, node, self.answer_s)
+        elif self.lease.held:
+            await self.lease.renew(link, node, self.answer_s)
 
     async def _beat(self, link: Link, plan: Plan) -> None:
         """Count the scans on the server's side, while there are any."""

@@ -10,6 +10,7 @@ from asyncua import ua
 
 from serving.errors import EndpointError
 from serving.manifest import Manifest, Signal
+from serving.opcua.certificates import last_day, valid_until
 from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, words
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
@@ -56,9 +57,20 @@ async def _inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[F
         ):
             if node:
                 found.append(await _one(link, manifest, server, f"{name}, written", node, 1.0, 0.0, True))
-        return found
+        return [*found, *_certificates(link, server)]
     finally:
         await link.close()
+
+
+def _certificates(link: Link, server: Server) -> list[Found]:
+    """Until when both sides may speak."""
+    if server.security == "None" or server.certificate is None:
+        return []
+    rows = [Found("certificate of this loop", "-", note=f"valid until {valid_until(server.certificate)}")]
+    own = link.server_certificate()
+    if own:
+        rows.append(Found("certificate of the server", "-", note=f"valid until {last_day(own)}"))
+    return rows
 
 
 async def _one(

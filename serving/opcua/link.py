@@ -6,20 +6,22 @@ import asyncio
 import math
 import socket
 import struct
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from contextlib import suppress
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
 
 from serving.errors import EndpointError, LoopError
+from serving.opcua.certificates import APPLICATION, require_valid
 from serving.opcua.settings import Server
 from serving.words import named
 
-APPLICATION = "urn:loopwright:client"
+T = TypeVar("T")
+
 INTEGERS = {
     t: (low, high)
     for t, low, high in (
@@ -46,6 +48,7 @@ class Reading(NamedTuple):
     source_s: float | None  # source time [s since 1970]; None where the server gives none
     kind: ua.VariantType | None
     text: str = ""
+    words_held: str = ""  # of a node that holds a text
 
     @property
     def quality(self) -> int:
@@ -63,6 +66,7 @@ class Link:
 
     def __init__(self, client: Client, server: Server) -> None:
         self.client, self.server = client, server
+        self._securing = False
 
     @classmethod
     async def opened(cls, server: Server) -> Link:
@@ -73,29 +77,57 @@ class Link:
         client.session_timeout = 60_000
         link = cls(client, server)
         try:
-            async with asyncio.timeout(server.connect_s):
-                if server.security != "None":
-                    pinned = None if server.server_certificate is None else str(server.server_certificate)
-                    policy = getattr(security_policies, f"SecurityPolicy{server.security}")
-                    await client.set_security(
-                        policy, str(server.certificate), str(server.private_key), server_certificate=pinned
-                    )
-                if server.user:
-                    client.set_user(server.user)
-                    client.set_password(server.password())
-                await client.connect()
+            await in_time(link._log_on(), server.connect_s)
         except TimeoutError:
             link.abort()
-            raise EndpointError(f"{server.endpoint} does not answer within {server.connect_s:g} s") from None
+            raise EndpointError(
+                f"{server.endpoint} does not answer within {server.connect_s:g} s{link._hint()}"
+            ) from None
         except LoopError:
             raise
+        except AssertionError:  # asyncua asks for the endpoints in the clear first, and expects an answer
+            link.abort()
+            raise EndpointError(
+                f"{server.endpoint} opens no channel to ask for its endpoints; pin its certificate by "
+                "server_certificate, and none is asked for"
+            ) from None
         except Exception as error:
             link.abort()
-            raise EndpointError(f"{server.endpoint} refuses: {_reason(error)}") from None
+            reason = _reason(error)
+            hint = "" if "User" in reason or "Identity" in reason else link._hint()
+            raise EndpointError(f"{server.endpoint} refuses: {reason}{hint}") from None
         except BaseException:
             link.abort()
             raise
         return link
+
+    def _hint(self) -> str:
+        """What to look at where a server does not open a secure channel."""
+        if not self._securing:
+            return ""
+        pinned = "" if self.server.server_certificate is None else ", and see that server_certificate is its own"
+        return f"; let the server trust {self.server.certificate}{pinned}"
+
+    def server_certificate(self) -> bytes:
+        """The server's own certificate; empty without security."""
+        return bytes(getattr(self.client.uaclient.security_policy, "peer_certificate", None) or b"")
+
+    async def _log_on(self) -> None:
+        server, client = self.server, self.client
+        if server.security != "None":
+            assert server.certificate is not None
+            require_valid(server.certificate)
+            pinned = None if server.server_certificate is None else str(server.server_certificate)
+            policy = getattr(security_policies, f"SecurityPolicy{server.security}")
+            await client.set_security(
+                policy, str(server.certificate), str(server.private_key), server_certificate=pinned
+            )
+            self._securing = True
+        if server.user:
+            client.set_user(server.user)
+            client.set_password(server.password())
+        await client.connect()
+        self._securing = False
 
     async def resolved(self, nodes: Sequence[str], timeout_s: float) -> list[ua.NodeId]:
         """The server's ids of nodes. EndpointError for a text that is no id and a namespace that is not there."""
@@ -138,8 +170,7 @@ class Link:
     async def close(self, timeout_s: float = 1.0) -> None:
         """Log off; where the server does not answer, break off."""
         with suppress(Exception):
-            async with asyncio.timeout(timeout_s):
-                await self.client.disconnect()
+            await in_time(self.client.disconnect(), timeout_s)
         self.abort()
 
     def abort(self) -> None:
@@ -159,12 +190,37 @@ class Link:
 
     async def _within(self, answer: Any, timeout_s: float) -> Any:
         try:
-            async with asyncio.timeout(timeout_s):
-                return await answer
+            return await in_time(answer, timeout_s)
         except TimeoutError:
             raise EndpointError(f"{self.server.endpoint} does not answer within {timeout_s:.3g} s") from None
         except Exception as error:
             raise EndpointError(f"{self.server.endpoint}: {_reason(error)}") from None
+
+
+async def in_time(doing: Awaitable[T], timeout_s: float) -> T:
+    """What ``doing`` gives. TimeoutError where it takes longer, ConnectionError where it was broken off.
+
+    It is a task of its own: asyncua waits by wait_for2, whose own kind of cancellation ``asyncio.timeout`` does not
+    take for its own when an answer comes in the moment of its deadline, and would let through to the thread's end.
+    """
+    task = asyncio.ensure_future(doing)
+    try:
+        await asyncio.wait({task}, timeout=timeout_s)
+        if not task.done():
+            raise TimeoutError
+        if task.cancelled():
+            raise ConnectionError("the connection was broken off")
+        return task.result()
+    finally:
+        if not task.done():
+            task.add_done_callback(_forgotten)
+            task.cancel()
+
+
+def _forgotten(task: asyncio.Future[T]) -> None:
+    """Nobody waits for it any more: what it raises is no news."""
+    if not task.cancelled():
+        task.exception()
 
 
 def node_id(text: str, spaces: Sequence[str]) -> ua.NodeId:
@@ -192,7 +248,7 @@ def reading(value: ua.DataValue) -> Reading:
         number = float(given)
         return Reading(number, status, source, kind, "" if math.isfinite(number) else f"{number}")
     text = "no value" if given is None else f"{type(given).__name__} instead of a number"
-    return Reading(math.nan, status, source, kind, text)
+    return Reading(math.nan, status, source, kind, text, given if isinstance(given, str) else "")
 
 
 def variant(value: float, kind: ua.VariantType, low: float, high: float) -> ua.Variant:

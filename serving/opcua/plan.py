@@ -42,6 +42,7 @@ class Plan:
         self.asked: list[ua.NodeId] = []
         self.written: list[tuple[ua.NodeId, ua.VariantType]] = []
         self.heartbeat: tuple[ua.NodeId, ua.VariantType, int] | None = None
+        self.lease: ua.NodeId | None = None  # read last, after the points
         self._hand_back: tuple[ua.NodeId, ua.VariantType] | None = None
 
     @classmethod
@@ -53,6 +54,9 @@ class Plan:
         extra += [nodes.hand_back.node] if nodes.hand_back is not None else []
         ids = await link.resolved([*texts, *(p.node for p in plan.mv_points), *extra], timeout_s)
         plan.asked = ids[: len(texts)]
+        if nodes.lease:
+            (plan.lease,) = await link.resolved([nodes.lease], timeout_s)
+            plan.asked = [*plan.asked, plan.lease]
         kinds = [r.kind for r in await link.read(ids[len(texts) :], timeout_s)]
         names = [*(f"MV {n}" for n in plan.mv_names), *extra]
         for name, kind in zip(names, kinds, strict=True):

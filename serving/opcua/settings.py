@@ -113,7 +113,8 @@ class Server:
     ``insecure``. ``server_certificate`` pins the server's own. The password comes from the environment variable
     ``password_env`` or from ``password_file``. ``uncertain`` says whether a value of uncertain quality is used.
     ``source_time`` says whether a value whose source time stands still grows old: ``ignore`` it for a server that
-    stamps a value only when it changes.
+    stamps a value only when it changes. An MV that has not changed is written again after ``rewrite_s`` [s]; 0: at
+    every scan.
     """
 
     endpoint: str
@@ -128,6 +129,7 @@ class Server:
     connect_s: float = 5.0
     uncertain: Literal["fault", "use"] = "fault"
     source_time: Literal["judge", "ignore"] = "judge"
+    rewrite_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.endpoint.startswith("opc.tcp://"):
@@ -149,6 +151,8 @@ class Server:
             raise LoopError("user needs a password: name an environment variable (password_env) or a file")
         if not (isfinite(self.connect_s) and self.connect_s > 0):
             raise LoopError(f"connect_s is {self.connect_s}; it must be above zero")
+        if not (isfinite(self.rewrite_s) and self.rewrite_s >= 0):
+            raise LoopError(f"rewrite_s is {self.rewrite_s}; it must be 0 (at every scan) or more")
 
     def password(self) -> str:
         """The password; empty without a user. LoopError where it is not to be had."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import getpass
+import json
 import logging
 import signal
 import sys
@@ -12,9 +14,11 @@ from pathlib import Path
 from serving.controller import Controller
 from serving.errors import LoopError
 from serving.guard import Sample
-from serving.loop import Command
+from serving.loop import Command, Mode
 from serving.manifest import Manifest
-from serving.station.export import export
+from serving.station.control import ask
+from serving.station.export import export, tag_table
+from serving.station.requests import TRIAL
 from serving.station.settings import Settings
 from serving.station.template import template
 
@@ -33,14 +37,68 @@ def options(parser: argparse.ArgumentParser) -> None:
     run = commands.add_parser("run", help="run the loop until Ctrl-C")
     run.add_argument("file", metavar="LOOP.TOML", type=Path, nargs="?", default=SETTINGS)
     run.add_argument("--scans", metavar="N", type=int, help="stop after so many")
+    _asking(commands)
     out = commands.add_parser("export", help="write a journal's scans as a CSV that `loopwright new` reads")
     out.add_argument("file", metavar="JOURNAL", type=Path)
     out.add_argument("--out", metavar="FILE", type=Path, help="where it goes (JOURNAL.csv)")
 
 
+def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The commands that steer a loop which runs."""
+    swap = commands.add_parser("swap", help="try another controller beside the one in charge; then it takes over")
+    which = swap.add_mutually_exclusive_group(required=True)
+    which.add_argument("controller", metavar="CONTROLLER", type=Path, nargs="?", help="its .onnx file")
+    which.add_argument("--back", action="store_true", help="the one that was replaced")
+    which.add_argument("--keep", action="store_true", help="end the trial; the one in charge stays")
+    swap.add_argument("--trial", metavar="N", type=int, default=TRIAL, help="good scans of trial (%(default)s)")
+    mode = commands.add_parser("mode", help="change the mode")
+    mode.add_argument("mode", metavar="MODE", type=str.upper, help=", ".join(Mode))
+    for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL")):
+        values = commands.add_parser(name, help=f"change {words}")
+        values.add_argument("values", metavar="NAME=VALUE", nargs="+")
+    state = commands.add_parser("state", help="how the loop stands, as JSON")
+    for parser in (swap, mode, *(commands.choices[name] for name in ("sp", "mv")), state):
+        parser.add_argument("--loop", metavar="LOOP.TOML", type=Path, default=SETTINGS, help="which (%(default)s)")
+        if parser is not state:
+            parser.add_argument("--who", default=getpass.getuser(), help="written down (%(default)s)")
+            parser.add_argument("--reason", default="", help="written down")
+
+
 def run(options: argparse.Namespace) -> int:
     """Do what was asked for; the exit status."""
-    return {"init": _init, "check": _check, "run": _run, "export": _export}[options.action](options)
+    does = {"init": _init, "check": _check, "run": _run, "export": _export, "state": _state}
+    return does.get(options.action, _ask)(options)
+
+
+def _state(options: argparse.Namespace) -> int:
+    print(json.dumps(ask(Settings.read(options.loop).journal.file, {"do": "state"}), indent=2))
+    return 0
+
+
+def _ask(options: argparse.Namespace) -> int:
+    settings = Settings.read(options.loop)
+    do, value = options.action, None
+    if do == "mode":
+        value = options.mode
+    elif do in {"sp", "mv"}:
+        value = dict(_pair(text) for text in options.values)
+    elif options.back or options.keep:
+        do, value = ("back", {"trial": options.trial}) if options.back else ("keep", None)
+    else:
+        value = {"file": str(options.controller.absolute()), "trial": options.trial}
+    request = {"do": do, "value": value, "who": options.who, "reason": options.reason}
+    print(ask(settings.journal.file, request)["done"])
+    if do in {"swap", "back"}:
+        print(f"once it has the plant: {options.loop} still names the old file; a restart brings that one")
+    return 0
+
+
+def _pair(text: str) -> tuple[str, float]:
+    name, _, number = text.partition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        raise LoopError(f"{text!r} is no NAME=VALUE with a number") from None
 
 
 def _init(options: argparse.Namespace) -> int:
@@ -106,9 +164,10 @@ def _run(options: argparse.Namespace) -> int:
     def tell(line: str) -> None:
         print(line, flush=True)
 
-    for line in _warnings(settings):
-        tell(f"note: {line}")
     station = Station(settings, tell=tell)
+    station.warnings = _warnings(settings)
+    for line in station.warnings:
+        tell(f"note: {line}")
     station.watch(_Lines(station.manifest).show)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: station.end())
@@ -143,8 +202,10 @@ class _Lines:
 def _export(options: argparse.Namespace) -> int:
     out = options.out or options.file.with_suffix(".csv")
     rows = export(options.file, out)
-    print(f"{rows} scans: {out}")
-    print(f"next: `loopwright new NAME {out}` makes a record of it")
+    tags = out.with_name(f"{out.stem}-tags.csv")
+    tag_table(options.file, tags)
+    print(f"{rows} scans: {out}, its tags: {tags}")
+    print(f"next: `loopwright new NAME {out} --tags {tags}` makes a record of it")
     return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,21 +16,30 @@ WRITTEN = ("pv", "dv", "applied", "sp")  # groups of columns; the MV as the actu
 
 
 def export(journal: Path, out: Path) -> int:
-    """Write the scans to a CSV file, whole or not at all; how many there were. LoopError where there is none."""
+    """Write the scans to a CSV file, whole or not at all; how many there were. LoopError where there is none.
+
+    Times are the plant's: where its time runs faster than the clock's, so do they, and runs follow each other.
+    """
     reader = JournalReader(journal)
     draft = out.with_name(out.name + ".draft")
     try:
-        runs = {run["id"]: run["columns"] for run in reader.runs()}
+        found = {run["id"]: run for run in reader.runs()}
+        runs = {id_: run["columns"] for id_, run in found.items()}
         names = list(dict.fromkeys(c for columns in runs.values() for c in columns if c.partition(" ")[0] in WRITTEN))
         names.sort(key=lambda name: WRITTEN.index(name.partition(" ")[0]))
         count = 0
         with draft.open("w", encoding="utf-8", newline="") as text:
             table = csv.writer(text)
             table.writerow(["time", *map(_tag, names), "MODE"])
+            of, began, last = 0, 0.0, 0.0
             for _, run, scan in reader.scans():
+                speed, period = found[run]["speed"], found[run]["period_s"]
+                if run != of:
+                    of, began = run, max(found[run]["began"], last + period)
+                last = began + (scan.time_s - found[run]["began"]) * speed
                 at = {name: i for i, name in enumerate(runs[run])}
                 cells = [_cell(scan.numbers[at[name]]) if name in at else "" for name in names]
-                when = datetime.fromtimestamp(scan.time_s, UTC).isoformat(timespec="milliseconds")
+                when = datetime.fromtimestamp(last, UTC).isoformat(timespec="milliseconds")
                 table.writerow([when, *cells, scan.mode])
                 count += 1
         if not count:
@@ -39,6 +49,24 @@ def export(journal: Path, out: Path) -> int:
         reader.close()
         draft.unlink(missing_ok=True)
     return count
+
+
+def tag_table(journal: Path, out: Path) -> None:
+    """Write the tags of the exported file: roles, names, units and ranges, as the last controller had them."""
+    with closing(JournalReader(journal)) as reader:
+        last = reader.runs()[-1]
+    fields = ["tag", "role", "name", "unit", "low", "high", "max_move_per_min"]
+    with out.open("w", encoding="utf-8", newline="") as text:
+        table = csv.DictWriter(text, fields)
+        table.writeheader()
+        for group, role in (("pv", "pv"), ("mv", "mv"), ("dv", "dv"), ("sp", "sp")):
+            for s in last["signals"][group]:
+                row = {"tag": _tag(f"{'applied' if group == 'mv' else group} {s['name']}"), "role": role}
+                row |= {"name": s["name"], "unit": s["unit"], "low": s["low"], "high": s["high"]}
+                if s.get("max_move") is not None:
+                    row["max_move_per_min"] = s["max_move"] * 60 / last["period_s"]
+                table.writerow(row)
+        table.writerow({"tag": "MODE", "role": "mode", "name": "MODE"})
 
 
 def _tag(column: str) -> str:

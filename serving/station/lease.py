@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
 from serving.errors import LoopError
+from serving.station.places import runtime_folder
 
 
 class Lease:
@@ -21,8 +21,7 @@ class Lease:
         import fcntl  # not on Windows, where only a lease node keeps loops apart
 
         self._held: list[int] = []
-        place = folder or Path(tempfile.gettempdir()) / f"loopwright-leases-{os.getuid()}"
-        place.mkdir(mode=0o700, exist_ok=True)
+        place = runtime_folder(folder)
         for node in nodes:
             path = place / hashlib.sha256(f"{endpoint} {node}".encode()).hexdigest()[:32]
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)

@@ -15,6 +15,7 @@ from serving.fields import nearest, parse
 from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate
 from serving.manifest import Manifest, Signal
 from serving.opcua.settings import Nodes, Server
+from serving.page.settings import Page
 
 MAX_AGE = 1.5  # periods: one answer may be late, two may not
 TRANSFER = 20.0  # periods
@@ -111,7 +112,10 @@ class JournalSettings:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """A loop: controller, plant, guards, fallback, journal. Paths are relative to the file that names them."""
+    """A loop: controller, plant, guards, fallback, journal, page. Paths are relative to the file that names them.
+
+    ``page`` is HOST:PORT or a table (see ``serving.page.settings``); empty: none.
+    """
 
     controller: Path
     server: Server
@@ -123,12 +127,15 @@ class Settings:
     guards: Guards = Guards()
     hold: Hold = Hold()
     journal: JournalSettings = JournalSettings()
+    page: str | Page = ""
 
     def __post_init__(self) -> None:
         if not (isfinite(self.speed) and self.speed > 0):
             raise LoopError(f"speed is {self.speed}; it must be above zero (1 is real time)")
         if self.hold.then == "hand back" and self.nodes.hand_back is None:
             raise LoopError('hold.then is "hand back", but nodes.hand_back does not say by which node')
+        if isinstance(self.page, str) and self.page:
+            Page(self.page)  # refuses an address that is none
 
     @classmethod
     def read(cls, path: Path) -> Settings:
@@ -150,7 +157,21 @@ class Settings:
             password_file=_under(at, s.password_file),
         )
         journal = replace(found.journal, file=at / found.journal.file)
-        return replace(found, controller=at / found.controller, server=server, journal=journal)
+        page = found.page
+        if isinstance(page, Page):
+            page = replace(
+                page,
+                token_file=_under(at, page.token_file),
+                certificate=_under(at, page.certificate),
+                private_key=_under(at, page.private_key),
+            )
+        return replace(found, controller=at / found.controller, server=server, journal=journal, page=page)
+
+    def served(self) -> Page | None:
+        """The page that is asked for."""
+        if isinstance(self.page, Page):
+            return self.page
+        return Page(self.page) if self.page else None
 
     def max_age_s(self, period_s: float) -> float:
         """Age from which on a sample is refused."""

@@ -5,39 +5,37 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeAlias
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from serving.clock import MonotonicClock
 from serving.controller import Controller
-from serving.errors import LoopError
+from serving.errors import LoopError, LoopwrightError
 from serving.grid import RunReport
 from serving.guard import Sample
-from serving.journal import Event, Journal, Scan
+from serving.journal import Journal, JournalReader
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.opcua.endpoint import OpcUaEndpoint, Values
+from serving.opcua.link import words
+from serving.page.process import PageProcess
+from serving.station.control import Answer, Control
 from serving.station.lease import Lease
+from serving.station.recorder import Recorder
+from serving.station.requests import Change, Request, change
 from serving.station.settings import Settings
+from serving.station.views import about, picture, state
+from serving.station.watching import Watching
 from serving.words import first_line
 
 Array: TypeAlias = NDArray[np.float64]
 
 POLL_S = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """What somebody wants changed: ``act`` does it, ``what`` says it, ``done`` is told how it went (empty: well)."""
-
-    act: Callable[[ControlLoop], None]
-    what: str
-    who: str
-    reason: str = ""
-    done: Callable[[str], None] = lambda _: None
+LONGEST_ANSWER_S = 5.0
 
 
 class Station:
@@ -51,7 +49,7 @@ class Station:
     """
 
     def __init__(self, settings: Settings, *, tell: Callable[[str], None] = lambda _: None) -> None:
-        self.settings, self._say = settings, tell
+        self.settings, self.tell = settings, tell
         self.controller = Controller(settings.controller, settings.sha256 or None)
         m = self.manifest
         age = settings.max_age_s(m.period_s)
@@ -64,19 +62,23 @@ class Station:
         self.lease = Lease(settings.server.endpoint, [p.node for p in points])
         try:
             self.journal = Journal(
-                settings.journal.file, max_mb=settings.journal.max_mb, fsync=settings.journal.fsync, tell=self._trouble
+                settings.journal.file, max_mb=settings.journal.max_mb, fsync=settings.journal.fsync, tell=tell
             )
         except BaseException:
             self.lease.release()
             raise
+        self.recorder = Recorder(self.journal, tell, settings.speed)
+        self.watching = Watching(self.controller, self.recorder)
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
-        self.last: tuple[Sample | None, Command] | None = None
+        self.last: tuple[Sample | None, Command, float] | None = None  # with when that was, since 1970
+        self.scans = self.faults = self.missed = 0
+        self.warnings: list[str] = []
         self.ended = False
+        self.page: PageProcess | None = None
         self._watchers: list[Callable[[Sample | None, Command], None]] = []
         self._asked_sp: dict[str, float] = {}
         self._asked_mode: str | None = None  # None: not read yet; what stands there at the start is no wish
-        self._fault = ""
 
     @property
     def manifest(self) -> Manifest:
@@ -98,7 +100,14 @@ class Station:
     def run(self, n: int | None = None) -> RunReport:
         """Connect, and scan until ``end`` or for ``n`` scans."""
         s, m = self.settings, self.manifest
-        try:
+        with ExitStack() as stack:
+            for held in (self.lease.release, self.journal.close):
+                stack.callback(held)
+            control = Control(s.journal.file, self.answer)
+            stack.callback(control.close)
+            self._serve(stack, control)
+            stack.callback(self.watching.keep)
+            stack.callback(self.endpoint.close)
             self.endpoint.start()
             first = self._first_values()
             pv = None if first is None else first.pv[: len(m.sp)]
@@ -115,15 +124,22 @@ class Station:
                 transfer_s=20 * m.period_s if s.transfer_s is None else s.transfer_s,
                 fallback=self.fallback,
             )
-            self.journal.begin(m, self.controller.sha256, time.time())
-            self._note("change", "loop.toml", f"started in {s.start}")
+            self.recorder.begin(self.controller)
+            self.recorder.note("change", "loop.toml", f"started in {s.start}")
             report = self.loop.run(n, before=self._before, observe=self._observe, until=lambda _: self.ended)
-            self._note("change", "loop", "ended")
+            self.recorder.note("change", "loop", "ended")
             return report
-        finally:
-            self.endpoint.close()
-            self.journal.close()
-            self.lease.release()
+
+    def _serve(self, stack: ExitStack, control: Control) -> None:
+        """The page, where one is asked for."""
+        wanted = self.settings.served()
+        if wanted is not None:
+            page = PageProcess(wanted, self.settings.journal.file, control.path, self.tell)
+            stack.callback(page.close)
+            self.page = page
+            self.tell(
+                f"page: {page.url}  token for changes: {page.token if wanted.token_file is None else 'in its file'}"
+            )
 
     # ------------------------------------------------------------------ around a scan
     def _first_values(self) -> Values | None:
@@ -139,16 +155,19 @@ class Station:
     def _before(self, k: int) -> None:
         """Changes that were asked for, here or on the plant's side."""
         assert self.loop is not None
+        self.missed = k - self.scans
         while not self.changes.empty():
             change = self.changes.get()
             try:
                 change.act(self.loop)
-            except LoopError as error:
+            except LoopwrightError as error:
                 change.done(first_line(error))
-                self._note("change", change.who, f"refused: {change.what} ({first_line(error)})", change.reason)
+                self.recorder.note(
+                    change.kind, change.who, f"refused: {change.what} ({first_line(error)})", change.reason
+                )
                 continue
             change.done("")
-            self._note("change", change.who, change.what, change.reason)
+            self.recorder.note(change.kind, change.who, change.what, change.reason)
         values = self.endpoint.values
         if values is not None:
             self._plant_side(self.loop, values)
@@ -170,44 +189,68 @@ class Station:
         try:
             act()
         except LoopError as error:
-            self._note("change", "plant", f"refused: {what} ({first_line(error)})")
+            self.recorder.note("change", "plant", f"refused: {what} ({first_line(error)})")
             return
-        self._note("change", "plant", what)
+        self.recorder.note("change", "plant", what)
 
     def _observe(self, sample: Sample | None, command: Command) -> None:
         """Write the scan down, and show it."""
-        m, values = self.manifest, self.endpoint.values
-        nan_mv, nan_pv = np.full(len(m.mv), np.nan), np.full(len(m.pv), np.nan)
-        nothing = sample is None
-        numbers = [
-            *command.sp,
-            *(nan_pv if sample is None else sample.pv),
-            *(command.mv if command.writes else nan_mv),
-            *(nan_mv if sample is None or sample.mv_applied is None else sample.mv_applied),
-            *(nan_mv if command.law_mv is None else command.law_mv),
-            *(nan_mv if command.successor_mv is None else command.successor_mv),
-            *(np.full(len(m.dv), np.nan) if sample is None else sample.dv),
-            *(np.full(len(m.info), np.nan) if command.info is None else command.info),
-        ]
-        quality = () if nothing or values is None else values.quality
-        self.journal.scan(Scan(time.time(), command.mode.value, tuple(map(float, numbers)), quality, command.reason))
-        if command.reason != self._fault:
-            self._fault = command.reason
-            self._note("fault", "loop", command.reason or "over")
-        self.last = sample, command
+        assert self.loop is not None
+        values = self.endpoint.values
+        self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
+        self.last = sample, command, time.time()
+        self.watching.seen(self.recorder.controller, self.last)
+        self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
         for seen in self._watchers:
             seen(sample, command)
 
-    # ------------------------------------------------------------------ words
-    def _note(self, kind: str, who: str, what: str, reason: str = "") -> None:
-        self.journal.event(Event(time.time(), kind, who, what, reason))
-        self._say(f"{who}: {what}" + (f" ({reason})" if reason else ""))
+    # ------------------------------------------------------------------ requests
+    def answer(self, tree: Any) -> Answer:
+        """What a request gets, from any thread: a view, or the change once a scan has carried it out."""
+        if isinstance(tree, dict) and tree.get("do") in {"state", "about", "picture"}:
+            return self._view(str(tree["do"]))
+        request = Request.read(tree)
+        if request.do == "acknowledge":
+            return self._acknowledge(request)
+        if self.loop is None:
+            raise LoopError(f"the loop has not begun yet: {self.endpoint.trouble}")
+        wanted = change(request, self.loop, self.settings.controller.parent)
+        said = queue.SimpleQueue[str]()
+        self.ask(replace(wanted, done=said.put))
+        period = self.manifest.period_s / self.settings.speed
+        try:
+            refused = said.get(timeout=min(2 * period, LONGEST_ANSWER_S))
+        except queue.Empty:
+            return {"done": f"{wanted.what}: with the next scan, within {period:g} s"}
+        if refused:
+            raise LoopError(refused)
+        return {"done": wanted.what}
+
+    def _view(self, name: str) -> Answer:
+        if name == "picture":
+            path = picture(self.controller if self.loop is None else self.loop.controller)
+            return {"file": None if path is None else str(path.absolute())}
+        return about(self) if name == "about" else state(self)
+
+    def _acknowledge(self, request: Request) -> Answer:
+        """Write down who has seen an alarm."""
+        with closing(JournalReader(self.settings.journal.file)) as reader:
+            entry = reader.entry(request.value) if type(request.value) is int else None
+        if entry is None or not entry.event.raised:
+            raise LoopError(f"there is no alarm {request.value!r}")
+        if entry.acknowledged is not None:
+            raise LoopError(f"{entry.acknowledged.who} has acknowledged it already")
+        self.recorder.note("acknowledged", request.who, entry.event.what, request.reason, about=entry.id)
+        return {"done": f"acknowledged: {entry.event.what}"}
+
+    def quality(self) -> list[str]:
+        """The quality of each PV, MV and DV, by OPC UA's own names."""
+        values = self.endpoint.values
+        return [] if values is None else [words(status) for status in values.quality]
 
     def _connection(self, what: str) -> None:
-        self._note("connection", "opcua", what)
-
-    def _trouble(self, what: str) -> None:
-        self._say(what)
+        up = what.startswith("connected")
+        self.recorder.note("connection", "opcua", what, alarm="connection", raised=not up)
 
 
 def _near(values: Array | None, signals: tuple[Signal, ...]) -> list[float]:

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from serving import Controller, LoopError
-from serving.journal import BLOCK, FRESH, Event, Journal, JournalReader, Scan, columns, packed, unpacked
+from serving.journal import Event, Journal, JournalReader, Scan, columns
+from serving.journal.packing import packed, unpacked
+from serving.journal.writer import BLOCK, FRESH
 
 pytest_plugins = ["small_laws"]
 

@@ -22,8 +22,9 @@ from serving import Mode, Sample
 from serving.journal import JournalReader, Scan
 from serving.loop import Command
 from serving.opcua.settings import HandBack, ModeNode, Nodes, Point, Server
+from serving.station.requests import Change
 from serving.station.settings import Hold, JournalSettings, Settings
-from serving.station.station import Change, Station
+from serving.station.station import Station
 
 ROOT = Path(__file__).parents[2]
 CASE, LAW = "thiosulfate_cstr", "pid"
@@ -262,3 +263,20 @@ def test_a_plant_is_handed_back_and_asked_for_again(plant: Plant, wire: Wire, tm
     assert running.ask(lambda loop: loop.set_mode(Mode.AUTO), "mode AUTO") == ""
     running.becomes(Mode.AUTO, scans=5)
     running.end()
+
+
+def test_a_servers_clock_may_be_an_hour_off_and_may_be_set(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    """Ages are judged by how source times advance: an offset is none, and a clock that is set costs a few scans."""
+    write(plant, "Faults.Clock", -3600.0)
+    try:
+        running = Running(tmp_path, wire.port)
+        running.becomes(Mode.AUTO, scans=30)
+        assert {c.mode for c in running.commands[10:]} == {Mode.AUTO}
+        for offset in (3600.0, 0.0):
+            write(plant, "Faults.Clock", offset)
+            before = len(running.commands)
+            assert within(20, lambda: len(running.commands) > before + 12)  # noqa: B023
+            running.becomes(Mode.AUTO, scans=20)
+        running.end()
+    finally:
+        write(plant, "Faults.Clock", 0.0)

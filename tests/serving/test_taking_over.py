@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.cases import CASES
+from pipeline.export.gate import export
 from pipeline.laws import LAWS
 from serving import Controller, ControlLoop, EndpointError, Fallback, LoopError, Mode, Sample, Signal, VirtualClock
 from serving.transfer import Transfer
@@ -302,6 +304,24 @@ def test_a_trial_may_be_ended(make_loop: Callable[..., ControlLoop], fast_file: 
     assert loop.controller is old
 
 
+def test_a_successor_for_other_set_points_waits_until_they_suit(
+    make_loop: Callable[..., ControlLoop], make_formula: Callable[..., Any], tmp_path: Path
+) -> None:
+    from small_laws import SIGNALS
+
+    (level,) = SIGNALS.sp
+    narrow = replace(SIGNALS, sp=(replace(level, high=0.5),))
+    export(make_formula(fast, signals=narrow), tmp_path / "narrow.onnx", case="tank", provenance={})
+    loop, new = make_loop(), Controller(tmp_path / "narrow.onnx")
+    loop.swap(new, trial=1)
+    loop.scan(sample())
+    assert loop.successor is not None
+    assert "the set point level = 1 is outside its range [0, 0.5]" in loop.successor.reason
+    loop.set_sp(0.4)
+    loop.scan(sample())
+    assert loop.controller is new
+
+
 @by_name
 def test_a_controller_of_another_plant_is_refused(path: Path, make_loop: Callable[..., ControlLoop]) -> None:
     with pytest.raises(LoopError, match=r"the new controller('s| has a period of)"):
@@ -311,11 +331,7 @@ def test_a_controller_of_another_plant_is_refused(path: Path, make_loop: Callabl
 def test_others_that_do_not_fit_are_named(
     make_loop: Callable[..., ControlLoop], make_formula: Callable[..., Any], tmp_path: Path
 ) -> None:
-    from dataclasses import replace
-
     from small_laws import SIGNALS
-
-    from pipeline.export.gate import export
 
     others = {
         "period of 1 s; the loop runs at 0.5 s": replace(SIGNALS, period_s=1.0),

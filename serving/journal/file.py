@@ -1,0 +1,52 @@
+"""A journal's SQLite file."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from serving.errors import LoopError
+
+SCHEMA = 2
+TABLES = """
+create table if not exists run (id integer primary key, began real not null, controller text not null,
+    sha256 text not null, period_s real not null, speed real not null, columns text not null,
+    signals text not null);
+create table if not exists scan (id integer primary key autoincrement, run integer not null, time real not null,
+    mode text not null, numbers blob not null, quality text, reason text);
+create table if not exists block (first integer primary key, last integer not null, run integer not null,
+    begin real not null, end real not null, data blob not null);
+create table if not exists event (id integer primary key autoincrement, time real not null, kind text not null,
+    who text not null, what text not null, reason text not null, alarm text not null, raised integer not null,
+    about integer not null);
+create table if not exists learnt (name text primary key, value text not null);
+create index if not exists event_time on event (time);
+create index if not exists event_alarm on event (alarm, id);
+create index if not exists event_about on event (about);
+create index if not exists block_end on block (end);
+"""
+
+
+def opened(path: Path, *, write: bool, fsync: str = "crash") -> sqlite3.Connection:
+    """A journal's database. LoopError where there is none to read, or the file is something else."""
+    if not write and not path.is_file():
+        raise LoopError(f"{path} is not here; it is the journal that a loop writes")
+    try:
+        address = path.absolute().as_uri() + ("" if write else "?mode=ro")
+        base = sqlite3.connect(address, uri=True, timeout=10, check_same_thread=False)
+        with closing(base.cursor()) as cursor:
+            (version,) = cursor.execute("pragma user_version").fetchone()
+            (tables,) = cursor.execute("select count(*) from sqlite_master").fetchone()
+            if version != SCHEMA and (tables or not write):
+                raise LoopError(
+                    f"{path} is no journal of this release (version {version}, not {SCHEMA}); name another file"
+                )
+            if write:
+                cursor.execute("pragma journal_mode=wal")
+                cursor.execute(f"pragma synchronous={'full' if fsync == 'power loss' else 'normal'}")
+                cursor.executescript(TABLES)
+                cursor.execute(f"pragma user_version={SCHEMA}")
+    except sqlite3.Error as error:
+        raise LoopError(f"{path} is no journal, or cannot be written: {error}") from None
+    return base

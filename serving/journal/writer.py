@@ -1,0 +1,178 @@
+"""Writes everything that a loop did, scan by scan, into one SQLite file that survives the death of its process."""
+
+from __future__ import annotations
+
+import json
+import queue
+import sqlite3
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from serving.journal.entries import Event, Scan, columns
+from serving.journal.file import opened
+from serving.journal.packing import packed
+from serving.manifest import Manifest
+from serving.words import named
+
+FLUSH_S = 0.25  # so much is lost at most when the process dies
+BLOCK = 600  # scans that are packed together
+FRESH = 1200  # the last scans, a row each
+WAITING = 200_000  # scans that wait in memory while the disk takes none
+
+
+class Journal:
+    """Writes scans and events from a thread of its own; ``scan`` and ``event`` return at once.
+
+    The file is in WAL mode: a process that dies, whatever it was doing, leaves a whole file without its last
+    ``FLUSH_S`` at most. With ``fsync`` "power loss" each write waits for the disk. Older scans are packed, and beyond
+    ``max_mb`` the oldest go. While the disk takes nothing, scans wait in memory, and ``trouble`` says why.
+
+    Raises LoopError for a file that is no journal.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        max_mb: float = 2000.0,
+        fsync: Literal["power loss", "crash"] = "crash",
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.path, self.max_bytes, self.tell = path, max_mb * 1e6, tell
+        self.trouble, self.lost = "", 0
+        self._fsync = fsync
+        self._queue = queue.SimpleQueue[Any]()
+        self._base = opened(path, write=True, fsync=fsync)
+        self._closing = threading.Event()
+        self._waiting: list[Any] = []
+        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        self._thread.start()
+
+    @property
+    def behind(self) -> int:
+        """How many scans and events wait to be written."""
+        return len(self._waiting) + self._queue.qsize()
+
+    def begin(self, manifest: Manifest, sha256: str, time_s: float, speed: float = 1.0) -> None:
+        """What follows is of this controller, on a plant that is ``speed`` times as fast as the clock."""
+        m = manifest
+        signals = {name: [s.to_dict() for s in m.signals(name)] for name in ("sp", "pv", "mv", "dv")}
+        texts = (json.dumps(columns(m)), json.dumps(signals))
+        row = (time_s, f"{m.law} for {m.case}", sha256, m.period_s, speed, *texts)
+        self._queue.put(("run", row))
+
+    def scan(self, scan: Scan) -> None:
+        """Write a scan down."""
+        self._queue.put(("scan", scan))
+
+    def event(self, event: Event) -> None:
+        """Write an event down."""
+        self._queue.put(("event", event))
+
+    def keep(self, name: str, value: str) -> None:
+        """Keep a text under a name, for the next run of the loop."""
+        self._queue.put(("learnt", (name, value)))
+
+    def close(self) -> None:
+        """Write what waits and end."""
+        self._closing.set()
+        self._queue.put(None)
+        self._thread.join()
+        self._base.close()
+
+    # ------------------------------------------------------------------ the writer
+    def _run(self) -> None:
+        run = 0
+        while True:
+            self._take()
+            if not self._waiting and self._closing.is_set():
+                return
+            try:
+                run = self._write(run)
+                if self.trouble:
+                    self.tell("the journal writes again")
+                self.trouble = ""
+                self._waiting.clear()
+                self._pack()
+            except Exception as error:
+                with suppress(sqlite3.Error):
+                    self._base.rollback()
+                if not self.trouble:
+                    self.tell(f"the journal cannot be written: {named(error)}")
+                self.trouble = named(error)
+                if self._closing.is_set():
+                    return
+                if len(self._waiting) > WAITING:
+                    self.lost += len(self._waiting) - WAITING
+                    del self._waiting[: len(self._waiting) - WAITING]
+
+    def _take(self) -> None:
+        """Wait for something to write, then gather for ``FLUSH_S``."""
+        if not self._waiting and not self._closing.is_set():
+            first = self._queue.get()
+            if first is not None:
+                self._waiting.append(first)
+        self._closing.wait(FLUSH_S)
+        with suppress(queue.Empty):
+            while True:
+                item = self._queue.get_nowait()
+                if item is not None:
+                    self._waiting.append(item)
+
+    def _write(self, run: int) -> int:
+        with self._base:
+            for kind, item in self._waiting:
+                if kind == "run":
+                    cursor = self._base.execute(
+                        "insert into run (began, controller, sha256, period_s, speed, columns, signals) "
+                        "values (?, ?, ?, ?, ?, ?, ?)",
+                        item,
+                    )
+                    run = int(cursor.lastrowid or 0)
+                elif kind == "scan":
+                    numbers = np.asarray(item.numbers, dtype=np.float64).tobytes()
+                    quality = json.dumps(item.quality) if any(item.quality) else None
+                    self._base.execute(
+                        "insert into scan (run, time, mode, numbers, quality, reason) values (?, ?, ?, ?, ?, ?)",
+                        (run, item.time_s, item.mode, numbers, quality, item.reason or None),
+                    )
+                elif kind == "learnt":
+                    self._base.execute("insert or replace into learnt (name, value) values (?, ?)", item)
+                else:
+                    self._base.execute(
+                        "insert into event (time, kind, who, what, reason, alarm, raised, about) "
+                        "values (?, ?, ?, ?, ?, ?, ?, ?)",
+                        astuple(item),
+                    )
+        return run
+
+    def _pack(self) -> None:
+        """Pack the oldest scans once there are enough, and drop the oldest blocks once there are too many."""
+        (count,) = self._base.execute("select count(*) from scan").fetchone()
+        while count >= FRESH + BLOCK:
+            rows = self._base.execute(
+                "select id, run, time, mode, numbers, quality, reason from scan order by id limit ?", (BLOCK,)
+            ).fetchall()
+            rows = [row for row in rows if row[1] == rows[0][1]]
+            with self._base:
+                self._base.execute(
+                    "insert into block values (?, ?, ?, ?, ?, ?)",
+                    (rows[0][0], rows[-1][0], rows[0][1], rows[0][2], rows[-1][2], packed(rows)),
+                )
+                self._base.execute("delete from scan where id <= ?", (rows[-1][0],))
+                self._shorten()
+            count -= len(rows)
+
+    def _shorten(self) -> None:
+        (size,) = self._base.execute("select coalesce(sum(length(data)), 0) from block").fetchone()
+        for first, length in self._base.execute("select first, length(data) from block order by first").fetchall():
+            if size <= self.max_bytes:
+                return
+            self._base.execute("delete from block where first = ?", (first,))
+            size -= length

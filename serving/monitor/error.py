@@ -1,0 +1,86 @@
+"""The control error: how large it is, whether it swings, and what the dead time alone would leave of it."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.monitor.memory import Remembers
+
+Array: TypeAlias = NDArray[np.float64]
+
+CROSSINGS = 10  # intervals between crossings that regularity needs
+ORDER = 15  # of the error's autoregressive model
+LEAST = 1e-12
+
+
+class Swing(Remembers):
+    """Zero crossings of an error, and how regular they are.
+
+    Regularity r = mean / (3 standard deviation) of the last ``CROSSINGS`` intervals between crossings; above 1 the
+    error swings. A crossing counts once the error was beyond a band of ``band`` on the other side.
+
+    Source: Thornhill, Huang, Zhang, "Detection of multiple oscillations in control loops", J. Process Control 13
+    (2003) 91.
+    """
+
+    KEPT = ("side", "since", "intervals", "largest", "amplitudes")
+
+    def __init__(self, band: float) -> None:
+        self.band = band
+        self.side, self.since, self.largest = 0, 0, 0.0
+        self.intervals: list[int] = []
+        self.amplitudes: list[float] = []
+
+    def add(self, error: float) -> None:
+        """One scan."""
+        self.since += 1
+        self.largest = max(self.largest, abs(error))
+        side = 1 if error > self.band else -1 if error < -self.band else 0
+        if side and side != self.side:
+            if self.side:
+                self.intervals = [*self.intervals, self.since][-CROSSINGS:]
+                self.amplitudes = [*self.amplitudes, self.largest][-CROSSINGS:]
+            self.side, self.since, self.largest = side, 0, 0.0
+        if self.intervals and self.since > 5 * max(self.intervals):
+            self.intervals, self.amplitudes = [], []  # it has stopped
+
+    def regularity(self) -> float:
+        """r; 0 as long as there are too few crossings."""
+        if len(self.intervals) < CROSSINGS:
+            return 0.0
+        spread = float(np.std(self.intervals))
+        return min(float(np.mean(self.intervals)) / (3 * spread), 100.0) if spread else 100.0
+
+    def period(self) -> float:
+        """Scans of a whole swing."""
+        return 2 * float(np.mean(self.intervals)) if self.intervals else 0.0
+
+    def amplitude(self) -> float:
+        """Mean of the largest errors between crossings."""
+        return float(np.mean(self.amplitudes)) if self.amplitudes else 0.0
+
+
+def harris_index(errors: Array, dead: int) -> float:
+    """Share of an error's variance that no controller could remove for the dead time of ``dead`` samples, 0 .. 1.
+
+    With the autoregressive model A(q) e(k) = w(k) (Yule-Walker, ``ORDER``) and its impulse response f:
+    eta = var(w) sum_{i < dead} f(i)^2 / var(e). One is minimum variance; small: there is something to win.
+
+    Source: Harris, "Assessment of control loop performance", Can. J. Chem. Eng. 67 (1989) 856; by AR models:
+    Desborough and Harris, the same journal 70 (1992) 1186.
+    """
+    e = errors - errors.mean()
+    n = len(e)
+    r = np.array([e[: n - i] @ e[i:] for i in range(ORDER + 1)]) / n
+    if r[0] <= LEAST:
+        return 1.0
+    toeplitz = r[np.abs(np.subtract.outer(np.arange(ORDER), np.arange(ORDER)))] + 1e-9 * r[0] * np.eye(ORDER)
+    a = np.linalg.solve(toeplitz, r[1:])
+    noise = max(float(r[0] - a @ r[1:]), 0.0)
+    f = [1.0]
+    for i in range(1, dead):
+        f.append(sum(a[j] * f[i - 1 - j] for j in range(min(i, ORDER))))
+    return float(min(noise * np.sum(np.square(f)) / r[0], 1.0))

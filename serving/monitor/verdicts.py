@@ -1,0 +1,174 @@
+"""What the figures mean, in plain lines.
+
+| verdict | held against |
+|---|---|
+| saturated, at a rate limit, outside the domain | twice the share of the learning time, at least .2 (domain: .1) |
+| in HOLD | .02 |
+| swing | regularity 1, with errors beyond LOUD times the learning time's at rest |
+| variability | the learning time's scatter at rest (CUSUM); the mean error also against the validation's largest |
+| load, offset, disturbance of the law's info | the learning time's (CUSUM) |
+| MV at rest | the learnt map and its scatter (CUSUM) |
+| gain | 15 % and four standard errors |
+| one-step error | the learning time's (CUSUM); retrain: RETRAIN_RATIO times it |
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from math import exp
+from typing import TYPE_CHECKING
+
+from serving.manifest import Signal
+from serving.monitor.verdict import Level, Verdict, unknown
+
+if TYPE_CHECKING:
+    from serving.monitor.monitor import Monitor
+
+MOST_HOLD = 0.02
+LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1
+SWINGS = 1.0
+WORSE = 2.0  # times the validation's worst mean error: how often set points move is another matter here
+LOUD = 4.0  # times the error at rest: noise crosses zero regularly too, by chance
+GAIN, ERRORS = 0.15, 4.0
+RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a linear model beside it
+
+
+def verdicts(m: Monitor) -> list[Verdict]:
+    """All of them."""
+    found = [*_residual(m), *_estimates(m), *_rest(m), *_variability(m), *_swing(m), *_shares(m)]
+    if m.trouble:
+        found.append(Verdict("monitor", "watch", f"the monitor itself failed: {m.trouble}"))
+    return found
+
+
+def _residual(m: Monitor) -> list[Verdict]:
+    found = []
+    limit = RETRAIN_RATIO if m.foresight.told else RETRAIN_LEARNT
+    source = "the law's own prediction" if m.foresight.told else "a model that was learnt beside the law"
+    for i, s in enumerate(m.manifest.sp):
+        name, drift = f"one-step error of {s.name}", m.foresight.drifts[i]
+        if not drift.learnt:
+            have = m.foresight.blocks / ((1 if m.foresight.told else 2) * m.foresight.learn)
+            found.append(unknown(name, f"{source} is still measured: {min(have, 1):.0%} done"))
+            continue
+        ratio = m.foresight.ratio(i)
+        if drift.found:
+            level: Level = "retrain" if ratio >= limit else "watch"
+            text = f"{source} errs {ratio:.2g} times as much as at first, since {_when(drift.cusum.since_s)}"
+        else:
+            level, text = "as validated", f"{source} errs as much as at first"
+        found.append(Verdict(name, level, text, ratio, limit))
+    return found
+
+
+def _estimates(m: Monitor) -> list[Verdict]:
+    found = []
+    for name, drift in zip(m.estimates.names, m.estimates.drifts, strict=True):
+        if not drift.learnt:
+            found.append(unknown(name, f"what the law corrects is still measured: {drift.count} of {drift.learn}"))
+            continue
+        ratio = exp((drift.last - drift.mean) / 2)
+        if drift.found:
+            text = f"what the law corrects of its model is {ratio:.2g} times that of the first days"
+            found.append(Verdict(name, "watch", f"{text}, since {_when(drift.cusum.since_s)}", ratio))
+        else:
+            found.append(Verdict(name, "as validated", "the law corrects its model as much as at first", ratio))
+    return found
+
+
+def _rest(m: Monitor) -> list[Verdict]:
+    found = []
+    for i, s in enumerate(m.manifest.mv):
+        name = f"{s.name} at rest"
+        if not m.rest.learnt:
+            text = f"what the plant needs at rest is still learnt: {m.rest.judged} of {m.rest.learn} periods of rest"
+            found.append(unknown(name, text))
+            continue
+        cusum, shift = m.rest.cusums[i], float(m.rest.shift[i]) * (s.high - s.low)
+        gain = m.rest.gain(i)
+        if gain is not None and abs(gain[0] - 1) > max(GAIN, ERRORS * gain[1]):
+            change = f"{abs(gain[0] - 1):.0%} {'higher' if gain[0] > 1 else 'lower'}"
+            since = f" since {_when(cusum.since_s)}" if cusum.found else ""
+            found.append(Verdict(name, "retrain", f"the plant's gain seems {change}{since}", gain[0], 1 + GAIN))
+        elif cusum.found:
+            text = f"the plant needs {shift:+.3g} {_unit(s)}for the same set points since {_when(cusum.since_s)}"
+            found.append(Verdict(name, "watch", text, shift, float(m.rest.sigma[i]) * (s.high - s.low)))
+        else:
+            found.append(Verdict(name, "as validated", "the plant needs what it needed at first", shift))
+    return found
+
+
+def _variability(m: Monitor) -> list[Verdict]:
+    found = []
+    for i, s in enumerate(m.manifest.sp):
+        name, drift, span = f"error of {s.name}", m.spread[i], s.high - s.low
+        worst = _worst_validated(m)
+        mean = m.errors[i].value * span
+        if worst is not None and len(m.manifest.sp) == 1 and m.errors[i].learnt and mean > WORSE * worst:
+            text = f"the mean error is {mean:.3g} {_unit(s)}; in the validation it was at most {worst:.3g}"
+            found.append(Verdict(name, "watch", text, mean, worst))
+        elif not drift.learnt:
+            found.append(unknown(name, f"the error at rest is still measured: {drift.count} of {drift.learn} periods"))
+        elif drift.found:
+            ratio = exp((drift.last - drift.mean) / 2)
+            text = f"the error at rest is {ratio:.2g} times that of the first days, since {_when(drift.cusum.since_s)}"
+            found.append(Verdict(name, "watch", text, ratio))
+        else:
+            left = m.harris[i]
+            more = ""
+            if left.count:
+                more = f"; {left.value:.0%} of its variance no controller could remove"
+            found.append(Verdict(name, "as validated", f"the error at rest is what it was{more}", mean, worst))
+    return found
+
+
+def _swing(m: Monitor) -> list[Verdict]:
+    found = []
+    for s, swing, drift in zip(m.manifest.sp, m.swings, m.spread, strict=True):
+        r, quiet = swing.regularity(), exp(drift.mean / 2) * (s.high - s.low)
+        if not drift.learnt:
+            found.append(unknown(f"swing of {s.name}", "the error at rest is still measured"))
+        elif r > SWINGS and swing.amplitude() > LOUD * quiet:
+            seconds = swing.period() * m.manifest.period_s
+            text = f"{s.name} swings by {swing.amplitude():.3g} {_unit(s)}every {seconds:.3g} s"
+            found.append(Verdict(f"swing of {s.name}", "watch", text, r, SWINGS))
+        else:
+            found.append(Verdict(f"swing of {s.name}", "as validated", "no regular swing", r, SWINGS))
+    return found
+
+
+def _shares(m: Monitor) -> list[Verdict]:
+    rows = [("saturated", m.saturated, LEAST_SHARE, "of the time an MV is at an end of its range")]
+    if any(s.max_move is not None for s in m.manifest.mv):
+        rows.append(("rate limit", m.limited, LEAST_SHARE, "of the time an MV moves as fast as it may"))
+    if "in_domain" in m.manifest.info:
+        rows.append(("domain", m.outside, LEAST_OUTSIDE, "of the time the law is outside its applicability domain"))
+    found = []
+    for name, share, least, words in rows:
+        if not share.learnt:
+            found.append(unknown(name, "still measured"))
+            continue
+        limit = max(2 * share.first, least)
+        level: Level = "watch" if share.value > limit else "as validated"
+        found.append(Verdict(name, level, f"{share.value:.1%} {words}", share.value, limit))
+    level = "watch" if m.hold.value > MOST_HOLD and m.hold.learnt else "as validated"
+    found.append(Verdict("HOLD", level, f"{m.hold.value:.1%} of the time the loop holds", m.hold.value, MOST_HOLD))
+    return found
+
+
+def _worst_validated(m: Monitor) -> float | None:
+    """The largest mean error of the validation's noisy tests."""
+    rows = m.manifest.evidence.get("scenarios")
+    if not isinstance(rows, dict):
+        return None
+    found = [row.get("mae") for name, row in rows.items() if isinstance(row, dict) and name.endswith("_noise")]
+    known = [float(v) for v in found if isinstance(v, int | float)]
+    return max(known) if known else None
+
+
+def _when(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).strftime("%d %b %H:%M UTC")
+
+
+def _unit(s: Signal) -> str:
+    return "" if s.unit == "-" else f"{s.unit} "

@@ -1,0 +1,73 @@
+"""Who writes a plant's MVs, in a node of the plant's server: loops on different machines find each other there."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+
+from asyncua import ua
+
+from serving.errors import EndpointError
+from serving.opcua.link import Link
+
+SCANS = 5  # without a renewal: the loop that had the lease is gone
+
+
+class NodeLease:
+    """A text node that holds ``OWNER COUNT`` of the loop that writes, renewed at each reading, empty without one.
+
+    Whether another owner lives is judged by whether its count moves, not by clocks. A loop takes the lease only to
+    write, and once it reads back its own name: of two that take it in one moment the later one has it, and the other
+    finds that out at its next reading.
+    """
+
+    def __init__(self) -> None:
+        self.owner = f"{socket.gethostname()}:{os.getpid()}:{secrets.token_hex(3)}"
+        self.held = False
+        self._count = 0
+        self._text, self._still = "", SCANS  # of the node, and for how many readings it has stood so
+
+    def seen(self, text: str) -> None:
+        """What the node holds at a reading."""
+        self._still = self._still + 1 if text == self._text else 0
+        self._text = text
+        if self.held and _owner(text) != self.owner:
+            self.held = False
+
+    @property
+    def other(self) -> str:
+        """The other loop that has the lease and lives; empty: nobody."""
+        owner = _owner(self._text)
+        return owner if owner not in {"", self.owner} and self._still < SCANS else ""
+
+    async def take(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
+        """Have the lease. EndpointError while another loop has it."""
+        if self.held:
+            return
+        if self.other:
+            raise EndpointError(f"the plant is controlled by {self.other}")
+        await self.renew(link, node, timeout_s)
+        (answer,) = await link.values([node], timeout_s)
+        found = "" if answer.Value is None else str(answer.Value.Value)
+        if _owner(found) != self.owner:
+            raise EndpointError(f"the plant is controlled by {_owner(found) or 'nobody: the lease cannot be written'}")
+        self.held, self._text, self._still = True, found, 0
+
+    async def renew(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
+        """Write the next count."""
+        self._count = (self._count + 1) % 1_000_000
+        await self._write(link, node, f"{self.owner} {self._count}", timeout_s)
+
+    async def give_back(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
+        """Let others have it at once."""
+        if self.held:
+            self.held = False
+            await self._write(link, node, "", timeout_s)
+
+    async def _write(self, link: Link, node: ua.NodeId, text: str, timeout_s: float) -> None:
+        await link.write([(node, ua.Variant(text, ua.VariantType.String))], timeout_s)
+
+
+def _owner(text: str) -> str:
+    return text.rpartition(" ")[0]

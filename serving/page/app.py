@@ -1,0 +1,194 @@
+"""The page's routes. Reading is free; a change needs the token."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from serving.errors import LoopError, LoopwrightError
+from serving.journal import JournalReader
+from serving.page import metrics
+from serving.page.access import LONGEST_BODY, Access
+from serving.page.candidates import candidates
+from serving.page.live import ENTRIES, Ask, Live, shown
+from serving.page.trend import MOST_POINTS, trend
+
+STATIC = Path(__file__).parent / "static"
+BODY_S = 5.0  # in which the body of a change must be here
+LONGEST_SPAN_S = 400 * 86_400.0
+TELL_S = 60.0  # between two lines about wrong tokens
+TRENDS = 2  # that are computed at a time
+
+
+class PageApp:
+    """What the page asks for, from the journal and from the loop itself (``ask``)."""
+
+    def __init__(self, journal: Path, ask: Ask, token: str, tell: Callable[[str], None] = lambda _: None) -> None:
+        self.journal, self.ask, self.token, self.tell = journal, ask, token, tell
+        self.live = Live(journal, ask)
+        self._told = -math.inf
+        self._trends = asyncio.Semaphore(TRENDS)
+
+    def asgi(self, hosts: Sequence[str], scheme: str) -> Starlette:
+        """The application, for those who ask for one of ``hosts``."""
+        routes = [
+            Route("/", self.index),
+            Route("/api/about", self.about),
+            Route("/api/state", self.state),
+            Route("/api/trend", self.trend),
+            Route("/api/events", self.events),
+            Route("/api/live", self.stream),
+            Route("/api/picture/{digest}", self.picture),
+            Route("/api/change", self.change, methods=["POST"]),
+            Route("/metrics", self.metrics),
+            Route("/healthz", self.healthz),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ]
+        return Starlette(
+            routes=routes,
+            middleware=[Middleware(Access, hosts=hosts, scheme=scheme)],
+            exception_handlers={HTTPException: _http_error, LoopwrightError: _refusal, Exception: _trouble},
+        )
+
+    async def index(self, _: Request) -> Response:
+        """The page itself."""
+        return FileResponse(STATIC / "index.html", media_type="text/html; charset=utf-8")
+
+    async def about(self, _: Request) -> Response:
+        """What the loop is."""
+        found = await self._asked({"do": "about"})
+        card = found["card"]
+        folder = Path(found.pop("folder"))
+        found["candidates"] = await asyncio.to_thread(self._candidates, folder, card["file"])
+        card["picture"] = f"/api/picture/{card['sha256'][:16]}" if card["picture"] else None
+        return JSONResponse(found)
+
+    def _candidates(self, folder: Path, in_charge: str) -> list[dict[str, Any]]:
+        try:
+            return candidates(folder, in_charge)
+        except (LoopwrightError, OSError, KeyError):
+            return []  # the file in charge is gone from its folder
+
+    async def state(self, _: Request) -> Response:
+        """How it stands."""
+        return JSONResponse(await self.live.state())
+
+    async def picture(self, _: Request) -> Response:
+        """The picture of the controller's closed loop."""
+        path = (await self._asked({"do": "picture"}))["file"]
+        if path is None or not Path(path).is_file():
+            raise HTTPException(404, "this controller has no picture beside its file")
+        return FileResponse(path, media_type="image/png")
+
+    async def trend(self, request: Request) -> Response:
+        """Columns over a time."""
+        begin, end = _number(request, "from"), _number(request, "to")
+        points = _number(request, "points", 1000)
+        if not 0 < end - begin <= LONGEST_SPAN_S:
+            raise HTTPException(400, f"from and to must be in order and at most {LONGEST_SPAN_S:.0f} s apart")
+        if not 1 <= points <= MOST_POINTS:
+            raise HTTPException(400, f"points must lie in 1 .. {MOST_POINTS}")
+        async with self._trends:
+            return Response(
+                await asyncio.to_thread(self._trend, begin, end, int(points)), media_type="application/json"
+            )
+
+    def _trend(self, begin: float, end: float, points: int) -> str:
+        with closing(JournalReader(self.journal)) as reader:
+            return json.dumps(trend(reader, begin, end, points), allow_nan=False)
+
+    async def events(self, request: Request) -> Response:
+        """What happened, newest first."""
+        limit = _number(request, "limit", ENTRIES)
+        if not 1 <= limit <= MOST_POINTS:
+            raise HTTPException(400, f"limit must lie in 1 .. {MOST_POINTS}")
+
+        def read() -> list[dict[str, Any]]:
+            with closing(JournalReader(self.journal)) as reader:
+                return [shown(entry) for entry in reader.entries(int(limit))]
+
+        return JSONResponse({"events": await asyncio.to_thread(read)})
+
+    async def stream(self, request: Request) -> Response:
+        """What is new, as server-sent events."""
+        last = request.headers.get("last-event-id", "")
+        seen = int(last) if last.isascii() and last.isdigit() and len(last) < 16 else None
+        return StreamingResponse(self.live.messages(seen), media_type="text/event-stream")
+
+    async def change(self, request: Request) -> Response:
+        """Have something changed."""
+        given = request.headers.get("authorization", "")
+        if not hmac.compare_digest(given.encode(), f"Bearer {self.token}".encode()):
+            if time.monotonic() - self._told > TELL_S:
+                self._told = time.monotonic()
+                self.tell(f"page: a wrong token was refused (from {request.client.host if request.client else '?'})")
+            return JSONResponse({"error": "the token is not the loop's; it prints its token at its start"}, 401)
+        try:
+            async with asyncio.timeout(BODY_S):
+                body = await request.body()
+            wanted = json.loads(body) if len(body) <= LONGEST_BODY else None
+        except TimeoutError:
+            raise HTTPException(408, "the change did not arrive in time") from None
+        except (ValueError, RecursionError):
+            raise HTTPException(400, "the change is no JSON") from None
+        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "picture"}:
+            raise HTTPException(400, 'a change is an object with "do"')
+        answer = await asyncio.to_thread(self.ask, wanted)
+        return JSONResponse(answer, 409 if "error" in answer else 200)
+
+    async def metrics(self, _: Request) -> Response:
+        """For Prometheus."""
+        about, state = await self._asked({"do": "about"}), await self.live.state()
+        return PlainTextResponse(metrics.text(about, state), media_type="text/plain; version=0.0.4")
+
+    async def healthz(self, _: Request) -> Response:
+        """200 while the loop scans, else 503."""
+        state = await self.live.state()
+        return JSONResponse(
+            {k: state.get(k) for k in ("alive", "mode", "reason", "time")}, 200 if state["alive"] else 503
+        )
+
+    async def _asked(self, request: dict[str, Any]) -> dict[str, Any]:
+        answer = await asyncio.to_thread(self.ask, request)
+        if "error" in answer:
+            raise LoopError(str(answer["error"]))
+        return answer
+
+
+def _number(request: Request, name: str, otherwise: float | None = None) -> float:
+    text = request.query_params.get(name)
+    try:
+        number = float(text) if text is not None and len(text) < 40 else otherwise
+    except ValueError:
+        number = None
+    if number is None or not math.isfinite(number):
+        raise HTTPException(400, f"{name} must be a number")
+    return number
+
+
+async def _http_error(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+
+
+async def _refusal(_: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, 503)
+
+
+async def _trouble(_: Request, error: Exception) -> Response:
+    return JSONResponse({"error": f"the page cannot answer: {type(error).__name__}"}, 500)

@@ -1,0 +1,149 @@
+"""What is new in a loop, sent to every open page."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from serving.errors import LoopwrightError
+from serving.journal import JournalReader
+from serving.journal.reader import Entry
+from serving.page.trend import plain
+
+Ask: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
+
+QUIET = ": still here\n\n"
+POLL_S, STATE_S, QUIET_S = 0.3, 1.0, 15.0
+WAITING = 100  # messages that a page that takes none may leave
+MOST_SCANS = 2_000  # that fill a gap; beyond it the page asks for the trend anew
+ENTRIES = 200
+
+
+class Live:
+    """Reads the journal and asks the loop for all pages together, as long as there is one."""
+
+    def __init__(self, journal: Path, ask: Ask) -> None:
+        self.journal, self._ask = journal, ask
+        self._pages: set[asyncio.Queue[str | None]] = set()
+        self._task: asyncio.Task[None] | None = None
+        self._last_id, self._state_at = 0, 0.0
+        self._log: dict[int, str] = {}
+        self._state: dict[str, Any] = {}
+
+    async def state(self, longest_s: float = 0.5) -> dict[str, Any]:
+        """The loop's state, at most so old; where the loop does not answer, one that says so."""
+        if not self._state or time.monotonic() - self._state_at > longest_s:
+            try:
+                found = await asyncio.to_thread(self._ask, {"do": "state"})
+            except LoopwrightError as error:
+                found = {**self._state, "alive": False, "connection": str(error)}
+                found.setdefault("time", time.time())
+                found.setdefault("mode", "HOLD")
+            self._state, self._state_at = found, time.monotonic()
+        return self._state
+
+    async def messages(self, last_id: int | None) -> AsyncIterator[str]:
+        """Server-sent events for one page; ``last_id`` is the last scan that it has seen."""
+        queue = asyncio.Queue[str | None](WAITING)
+        if self._task is None or self._task.done():
+            self._last_id = (await asyncio.to_thread(self._read, None))[1]
+            self._task = asyncio.create_task(self._run())
+        self._pages.add(queue)
+        try:
+            yield "retry: 1000\n\n"
+            yield _message("state", await self.state())
+            if last_id is not None:
+                for missed in (await asyncio.to_thread(self._read, last_id))[0]:
+                    yield missed
+            while True:
+                text: str | None
+                try:
+                    async with asyncio.timeout(QUIET_S):
+                        text = await queue.get()
+                except TimeoutError:
+                    text = QUIET
+                if text is None:
+                    return  # too slow: it connects again and gets what it lacks
+                yield text
+        finally:
+            self._pages.discard(queue)
+
+    async def _run(self) -> None:
+        began = 0.0
+        while self._pages:
+            await asyncio.sleep(POLL_S)
+            texts, self._last_id = await asyncio.to_thread(self._read, self._last_id)
+            texts += await asyncio.to_thread(self._entries)
+            if time.monotonic() - began > STATE_S or any("event: log" in text for text in texts):
+                began = time.monotonic()
+                texts.append(_message("state", await self.state(0.0)))
+            for text in texts:
+                self._send(text)
+
+    def _send(self, text: str) -> None:
+        for page in list(self._pages):
+            try:
+                page.put_nowait(text)
+            except asyncio.QueueFull:
+                self._pages.discard(page)
+                while not page.empty():
+                    page.get_nowait()
+                page.put_nowait(None)
+
+    # ------------------------------------------------------------------ the journal, in a thread
+    def _read(self, after_id: int | None) -> tuple[list[str], int]:
+        """Messages of the scans after an id, and the newest id; None: only that."""
+        with closing(JournalReader(self.journal)) as reader:
+            newest = reader.last_id()
+            if after_id is None or newest <= after_id:
+                return [], newest
+            if newest - after_id > MOST_SCANS:
+                return [_message("reset", {}, newest)], newest
+            runs = {run["id"]: run["columns"] for run in reader.runs()}
+            texts: list[str] = []
+            rows: list[tuple[float, ...]] = []
+            columns: list[str] = []
+            last = after_id
+            for id_, run, scan in reader.scans(after_id):
+                if rows and runs[run] != columns:
+                    texts.append(_scans(columns, rows, last))
+                    rows = []
+                columns, last = runs[run], id_
+                rows.append((scan.time_s, *scan.numbers))
+            if rows:
+                texts.append(_scans(columns, rows, last))
+            return texts, last
+
+    def _entries(self) -> list[str]:
+        """Messages of the events that are new, over or acknowledged since the last time."""
+        with closing(JournalReader(self.journal)) as reader:
+            found = {entry.id: json.dumps(shown(entry)) for entry in reader.entries(ENTRIES)}
+        first, news = not self._log, [text for id_, text in sorted(found.items()) if self._log.get(id_) != text]
+        self._log = found
+        return [] if first else [f"event: log\ndata: {text}\n\n" for text in news]
+
+
+def shown(entry: Entry) -> dict[str, Any]:
+    """An event for the page."""
+    e, seen = entry.event, entry.acknowledged
+    return {
+        "id": entry.id, "time": e.time_s, "kind": e.kind, "who": e.who, "what": e.what, "reason": e.reason,
+        "alarm": e.raised, "over": entry.over_s,
+        "acknowledged": None if seen is None else {"who": seen.who, "time": seen.time_s, "reason": seen.reason},
+    }  # fmt: skip
+
+
+def _scans(columns: list[str], rows: list[tuple[float, ...]], last: int) -> str:
+    times, *numbers = zip(*rows, strict=True)
+    values = {name: plain(column) for name, column in zip(columns, numbers, strict=True)}
+    return _message("scans", {"time": times, "columns": values}, last)
+
+
+def _message(event: str, data: Any, id_: int | None = None) -> str:
+    head = "" if id_ is None else f"id: {id_}\n"
+    return f"{head}event: {event}\ndata: {json.dumps(data, allow_nan=False)}\n\n"

@@ -1,0 +1,65 @@
+"""A loop's state as Prometheus text, exposition format 0.0.4."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+MODES = ("SHADOW", "MANUAL", "AUTO", "HOLD")
+LEVELS = ("as validated", "watch", "retrain")
+GROUPS = (
+    ("setpoint", "sp", "sp", "Set point, in the signal's unit."),
+    ("process_variable", "pv", "pv", "Process variable, in the signal's unit."),
+    ("manipulated_variable", "mv", "mv", "Manipulated variable that the loop asks for; none in SHADOW."),
+    ("applied", "applied", "mv", "Manipulated variable that the actuator has."),
+    ("law", "law", "mv", "Manipulated variable that the law wants."),
+)
+
+
+def text(about: Mapping[str, Any], state: Mapping[str, Any]) -> str:
+    """One gauge or counter a line, each family with its help."""
+    lines: list[str] = []
+    for name, kind, words, rows in _families(about, state):
+        lines += [f"# HELP loopwright_{name} {words}", f"# TYPE loopwright_{name} {kind}"]
+        lines += [f"loopwright_{name}{_labels(labels)} {float(value)!r}" for labels, value in rows if value is not None]
+    return "\n".join(lines) + "\n"
+
+
+def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tuple[str, str, str, Iterable[Any]]]:
+    none: Mapping[str, str] = {}
+    card = about["card"]
+    info = {"law": card["law"], "case": card["case"], "sha256": card["sha256"], "file": card["file"]}
+    yield "controller_info", "gauge", "The controller in charge.", [(info, 1)]
+    yield "up", "gauge", "1 while the loop scans.", [(none, int(state["alive"]))]
+    yield "mode", "gauge", "1 for the present mode.", [({"mode": m}, int(m == state["mode"])) for m in MODES]
+    for name, words in (
+        ("scans", "Scans since the loop's start."),
+        ("missed", "Periods without a scan, because the machine was late."),
+        ("faults", "Scans with a fault."),
+        ("connections", "Connections that were made to the plant's server."),
+    ):
+        value = state.get({"scans": "scan"}.get(name, name))
+        yield f"{name}_total", "counter", words, [(none, value)]
+    yield "last_scan_seconds", "gauge", "Time of the last scan, since 1970.", [(none, state["time"])]
+    yield "journal_ok", "gauge", "1 while the journal can be written.", [(none, int(not state.get("journal")))]
+    for name, key, group, words in GROUPS:
+        signals = about["signals"][group]
+        values = state.get(key) or [None] * len(signals)
+        rows = [({"signal": s["name"], "unit": s["unit"]}, v) for s, v in zip(signals, values, strict=False)]
+        yield name, "gauge", words, rows
+    infos = zip(about["info"], state.get("info") or [], strict=False)
+    yield "info", "gauge", "What the law tells of itself.", [({"name": name}, v) for name, v in infos]
+    numbers = state.get("numbers") or {}
+    yield "monitor", "gauge", "What the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
+    levels = [
+        ({"name": v["name"]}, LEVELS.index(v["level"])) for v in state.get("verdicts") or [] if v["level"] in LEVELS
+    ]
+    yield "verdict", "gauge", "Is the controller still right? 0 as validated, 1 watch, 2 retrain.", levels
+
+
+def _labels(labels: Mapping[str, Any]) -> str:
+    """Labels in braces, with what the format forbids in a value escaped."""
+    if not labels:
+        return ""
+    escaped = {k: str(v).replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n") for k, v in labels.items()}
+    return "{" + ",".join(f'{k}="{v}"' for k, v in escaped.items()) + "}"

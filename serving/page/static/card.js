@@ -1,0 +1,121 @@
+// The controller's card, the monitor's verdicts, and swapping.
+import { ask } from "./dialog.js";
+import { element, figure } from "./format.js";
+
+const $ = (id) => document.getElementById(id);
+const TRIAL = 60;
+const COLUMNS = 4;
+const SIGNS = { "as validated": "●", watch: "◆", retrain: "▲", "not known yet": "○" };
+
+export function describe(about) {
+  const c = about.card;
+  const digest = element("button", { type: "button", class: "digest", title: "copy the whole digest", onclick: copy }, c.sha256.slice(0, 16) + "…");
+  digest.dataset.whole = c.sha256;
+  const facts = [
+    ["law", c.law],
+    ["case", c.case],
+    ["file", c.file],
+    ["sha256", digest],
+    ["period", `${c.period_s} s`],
+    ["size", `${Math.round(c.size_bytes / 1024)} KiB`],
+    ["commit", c.commit ? c.commit.slice(0, 12) : "–"],
+    ["versions", Object.entries(c.versions || {}).map(([k, v]) => `${k} ${v}`).join(", ") || "–"],
+    ["lock-ups in its validation", c.lock_ups === 0 ? "none" : String(c.lock_ups ?? "not known")],
+  ];
+  const list = element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+  const picture = c.picture && element("img", { src: c.picture, alt: "closed loop of its validation", loading: "lazy" });
+  const notes = (about.warnings || []).map((words) => element("p", { class: "note" }, `◆ ${words}`));
+  $("card-body").replaceChildren(list, ...notes, scenarios(c), picture || "", candidates(about));
+}
+
+async function copy(event) {
+  const digest = event.currentTarget;
+  digest.textContent = digest.dataset.whole;
+  try {
+    await navigator.clipboard.writeText(digest.dataset.whole);
+  } catch {
+    // not allowed here; the whole digest is shown and can be marked
+  }
+}
+
+function scenarios(c) {
+  const rows = Object.entries(c.scenarios || {});
+  if (!rows.length) return element("p", { class: "note" }, "This controller was not validated.");
+  const columns = Object.keys(rows[0][1]).slice(0, COLUMNS);
+  const named = (name) => (c.units && c.units[name] ? `${name} [${c.units[name]}]` : name);
+  return element(
+    "details",
+    {},
+    element("summary", {}, `Evidence: ${rows.length} closed loops of its validation`),
+    element(
+      "div",
+      { class: "scroll" },
+      element(
+        "table",
+        {},
+        element("thead", {}, element("tr", {}, element("th", {}, "test"), ...columns.map((n) => element("th", {}, named(n))))),
+        element(
+          "tbody",
+          {},
+          ...rows.map(([test, row]) => element("tr", {}, element("th", {}, test), ...columns.map((n) => element("td", {}, figure(row[n]))))),
+        ),
+      ),
+    ),
+  );
+}
+
+function candidates(about) {
+  const box = element("div", { id: "candidates" }, element("h3", {}, "Swap the controller"));
+  if (!about.candidates.length) box.append(element("p", { class: "calm" }, "No other controller with these signals lies beside this one's file."));
+  for (const other of about.candidates) {
+    box.append(
+      element("div", { class: "candidate" }, `${other.law} (${other.file}) `, element("button", { type: "button", "data-file": other.file, onclick: () => swap(about, other) }, "Try…")),
+    );
+  }
+  box.append(element("div", { id: "back", hidden: true }));
+  return box;
+}
+
+const trialField = { name: "trial", label: "Good scans of trial", value: TRIAL, min: 1, max: 1000000, step: 1 };
+
+function swap(about, other) {
+  ask({
+    title: `Try ${other.law}`,
+    words: `${other.file} runs beside ${about.card.law}, in the shadow. After the trial it takes over without a bump.`,
+    fields: [trialField],
+    request: (values) => ({ do: "swap", value: { file: other.file, sha256: other.sha256, trial: values.trial } }),
+  });
+}
+
+export function show(state) {
+  const back = $("back");
+  if (back) {
+    back.hidden = !state.replaced || Boolean(state.successor);
+    if (state.replaced && back.dataset.of !== state.replaced.sha256) {
+      back.dataset.of = state.replaced.sha256;
+      const act = () =>
+        ask({
+          title: `Put ${state.replaced.law} back`,
+          words: `${state.replaced.file} had the plant before. It is tried beside the present one first.`,
+          fields: [trialField],
+          request: (values) => ({ do: "back", value: { trial: values.trial } }),
+        });
+      back.replaceChildren(element("button", { id: "put-back", type: "button", onclick: act }, `Put ${state.replaced.law} back…`));
+    }
+  }
+  const verdicts = state.verdicts || [];
+  $("verdicts").replaceChildren(
+    ...(verdicts.length ? verdicts.map(verdict) : [element("li", { class: "calm" }, "nothing to say yet")]),
+  );
+}
+
+function verdict(v) {
+  return element(
+    "li",
+    { class: "verdict", "data-level": v.level },
+    element("span", { class: "sign", "aria-hidden": "true" }, SIGNS[v.level] || "○"),
+    element("span", { class: "name" }, v.name),
+    element("span", { class: "level" }, v.level),
+    element("span", { class: "what" }, v.text),
+  );
+}

@@ -1,0 +1,186 @@
+// Trends, one chart a signal, with one cursor and one time axis for all.
+import { clock, element, number, unit } from "./format.js";
+
+const HEIGHT = 170;
+const SMALL = 120;
+const LABELS = { time: 76, value: 22 }; // pixels that a label of an axis needs
+const SYNC = window.uPlot.sync("loop");
+
+// What is drawn of a loop: charts with their lines. `kind` says how a line looks.
+export function plan(about) {
+  const { sp, pv, mv, dv } = about.signals;
+  const charts = pv.map((s, i) => ({
+    name: s.name,
+    signal: s,
+    tall: i < sp.length,
+    lines: [...(i < sp.length ? [line(`sp ${s.name}`, "SP", "sp")] : []), line(`pv ${s.name}`, "PV", "pv")],
+  }));
+  for (const s of mv)
+    charts.push({
+      name: s.name,
+      signal: s,
+      tall: true,
+      lines: [
+        line(`applied ${s.name}`, "applied", "pv"),
+        line(`mv ${s.name}`, "asked", "mv"),
+        line(`law ${s.name}`, "law", "law"),
+        line(`beside ${s.name}`, "successor", "beside"),
+      ],
+    });
+  for (const s of dv) charts.push({ name: s.name, signal: s, lines: [line(`dv ${s.name}`, "DV", "pv")] });
+  for (const name of about.info)
+    charts.push({ name, signal: { name, unit: "" }, optional: true, lines: [line(`info ${name}`, name, "pv")] });
+  return charts;
+}
+
+// How the legend tells the lines apart, beside their colour.
+const DASHES = { sp: "dashed", law: "dotted", beside: "dashed" };
+const line = (column, label, kind) => ({ column, label, kind });
+
+export class Charts {
+  constructor(box, { zoomed, back }) {
+    this.box = box;
+    this.zoomed = zoomed;
+    this.back = back;
+    this.made = [];
+    this.whole = false;
+    new ResizeObserver(() => this.resize()).observe(box);
+  }
+
+  build(charts, data) {
+    for (const { plot } of this.made) plot.destroy();
+    this.box.replaceChildren();
+    this.data = data;
+    this.made = charts.map((chart) => {
+      const title = element("h3", {}, chart.name, element("span", { class: "unit" }, ` ${unit(chart.signal)}`));
+      const box = element("div", { class: "chart", "data-chart": chart.name }, title);
+      this.box.append(box);
+      return { chart, plot: new window.uPlot(this.options(chart), data.of(chart.lines.map((l) => l.column)), box) };
+    });
+  }
+
+  draw(from, to) {
+    this.from = from;
+    this.to = to;
+    for (const { chart, plot } of this.made) {
+      plot.setData(this.data.of(chart.lines.map((l) => l.column)), false);
+      plot.setScale("x", { min: from, max: to });
+      plot.root.parentElement.dataset.rows = this.data.time.length; // for tests, which cannot read a canvas
+    }
+  }
+
+  width() {
+    return Math.max(260, this.box.clientWidth);
+  }
+
+  resize() {
+    for (const { chart, plot } of this.made) plot.setSize({ width: this.width(), height: chart.tall ? HEIGHT : SMALL });
+  }
+
+  options(chart) {
+    const color = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+    const axis = { stroke: color("ink-2"), grid: { stroke: color("grid"), width: 1 }, ticks: { stroke: color("grid"), width: 1 } };
+    const looks = {
+      sp: { stroke: color("sp"), width: 1.5, dash: [6, 4] },
+      pv: { stroke: color("pv"), width: 1.5 },
+      mv: { stroke: color("mv"), width: 1.5, paths: window.uPlot.paths.stepped({ align: 1 }) },
+      law: { stroke: color("law"), width: 1, dash: [2, 3] },
+      beside: { stroke: color("beside"), width: 1.5, dash: [8, 3, 2, 3] },
+    };
+    const value = (_, v) => (v === null || v === undefined ? "–" : number(v, chart.signal.high === undefined ? { low: 0, high: Math.abs(v) || 1 } : chart.signal));
+    return {
+      width: this.width(),
+      height: chart.tall ? HEIGHT : SMALL,
+      cursor: { sync: { key: SYNC.key, setSeries: false }, drag: { x: true, y: false, setScale: false } },
+      legend: { live: true, markers: { dash: (_, i) => DASHES[chart.lines[i - 1]?.kind] || "solid" } },
+      scales: { x: { time: true }, y: { range: (_, low, high) => this.range(chart.signal, low, high) } },
+      axes: [
+        { ...axis, values: times, space: LABELS.time },
+        { ...axis, size: 62, space: LABELS.value },
+      ],
+      series: [
+        { value: (_, v) => (v === null || v === undefined ? "–" : clock(v)) },
+        ...chart.lines.map((l) => ({ label: l.label, spanGaps: false, points: { show: false }, value, ...looks[l.kind] })),
+      ],
+      hooks: {
+        drawClear: [(u) => this.bands(u, color)],
+        setSelect: [(u) => this.selected(u)],
+        ready: [(u) => u.over.addEventListener("dblclick", () => this.back())],
+      },
+    };
+  }
+
+  // The whole range of the signal, or what is there with some air, at least 1 % of the range.
+  range(signal, low, high) {
+    const known = signal.high !== undefined;
+    if (low === null || high === null || (this.whole && known)) return known ? [signal.low, signal.high] : [0, 1];
+    const least = known ? 0.01 * (signal.high - signal.low) : 1e-9 + 1e-6 * Math.max(Math.abs(low), Math.abs(high));
+    const air = Math.max(0.08 * (high - low), (least - (high - low)) / 2, least / 2);
+    return [low - air, high + air];
+  }
+
+  selected(u) {
+    if (u.select.width < 6) return;
+    const [from, to] = [u.select.left, u.select.left + u.select.width].map((x) => u.posToVal(x, "x"));
+    u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+    if (to - from > 0.5) this.zoomed(from, to);
+  }
+
+  // The time in each mode: HOLD hatched, SHADOW and MANUAL shaded, AUTO plain; each change with its word.
+  bands(u, color) {
+    const { ctx, bbox } = u;
+    const modes = this.data.modes;
+    ctx.save();
+    ctx.beginPath();
+    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+    ctx.clip();
+    ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.textAlign = "left"; // uPlot leaves what its axes needed
+    ctx.textBaseline = "alphabetic";
+    modes.forEach(([time, mode], i) => {
+      const left = Math.max(bbox.left, u.valToPos(time, "x", true));
+      const end = i + 1 < modes.length ? u.valToPos(modes[i + 1][0], "x", true) : bbox.left + bbox.width;
+      const right = Math.min(bbox.left + bbox.width, end);
+      if (right <= left) return;
+      if (mode !== "AUTO") {
+        ctx.fillStyle = color(mode === "HOLD" ? "band-hold" : "band-other");
+        ctx.fillRect(left, bbox.top, right - left, bbox.height);
+      }
+      if (mode === "HOLD") hatch(ctx, left, right, bbox, color("hatch"));
+      if (right - left > 44 * devicePixelRatio) {
+        ctx.fillStyle = color("ink-2");
+        ctx.fillText(mode, left + 4 * devicePixelRatio, bbox.top + 11 * devicePixelRatio);
+      }
+    });
+    ctx.restore();
+  }
+}
+
+// Times of the axis, in 24 hours; the day where it changes.
+function times(_, splits, axis, space, step) {
+  let day = null;
+  return splits.map((t) => {
+    const date = new Date(t * 1000);
+    const clock = date.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: step < 60 ? "2-digit" : undefined, hourCycle: "h23" });
+    const today = date.toLocaleDateString([], { day: "2-digit", month: "short" });
+    const first = day !== today;
+    day = today;
+    return step >= 86400 ? today : first ? `${clock}\n${today}` : clock;
+  });
+}
+
+function hatch(ctx, left, right, bbox, stroke) {
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(left, bbox.top, right - left, bbox.height);
+  ctx.clip();
+  ctx.strokeStyle = stroke;
+  ctx.lineWidth = devicePixelRatio;
+  ctx.beginPath();
+  for (let x = left - bbox.height; x < right; x += 9 * devicePixelRatio) {
+    ctx.moveTo(x, bbox.top + bbox.height);
+    ctx.lineTo(x + bbox.height, bbox.top);
+  }
+  ctx.stroke();
+  ctx.restore();
+}

@@ -1,0 +1,71 @@
+// The columns that are drawn: a trend from the journal, continued by what comes in live.
+import { get } from "./api.js";
+
+const POINTS = 1200;
+const MOST_LIVE = 3000; // rows that came in live, after which the trend is thinned anew by the server
+
+export class Data {
+  constructor() {
+    this.time = [];
+    this.columns = {};
+    this.modes = [];
+    this.live = 0;
+    this.asked = 0;
+  }
+
+  // Replace everything by the trend of a time, and keep the scans that came in while it was made; an answer that a
+  // later one overtook is dropped.
+  async load(from, to) {
+    const asked = ++this.asked;
+    const known = this.time.at(-1) ?? -Infinity;
+    const found = await get(`/api/trend?from=${from}&to=${to}&points=${POINTS}`);
+    if (asked !== this.asked) return false;
+    const late = this.after(Math.max(known, found.time.at(-1) ?? -Infinity));
+    this.time = found.time;
+    this.columns = found.columns;
+    this.modes = found.modes;
+    this.live = 0;
+    this.append(late, -Infinity);
+    return true;
+  }
+
+  // The rows after a time.
+  after(time) {
+    const first = this.time.findIndex((t) => t > time);
+    const from = first < 0 ? this.time.length : first;
+    const columns = Object.entries(this.columns).map(([name, values]) => [name, values.slice(from)]);
+    return { time: this.time.slice(from), columns: Object.fromEntries(columns) };
+  }
+
+  // Scans that came in; true once the trend should be loaded anew.
+  append({ time, columns }, oldest) {
+    const last = this.time.length ? this.time[this.time.length - 1] : -Infinity;
+    const first = time.findIndex((t) => t > last);
+    if (first < 0) return false;
+    for (const name of new Set([...Object.keys(this.columns), ...Object.keys(columns)])) {
+      const old = this.columns[name] || (this.columns[name] = new Array(this.time.length).fill(null));
+      const added = columns[name] ? columns[name].slice(first) : new Array(time.length - first).fill(null);
+      old.push(...added);
+    }
+    this.time.push(...time.slice(first));
+    this.live += time.length - first;
+    let gone = 0;
+    while (gone < this.time.length && this.time[gone] < oldest) gone++;
+    if (gone > 200) {
+      this.time.splice(0, gone);
+      for (const values of Object.values(this.columns)) values.splice(0, gone);
+    }
+    return this.live > MOST_LIVE;
+  }
+
+  mode(time, mode) {
+    const last = this.modes[this.modes.length - 1];
+    if (!last || last[1] !== mode) this.modes.push([time, mode]);
+  }
+
+  // The numbers of some columns, beside their times, as uPlot takes them.
+  of(names) {
+    const nothing = new Array(this.time.length).fill(null);
+    return [this.time, ...names.map((name) => this.columns[name] || nothing)];
+  }
+}

@@ -1,0 +1,98 @@
+// Every change goes through this one dialog: what, from what to what, who, why, token.
+import { change } from "./api.js";
+import { element, say } from "./format.js";
+
+const $ = (id) => document.getElementById(id);
+const UNAUTHORIZED = 401;
+let pending = null; // what is asked for now; an answer to an earlier one does not touch this one
+
+// title, words: what will change; fields: [{name, label, value, now, unit, min, max, choices}]; request(values): what is
+// sent. A field with `now` is sent only where the operator changed it, so that rounding moves nothing.
+export function ask({ title, words, fields = [], request }) {
+  const opener = document.activeElement;
+  pending = { fields, request, touched: new Set(), opener, place: opener?.closest("section") };
+  $("dialog-title").textContent = title;
+  $("dialog-words").textContent = words;
+  $("dialog-fields").replaceChildren(...fields.map(field));
+  $("who").value = sessionStorage.getItem("who") || "";
+  $("token").value = sessionStorage.getItem("token") || "";
+  $("why").value = "";
+  $("refusal").textContent = "";
+  $("confirm").disabled = false;
+  moves();
+  $("dialog").showModal();
+  const first = $("dialog").querySelector("#dialog-fields input, #dialog-fields select");
+  (first || ($("who").value ? $("why") : $("who"))).focus();
+}
+
+function field({ name, label, value, min, max, choices, step }) {
+  const given = choices
+    ? element("select", { "data-field": name }, ...choices.map(([c, words]) => element("option", { value: c, selected: c === value }, words)))
+    : element("input", { "data-field": name, type: "number", step: step || "any", required: true, min, max, value });
+  given.dataset.first = given.value;
+  return element("label", {}, label + " ", given);
+}
+
+const inputs = () => [...$("dialog-fields").querySelectorAll("[data-field]")];
+const changed = (input) => pending.touched.has(input.dataset.field) || input.value !== input.dataset.first;
+
+// The fields that will be sent, each with its input.
+const wanted = () =>
+  inputs()
+    .map((input, i) => [pending.fields[i], input])
+    .filter(([given, input]) => given.now === undefined || changed(input));
+
+function moves() {
+  const said = wanted()
+    .filter(([given]) => given.now !== undefined)
+    .map(([given, input]) => {
+      const to = input.selectedOptions ? input.selectedOptions[0].textContent : input.value;
+      return `${given.name} ${given.now || "–"} → ${to || "…"} ${given.unit}`.trim();
+    });
+  say($("dialog-moves"), said.join(", "));
+}
+
+async function confirm(event) {
+  event.preventDefault();
+  const mine = pending;
+  const sent = wanted();
+  if (mine.fields.length && !sent.length) return say($("refusal"), "No value is changed yet.");
+  const values = Object.fromEntries(sent.map(([given, input]) => [given.name, Number(input.value)]));
+  const [who, reason, token] = ["who", "why", "token"].map((id) => $(id).value.trim());
+  sessionStorage.setItem("who", who);
+  $("refusal").textContent = "";
+  $("confirm").disabled = true;
+  let said, refused;
+  try {
+    said = `Done: ${await change({ ...mine.request(values), who, reason }, token)}`;
+  } catch (error) {
+    refused = error;
+    said = error.status ? `Not done: ${error.message}` : error.message;
+  }
+  if (refused?.status !== UNAUTHORIZED) sessionStorage.setItem("token", token);
+  const open = pending === mine && $("dialog").open;
+  if (open) $("confirm").disabled = false;
+  if (refused && open) {
+    $("refusal").textContent = said;
+    if (refused.status === UNAUTHORIZED) $("token").select();
+    return;
+  }
+  $("answer").textContent = said; // the dialog may have been left meanwhile; the answer is still told
+  if (open) $("dialog").close();
+}
+
+// The button that opened the dialog may be gone: then a keyboard goes on in its section, not at the page's top.
+function closed() {
+  const { opener, place } = pending;
+  if (opener?.isConnected || !place) return;
+  place.tabIndex = -1;
+  place.focus();
+}
+
+$("form").addEventListener("submit", confirm);
+$("dialog-fields").addEventListener("input", (event) => {
+  pending.touched.add(event.target.dataset.field);
+  moves();
+});
+$("cancel").addEventListener("click", () => $("dialog").close());
+$("dialog").addEventListener("close", closed);

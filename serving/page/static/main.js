@@ -1,0 +1,189 @@
+// The page: loads what there is, follows what comes, and says when it is old.
+import { get, listen } from "./api.js";
+import * as card from "./card.js";
+import { Charts, plan } from "./charts.js";
+import { Data } from "./data.js";
+import * as faceplate from "./faceplate.js";
+import { clock, element, say, zone } from "./format.js";
+import * as log from "./log.js";
+
+const $ = (id) => document.getElementById(id);
+const SPANS = [["5 min", 300], ["1 h", 3600], ["8 h", 28800], ["1 d", 86400], ["7 d", 604800]];
+const AGAIN_MS = 2000; // before what failed is tried again
+const PATIENCE = 5; // seconds without news, beside three periods, after which what is seen is old
+
+const data = new Data();
+let about = null;
+let state = null;
+let span = Number(localStorage.getItem("span")) || 300;
+let zoom = null; // [from, to] while the operator looks closer, or back
+let heard = 0; // when a state was shown last
+let describing = null; // the description that is on its way
+let described = ""; // the controller whose description is complete
+let again = 0; // the timer of a trend that failed and is asked for again
+let broken = false;
+let hidden = new Set(JSON.parse(localStorage.getItem("hidden") || "null") || []);
+const charts = new Charts($("charts"), { zoomed: (from, to) => look([from, to]), back: () => look(null) });
+
+const now = () => (state && state.time && !broken && state.alive ? Math.max(state.time, data.time.at(-1) || 0) : Date.now() / 1000);
+const shown = () => zoom || [now() - span, now()];
+
+async function look(wanted) {
+  zoom = wanted;
+  $("follow").setAttribute("aria-pressed", String(!zoom));
+  $("follow").textContent = zoom ? "Paused" : "Live";
+  await reload();
+}
+
+async function reload() {
+  clearTimeout(again);
+  const [from, to] = shown();
+  try {
+    if (await data.load(from, to)) charts.draw(...shown());
+  } catch (error) {
+    old(error.message);
+    clearTimeout(again);
+    again = setTimeout(reload, AGAIN_MS);
+  }
+}
+
+function describe() {
+  return (describing ??= describeAll()
+    .catch((error) => old(error.message))
+    .finally(() => (describing = null)));
+}
+
+async function describeAll() {
+  const found = await get("/api/about");
+  const stands = state || (await get("/api/state")); // the trend is asked for in the loop's time, not in this machine's
+  about = found;
+  $("title").textContent = about.title;
+  faceplate.describe(about);
+  card.describe(about);
+  choice();
+  build();
+  show(state || stands);
+  await log.load();
+  described = about.card.sha256;
+  await reload();
+}
+
+function build() {
+  charts.build(plan(about).filter((chart) => !(hidden.has(chart.name) || (chart.optional && !hidden.has(`+${chart.name}`)))), data);
+}
+
+// Which signals are drawn; the law's own numbers only when they are asked for.
+function choice() {
+  $("shown").replaceChildren(
+    ...plan(about).map((chart) => {
+      const key = chart.optional ? `+${chart.name}` : chart.name;
+      const box = element("input", { type: "checkbox", checked: chart.optional ? hidden.has(key) : !hidden.has(key) });
+      box.addEventListener("change", () => {
+        hidden[hidden.has(key) ? "delete" : "add"](key);
+        localStorage.setItem("hidden", JSON.stringify([...hidden]));
+        build();
+        charts.draw(...shown());
+      });
+      return element("label", {}, box, ` ${chart.name}${chart.optional ? " (law)" : ""}`);
+    }),
+  );
+}
+
+function show(found) {
+  state = found;
+  data.mode(found.time, found.mode);
+  faceplate.show(found);
+  card.show(found);
+  fresh();
+}
+
+function onState(found) {
+  show(found);
+  if (described !== found.sha256) describe(); // another controller took over, or the last try failed
+}
+
+function onScans(rows) {
+  if (zoom) return;
+  const thin = data.append(rows, now() - 1.1 * span);
+  charts.draw(...shown());
+  if (thin) reload();
+}
+
+function old(words) {
+  $("banner").hidden = false;
+  say($("banner"), `▲ ${words}`);
+  document.body.classList.add("old");
+}
+
+function fresh() {
+  heard = Date.now();
+  if (broken || (state && !state.alive)) return;
+  document.body.classList.remove("old");
+  const trouble = state && (state.journal ? `The journal cannot be written: ${state.journal}` : "");
+  $("banner").hidden = !trouble;
+  if (trouble) say($("banner"), `▲ ${trouble}`);
+}
+
+function watch() {
+  $("clock").textContent = `${clock(Date.now() / 1000)} ${zone()}`;
+  if (!state) {
+    if (broken) old("The page's server gives no news: what you see is old.");
+    return;
+  }
+  const patience = PATIENCE + (3 * about?.period_s || 0) / (about?.speed || 1);
+  if (broken || (Date.now() - heard) / 1000 > patience) old(`No news since ${clock(heard / 1000)}: what you see is old.`);
+  else if (!state.alive) old(`The loop does not scan; its last scan was at ${clock(state.time)}: what you see is old. ${state.connection || ""}`);
+}
+
+function buttons() {
+  $("spans").replaceChildren(
+    ...SPANS.map(([words, seconds]) =>
+      element("button", { type: "button", "data-span": seconds, "aria-pressed": String(seconds === span), onclick: () => choose(seconds) }, words),
+    ),
+  );
+  $("follow").addEventListener("click", () => look(zoom ? null : shown()));
+  $("scale").addEventListener("click", () => {
+    charts.whole = !charts.whole;
+    $("scale").setAttribute("aria-pressed", String(charts.whole));
+    charts.draw(...shown());
+  });
+  $("theme").addEventListener("click", () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  const given = () => theme(localStorage.getItem("theme") || (system.matches ? "dark" : "light"), false);
+  system.addEventListener("change", given);
+  given();
+}
+
+function choose(seconds) {
+  span = seconds;
+  localStorage.setItem("span", String(span));
+  for (const button of $("spans").children) button.setAttribute("aria-pressed", String(Number(button.dataset.span) === span));
+  look(null);
+}
+
+function theme(name, keep = true) {
+  document.documentElement.dataset.theme = name;
+  $("theme").textContent = name === "dark" ? "Light" : "Dark";
+  if (keep) localStorage.setItem("theme", name);
+  if (about) {
+    build();
+    charts.draw(...shown());
+  }
+}
+
+buttons();
+watch();
+setInterval(watch, 1000);
+const lost = () => {
+  broken = true;
+  watch();
+};
+// What happened meanwhile is asked for: the stream fills up scans, not events.
+const found = () => {
+  if (!broken) return;
+  broken = false;
+  described = "";
+  reload();
+};
+describe();
+listen({ state: onState, scans: onScans, log: log.add, reset: reload }, lost, found);

@@ -1,0 +1,113 @@
+"""Columns of a journal over a time, thinned to what a screen can show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.journal import JournalReader
+
+Array: TypeAlias = NDArray[np.float64]
+
+GAP = 5  # periods without a scan: a gap in the line
+MOST_POINTS = 5_000
+
+
+class Thinned:
+    """The least and the greatest value of every column in each of ``points`` bins of a time, as they come in.
+
+    A bin gives two rows at one time vector for all columns, in the order in which the two came in most columns' time;
+    with fewer scans than rows there is nothing to thin, and the scans themselves are given.
+    """
+
+    def __init__(self, begin_s: float, end_s: float, points: int) -> None:
+        self.begin_s, self.points = begin_s, points
+        self.bin_s = max((end_s - begin_s) / points, 1e-9)
+        self.low: dict[str, Array] = {}
+        self.high: dict[str, Array] = {}
+        self.rising: dict[str, NDArray[np.bool_]] = {}
+        self.count = np.zeros(points, dtype=np.int64)
+        self.first, self.last = np.full(points, np.nan), np.full(points, np.nan)
+
+    def add(self, times: Array, columns: dict[str, Array]) -> None:
+        """Scans at ``times`` (n,), in order; each column (n,)."""
+        bins = np.clip(((times - self.begin_s) / self.bin_s).astype(np.int64), 0, self.points - 1)
+        starts = np.flatnonzero(np.r_[True, bins[1:] != bins[:-1]])
+        at = bins[starts]
+        ends = np.r_[starts[1:], len(bins)] - 1
+        self.first[at] = np.fmin(self.first[at], times[starts])
+        self.last[at] = np.fmax(self.last[at], times[ends])
+        self.count[at] += ends - starts + 1
+        for name, values in columns.items():
+            if name not in self.low:
+                self.low[name], self.high[name] = np.full((2, self.points), np.nan)
+                self.rising[name] = np.ones(self.points, dtype=bool)
+            low, high = np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+            self.rising[name][at] = ~(values[starts] > values[ends])
+            self.low[name][at] = np.fmin(self.low[name][at], low)
+            self.high[name][at] = np.fmax(self.high[name][at], high)
+
+    def rows(self) -> tuple[Array, dict[str, Array]]:
+        """Times and columns, two rows a bin that has scans."""
+        full = np.flatnonzero(self.count)
+        times = np.stack([self.first[full], self.last[full]], axis=1).ravel()
+        columns = {
+            name: np.where(
+                self.rising[name][full, None],
+                np.stack([self.low[name][full], self.high[name][full]], axis=1),
+                np.stack([self.high[name][full], self.low[name][full]], axis=1),
+            ).ravel()
+            for name in self.low
+        }
+        return times, columns
+
+
+def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> dict[str, Any]:
+    """What is drawn from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode."""
+    runs = {run["id"]: run for run in reader.runs()}
+    thinned, whole, modes, count = Thinned(begin_s, end_s, points), list[tuple[Array, dict[str, Array]]](), [], 0
+    period = max((run["period_s"] for run in runs.values()), default=1.0)
+    for run, numbers, mode in reader.tables(begin_s, end_s):
+        times = numbers[:, 0]
+        columns = {name: numbers[:, i + 1] for i, name in enumerate(runs[run]["columns"])}
+        thinned.add(times, columns)
+        count += len(times)
+        if count <= 2 * points:
+            whole.append((times, columns))
+        modes += [
+            [t, m] for i, (t, m) in enumerate(zip(times.tolist(), mode, strict=True)) if i == 0 or m != mode[i - 1]
+        ]
+    times, columns = _joined(whole) if count <= 2 * points else thinned.rows()
+    times, columns = _with_gaps(times, columns, max(GAP * period, 2.5 * thinned.bin_s if count > 2 * points else 0.0))
+    return {
+        "time": times.tolist(),
+        "columns": {name: plain(values) for name, values in columns.items()},
+        "modes": [m for i, m in enumerate(modes) if i == 0 or m[1] != modes[i - 1][1]],
+    }
+
+
+def _joined(pieces: list[tuple[Array, dict[str, Array]]]) -> tuple[Array, dict[str, Array]]:
+    """Pieces one after the other; a column that a piece lacks is NaN there."""
+    names = list(dict.fromkeys(name for _, columns in pieces for name in columns))
+    times = np.concatenate([t for t, _ in pieces]) if pieces else np.zeros(0)
+    joined = {
+        name: np.concatenate([columns.get(name, np.full(len(t), np.nan)) for t, columns in pieces]) for name in names
+    }
+    return times, joined
+
+
+def _with_gaps(times: Array, columns: dict[str, Array], longest_s: float) -> tuple[Array, dict[str, Array]]:
+    """A row of NaN in each pause that is longer than ``longest_s``."""
+    at = np.flatnonzero(np.diff(times) > longest_s) + 1
+    if not len(at):
+        return times, columns
+    between = (times[at] + times[at - 1]) / 2
+    return np.insert(times, at, between), {name: np.insert(v, at, np.nan) for name, v in columns.items()}
+
+
+def plain(values: Iterable[float]) -> list[float | None]:
+    """Numbers for JSON: seven digits are more than a screen shows; NaN is null."""
+    return [None if v != v or v in (np.inf, -np.inf) else float(f"{v:.7g}") for v in values]

@@ -1,0 +1,104 @@
+"""The door of a running loop on its own machine: requests in, answers out, both lines of JSON."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import socket
+import socketserver
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from serving.errors import LoopError, LoopwrightError
+from serving.station.places import runtime_folder
+from serving.words import first_line, named
+
+Answer: TypeAlias = dict[str, Any]
+
+LONGEST = 100_000  # bytes of a request
+PATIENCE_S = 10.0
+
+
+class Control:
+    """Answers whoever of this user knocks at the socket of a journal. Others cannot enter its folder.
+
+    ``answer`` gets each request as it came and is called in threads of its own; what it raises on purpose is told.
+    """
+
+    def __init__(self, journal: Path, answer: Callable[[Any], Answer]) -> None:
+        self.path = door(journal)
+        with suppress(FileNotFoundError):
+            self.path.unlink()  # of a loop that was killed; the lease says that none lives
+        self._server = _Server(str(self.path), _Handler)
+        self._server.answer = answer
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="control", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self.path.unlink(missing_ok=True)
+
+
+def door(journal: Path) -> Path:
+    """The socket of the loop that writes a journal. Its path is short: a socket's may have 100 characters."""
+    return runtime_folder() / (hashlib.sha256(os.fsencode(journal.resolve())).hexdigest()[:24] + ".loop")
+
+
+def ask(journal: Path, request: Answer, patience_s: float = PATIENCE_S) -> Answer:
+    """Ask the loop that writes a journal. LoopError where none runs, or it refuses."""
+    answer = asked(door(journal), request, patience_s)
+    if "error" in answer:
+        raise LoopError(str(answer["error"]))
+    return answer
+
+
+def asked(path: Path, request: Answer, patience_s: float = PATIENCE_S) -> Answer:
+    """The answer at a socket, a refusal too. LoopError where nobody answers."""
+    try:
+        with socket.socket(socket.AF_UNIX) as wire:
+            wire.settimeout(patience_s)
+            wire.connect(str(path))
+            wire.sendall(json.dumps(request).encode() + b"\n")
+            with wire.makefile("rb") as said:
+                line = said.readline()
+        answer = json.loads(line)
+    except (FileNotFoundError, ConnectionRefusedError):
+        raise LoopError("no loop runs with this journal; `loopwright loop run` starts it") from None
+    except (OSError, ValueError) as error:
+        raise LoopError(f"the loop does not answer: {named(error)}") from None
+    if not isinstance(answer, dict):
+        raise LoopError("the loop gives no answer that can be read")
+    return answer
+
+
+class _Server(socketserver.ThreadingUnixStreamServer):
+    daemon_threads = True
+    request_queue_size = 32
+    answer: Callable[[Any], Answer]
+
+
+class _Handler(socketserver.StreamRequestHandler):
+    timeout = PATIENCE_S
+
+    def handle(self) -> None:
+        """One request, one answer."""
+        with suppress(OSError):
+            self.wfile.write(json.dumps(self._said(), allow_nan=False).encode() + b"\n")
+
+    def _said(self) -> Answer:
+        assert isinstance(self.server, _Server)
+        try:
+            line = self.rfile.readline(LONGEST)
+            if not line.endswith(b"\n"):
+                raise LoopError(f"a request is one line of JSON of at most {LONGEST} bytes")
+            return self.server.answer(json.loads(line))
+        except LoopwrightError as error:
+            return {"error": first_line(error)}
+        except Exception as error:
+            return {"error": f"the request cannot be read: {named(error)}"}

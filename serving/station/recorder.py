@@ -1,0 +1,92 @@
+"""What a loop writes down of each scan: the numbers, and what began or ended with it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.controller import Controller
+from serving.guard import Sample
+from serving.journal import Event, Journal, Scan
+from serving.journal.entries import Kind
+from serving.loop import Command, ControlLoop
+from serving.manifest import Manifest
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Recorder:
+    """Writes scans and events into a journal, and says each event as a line."""
+
+    def __init__(self, journal: Journal, say: Callable[[str], None], speed: float = 1.0) -> None:
+        self.journal, self._say, self._speed = journal, say, speed
+        self._controller: Controller | None = None
+        self._fault, self._trial = "", ""
+
+    @property
+    def controller(self) -> Controller:
+        """The one whose scans are written down: at a swap the scan that ended the trial is still the old one's."""
+        assert self._controller is not None
+        return self._controller
+
+    def begin(self, controller: Controller) -> None:
+        """What follows is of this controller."""
+        self._controller = controller
+        self.journal.begin(controller.manifest, controller.sha256, time.time(), self._speed)
+
+    def note(
+        self,
+        kind: Kind,
+        who: str,
+        what: str,
+        reason: str = "",
+        *,
+        alarm: str = "",
+        raised: bool = False,
+        about: int = 0,
+    ) -> None:
+        """Write an event down, and say it."""
+        self.journal.event(Event(time.time(), kind, who, what, reason, alarm, raised, about))
+        self._say(f"{who}: {what}" + (f" ({reason})" if reason else ""))
+
+    def scan(self, loop: ControlLoop, sample: Sample | None, command: Command, quality: tuple[int, ...]) -> None:
+        """Write a scan down, and the fault or the new controller that came with it."""
+        numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
+        self.journal.scan(Scan(time.time(), command.mode.value, numbers, quality, command.reason))
+        if command.reason != self._fault:
+            self._fault = command.reason
+            self.note("fault", "loop", command.reason or "over", alarm="fault", raised=bool(command.reason))
+        if loop.controller is not self.controller:
+            self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
+            self.begin(loop.controller)
+        self._tried(loop)
+
+    def _tried(self, loop: ControlLoop) -> None:
+        """Say once why a trial began anew."""
+        reason = "" if loop.successor is None else loop.successor.reason
+        if reason and reason != self._trial and loop.successor is not None:
+            self.note("swap", "loop", f"the trial of {named(loop.successor.controller)} begins anew", reason)
+        self._trial = reason
+
+
+def named(controller: Controller) -> str:
+    """A controller in a sentence."""
+    return f"{controller.manifest.law} ({controller.path.name}, {controller.sha256[:12]})"
+
+
+def _numbers(m: Manifest, sample: Sample | None, command: Command) -> Iterator[float]:
+    """The columns of ``serving.journal.columns``."""
+    nan_mv, nan_pv = np.full(len(m.mv), np.nan), np.full(len(m.pv), np.nan)
+    applied = None if sample is None else sample.mv_applied
+    yield from command.sp
+    yield from nan_pv if sample is None else sample.pv
+    yield from command.mv if command.writes else nan_mv
+    yield from nan_mv if applied is None else applied
+    yield from nan_mv if command.law_mv is None else command.law_mv
+    yield from nan_mv if command.successor_mv is None else command.successor_mv
+    yield from np.full(len(m.dv), np.nan) if sample is None else sample.dv
+    yield from np.full(len(m.info), np.nan) if command.info is None else command.info

@@ -1,0 +1,155 @@
+"""What somebody asks a running loop for, checked before it comes near the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from serving.controller import Controller
+from serving.errors import LoopError
+from serving.fields import nearest
+from serving.journal.entries import Kind
+from serving.loop import ControlLoop, Mode, within
+from serving.manifest import Signal
+from serving.station.recorder import named
+from serving.successor import require_same_signals
+
+LONGEST_NAME, LONGEST_REASON = 60, 300
+TRIAL, LONGEST_TRIAL = 60, 1_000_000  # scans
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What somebody wants changed: ``act`` does it, ``what`` says it, ``done`` is told how it went (empty: well)."""
+
+    act: Callable[[ControlLoop], None]
+    what: str
+    who: str
+    reason: str = ""
+    done: Callable[[str], None] = lambda _: None
+    kind: Kind = "change"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What is wanted, by whom and why."""
+
+    do: str
+    value: Any
+    who: str
+    reason: str
+
+    @classmethod
+    def read(cls, tree: Any) -> Request:
+        """LoopError for anything else than an object with ``do``, ``who`` and, if need be, ``value`` and ``reason``."""
+        if not isinstance(tree, Mapping) or not isinstance(tree.get("do"), str):
+            raise LoopError('a request is an object with "do"')
+        unknown = sorted(set(tree) - {"do", "value", "who", "reason"})
+        if unknown:
+            raise LoopError(f"a request has no {unknown[0]!r}{nearest(unknown[0], ('do', 'value', 'who', 'reason'))}")
+        who, reason = tree.get("who", ""), tree.get("reason", "")
+        for word, text, most in (("who", who, LONGEST_NAME), ("reason", reason, LONGEST_REASON)):
+            if not isinstance(text, str) or len(text) > most or not (text.isprintable()):
+                raise LoopError(f"{word} must be a line of at most {most} characters")
+        if not who.strip():
+            raise LoopError("who is empty: a change is written down with a name")
+        return cls(tree["do"], tree.get("value"), who.strip(), reason.strip())
+
+
+def change(request: Request, loop: ControlLoop, folder: Path) -> Change:
+    """The change of the loop that is asked for; LoopError or ArtifactError where it would be refused.
+
+    A file of another controller is read here, so that no scan waits for it; relative paths lie in ``folder``.
+    """
+    made = {"mode": _mode, "sp": _sp, "mv": _mv, "swap": _swap, "keep": _keep, "back": _back}.get(request.do)
+    if made is None:
+        known = ("mode", "sp", "mv", "swap", "keep", "back", "acknowledge", "state", "about")
+        raise LoopError(f"the loop cannot {request.do!r}{nearest(request.do, known)}")
+    return made(request, loop, folder)
+
+
+def _mode(request: Request, loop: ControlLoop, _: Path) -> Change:
+    if request.value not in [m.value for m in Mode]:
+        raise LoopError(f"mode is {request.value!r}{nearest(request.value, [m.value for m in Mode])}")
+    mode = Mode(request.value)
+    return Change(lambda loop: loop.set_mode(mode), f"mode {loop.mode} -> {mode}", request.who, request.reason)
+
+
+def _sp(request: Request, loop: ControlLoop, _: Path) -> Change:
+    signals = loop.controller.manifest.sp
+    wanted = _numbers(request.value, signals, loop.sp.tolist(), "set point")
+    within(wanted, signals, "set point")
+    what = _moves(loop.sp.tolist(), wanted, signals, "set point")
+    return Change(lambda loop: loop.set_sp(wanted), what, request.who, request.reason)
+
+
+def _mv(request: Request, loop: ControlLoop, _: Path) -> Change:
+    signals = loop.controller.manifest.mv
+    wanted = _numbers(request.value, signals, loop.mv.tolist(), "MV")
+    within(wanted, signals, "MV")
+    if loop.mode is not Mode.MANUAL:
+        raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {loop.mode}")
+    what = _moves(loop.mv.tolist(), wanted, signals, "MV")
+    return Change(lambda loop: loop.set_mv(wanted), what, request.who, request.reason)
+
+
+def _swap(request: Request, loop: ControlLoop, folder: Path) -> Change:
+    value = request.value
+    if not isinstance(value, Mapping) or not isinstance(value.get("file"), str) or not value["file"]:
+        raise LoopError('a swap needs {"file": a controller\'s .onnx, "trial": a number of scans}')
+    trial = value.get("trial", TRIAL)
+    sha256 = value.get("sha256")
+    if not (sha256 is None or isinstance(sha256, str)):
+        raise LoopError("sha256 is no text")
+    return _tried(request, loop, Controller(folder / value["file"], sha256), trial)
+
+
+def _back(request: Request, loop: ControlLoop, _: Path) -> Change:
+    if loop.replaced is None:
+        raise LoopError("no controller was replaced since this loop began")
+    trial = request.value.get("trial", TRIAL) if isinstance(request.value, Mapping) else TRIAL
+    return _tried(request, loop, loop.replaced, trial)
+
+
+def _tried(request: Request, loop: ControlLoop, controller: Controller, trial: Any) -> Change:
+    if not isinstance(trial, int) or isinstance(trial, bool) or not 1 <= trial <= LONGEST_TRIAL:
+        raise LoopError(f"trial is {trial!r}; it must be a whole number of scans, 1 .. {LONGEST_TRIAL}")
+    require_same_signals(loop.controller.manifest, controller.manifest)
+    if controller.sha256 == loop.controller.sha256:
+        raise LoopError(f"{named(controller)} is in charge already")
+    what = f"{named(controller)} beside {named(loop.controller)} for {trial} scans"
+    return Change(lambda loop: loop.swap(controller, trial), what, request.who, request.reason, kind="swap")
+
+
+def _keep(request: Request, loop: ControlLoop, _: Path) -> Change:
+    if loop.successor is None:
+        raise LoopError("no controller is on trial")
+    what = f"{named(loop.successor.controller)} is tried no more"
+    return Change(lambda loop: loop.keep(), what, request.who, request.reason, kind="swap")
+
+
+def _numbers(value: Any, signals: tuple[Signal, ...], present: list[float], what: str) -> list[float]:
+    """The present values with those that are named changed."""
+    names = [s.name for s in signals]
+    if not isinstance(value, Mapping) or not value:
+        raise LoopError(f"a {what} is given by name: {', '.join(names)}")
+    wanted = list(present)
+    for name, number in value.items():
+        if name not in names:
+            raise LoopError(f"there is no {what} {name!r}{nearest(name, names)}")
+        if not isinstance(number, int | float) or isinstance(number, bool) or not isfinite(number):
+            raise LoopError(f"the {what} {name} is {number!r}; it must be a number")
+        wanted[names.index(name)] = float(number)
+    return wanted
+
+
+def _moves(before: list[float], wanted: list[float], signals: tuple[Signal, ...], what: str) -> str:
+    moves = [
+        f"{s.name} {old:g} -> {new:g} {s.unit}".rstrip(" -")
+        for s, old, new in zip(signals, before, wanted, strict=True)
+        if old != new
+    ]
+    return f"{what} {', '.join(moves) or 'as it was'}"

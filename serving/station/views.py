@@ -1,0 +1,130 @@
+"""A running loop as others see it: what it is, and how it stands; JSON-ready."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import asdict
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from serving.controller import Controller
+from serving.journal import columns
+
+if TYPE_CHECKING:
+    from serving.station.station import Station
+
+View = dict[str, Any]
+
+SILENT_PERIODS = 3  # without a scan: the loop counts as dead
+PICTURES = ("{stem}.png", "figures/closed_loop_{stem}.png")
+
+
+def about(station: Station) -> View:
+    """What the loop is: its controller, its signals, the controllers that could take its place."""
+    controller = station.loop.controller if station.loop is not None else station.controller
+    m = controller.manifest
+    groups = {"sp": m.sp, "pv": m.pv, "mv": m.mv, "dv": m.dv}
+    return {
+        "title": f"{m.law} for {m.case}",
+        "period_s": m.period_s,
+        "speed": station.settings.speed,
+        "signals": {name: [s.to_dict() for s in signals] for name, signals in groups.items()},
+        "info": list(m.info),
+        "columns": columns(m),
+        "card": _card(controller),
+        "folder": str(controller.path.absolute().parent),
+        "warnings": station.warnings,
+    }
+
+
+def state(station: Station) -> View:
+    """How the loop stands now."""
+    loop, last, now = station.loop, station.last, time.time()
+    if loop is None or last is None:
+        trouble = station.endpoint.trouble
+        return {
+            "time": now,
+            "scan": 0,
+            "alive": False,
+            "mode": station.settings.start,
+            "reason": trouble,
+            "connection": trouble,
+            "sha256": station.controller.sha256,
+            "verdicts": [],
+        }
+    sample, command, seen_s = last
+    applied = None if sample is None else sample.mv_applied
+    patience = SILENT_PERIODS * station.manifest.period_s / station.settings.speed
+    return {
+        "time": seen_s,
+        "scan": command.scan,
+        "alive": now - seen_s <= patience,
+        "mode": command.mode.value,
+        "reason": command.reason,
+        "sp": _plain(command.sp),
+        "pv": _plain(None if sample is None else sample.pv),
+        "mv": _plain(command.mv if command.writes else None),
+        "applied": _plain(applied),
+        "law": _plain(command.law_mv),
+        "beside": _plain(command.successor_mv),
+        "dv": _plain(None if sample is None else sample.dv),
+        "info": _plain(command.info),
+        "quality": station.quality(),
+        "sha256": loop.controller.sha256,
+        "successor": _successor(station),
+        "replaced": None if loop.replaced is None else _named(loop.replaced),
+        "connection": station.endpoint.trouble,
+        "connections": station.endpoint.connections,
+        "journal": station.journal.trouble,
+        "missed": station.missed,
+        "faults": station.faults,
+        "verdicts": [asdict(v) for v in station.watching.monitor.verdicts()],
+        "numbers": station.watching.monitor.numbers(),
+    }
+
+
+def _plain(values: Iterable[float] | None) -> list[float | None] | None:
+    """Numbers for JSON, which has neither NaN nor infinity."""
+    return None if values is None else [float(v) if isfinite(v) else None for v in values]
+
+
+def _named(controller: Controller) -> View:
+    return {"law": controller.manifest.law, "file": controller.path.name, "sha256": controller.sha256}
+
+
+def _successor(station: Station) -> View | None:
+    new = None if station.loop is None else station.loop.successor
+    if new is None:
+        return None
+    return {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
+
+
+def _card(controller: Controller) -> View:
+    m, evidence = controller.manifest, controller.manifest.evidence
+    scenarios = evidence.get("scenarios")
+    rows = scenarios if isinstance(scenarios, dict) else {}
+    return {
+        "law": m.law,
+        "case": m.case,
+        "file": controller.path.name,
+        "sha256": controller.sha256,
+        "size_bytes": controller.size_bytes,
+        "period_s": m.period_s,
+        "commit": m.provenance.get("commit"),
+        "versions": m.provenance.get("versions", {}),
+        "lock_ups": evidence.get("lock_ups"),
+        "scenarios": {name: row for name, row in rows.items() if isinstance(row, dict)},
+        "units": evidence.get("units", {}),
+        "picture": picture(controller) is not None,
+    }
+
+
+def picture(controller: Controller) -> Path | None:
+    """The picture of the controller's closed loop beside its file, where there is one."""
+    for name in PICTURES:
+        path = controller.path.parent / name.format(stem=controller.path.stem)
+        if path.is_file():
+            return path
+    return None

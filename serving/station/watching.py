@@ -1,0 +1,75 @@
+"""The monitor of whichever controller has the plant: fed with each scan, its alarms written down, its memory kept."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import closing, suppress
+
+from serving.controller import Controller
+from serving.errors import LoopError
+from serving.guard import Sample
+from serving.journal import JournalReader
+from serving.loop import Command
+from serving.monitor import Monitor
+from serving.station.recorder import Recorder
+
+LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt
+
+
+class Watching:
+    """A monitor for each controller that comes to the plant; one that was here before goes on where it was."""
+
+    def __init__(self, controller: Controller, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._levels: dict[str, str] = {}
+        self._looked = self._kept = time.time()
+        self._of = controller
+        self.monitor = self._begun(controller)
+
+    def seen(self, controller: Controller, scan: tuple[Sample | None, Command, float]) -> None:
+        """A scan, with its time; now and then what the verdicts have become."""
+        if controller is not self._of:
+            self.keep()
+            self._of, self._levels = controller, {}
+            self.monitor = self._begun(controller)
+        sample, command, time_s = scan
+        self.monitor.observe(time_s, sample, command)
+        if time_s - self._looked >= LOOK_S:
+            self._looked = time_s
+            self._look()
+        if time_s - self._kept >= KEEP_S:
+            self._kept = time_s
+            self.keep()
+
+    def keep(self) -> None:
+        """Write down what was learnt."""
+        self._recorder.journal.keep(_name(self._of), json.dumps(self.monitor.state()))
+
+    def _begun(self, controller: Controller) -> Monitor:
+        kept = None
+        with suppress(LoopError), closing(JournalReader(self._recorder.journal.path)) as reader:
+            kept = reader.learnt(_name(controller))
+        if kept is not None:
+            with suppress(ValueError, KeyError, TypeError):
+                return Monitor.restored(controller.manifest, json.loads(kept))
+        return Monitor(controller.manifest, started_s=time.time())
+
+    def _look(self) -> None:
+        """An alarm for each verdict that has become one, and its end."""
+        for verdict in self.monitor.verdicts():
+            before = self._levels.get(verdict.name, "")
+            self._levels[verdict.name] = verdict.level
+            alarming = verdict.level in {"watch", "retrain"}
+            if verdict.level != before and (alarming or before in {"watch", "retrain"}):
+                self._recorder.note(
+                    "monitor",
+                    "monitor",
+                    f"{verdict.name}: {verdict.level}: {verdict.text}",
+                    alarm=f"monitor {verdict.name}",
+                    raised=alarming,
+                )
+
+
+def _name(controller: Controller) -> str:
+    return f"monitor {controller.sha256}"

@@ -1,0 +1,127 @@
+"""Who trusts whom: a server that does not know the loop, a loop that expects another server, and certificates' ends."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from plant_servers import Plant, RunningLoop
+from processes import within
+
+from pipeline.__main__ import main
+from serving import LoopError
+from serving.opcua.certificates import make, valid_until
+
+PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
+    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", 5.0, "--only-trusted")
+    made.start()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def settings(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    assert main(["loop", "init", str(PID), "--endpoint", plant.endpoint]) == 0
+    path = tmp_path / "loop.toml"
+    path.write_text(path.read_text().replace('page = "127.0.0.1:8080"', "speed = 5.0"))
+    return path
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    capsys.readouterr()
+    status = main(["loop", "check"])
+    found = capsys.readouterr()
+    return status, found.err if status else found.out
+
+
+def test_a_server_that_does_not_trust_the_loop_and_then_does(
+    plant: Plant, settings: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, words = said(capsys)
+    assert status == 2
+    assert words.count("\n") == 1
+    assert "let the server trust" in words
+    assert "loop-certificate.der" in words
+    # A loop that runs meanwhile goes on trying, and connects once it is trusted.
+    text = settings.read_text()
+    settings.write_text(text.replace("[server]", "[server]\nconnect_s = 2.0", 1))
+    loop = RunningLoop(settings)
+    try:
+        assert any("let the server trust" in line for line in loop.told)
+        plant.end()
+        shutil.copy(settings.parent / "loop-certificate.der", plant.folder / "server" / "trusted")
+        plant.start()
+        assert within(30, lambda: loop.station.endpoint.connections == 1)
+        status, words = said(capsys)
+        assert status == 0
+        assert (
+            f"note: certificate of this loop: valid until {valid_until(settings.parent / 'loop-certificate.der')}"
+            in words
+        )
+        assert "note: certificate of the server: valid until" in words
+        # Another server than the pinned one.
+        settings.write_text(
+            text.replace('# server_certificate = "server.der"', 'server_certificate = "loop-certificate.der"')
+        )
+        status, words = said(capsys)
+        assert status == 2
+        assert words.count("\n") == 1
+        assert "server_certificate" in words
+        settings.write_text(
+            text.replace(
+                '# server_certificate = "server.der"',
+                f'server_certificate = "{plant.folder / "server" / "certificate.der"}"',
+            )
+        )
+        assert said(capsys)[0] == 0
+    finally:
+        loop.end()
+
+
+def test_a_certificate_that_has_ended_is_named(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    expired(settings.parent / "loop-certificate.der", settings.parent / "loop-key.pem")
+    status, words = said(capsys)
+    assert status == 2
+    assert words.count("\n") == 1
+    assert "loop-certificate.der was valid until 2021-01-02" in words
+    assert "`loopwright loop init` makes a new one" in words
+
+
+def expired(certificate: Path, key: Path) -> None:
+    """The same certificate with an end long ago."""
+    private = serialization.load_pem_private_key(key.read_bytes(), None)
+    old = x509.load_der_x509_certificate(certificate.read_bytes())
+    ended = datetime(2021, 1, 2, tzinfo=UTC)
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(old.subject)
+        .issuer_name(old.issuer)
+        .public_key(old.public_key())
+        .serial_number(old.serial_number)
+        .not_valid_before(ended - timedelta(days=365))
+        .not_valid_after(ended)
+    )
+    for extension in old.extensions:
+        builder = builder.add_extension(extension.value, extension.critical)
+    made = builder.sign(private, hashes.SHA256())  # type: ignore[arg-type]
+    certificate.write_bytes(made.public_bytes(serialization.Encoding.DER))
+
+
+def test_what_is_no_certificate_is_named(tmp_path: Path) -> None:
+    make(tmp_path / "a.der", tmp_path / "a.pem")
+    assert valid_until(tmp_path / "a.der") > datetime.now(UTC).date().isoformat()
+    (tmp_path / "b.der").write_bytes(b"no certificate")
+    with pytest.raises(LoopError, match=r"b\.der is no certificate"):
+        valid_until(tmp_path / "b.der")
+    with pytest.raises(LoopError, match=r"c\.der cannot be read"):
+        valid_until(tmp_path / "c.der")

@@ -1,0 +1,176 @@
+"""A loop on node-opcua, a server of another stack than the client's: signed, encrypted, with a password, in REAL.
+
+`npm ci` in tests/node_opcua brings it; without it these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from asyncua import Client, ua
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+from plant_servers import RunningLoop, free_port
+from processes import within
+
+from pipeline.__main__ import main
+from serving import Mode
+from serving.journal import JournalReader
+from serving.opcua.certificates import APPLICATION
+from serving.station.control import ask
+
+HERE = Path(__file__).parents[1] / "node_opcua"
+PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+NODE = shutil.which("node")
+if NODE is None or not (HERE / "node_modules").is_dir():
+    pytest.skip("node or its packages are missing (npm ci in tests/node_opcua)", allow_module_level=True)
+
+PERIOD_MS = 100  # as fast as the loop's: 0.5 s, five times as fast as the clock
+
+
+class NodeServer:
+    """The server as a process; ``lines`` is what it has said of its MV node."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.port = folder, free_port()
+        self.log = folder / "node.log"
+        self.process: subprocess.Popen[str] | None = None
+
+    @property
+    def endpoint(self) -> str:
+        return f"opc.tcp://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        assert NODE is not None
+        before = self.log.read_text().count('"ready"') if self.log.exists() else 0
+        with self.log.open("a") as said:
+            self.process = subprocess.Popen(
+                [NODE, str(HERE / "server.js"), str(self.port), str(self.folder), str(PERIOD_MS)],
+                stdout=said,
+                stderr=said,
+            )
+        assert within(60, lambda: self.log.read_text().count('"ready"') > before), self.log.read_text()
+
+    def end(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+
+    def rows(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.log.read_text().splitlines() if line.startswith('{"asked"')]
+
+    def spoil(self, number: int) -> None:
+        """1: the temperature's quality is bad."""
+
+        async def write() -> None:
+            client = Client(self.endpoint)
+            client.application_uri = APPLICATION
+            client.set_user("loopwright")
+            client.set_password("a secret")
+            await client.set_security(
+                SecurityPolicyBasic256Sha256,
+                str(self.folder / "loop-certificate.der"),
+                str(self.folder / "loop-key.pem"),
+            )
+            async with client:
+                index = await client.get_namespace_index("urn:loopwright:plant")
+                value = ua.Variant(number, ua.VariantType.Int32)
+                await client.get_node(f"ns={index};s=Faults.T").write_value(value)
+
+        asyncio.run(write())
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeServer]:
+    made = NodeServer(tmp_path_factory.mktemp("node"))
+    made.start()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def settings(server: NodeServer, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("LOOP_PASSWORD", "a secret")
+    path = server.folder / "loop.toml"
+    path.unlink(missing_ok=True)
+    assert main(["loop", "init", str(PID), "--endpoint", server.endpoint, "--out", str(path)]) == 0
+    text = path.read_text()
+    for old, new in (
+        ('page = "127.0.0.1:8080"', "speed = 5.0"),
+        ('# user = "loopwright"', 'user = "loopwright"'),
+        ('# password_env = "LOOP_PASSWORD"', 'password_env = "LOOP_PASSWORD"'),
+        ("s=Control.Heartbeat", "s=Heartbeat"),
+        ("s=Control.Watchdog", "s=Watchdog"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(re.sub("max_age_s = .*", "max_age_s = 5", text))  # this machine has other work beside it
+    return path
+
+
+def test_check_reads_what_this_server_says(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main(["loop", "check", str(settings)]) == 0
+    said = capsys.readouterr().out
+    assert "nothing would stop the loop" in said
+    row = next(line for line in said.splitlines() if line.startswith("PV T"))
+    assert "Float" in row
+    assert "200 .. 600" in row
+
+
+def test_a_wrong_password_is_one_line(
+    settings: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LOOP_PASSWORD", "a guess")
+    capsys.readouterr()
+    assert main(["loop", "check", str(settings)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "refuses" in said
+    assert "a guess" not in said
+
+
+def test_a_loop_from_the_shadow_through_a_fault_and_a_killed_server(settings: Path, server: NodeServer) -> None:
+    loop = RunningLoop(settings)
+    journal = loop.settings.journal.file
+
+    def becomes(mode: Mode) -> bool:
+        return within(40, lambda: loop.station.last is not None and loop.station.last[1].mode is mode)
+
+    try:
+        assert len({row["asked"] for row in server.rows()}) == 1  # a shadow writes nothing
+        assert ask(journal, {"do": "mode", "value": "AUTO", "who": "anna"})["done"] == "mode SHADOW -> AUTO"
+        assert ask(journal, {"do": "sp", "value": {"C_A": 0.55}, "who": "anna"})
+        assert within(20, lambda: len({row["asked"] for row in server.rows()[-30:]}) > 5)
+        for row in server.rows():
+            assert row["type"] == "Float"
+            assert row["asked"] == float(np.float32(row["asked"]))
+            assert 0 <= row["asked"] <= 500
+        server.spoil(1)
+        assert within(40, lambda: any("PV T: BadSensorFailure" in event for event in loop.events()))
+        assert becomes(Mode.HOLD)
+        server.spoil(0)
+        assert becomes(Mode.AUTO)
+        server.end()
+        assert becomes(Mode.HOLD)
+        server.start()
+        assert becomes(Mode.AUTO)
+        assert loop.station.endpoint.connections >= 2
+    finally:
+        loop.end()
+    with closing(JournalReader(journal)) as reader:
+        scans = list(reader.scans())
+        events = [event.what for _, event in reader.events()]
+    assert [id_ for id_, _, _ in scans] == list(range(1, len(scans) + 1))
+    assert {"AUTO", "HOLD", "SHADOW"} == {scan.mode for _, _, scan in scans}
+    assert any("BadSensorFailure" in what for what in events)
+    assert sum(what.startswith("connected to") for what in events) >= 2

@@ -1,0 +1,70 @@
+"""How often an MV that stands is written."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from serving import Controller, LoopError
+from serving.opcua.endpoint import OpcUaEndpoint
+from serving.opcua.settings import Nodes, Server
+
+pytest_plugins = ["small_laws"]
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def endpoint(controller: Controller, rewrite_s: float, clock: Clock) -> OpcUaEndpoint:
+    m = controller.manifest
+    nodes: dict[str, Any] = {g: {s.name: "ns=2;s=x" for s in m.signals(g)} for g in ("pv", "mv", "dv")}
+    server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, rewrite_s=rewrite_s)
+    made = OpcUaEndpoint(m, server, Nodes(**nodes), max_age_s=1.0, clock=clock)
+    made._link = object()  # type: ignore[assignment]
+    return made
+
+
+def written(made: OpcUaEndpoint, clock: Clock, mvs: list[float | None]) -> list[bool]:
+    """Scan by scan 0.5 s apart, whether an MV went out; None: a scan that writes nothing."""
+    out = []
+    for mv in mvs:
+        made._scans += 1
+        clock.now += 0.5
+        if mv is not None:
+            made.write(np.array([mv]))
+        out.append(bool(made._outbox))
+        made._outbox.clear()
+    return out
+
+
+def test_every_scan_unless_told_otherwise(controller: Controller) -> None:
+    clock = Clock()
+    assert written(endpoint(controller, 0.0, clock), clock, [1.0] * 4) == [True] * 4
+
+
+def test_one_that_stands_is_written_now_and_then_and_one_that_moves_at_once(controller: Controller) -> None:
+    clock = Clock()
+    made = endpoint(controller, 2.0, clock)
+    assert written(made, clock, [1.0] * 6) == [True, False, False, False, True, False]
+    assert written(made, clock, [2.0, 2.0, 3.0]) == [True, False, True]
+
+
+def test_whoever_had_the_plant_meanwhile_it_is_written_again(controller: Controller) -> None:
+    clock = Clock()
+    made = endpoint(controller, 100.0, clock)
+    assert written(made, clock, [1.0, 1.0, None, 1.0]) == [True, False, False, True]
+    made.unwritten = "the server refuses"
+    with pytest.raises(Exception, match="the server refuses"):
+        written(made, clock, [1.0])
+    assert made._outbox
+
+
+def test_a_time_that_is_none_is_refused() -> None:
+    with pytest.raises(LoopError, match="rewrite_s is -1"):
+        Server("opc.tcp://h:1", security="None", insecure=True, rewrite_s=-1)

@@ -1,0 +1,133 @@
+"""Two loops on two machines that would write one MV: one writes, the other says who does."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from asyncua import Client
+from plant_servers import Plant, RunningLoop
+from processes import within
+
+from serving import Mode
+from serving.opcua.lease import SCANS, NodeLease
+from serving.station import station
+from serving.station.control import ask
+from serving.station.lease import Lease
+
+PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+LOOP = """
+controller = "{pid}"
+start = "{start}"
+speed = 5.0
+[guards]
+max_age_s = 5
+[server]
+endpoint = "{endpoint}"
+security = "None"
+insecure = true
+[nodes]
+lease = "nsu=urn:loopwright:plant;s=Control.Lease"
+[nodes.pv]
+C_A = "nsu=urn:loopwright:plant;s=PV.C_A"
+T = "nsu=urn:loopwright:plant;s=PV.T"
+[nodes.mv]
+T_j = {{ node = "nsu=urn:loopwright:plant;s=MV.T_j", read_back = "nsu=urn:loopwright:plant;s=RB.T_j" }}
+"""
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
+    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", 5.0)
+    made.start()
+    yield made
+    made.end()
+
+
+def machine(folder: Path, plant: Plant, start: str, monkeypatch: pytest.MonkeyPatch) -> RunningLoop:
+    """A loop that another one finds by the node alone: its file locks lie in a folder of its own."""
+    folder.mkdir(mode=0o700)
+    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, folder))
+    (folder / "loop.toml").write_text(LOOP.format(pid=PID, start=start, endpoint=plant.endpoint))
+    return RunningLoop(folder / "loop.toml")
+
+
+def lease(plant: Plant, text: str | None = None) -> Any:
+    """What the node holds; or write there."""
+
+    async def act() -> Any:
+        async with Client(plant.endpoint) as client:
+            index = await client.get_namespace_index("urn:loopwright:plant")
+            node = client.get_node(f"ns={index};s=Control.Lease")
+            return await node.read_value() if text is None else await node.write_value(text)
+
+    with ThreadPoolExecutor(1) as apart:
+        return apart.submit(asyncio.run, act()).result()
+
+
+def mode(loop: RunningLoop) -> tuple[Mode, str]:
+    assert loop.station.last is not None
+    return loop.station.last[1].mode, loop.station.last[1].reason
+
+
+def test_the_second_loop_holds_until_the_first_is_gone(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
+    assert within(20, lambda: first.station.endpoint.lease.held and mode(first)[0] is Mode.AUTO)
+    second = machine(tmp_path / "b", plant, "SHADOW", monkeypatch)
+    try:
+        # A shadow beside it needs no lease and takes none.
+        assert within(10, lambda: second.station.scans > 10)
+        assert lease(plant).startswith(first.station.endpoint.lease.owner)
+        ask(second.settings.journal.file, {"do": "mode", "value": "AUTO", "who": "anna"})
+        owner = first.station.endpoint.lease.owner
+        assert within(20, lambda: f"the plant is controlled by {owner}" in mode(second)[1])
+        assert mode(second)[0] is Mode.HOLD
+        before = len(plant.actuator())
+        assert within(20, lambda: len(plant.actuator()) > before + 10)
+        assert not second.station.endpoint.lease.held
+        assert mode(first)[0] is Mode.AUTO
+        first.end()
+        assert within(30, lambda: second.station.endpoint.lease.held and mode(second)[0] is Mode.AUTO)
+        ask(second.settings.journal.file, {"do": "mode", "value": "SHADOW", "who": "anna"})
+        assert within(20, lambda: lease(plant) == "")
+    finally:
+        first.station.end()
+        second.end()
+
+
+def test_a_lease_of_a_loop_that_was_killed_is_taken_over(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lease(plant, "elsewhere:17:abc 41")
+    loop = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
+    try:
+        assert within(30, lambda: loop.station.endpoint.lease.held and mode(loop)[0] is Mode.AUTO)
+        # Somebody else takes it: the next reading finds that out, and nothing is written any more.
+        lease(plant, "elsewhere:18:def 1")
+        assert within(20, lambda: mode(loop)[0] is Mode.HOLD)
+    finally:
+        loop.end()
+
+
+def test_a_lease_is_judged_by_whether_it_moves() -> None:
+    node = NodeLease()
+    assert node.other == ""
+    node.seen("other:1:a 1")
+    assert node.other == "other:1:a"
+    for k in range(20):
+        node.seen(f"other:1:a {k}")
+        assert node.other == "other:1:a"
+    for _ in range(SCANS):
+        node.seen("other:1:a 19")
+    assert node.other == ""
+    node.held = True
+    node.seen(f"{node.owner} 3")
+    assert node.held
+    node.seen("other:1:b 1")
+    assert not node.held
