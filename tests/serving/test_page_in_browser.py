@@ -26,6 +26,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr"
 PICTURES = os.environ.get("LOOPWRIGHT_PICTURES")
 TOKEN = "a token that is long enough"
+SPEED = 2.0  # periods of .25 s: this law stands one sample of delay, not two, and other tests run beside this one
 PATIENT = re.compile("max_age_s = .*")
 WIDE = {"width": 1500, "height": 1000}
 expect.set_options(timeout=20_000)
@@ -33,7 +34,7 @@ expect.set_options(timeout=20_000)
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", 5.0, "--noise")
+    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", SPEED, "--noise")
     made.start()
     yield made
     made.end()
@@ -49,7 +50,7 @@ def loop(plant: Plant, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run
     path = folder / "loop.toml"
     assert main(["loop", "init", str(folder / "pid.onnx"), "--endpoint", plant.endpoint, "--out", str(path)]) == 0
     (folder / "token").write_text(TOKEN)
-    text = path.read_text().replace('page = "127.0.0.1:8080"', "speed = 5.0")
+    text = path.read_text().replace('page = "127.0.0.1:8080"', f"speed = {SPEED}")
     text = PATIENT.sub("max_age_s = 5", text)  # this machine has other work beside it
     path.write_text(text + '\n[page]\nlisten = "127.0.0.1:0"\ntoken_file = "token"\n')
     made = RunningLoop(path)
