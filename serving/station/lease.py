@@ -18,10 +18,10 @@ class Lease:
     """
 
     def __init__(self, endpoint: str, nodes: Iterable[str], folder: Path | None = None) -> None:
-        import fcntl  # not on Windows, where only a lease node keeps loops apart
-
         self._held: list[int] = []
         place = runtime_folder(folder)
+        import fcntl  # which Windows lacks; the line above has said so there
+
         for node in nodes:
             path = place / hashlib.sha256(f"{endpoint} {node}".encode()).hexdigest()[:32]
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)

@@ -14,6 +14,7 @@ from plant_servers import Plant, RunningLoop
 from processes import within
 
 from serving import Mode
+from serving.errors import LoopError
 from serving.opcua.lease import SCANS, NodeLease
 from serving.station import station
 from serving.station.control import ask
@@ -131,3 +132,10 @@ def test_a_lease_is_judged_by_whether_it_moves() -> None:
     assert node.held
     node.seen("other:1:b 1")
     assert not node.held
+
+
+def test_a_system_without_unix_users_is_told_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delattr("os.getuid")
+    with pytest.raises(LoopError, match="runs on Linux and macOS; on Windows run it in WSL"):
+        Lease("opc.tcp://plant", ["ns=2;s=MV.u"], tmp_path / "locks")
+    assert not (tmp_path / "locks").exists()
