@@ -35,7 +35,8 @@ def settings(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     monkeypatch.chdir(tmp_path)
     assert main(["loop", "init", str(PID), "--endpoint", plant.endpoint]) == 0
     path = tmp_path / "loop.toml"
-    path.write_text("speed = 5.0\n" + path.read_text())
+    # Another program may listen at the port that a loop.toml begins with.
+    path.write_text("speed = 5.0\n" + path.read_text().replace("127.0.0.1:8080", "127.0.0.1:0"))
     return path
 
 
