@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from serving import graph_audit
 from serving.digest import file_digest
@@ -35,6 +35,12 @@ class Signed:
     files: tuple[str, ...]
     signed: datetime | None
     expires: datetime | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready: name, fingerprint, kind of key, times in ISO 8601 (None: not said), and all of it in words."""
+        times = {"signed": self.signed, "expires": self.expires}
+        iso = {name: None if time is None else time.isoformat() for name, time in times.items()}
+        return {"name": self.name, "fingerprint": self.fingerprint, "kind": self.kind, **iso, "words": self.words}
 
     @property
     def words(self) -> str:
