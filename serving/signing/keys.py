@@ -131,7 +131,10 @@ class PrivateKey:
             raise SignatureError(f"{path} is no private key in PEM form; `loopwright keygen` makes one")
         encrypted = b"ENCRYPTED" in data
         if encrypted and not password:
-            raise SignatureError(f"{path} has a password; say where it is by --password-env or --password-file")
+            raise SignatureError(
+                f"{path} has a password; name it by --password-env or --password-file, "
+                "for `registry publish` by LOOPWRIGHT_SIGNING_PASSWORD"
+            )
         if not encrypted and os.name == "posix" and Path(path).stat().st_mode & 0o077:
             raise SignatureError(f"{path} has no password and others may read it: chmod 600 {path}")
         try:
