@@ -59,12 +59,13 @@ def read(data: bytes) -> Envelope:
         raise SignatureError(f"the signature's mediaType is {_short(media)}; it must be {MEDIA_TYPE!r}")
     material = entry(tree, "verificationMaterial", dict)
     if "publicKey" not in material:
+        other = sorted(set(material) - {"tlogEntries"})
         raise SignatureError(
-            f"the signature was made with {', '.join(sorted(set(material) - {'tlogEntries'}))[:_SHOWN] or 'nothing'}; "
-            "only signatures of keys can be verified here: `loopwright sign`, or `model_signing sign key`"
+            f"the signature was made with {_short(other)}; only signatures of keys can be verified here: "
+            "`loopwright sign`, or `model_signing sign key`"
         )
     hint = entry(material, "publicKey", dict).get("hint") or ""
-    if not isinstance(hint, str) or len(hint) > MAX_HINT or not hint.isascii():
+    if not isinstance(hint, str) or len(hint) > MAX_HINT or not (hint.isascii() and hint.isprintable()):
         raise SignatureError(f"the signature's key hint is {_short(hint)}; it must be a SHA-256 in hexadecimal digits")
     if "dsseEnvelope" not in tree:
         raise SignatureError(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from serving.errors import SignatureError
 from serving.signing.reading import contents
 
-MAX_PASSWORD = 4096  # bytes
+MAX_PASSWORD = 1023  # bytes, of cryptography
+MAX_FILE = 4096  # bytes, of a file with a password
 
 
 def keygen_options(parser: argparse.ArgumentParser) -> None:
@@ -72,25 +72,26 @@ def run_verify(options: argparse.Namespace) -> None:
 
 
 def password_of(variable: str | None, file: Path | None) -> bytes | None:
-    """The password in an environment variable or in the first line of a file; None where neither is named."""
+    """The password in an environment variable or in the first line of a file; None where neither is named.
+
+    Raises SignatureError where there is none, or it is longer than a key's file can have.
+    """
     if variable is not None:
-        return _from_environment(variable, os.environ)
-    if file is None:
+        password, where = os.fsencode(os.environ.get(variable, "")), f"the environment variable {variable}"
+    elif file is not None:
+        password, where = _first_line(file), f"the first line of {file}"
+    else:
         return None
-    try:
-        password = (contents(file, MAX_PASSWORD).splitlines() or [b""])[0]
-    except FileNotFoundError:
-        raise SignatureError(f"{file} does not exist; --password-file names the file that holds the password") from None
-    if not password:
-        raise SignatureError(f"{file} has no password in its first line")
+    if not 1 <= len(password) <= MAX_PASSWORD:
+        raise SignatureError(f"{where} must hold the key's password, of 1 to {MAX_PASSWORD} bytes")
     return password
 
 
-def _from_environment(variable: str, environment: Mapping[str, str]) -> bytes:
-    password = environment.get(variable, "")
-    if not password:
-        raise SignatureError(f"the environment variable {variable} is not set; it should hold the key's password")
-    return password.encode()
+def _first_line(file: Path) -> bytes:
+    try:
+        return (contents(file, MAX_FILE).splitlines() or [b""])[0]
+    except FileNotFoundError:
+        raise SignatureError(f"{file} does not exist; it should hold the key's password") from None
 
 
 def _password(parser: argparse.ArgumentParser, what: str) -> None:

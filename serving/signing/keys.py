@@ -149,6 +149,8 @@ class PrivateKey:
 
 def make_pair(path: Path, kind: Kind, password: bytes | None) -> tuple[Path, PublicKey]:
     """Write a new private key to ``path`` and its public key beside it; the public one's file, and it."""
+    if not path.name:
+        raise SignatureError(f"{path} is a folder; give the private key's file, such as anna.key")
     if path.suffix == ".pub":
         raise SignatureError(
             f"{path} ends as a public key's file does; name the private key's, such as {path.stem}.key"
@@ -186,5 +188,5 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
             file.write(data)
     except FileExistsError:
         raise SignatureError(f"{path} is there already; give another name, or remove it") from None
-    except OSError as error:
-        raise SignatureError(f"{path} cannot be written: {error.strerror}") from None
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+        raise SignatureError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from None

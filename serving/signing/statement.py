@@ -98,8 +98,10 @@ def _files(resources: list[Any], subject: str) -> dict[str, str]:
             raise SignatureError("a file was signed with another algorithm than sha256: sign it again")
         name, digest = entry(row, "name", str), entry(row, "digest", str)
         name = subject if name == "." and len(resources) == 1 else name
-        if name in files or not _DIGEST.fullmatch(digest):
-            raise SignatureError(f"what was signed has the file {name[:100]!r} twice, or without a SHA-256")
+        if name in files or not name.isprintable() or not _DIGEST.fullmatch(digest):
+            raise SignatureError(
+                f"what was signed has the file {name[:100]!r} twice, or without a SHA-256, or under a strange name"
+            )
         files[name] = digest
     return files
 

@@ -52,6 +52,8 @@ class Signed:
 
 def signature_of(path: Path) -> Path:
     """Where the signature of a file lies: beside it, .sig after its whole name."""
+    if not path.name:
+        raise SignatureError(f"{path} is a folder; give a controller's .onnx file")
     return path.with_name(path.name + SUFFIX)
 
 

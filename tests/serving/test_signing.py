@@ -274,9 +274,14 @@ def test_any_other_statement_is_refused_even_if_a_trusted_key_signed_it(
 
 BUNDLES: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "v0.1": (lambda t: t.update(mediaType="application/vnd.dev.sigstore.bundle+json;version=0.1"), "mediaType"),
+    "two lines": (
+        lambda t: t.update(verificationMaterial={"a\nb": 1}),
+        "made with ['a\\nb']; only signatures of keys",
+    ),
+    "hint of two lines": (lambda t: t["verificationMaterial"]["publicKey"].update(hint="a\nb"), "key hint"),
     "certificate": (
         lambda t: t.update(verificationMaterial={"certificate": {"rawBytes": "QQ=="}, "tlogEntries": []}),
-        "made with certificate; only signatures of keys",
+        "made with ['certificate']; only signatures of keys",
     ),
     "message": (
         lambda t: t.update(messageSignature={"signature": t.pop("dsseEnvelope")["signatures"][0]["sig"]}),
@@ -304,6 +309,7 @@ STATEMENTS: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "blake3": (lambda t: t["predicate"]["resources"][0].update(algorithm="blake3"), "another algorithm"),
     "root": (lambda t: t["subject"][0]["digest"].update(sha256="0" * 64), "subject's digest"),
     "twice": (lambda t: t["predicate"].update(resources=2 * t["predicate"]["resources"]), "twice"),
+    "strange": (lambda t: t["predicate"]["resources"][0].update(name="pi\nonnx"), "under a strange name"),
     "short": (lambda t: t["predicate"]["resources"][0].update(digest="ab"), "without a SHA-256"),
     "later": (lambda t: t["predicate"]["loopwright"].update(until="2030"), "entries of loopwright"),
     "no time": (lambda t: t["predicate"]["loopwright"].update(expires="tomorrow"), "the time 'tomorrow'"),
@@ -337,6 +343,27 @@ def test_what_is_no_regular_file_is_no_signature(signed: Path, public: Public, k
     place.unlink()
     {"pipe": os.mkfifo, "folder": os.mkdir, "device": lambda p: os.symlink("/dev/zero", p)}[kind](place)
     refused(signed, public("anna"), words="is no regular file|cannot be read")
+
+
+@pytest.mark.parametrize("name", ["anna", "eve"])
+@pytest.mark.parametrize("length", [0, 1, 63, 64, 65, 10_000])
+def test_a_signature_of_any_other_length_is_refused(
+    unsigned: Path, private: Private, public: Public, name: str, length: int
+) -> None:
+    sign(unsigned, private(name), now=NOW)
+    zeros = base64.b64encode(bytes(length)).decode()
+    edit_bundle(unsigned, lambda tree: tree["dsseEnvelope"]["signatures"][0].update(sig=zeros))
+    refused(unsigned, public(name), words="forged or changed")
+
+
+@pytest.mark.parametrize("place", [".", "/", "", "no\0file"])
+def test_what_names_no_file_is_refused(place: str, public: Public, private: Private) -> None:
+    with pytest.raises(SignatureError):
+        verified(place, [public("anna")])
+    with pytest.raises(SignatureError):
+        sign(place, private("anna"))
+    with pytest.raises(SignatureError):
+        make_pair(Path(place), "p256", None)
 
 
 # ---------------------------------------------------------------------- signing
@@ -466,7 +493,14 @@ def test_what_goes_wrong_is_one_line_and_status_2(
         ("verify", str(signed), "--key", key): "is a private key",
         ("verify", str(signed), "--key", str(keys / "anna.pub"), "--signature", str(tmp_path / "x")): "is not signed",
         ("sign", str(signed), "--key", key, "--expires", "2001-01-01"): "would have expired",
-        ("sign", str(signed), "--key", key, "--password-env", "NO_SUCH_PASSWORD"): "NO_SUCH_PASSWORD is not set",
+        (
+            "sign",
+            str(signed),
+            "--key",
+            key,
+            "--password-env",
+            "NO_SUCH_PASSWORD",
+        ): "NO_SUCH_PASSWORD must hold",
         (
             "sign",
             str(signed),
@@ -474,7 +508,7 @@ def test_what_goes_wrong_is_one_line_and_status_2(
             key,
             "--password-file",
             str(tmp_path / "empty"),
-        ): "no password in its first line",
+        ): "empty must hold the key's password",
         ("keygen", key): "is there already",
         ("keygen", str(tmp_path / "none" / "a.key")): "cannot be written: No such file or directory",
         ("keygen", str(tmp_path / "a.pub")): "name the private key's",
