@@ -11,7 +11,6 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
-from serving.controller import Controller
 from serving.errors import LoopError
 from serving.guard import Sample
 from serving.loop import Command, Mode
@@ -21,6 +20,7 @@ from serving.station.export import export, tag_table
 from serving.station.requests import TRIAL
 from serving.station.settings import Settings
 from serving.station.template import template
+from serving.trust import Controller
 
 SETTINGS = Path("loop.toml")
 
@@ -122,7 +122,8 @@ def _init(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     settings = Settings.read(options.file)
     _quiet()
-    manifest = Controller(settings.controller, settings.sha256 or None).manifest
+    controller = Controller(settings.controller, settings.sha256 or None, settings.trusted)
+    manifest = controller.manifest
     from serving.opcua.inspection import Found, inspected
 
     settings.guards.of(manifest, settings.max_age_s(manifest.period_s))
@@ -133,6 +134,8 @@ def _check(options: argparse.Namespace) -> int:
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
     for cells in table:
         print("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
+    if controller.signed is not None:
+        print(f"{controller.path.name}: signed by {controller.signed.words}")
     wrong = [f"{row.signal}: {row.wrong}" for row in rows if row.wrong]
     for note in [f"{row.signal}: {row.note}" for row in rows if row.note] + _warnings(settings):
         print(f"note: {note}")
@@ -146,7 +149,8 @@ def _check(options: argparse.Namespace) -> int:
 def _warnings(settings: Settings) -> list[str]:
     server = settings.server
     return [
-        *["sha256 is not set: any controller in that file would run"] * (not settings.sha256),
+        *["neither sha256 nor trusted is set: any controller in that file would run"]
+        * (not settings.sha256 and settings.trusted is None),
         *["security is None: what is sent can be read and changed on the way"] * (server.security == "None"),
         *["server_certificate is not set: any server at that address is believed"]
         * (server.security != "None" and server.server_certificate is None),

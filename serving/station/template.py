@@ -18,6 +18,7 @@ def template(controller: Controller, path: Path, endpoint: str) -> str:
         "# `loopwright loop check` reads every node and writes none.",
         f'controller = "{path.as_posix()}"',
         f'sha256 = "{controller.sha256}"  # this very file and no other',
+        '# trusted = ["maker.pub"]  # only controllers that one of these public keys signed; see docs/trust.md',
         'start = "SHADOW"  # the law is computed and shown, nothing is written; or MANUAL, AUTO',
         'page = "127.0.0.1:8080"  # the operator\'s page; leave it out for none',
         f"transfer_s = {20 * period:g}  # [s] in which an MV crosses its range at most once after a change to AUTO",
