@@ -14,7 +14,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from asyncua import Server, ua
+from asyncua import Client, Server, ua
 from asyncua.crypto.cert_gen import setup_self_signed_certificate
 from asyncua.crypto.truststore import TrustStore
 from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
@@ -27,7 +27,6 @@ from serving.manifest import Signal
 
 NAMESPACE = "urn:loopwright:plant"
 APPLICATION = "urn:loopwright:plant:server"
-FAULTS = ("", "bad", "uncertain", "frozen", "text", "deleted", "int", "nan")
 LOCAL, REMOTE = 0, 1  # who has the plant: its own controller, or whoever writes the MVs
 ALIVE_PERIODS = 3
 PARTS, LEAST_PART_S = 10, 0.025  # a period has so many parts at most, each at least as long by the clock
@@ -152,6 +151,7 @@ class PlantServer:
         await setup_self_signed_certificate(
             key, certificate, APPLICATION, host, [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH], {}
         )
+        key.chmod(0o600)
         await self.server.load_certificate(str(certificate))
         await self.server.load_private_key(str(key))
         policies = [ua.SecurityPolicyType.NoSecurity, ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt]
@@ -284,3 +284,21 @@ def in_parts(plant: Simulator, period_s: float) -> tuple[int, Advance]:
         state = rk4_step(lambda at: plant.rate(at, mv, dv, p), state, h)
     transition = ca.Function("part", [x, mv, dv, p], [ca.densify(state)])
     return n, lambda x, mv, dv, p: np.array(transition(x, mv, dv, p))[:, 0]
+
+
+async def spoil(endpoint: str, tag: str, fault: str) -> None:
+    """Give a signal of a served plant one of FAULTS. PlantError where no such plant answers, or it has no such tag."""
+    try:
+        async with Client(endpoint, timeout=5) as client:
+            index = await client.get_namespace_index(NAMESPACE)
+            node = client.get_node(ua.NodeId(ua.String(f"Faults.{tag}"), ua.Int16(index)))
+            await node.read_value()  # a node that is not there would be refused as one that may not be written
+            await node.write_value(fault)
+    except ua.uaerrors.BadNodeIdUnknown:
+        words = f"the plant at {endpoint} has no signal {tag!r}; write it as PV.NAME, RB.NAME, MV.NAME or DV.NAME"
+        raise PlantError(words) from None
+    except (OSError, TimeoutError) as error:
+        words = f"no served plant answers at {endpoint} ({type(error).__name__}); `loopwright plant serve` starts one"
+        raise PlantError(words) from None
+    except ValueError:
+        raise PlantError(f"the server at {endpoint} is no `loopwright plant serve`: it has no {NAMESPACE}") from None

@@ -16,7 +16,7 @@ MOST = 50  # files that are looked at
 
 
 def candidates(folder: Path, in_charge: str, trusted: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Law, file, sha256 and signer of each controller with the period and the signals of the file ``in_charge``.
+    """Law, case, file, sha256 and signer of each controller with the period and the signals of the file ``in_charge``.
 
     Where public keys are ``trusted``, only of files that one of them signed: the loop would refuse any other.
     """
@@ -29,7 +29,8 @@ def candidates(folder: Path, in_charge: str, trusted: Sequence[str] | None = Non
         except (LoopwrightError, OSError, KeyError):
             continue
         if path.name != in_charge:
-            found.append({"law": manifest.law, "file": path.name, "sha256": sha256, "signed": signed})
+            row = {"law": manifest.law, "case": manifest.case, "file": path.name, "sha256": sha256, "signed": signed}
+            found.append(row)
     return found
 
 

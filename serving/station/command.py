@@ -8,11 +8,13 @@ import json
 import logging
 import signal
 import sys
+from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 
 from serving.errors import LoopError
 from serving.guard import Sample
+from serving.journal import JournalReader
 from serving.loop import Command, Mode
 from serving.manifest import Manifest
 from serving.station.control import ask
@@ -71,7 +73,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _state(options: argparse.Namespace) -> int:
-    print(json.dumps(ask(Settings.read(options.loop).journal.file, {"do": "state"}), indent=2))
+    journal = Settings.read(options.loop).journal.file
+    state, about = (ask(journal, {"do": do}) for do in ("state", "about"))
+    signals = {group: [s["name"] for s in about["signals"][group]] for group in ("sp", "pv", "mv", "dv")}
+    names = {**signals, **dict.fromkeys(("applied", "law", "beside"), signals["mv"]), "info": about["info"]}
+    for group, of in names.items():
+        if state.get(group) is not None:
+            state[group] = dict(zip(of, state[group], strict=True))
+    print(json.dumps(state, indent=2))
     return 0
 
 
@@ -113,7 +122,9 @@ def _init(options: argparse.Namespace) -> int:
     except ValueError:
         path = options.file.absolute()
     make(folder / "loop-certificate.der", folder / "loop-key.pem")
-    options.out.write_text(template(controller, path, options.endpoint), encoding="utf-8")
+    options.out.write_text(
+        template(controller, path, options.endpoint, f"{options.out.stem}.journal"), encoding="utf-8"
+    )
     print(f"written: {options.out}, and beside it loop-certificate.der (for the server to trust) and loop-key.pem")
     print(f"next: put the plant's node ids in, then `loopwright loop check {options.out}`")
     return 0
@@ -176,9 +187,19 @@ def _run(options: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: station.end())
     report = station.run(options.scans)
+    if station.last is not None:
+        tell(_left(station.manifest, station.last[1]))
     tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
     tell(f"journal: {settings.journal.file}")
     return 0
+
+
+def _left(manifest: Manifest, last: Command) -> str:
+    """What the plant is left with."""
+    if not last.writes:
+        return f"ended in {last.mode}: nothing was written by this loop"
+    stay = ", ".join(f"{s.name} at {v:.5g} {s.unit}" for s, v in zip(manifest.mv, last.mv.tolist(), strict=True))
+    return f"ended in {last.mode}: the plant keeps {stay}, and this loop moves it no more"
 
 
 class _Lines:
@@ -209,7 +230,10 @@ def _export(options: argparse.Namespace) -> int:
     tags = out.with_name(f"{out.stem}-tags.csv")
     tag_table(options.file, tags)
     print(f"{rows} scans: {out}, its tags: {tags}")
-    print(f"next: `loopwright new NAME {out} --tags {tags}` makes a record of it")
+    with closing(JournalReader(options.file)) as reader:
+        period_s = reader.runs()[-1]["period_s"]
+    # Without the period `new` would choose one, and a controller of another period could not be swapped in.
+    print(f"next: `loopwright new NAME {out} --tags {tags} --period {period_s:g}` makes a record of it")
     return 0
 
 

@@ -72,6 +72,7 @@ class Station:
             self.lease.release()
             raise
         self.recorder = Recorder(self.journal, tell, settings.speed)
+        self.recorder.end_old_alarms()
         self.watching = Watching(self.controller, self.recorder)
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None

@@ -71,14 +71,13 @@ function scenarios(c) {
 }
 
 function candidates(about) {
-  const box = element("div", { id: "candidates" }, element("h3", {}, "Swap the controller"));
+  const box = element("div", { id: "candidates" }, element("h3", {}, "Swap the controller"), element("div", { id: "back", hidden: true }));
   if (!about.candidates.length) box.append(element("p", { class: "calm" }, "No other controller with these signals lies beside this one's file."));
   for (const other of about.candidates) {
     box.append(
-      element("div", { class: "candidate" }, `${other.law} (${other.file}${other.signed ? `, signed by ${other.signed}` : ""}) `, element("button", { type: "button", "data-file": other.file, onclick: () => swap(about, other) }, "Try…")),
+      element("div", { class: "candidate" }, `${other.law} for ${other.case} (${other.file}, ${other.sha256.slice(0, 8)}${other.signed ? `, signed by ${other.signed}` : ""}) `, element("button", { type: "button", "data-file": other.file, onclick: () => swap(about, other) }, "Try…")),
     );
   }
-  box.append(element("div", { id: "back", hidden: true }));
   return box;
 }
 
@@ -106,7 +105,7 @@ export function show(state) {
           fields: [trialField],
           request: (values) => ({ do: "back", value: { trial: values.trial } }),
         });
-      back.replaceChildren(element("button", { id: "put-back", type: "button", onclick: act }, `Put ${state.replaced.law} back…`));
+      back.replaceChildren(element("button", { id: "put-back", type: "button", onclick: act }, `Put ${state.replaced.law} (${state.replaced.sha256.slice(0, 8)}) back…`));
     }
   }
   const verdicts = state.verdicts || [];
