@@ -15,11 +15,12 @@ from pipeline.export.gate import export
 from pipeline.laws import ControlLaw
 from serving import Controller
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "embed"
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "examples" / "embed" / "python"
 
 
 def run(example: str, file: Path) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-W", "error", str(EXAMPLES / example), str(file)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 0, done.stderr
@@ -41,7 +42,7 @@ def test_both_examples_give_the_controllers_bits(make_law: object, name: str, tm
     assert np.isfinite(first.mv).all()
 
 
-SHIPPED = sorted((EXAMPLES.parents[2] / "artifacts").glob("*/*.onnx"))
+SHIPPED = sorted((ROOT / "artifacts").glob("*/*.onnx"))
 
 
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
