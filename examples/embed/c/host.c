@@ -4,7 +4,7 @@
      host --conformance KIT [ANSWERS.json]        the kit of `loopwright conformance FILE.onnx KIT`
 
    The parts: JSON, SHA-256, controller, loop, plant, run, conformance, main. To use the controller and the loop in a
-   program of your own, compile this file with -DLOOPWRIGHT_NO_MAIN, or include it. Nothing is allocated after
+   program of your own, define LOOPWRIGHT_NO_MAIN and include this file. Nothing is allocated after
    controller_open. No function sets the locale; strtod needs the "C" one, which a C program starts with. */
 
 #define _POSIX_C_SOURCE 200809L
@@ -174,14 +174,14 @@ static bool read_json(const char *path, Json *j, char *words) {
   char *text = read_file(path, &size);
   memset(j, 0, sizeof *j);
   if (!text) {
-    snprintf(words, WORDS, "%s cannot be read: %s", path, strerror(errno));
+    snprintf(words, WORDS, "%.300s cannot be read: %s", path, strerror(errno));
     return false;
   }
   const char *end = strlen(text) == size ? json_value(text, j, 0) : NULL;
   bool good = end && !*blanks(end) && j->kind == J_OBJECT;
   free(text);
   if (!good) {
-    snprintf(words, WORDS, "%s is no JSON object", path);
+    snprintf(words, WORDS, "%.300s is no JSON object", path);
     json_free(j);
   }
   return good;
