@@ -70,7 +70,7 @@ class Plant extends MadeUpPlant {
   read() {
     const sample = super.read();
     if (this.k === 4) throw new Error("no answer");
-    return { ...sample, pv: [0.1, 300] };
+    return { ...sample, pv: [0.499, 300] };
   }
   write(mv) {
     if (this.k === 10) throw new Error("no way");
