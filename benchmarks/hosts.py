@@ -4,9 +4,9 @@
 A host whose parts are missing is named and left out: C needs cmake, a C compiler and ONNXRUNTIME_DIR
 (``tools/onnxruntime_c.sh build/onnxruntime``), Node and the browser ``npm ci`` in examples/embed/node and
 examples/embed/browser. Each host runs the kit of ``loopwright conformance`` and ``serving.conformance`` compares its
-answers. Step: the median over the kit's steps; in Node over 600 equal ones, in the browser over 30 blocks of 20, because
-its clock counts in 100 us; the lowest of three rounds, because on a shared machine whole rounds run slower. A
-difference is a share of the entry's scale; same bits: in every number of the file.
+answers. Step: the median over the kit's steps; in Node over 600 equal ones, in the browser over 30 blocks of 20,
+because its clock counts in 100 us; the lowest of three rounds, because on a shared machine whole rounds run slower.
+A difference is a share of the entry's scale; same bits: in every number of the file.
 """
 
 from __future__ import annotations
@@ -202,10 +202,10 @@ def summary(cells: dict[str, list[Cell]], sizes: dict[str, int]) -> str:
         runtime = good[0].runtime if good else "-"
         same = sum(v.same_bits == v.steps and not v.largest for v in good)
         largest = max((v.largest for v in good), default=np.nan)
-        times = [cell.p50_us for cell in row]
+        times = [cell.p50_us for cell in row if cell.verdict] or [np.nan]
         lines.append(
             f"| {host} | {runtime} | {len(good)} of {len(row)} | {sum(v.passed for v in good)} | {same} | "
-            f"{largest:.1g} | {np.nanmin(times):.0f} .. {np.nanmax(times):.0f} | {sizes[host] / 1e6:.0f} |"
+            f"{largest:.1g} | {min(times):.0f} .. {max(times):.0f} | {sizes[host] / 1e6:.0f} |"
         )
     return "\n".join(lines)
 
