@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,7 @@ if CMAKE is None or shutil.which("cc") is None:
 if not (ONNXRUNTIME / "include" / "onnxruntime_c_api.h").is_file():
     pytest.skip("onnxruntime's C header is missing (tools/onnxruntime_c.sh build/onnxruntime)", allow_module_level=True)
 
+pytest_plugins = ["small_laws"]
 PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
 SANITIZERS = "-O1 -g -Werror -fsanitize=address,undefined -fno-sanitize-recover=all"
 
@@ -51,6 +54,18 @@ def test_c_gives_the_bits_of_our_runtime(host: Path, file: Path, tmp_path: Path)
     verdict = verdict_on(file, tmp_path / "answers.json")
     assert verdict.passed, verdict.text()
     assert verdict.same_bits == verdict.steps > 300
+
+
+def test_c_refuses_results_and_takes_measured_disturbances(host: Path, disobedient_file: Path, tmp_path: Path) -> None:
+    """No shipped controller has measured disturbances or leaves its range; this one does both."""
+    vectors = json.loads((kit_of(disobedient_file) / "vectors.json").read_text())
+    refused = Counter(row.get("refused", "") for row in vectors["steps"])
+    assert min(refused["output"], refused["input"], refused[""]) >= 15
+    done = run(host, "--conformance", kit_of(disobedient_file), tmp_path / "answers.json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = verdict_on(disobedient_file, tmp_path / "answers.json")
+    assert verdict.passed, verdict.text()
+    assert verdict.same_bits == verdict.steps
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

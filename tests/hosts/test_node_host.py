@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ NODE = shutil.which("node")
 if NODE is None or not (EMBED / "node" / "node_modules").is_dir():
     pytest.skip("node or its packages are missing (npm ci in examples/embed/node)", allow_module_level=True)
 
+pytest_plugins = ["small_laws"]
 PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
 
 
@@ -35,6 +37,18 @@ def test_node_gives_the_bits_of_our_runtime(file: Path, tmp_path: Path) -> None:
     verdict = verdict_on(file, tmp_path / "answers.json")
     assert verdict.passed, verdict.text()
     assert verdict.same_bits == verdict.steps > 300
+
+
+def test_node_refuses_results_and_takes_measured_disturbances(disobedient_file: Path, tmp_path: Path) -> None:
+    """No shipped controller has measured disturbances or leaves its range; this one does both."""
+    vectors = json.loads((kit_of(disobedient_file) / "vectors.json").read_text())
+    refused = Counter(row.get("refused", "") for row in vectors["steps"])
+    assert min(refused["output"], refused["input"], refused[""]) >= 15
+    done = run("--conformance", kit_of(disobedient_file), tmp_path / "answers.json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = verdict_on(disobedient_file, tmp_path / "answers.json")
+    assert verdict.passed, verdict.text()
+    assert verdict.same_bits == verdict.steps
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
