@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import shutil
 from collections.abc import Callable
@@ -29,8 +30,9 @@ def name(file: Path) -> str:
 
 @cache
 def kit_of(file: Path) -> Path:
-    """The folder of the kit of one controller file, written once a process."""
+    """The folder of the kit of one controller file, written once a process and removed at its end."""
     folder = Path(mkdtemp(prefix="kit-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     write_kit(Controller(file), folder)
     return folder
 
