@@ -45,8 +45,8 @@ registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes
 	loopwright registry publish
 	loopwright registry serve --port $(PORT)
 
-bench: $(STAMP) ## run the benchmarks, about 12 minutes
-	@echo "benchmarks: about 12 minutes; each says beforehand what it measures and how long it takes"
+bench: $(STAMP) ## run the benchmarks, about 15 minutes
+	@echo "benchmarks: about 15 minutes; each says beforehand what it measures and how long it takes"
 	@for script in $(filter-out benchmarks/identification.py,$(wildcard benchmarks/[a-z]*.py)); do echo "== $$script"; python $$script || exit 1; done
 
 clean: ## remove what can be rebuilt (the virtual environment stays)
