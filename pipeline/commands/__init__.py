@@ -20,6 +20,7 @@ COMMANDS = {
     "inspect": "show what a controller file is and how its validation went",
     "bench": "measure how long a step of a controller file takes here",
     "conformance": "write test vectors of a controller file for a host in any language, or check its answers",
+    "fmu": "write a controller file as a Functional Mock-up Unit, for Simulink, Modelica tools and test benches",
     "laws": "list the control laws, or the parameters of one",
     "models": "list the kinds of model, or the parameters of one",
     "bounds": "compute what no controller of a case can beat",
