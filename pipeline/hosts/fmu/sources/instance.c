@@ -242,7 +242,8 @@ static bool is_ours(Instance *i, const void *bytes, size_t size) {
 }
 
 static bool instance_restore(Instance *i, const Saved *from) {
-  if (!from || !is_ours(i, from, saved_size(i))) return false;
+  if (!from) return REFUSE(i, "no state is given");
+  if (!is_ours(i, from, saved_size(i))) return false;
   size_t n_state = i->c.n_in[STATE];
   memcpy(i->memory, from->numbers, i->n_memory * sizeof *i->memory);
   memcpy(i->c.state, i->memory + i->n_memory - n_state, n_state * sizeof *i->memory);
