@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import shutil
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 from controller_fmus import MISSING, ONNXRUNTIME, file_of
+from kits import ROOT
 
 from pipeline.__main__ import main
+from pipeline.commands import Parser
+from pipeline.commands.fmu import options
+from pipeline.hosts.fmu.compiling import HOSTS, SOURCES
+from pipeline.hosts.fmu.variables import variables_of
+from serving import Controller
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
@@ -103,3 +110,24 @@ def test_a_compiler_that_fails_is_one_line(tmp_path: Path, monkeypatch: pytest.M
     assert "cannot compile the FMU: " in told
     assert "this is no header of onnxruntime" in told
     assert [path.name for path in tmp_path.iterdir()] == ["onnxruntime_c_api.h"]
+
+
+def test_the_page_names_every_option_and_variable() -> None:
+    page = (ROOT / "docs" / "fmu.md").read_text()
+    parser = Parser()
+    options(parser)
+    names = {name for action in parser._actions for name in action.option_strings} - {"-h", "--help"}
+    assert names == {"--out", "--fmi", "--onnxruntime"}
+    assert all(f"{name} " in page for name in names)
+    groups = {row.group for row in variables_of(Controller(PID).manifest)} - {"time"}
+    assert groups == {"sp", "pv", "mv_applied", "mv_start", "mv", "info", "fault", "use_mv_applied"}
+    assert all(f"`{group}" in page for group in (*groups, "dv."))
+    assert "**Not tested: Simulink, OpenModelica, Dymola" in page
+
+
+def test_the_package_ships_what_is_compiled() -> None:
+    """The globs of package data name every file that the command reads."""
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["pipeline"]
+    shipped = {path for glob in data for path in (ROOT / "pipeline").glob(glob)}
+    assert {HOSTS / "c" / "host.c", *SOURCES.iterdir()} <= shipped
+    assert (ROOT / "examples" / "embed" / "c" / "host.c").resolve() == HOSTS / "c" / "host.c"
