@@ -130,9 +130,13 @@ static void carry(void *i, void *other) {
 
 int main(int n, char **words) {
   NEED(n == 4);
+  const char *locale = getenv("DRIVER_LOCALE"); /* of the program around an FMU, as some set it */
+  NEED(!locale || (setlocale(LC_NUMERIC, locale) && strtod("0,5", NULL) == 0.5));
   NEED(!instantiate(words[1], "{wrong}") && !instantiate("/nowhere", words[2]) && said == 2);
   void *i = instantiate(words[1], words[2]), *other = instantiate(words[1], words[2]);
   NEED(i && other);
+  NEED(!locale || strtod("0,5", NULL) == 0.5); /* and it is as it was */
+  setlocale(LC_NUMERIC, "C");
   begin(other);
   const Instance *in = i;
   size_t n_in = in->at[G_START] - in->at[G_SP], n_out = in->n[G_MV] + in->n[G_INFO];

@@ -400,6 +400,14 @@ def test_a_tool_that_knows_nothing_of_us_simulates_the_file(fmi: int, tmp_path: 
     assert not found["fault"].any()
 
 
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_may_lie_in_a_folder_of_any_name(fmi: int, tmp_path: Path) -> None:
+    (tmp_path / "50% of \u00fc #1").symlink_to(unpacked(PID, fmi))  # FMI 2.0 gives it as a URI, with escapes
+    with closing(Unit(tmp_path / "50% of \u00fc #1")) as u:
+        u.begin().step(0.5)
+        assert not u.fault
+
+
 def test_the_same_controller_gives_the_same_file(tmp_path: Path) -> None:
     for k in (1, 2):
         folder = tmp_path / str(k)

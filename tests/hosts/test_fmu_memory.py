@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -50,13 +51,16 @@ def steps_of(of: str, to: Path) -> int:
     return len(lines)
 
 
-def played(driver: Path, of: str, fmi: int, folder: Path) -> subprocess.CompletedProcess[str]:
+def played(
+    driver: Path, of: str, fmi: int, folder: Path, environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     steps_of(of, folder / "steps")
     resources = unpacked(of, fmi) / "resources"
     return subprocess.run(
         [str(driver), str(resources), token_of(controller_of(of)), str(folder / "steps")],
         capture_output=True,
         text=True,
+        env={**os.environ, **(environment or {})},
         timeout=120,
     )
 
@@ -76,3 +80,15 @@ def test_a_leak_of_the_fmu_would_be_found(tmp_path: Path) -> None:
     done = played(driver, "thiosulfate_cstr/pid", 3, tmp_path)
     assert done.returncode != 0
     assert "LeakSanitizer: detected memory leaks" in done.stderr
+
+
+def test_a_program_with_decimal_commas_can_load_the_fmu(tmp_path: Path) -> None:
+    """The manifest's numbers have points, and strtod obeys the locale of the program around it."""
+    (tmp_path / "comma").write_text('comment_char %\nescape_char /\nLC_NUMERIC\ndecimal_point ","\nthousands_sep ""\n'
+                                    "grouping -1\nEND LC_NUMERIC\n")  # fmt: skip
+    (tmp_path / "locales").mkdir()
+    words = ["localedef", "-c", "-i", str(tmp_path / "comma"), str(tmp_path / "locales" / "comma")]
+    subprocess.run(words, capture_output=True)  # it warns of the other categories; the driver needs this one
+    environment = {"LOCPATH": str(tmp_path / "locales"), "DRIVER_LOCALE": "comma"}
+    done = played(built(3, tmp_path), "thiosulfate_cstr/pid", 3, tmp_path, environment)
+    assert done.returncode == 0, done.stderr
