@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 from functools import cache
@@ -56,8 +57,9 @@ def tools() -> Toolchain:
 
 @cache
 def unpacked(name: str, fmi: int) -> Path:
-    """The folder of an FMU, written once a process."""
+    """The folder of an FMU, written once a process and removed at its end."""
     folder = Path(mkdtemp(prefix="controller-fmu-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     write_folder(controller_of(name), folder, fmi, tools())
     return folder
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -18,11 +19,14 @@ from pipeline.hosts.fmu.description import build_description, description, token
 from pipeline.hosts.fmu.folder import identifier_of, pack, write_folder
 from pipeline.hosts.fmu.gate import check, problems
 from pipeline.hosts.fmu.variables import variables_of
+from serving import Controller
+from serving.conformance.steps import Answer, answered
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
 fmpy = pytest.importorskip("fmpy")
 
+pytest_plugins = ["small_laws"]
 PID = "thiosulfate_cstr/pid"
 # Laws with and without state, read-back and network; several MVs, one of set values; several set points.
 # The law's part is the same C in both versions, so only some are played in both.
@@ -52,24 +56,50 @@ def state_of(u: Unit, of: str) -> bytes:
 
 
 # ------------------------------------------------------------------ the same bits
-@pytest.mark.parametrize(("of", "fmi"), [(of, fmi) for of, versions in PLAYED.items() for fmi in versions])
-def test_an_fmu_gives_the_bits_of_the_kit(of: str, fmi: int, opened: ExitStack) -> None:
-    controller, u, compared = controller_of(of), unit(opened, of, fmi), 0
-    period, groups = controller.manifest.period_s, [n for n in controller.manifest.inputs if n != "state"]
-    for answer in answers_of(of):
+def compared(controller: Controller, answers: list[Answer], u: Unit) -> Counter[str]:
+    """Play a kit's steps; how many gave numbers ("") and how many were refused, and because of what."""
+    n, seen = controller.manifest.n_state, Counter[str]()
+    groups = [group for group in controller.manifest.inputs if group != "state"]
+
+    def found() -> list[bytes]:
+        state = u.written()[-8 * n :] if n else b""  # it stands last
+        return [bytes(u.get("mv")), bytes(u.get("info")), state]
+
+    for answer in answers:
         if answer.given.cold:
             u.reset()
             u.begin()
-        before = [u.get("mv"), u.get("info"), state_of(u, of)]
+        before = found()
         u.set(**{group: answer.given.inputs[group] for group in groups})
-        u.step(period)
-        assert u.fault == (answer.step is None)
+        u.step(controller.manifest.period_s)
         step = answer.step
-        wanted = before if step is None else [step.mv, step.info, step.state]
-        for ours, theirs in zip([u.get("mv"), u.get("info"), state_of(u, of)], wanted, strict=True):
-            assert bytes(ours) == bytes(theirs)
-        compared += step is not None
-    assert compared > 300
+        assert u.fault == (step is None)
+        assert found() == (before if step is None else [bytes(step.mv), bytes(step.info), bytes(step.state)])
+        seen[answer.refused] += 1
+    return seen
+
+
+@pytest.mark.parametrize(("of", "fmi"), [(of, fmi) for of, versions in PLAYED.items() for fmi in versions])
+def test_an_fmu_gives_the_bits_of_the_kit(of: str, fmi: int, opened: ExitStack) -> None:
+    seen = compared(controller_of(of), answers_of(of), unit(opened, of, fmi))
+    assert seen[""] > 300
+    assert seen["input"] >= 6
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_refuses_results_and_takes_measured_disturbances(
+    fmi: int, disobedient_file: Path, tmp_path: Path
+) -> None:
+    """No shipped controller has measured disturbances or leaves its range; this one does both."""
+    controller = Controller(disobedient_file)
+    write_folder(controller, tmp_path, fmi, tools())
+    assert problems(tmp_path) == []
+    with closing(Unit(tmp_path, logging=True)) as u:
+        seen = compared(controller, answered(controller), u)
+        assert u.names("dv")
+        assert min(seen.values()) >= 15
+        assert len(u.said) == seen["input"] + seen["output"]
+        assert sum("the law gave valve = " in words and "%, which it may not have" in words for words in u.said) > 0
 
 
 def test_the_gate_lets_no_fmu_of_another_controller_pass(tmp_path: Path) -> None:
