@@ -28,14 +28,13 @@ fmpy = pytest.importorskip("fmpy")
 
 pytest_plugins = ["small_laws"]
 PID = "thiosulfate_cstr/pid"
-# Laws with and without state, read-back and network; several MVs, one of set values; several set points.
+# Laws with and without state, read-back and network; several MVs, one of set values.
 # The law's part is the same C in both versions, so only some are played in both.
 PLAYED = {
     PID: (2, 3), "thiosulfate_cstr/incad": (3,), "jacketed_batch_reactor/fuzzy_feedforward_observer": (2, 3),
     "ph_neutralization/predictive": (3,), "batch_reactor/recursive_pid": (2,), "reversible_cstr/model_reference": (3,),
     "henson_seborg_cstr/local_pid_network": (2,),
 }  # fmt: skip
-Unpacked = tuple[str, int]
 
 
 @pytest.fixture
