@@ -1,4 +1,4 @@
-"""``python -m serving``: inspect and bench a controller file, show that a host computes the same, sign and verify it."""
+"""``python -m serving``: inspect, bench, sign and verify a controller file, or write test vectors of it."""
 
 from __future__ import annotations
 
