@@ -20,7 +20,7 @@ help: ## list the targets
 
 setup: $(STAMP) ## make the virtual environment .venv (the others call it)
 
-$(STAMP): pyproject.toml constraints.txt tools/setup.sh
+$(STAMP): pyproject.toml constraints.txt serving/version.py tools/setup.sh
 	@PYTHON="$(PYTHON)" bash tools/setup.sh "$(VENV)"
 	@touch $@
 

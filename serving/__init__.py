@@ -17,6 +17,7 @@ from serving.grid import RunReport
 from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
 from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
+from serving.version import __version__ as __version__
 
 __all__ = [
     "Allowed",

@@ -34,10 +34,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve the plant until Ctrl-C."""
-    try:
-        from pipeline.simulation.opcua_server import PlantServer
-    except ModuleNotFoundError as error:
-        raise PipelineError(f"{error.name} is not installed; pip install 'loopwright[plant]' brings it") from None
+    from pipeline.simulation.opcua_server import PlantServer
+
     case = choose(CASES, options.case, "case", "plant serve")
     test = next(iter(case.scenarios().values()))[0]
     server = PlantServer(
