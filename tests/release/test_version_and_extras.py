@@ -15,6 +15,7 @@ import pytest
 import serving
 from pipeline.__main__ import main
 from pipeline.commands.extras import advice, extra_of
+from pipeline.stages import check
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -65,3 +66,14 @@ def test_a_missing_module_of_our_own_is_a_fault_and_stays_one(monkeypatch: pytes
     with pytest.raises(ModuleNotFoundError, match=r"pipeline\.commands\.inspect"):
         main(["inspect", "x.onnx"])
     assert advice("pipeline.commands.inspect") is None
+
+
+def test_check_says_once_that_a_wheel_holds_no_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And does not ask for what would be computed into site-packages."""
+    monkeypatch.chdir(ROOT)
+    wheel = Path("/venv/lib/python3.11/site-packages/pipeline/cases")
+    monkeypatch.setattr(check, "bounds_path", lambda case: wheel / case.name / "bounds.json")
+    said = [line for line in check.notes() if "bounds" in line]
+    assert said == [check.FROM_A_WHEEL]
+    monkeypatch.setattr(check, "bounds_path", lambda case: ROOT / "pipeline/cases" / case.name / "none.json")
+    assert any("run `loopwright bounds" in line for line in check.notes())
