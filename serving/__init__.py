@@ -19,6 +19,7 @@ from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate
 from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.trust import Controller
+from serving.version import __version__ as __version__
 
 __all__ = [
     "Allowed",

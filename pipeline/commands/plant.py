@@ -40,10 +40,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Serve the plant until Ctrl-C, or spoil a signal of one that is served."""
-    try:
-        from pipeline.simulation.opcua_server import PlantServer, spoil
-    except ModuleNotFoundError as error:
-        raise PipelineError(f"{error.name} is not installed; pip install 'loopwright[plant]' brings it") from None
+    from pipeline.simulation.opcua_server import PlantServer, spoil
+
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what went wrong is said below, in a line
     if options.action == "fault":
         asyncio.run(spoil(options.endpoint, options.tag, "" if options.kind == "ok" else options.kind))
