@@ -73,7 +73,10 @@ def page_of(case: Case, artifacts: Path) -> Playground:
 def _cases(names: list[str], artifacts: Path) -> list[Case]:
     cases = all_cases()
     if names == [ALL]:
-        return [case for name, case in cases.items() if any((artifacts / name).glob("*.onnx"))]
+        found = [case for name, case in cases.items() if any((artifacts / name).glob("*.onnx"))]
+        if not found:
+            raise ParamsError(f"{artifacts} has no controller; make some with `loopwright run`")
+        return found
     return [choose(cases, name, "case", "playground") for name in dict.fromkeys(names)]
 
 

@@ -35,7 +35,7 @@ def about(case: Case, controllers: Sequence[Controller], validation: Validation 
         "noise_std": case.noise_std.tolist(),
         "noise_colour": plant.noise_colour.tolist(),
         "parameters": _parameters(case, plant, tests),
-        "tests": [_test(plant, test) for test in tests.values()],
+        "tests": [_by_hand(plant, tests), *(_test(plant, test) for test in tests.values())],
         "controllers": [_controller(controller, validation) for controller in controllers],
         "beside": _first_two(case, controllers, validation),
     }
@@ -80,6 +80,17 @@ def _test(plant: EquationPlant, test: Scenario) -> dict[str, Any]:
     }
 
 
+def _by_hand(plant: EquationPlant, tests: Mapping[str, Scenario]) -> dict[str, Any]:
+    """The start of the first test, after which nothing moves by itself; without tests, that of the plant."""
+    if tests:
+        start = _test(plant, next(iter(tests.values())))
+    else:
+        x, mv = plant.start
+        start = _test(plant, Scenario("start", "", plant.measure(x)[None, : len(plant.sp_signals)], x, mv))
+    course = [row for row in start["course"] if row[0] == 0]
+    return {**start, "name": "by hand", "title": "By hand: nothing moves by itself", "course": course}
+
+
 def _moves(what: str, columns: Sequence[Array] | Array) -> list[tuple[str, int, int, float]]:
     rows = []
     for i, values in enumerate(columns):
@@ -90,11 +101,12 @@ def _moves(what: str, columns: Sequence[Array] | Array) -> list[tuple[str, int, 
 
 def _controller(controller: Controller, validation: Validation | None) -> dict[str, Any]:
     name = controller.path.stem
-    titles = {} if validation is None else validation.titles.laws
+    short, title = law_name(name), "" if validation is None else validation.titles.laws.get(name, "")
     manifest = json.loads(controller.manifest.to_json())
     return {
         "name": name,
-        "title": titles.get(name) or law_name(name),
+        "short": short,
+        "title": title if title.casefold() != short.casefold() else "",
         "file": controller.path.name,
         "sha256": controller.sha256,
         **{key: manifest[key] for key in ("law", "period_s", "sp", "pv", "dv", "mv", "n_state", "info", "inputs")},

@@ -10,7 +10,7 @@ export class Faceplate {
     Object.assign(this, { box, lane, simulation, about: simulation.about });
     const { about } = this;
     const i = lane === "A" ? 0 : 1;
-    this.choice = element("select", { "aria-label": `Controller ${lane}`, "data-choose": lane }, ...about.controllers.map((c) => element("option", { value: c.name }, c.title)));
+    this.choice = element("select", { "aria-label": `Controller ${lane}`, "data-choose": lane }, ...about.controllers.map((c) => element("option", { value: c.name }, c.short)));
     this.choice.value = simulation.chosen[i];
     this.choice.addEventListener("change", async () => {
       await simulation.choose(i, this.choice.value);
@@ -25,6 +25,7 @@ export class Faceplate {
         changed(lane, `${before} → ${mode}`);
       } }, mode));
     this.words = element("p", { class: "hint" });
+    this.title = element("p", { class: "hint title" });
     this.reason = element("p", { class: "reason", hidden: true });
     this.values = element("div", { class: "values" });
     this.hands = about.mv.map((s, place) => field({
@@ -42,6 +43,7 @@ export class Faceplate {
     this.info = element("dl", {});
     box.replaceChildren(
       element("div", { class: "faceplate-head" }, element("h2", {}, element("span", { class: `key key-${lane}`, "aria-hidden": "true" }), ` ${lane}`), this.choice),
+      this.title,
       element("div", { class: "mode-line" }, this.mode, element("div", { class: "buttons" }, ...this.buttons)),
       this.words,
       this.reason,
@@ -63,6 +65,7 @@ export class Faceplate {
     say(this.mode, loop.mode);
     this.mode.dataset.mode = loop.mode;
     say(this.words, MODES[loop.mode]);
+    say(this.title, loop.controller.manifest.title);
     for (const button of this.buttons) button.setAttribute("aria-pressed", String(button.dataset.mode === loop.mode));
     const reason = scan?.reason && loop.mode !== "AUTO" ? `▲ ${scan.reason}` : "";
     this.reason.hidden = !reason;
@@ -77,10 +80,10 @@ export class Faceplate {
       this.hand.dataset.mode = loop.mode;
     }
     const told = notes(about, loop.controller.manifest, scan, here.mv);
-    const text = told.join();
+    const text = JSON.stringify(told);
     if (this.notes.dataset.text !== text) {
       this.notes.dataset.text = text;
-      this.notes.replaceChildren(...told.map((words) => element("li", {}, `◆ ${words}`)));
+      this.notes.replaceChildren(...told.map(({ watch, words }) => element("li", { class: watch ? "watch" : "" }, `${watch ? "◆" : "○"} ${words}`)));
     }
     const names = loop.controller.manifest.info;
     this.info.replaceChildren(...names.flatMap((name, i) => [element("dt", {}, name), element("dd", {}, figure(scan?.info?.[i]))]));
@@ -124,19 +127,20 @@ export class Faceplate {
 export function notes(about, manifest, scan, applied) {
   if (!scan) return [];
   const told = [];
+  const tell = (words, watch = false) => told.push({ words: words.trim(), watch });
   const of = (name) => (scan.info && manifest.info.includes(name) ? scan.info[manifest.info.indexOf(name)] : null);
-  if (of("in_domain") === 0) told.push(`outside its applicability domain (leverage ${figure(of("leverage"))}): its models never saw such a state`);
+  if (of("in_domain") === 0) tell(`outside its applicability domain (leverage ${figure(of("leverage"))}): its models never saw such a state`, true);
   const [low, high, sp] = [of("sp_min"), of("sp_max"), of("sp_requested")];
   const s = about.sp[0];
   const span = s.high - s.low;
   if (low !== null && high !== null && sp !== null && low < high) {
     const at = Math.abs(sp - low) < NEAR * span ? low : Math.abs(sp - high) < NEAR * span ? high : null;
-    if (at !== null) told.push(`it asks its model for ${s.name} = ${number(at, s)} ${unit(s)} next, the end of what it may ask for`.trim());
+    if (at !== null) tell(`it asks for ${s.name} = ${number(at, s)} ${unit(s)} next, the end of what it may ask for`);
   }
   manifest.mv.forEach((mv, i) => {
     const asked = of(manifest.mv.length === 1 ? "mv_requested" : `${mv.name}_requested`);
-    if (asked !== null && (asked < mv.low || asked > mv.high)) told.push(`${mv.name} is at its limit; the law would give ${figure(asked)} ${unit(mv)}`.trim());
-    else if (!mv.values && scan.law && scan.mode === "AUTO" && (scan.mv[i] === mv.low || scan.mv[i] === mv.high)) told.push(`${mv.name} is at its limit`);
+    if (asked !== null && (asked < mv.low || asked > mv.high)) tell(`${mv.name} is at its limit; the law would give ${figure(asked)} ${unit(mv)}`);
+    else if (!mv.values && scan.law && scan.mode === "AUTO" && (scan.mv[i] === mv.low || scan.mv[i] === mv.high)) tell(`${mv.name} is at its limit`);
   });
   return told;
 }

@@ -51,7 +51,7 @@ function build(about) {
   $("speed").replaceChildren(...SPEEDS.map(([rate, words]) => element("option", { value: rate }, words)));
   $("speed").value = String(speed);
   $("speed").addEventListener("change", () => (speed = Number($("speed").value)));
-  $("test").replaceChildren(...about.tests.map((test, i) => element("option", { value: i }, `${test.name}: ${test.title}`)));
+  $("test").replaceChildren(...about.tests.map((test, i) => element("option", { value: i }, test.title)));
   $("test").addEventListener("change", () => reset(about.tests[$("test").value]));
   $("go").addEventListener("click", () => run(!running));
   $("step").addEventListener("click", () => steps(1));
@@ -198,7 +198,8 @@ async function reset(test) {
 }
 
 function keys(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, button, summary, textarea")) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select")) return;
+  if (event.key === " " && event.target.closest("button, summary")) return; // the browser presses it
   const act = { " ": () => run(!running), ArrowRight: () => steps(1), r: () => reset(), R: () => reset() }[event.key];
   if (!act) return;
   event.preventDefault();
@@ -250,12 +251,14 @@ function look(samples) {
 
 function event(who, words, quiet = false, k = simulation.k) {
   const list = $("events");
-  list.prepend(element("li", { class: quiet ? "quiet" : "" }, element("time", {}, duration(k * simulation.about.period_s)), element("span", { class: "who" }, who), element("span", { class: "what" }, words)));
+  const row = element("li", { class: quiet ? "quiet" : "", "data-k": k }, element("time", {}, duration(k * simulation.about.period_s)), element("span", { class: "who" }, who), element("span", { class: "what" }, words));
+  list.insertBefore(row, [...list.children].find((other) => Number(other.dataset.k) <= k) ?? null); // the newest first
   while (list.children.length > MOST_EVENTS) list.lastChild.remove();
 }
 
 start().catch((error) => {
   $("banner").hidden = false;
   say($("banner"), `▲ ${error.message}`);
+  say($("clock"), "");
   document.body.dataset.ready = "no";
 });

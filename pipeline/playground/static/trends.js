@@ -1,8 +1,8 @@
 // Trends of both controllers: one chart a signal, one cursor and one time axis for all.
 import { element, number, unit } from "loopwright/format";
 
-const TALL = 170;
-const SMALL = 130;
+const TALL = 175;
+const SMALL = 145;
 const LABELS = { time: 80, value: 20 }; // pixels that a label of an axis needs
 const STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 21600, 43200, 86400]; // of the time axis [s]
 const DASHES = { sp: "dashed", B: "dashed", asked: "dotted" };
