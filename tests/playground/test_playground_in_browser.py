@@ -8,6 +8,9 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -429,3 +432,20 @@ def test_a_picture_of_a_changed_set_point_a_warmer_feed_and_noise(page: Page, si
     if PICTURES:
         page.evaluate("document.activeElement.blur(); scrollTo(0, 0)")
         page.screenshot(path=Path(PICTURES) / "playground.png", full_page=True)
+
+
+def test_the_command_serves_the_page_until_it_is_interrupted(page: Page) -> None:
+    code = "import sys; from pipeline.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    words = ["playground", CASE, "--port", "0", "--artifacts", str(ARTIFACTS)]
+    process = subprocess.Popen([sys.executable, "-c", code, *words], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        url = re.search(r"http://127\.0\.0\.1:\d+/\w+/", process.stdout.readline())
+        assert url is not None
+        opened(page, url[0])
+        steps(page, 2)
+        expect(page.locator("#clock")).to_contain_text("sample 2")
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        process.stdout.close()
