@@ -3,10 +3,12 @@ import { field } from "loopwright/fields";
 import { element, figure, number, say, unit } from "loopwright/format";
 
 const MODES = { AUTO: "The law sets the MV.", MANUAL: "You set the MV.", HOLD: "The last MV stays." };
-const NEAR = 1e-9; // share of a range within which two values are one
+const NEAR = 1e-6; // share of a range within which two values are one
+const atEnd = (value, s) => Math.min(Math.abs(value - s.low), Math.abs(value - s.high)) <= NEAR * (s.high - s.low);
 
 export class Faceplate {
-  constructor(box, lane, simulation, { changed, refused }) {
+  // `changed` is told what was done here, `said` the same where no controller or mode changed.
+  constructor(box, lane, simulation, { changed, said }) {
     Object.assign(this, { box, lane, simulation, about: simulation.about });
     const { about } = this;
     const i = lane === "A" ? 0 : 1;
@@ -36,7 +38,7 @@ export class Faceplate {
         const { loop } = this.here;
         const before = loop.mv[place];
         loop.setMv(loop.mv.map((v, j) => (j === place ? value : v)));
-        if (value !== before) refused(lane, `MV by hand: ${s.name} = ${+value.toPrecision(6)} ${unit(s)}`);
+        if (value !== before) said(lane, `MV by hand: ${s.name} = ${+value.toPrecision(6)} ${unit(s)}`);
       },
     }));
     this.notes = element("ul", { class: "notes", "aria-live": "polite" });
@@ -79,7 +81,7 @@ export class Faceplate {
       if (loop.mode === "MANUAL") this.hand.open = true;
       this.hand.dataset.mode = loop.mode;
     }
-    const told = notes(about, loop.controller.manifest, scan, here.mv);
+    const told = notes(about, loop.controller.manifest, scan);
     const text = JSON.stringify(told);
     if (this.notes.dataset.text !== text) {
       this.notes.dataset.text = text;
@@ -118,13 +120,13 @@ export class Faceplate {
       bar.append(line);
     }
     return element("div", { class: bad ? "value bad" : "value", "data-signal": `${kind} ${this.lane} ${signal.name}` },
-      element("span", { class: "kind" }, kind), element("span", { class: "name" }, signal.name), element("span", { class: "number" }, number(value, signal)),
+      element("span", { class: "kind" }, kind), element("span", { class: "name" }, signal.name), element("span", { class: "number" }, signal.values ? String(value) : number(value, signal)),
       element("span", { class: "unit" }, unit(signal)), bar, element("span", { class: "quality" }, bad ? `▲ ${words}` : ""));
   }
 }
 
 // In words, what of the law's own numbers a person should know. Nothing when all is well.
-export function notes(about, manifest, scan, applied) {
+export function notes(about, manifest, scan) {
   if (!scan) return [];
   const told = [];
   const tell = (words, watch = false) => told.push({ words: words.trim(), watch });
@@ -140,7 +142,7 @@ export function notes(about, manifest, scan, applied) {
   manifest.mv.forEach((mv, i) => {
     const asked = of(manifest.mv.length === 1 ? "mv_requested" : `${mv.name}_requested`);
     if (asked !== null && (asked < mv.low || asked > mv.high)) tell(`${mv.name} is at its limit; the law would give ${figure(asked)} ${unit(mv)}`);
-    else if (!mv.values && scan.law && scan.mode === "AUTO" && (scan.mv[i] === mv.low || scan.mv[i] === mv.high)) tell(`${mv.name} is at its limit`);
+    else if (!mv.values && scan.law && scan.mode === "AUTO" && atEnd(scan.law[i], mv)) tell(`${mv.name} is at its limit`);
   });
   return told;
 }

@@ -96,7 +96,7 @@ function build(about) {
 
   faceplates = LANES.map((lane) => new Faceplate(document.querySelector(`.faceplate[data-lane=${lane}]`), lane, simulation, {
     changed: (who, words) => { event(who, words); refresh(); rechart(); },
-    refused: event,
+    said: event,
   }));
   $("spans").replaceChildren(...SPANS.map(([samples, words]) => element("button", { type: "button", "data-span": samples, "aria-pressed": String(samples === span), onclick: () => look(samples) }, words)));
   $("scale").addEventListener("click", () => {
