@@ -14,7 +14,7 @@ const $ = (id) => document.getElementById(id);
 const WASM = "ort-wasm-simd-threaded.wasm";
 const SPEEDS = [[1, "1 sample/s"], [2, "2 samples/s"], [5, "5 samples/s"], [10, "10 samples/s"], [20, "20 samples/s"], [50, "50 samples/s"], [Infinity, "as fast as it can"]];
 const USUAL = 20; // samples a second
-const SPANS = [[100, "100 samples"], [300, "300"], [1000, "1000"], [Infinity, "all"]];
+const SPANS = [[100, "100 samples"], [300, "300"], [1000, "1000"], [Infinity, "all"]]; // all: as many as are kept, see simulation.js
 const FRAME_MS = 40; // of computing, after which the picture is drawn
 const MOST_EVENTS = 200;
 
@@ -224,7 +224,7 @@ function rechart() {
   const { about } = simulation;
   const infos = [...new Set(simulation.chosen.flatMap((name) => simulation.controllers[name].manifest.info))];
   const all = plan(about, infos, simulation.asked);
-  for (const [i, p] of about.parameters.entries()) if (simulation.p[i] !== p.value) shown.add(`disturbance ${p.name}`);
+  for (const [i, p] of about.parameters.entries()) if (simulation.p[i] !== p.value) shown.add(`parameter ${p.name}`);
   const wanted = all.filter((c) => !c.optional || shown.has(`${c.optional} ${c.name}`));
   const key = wanted.map((c) => `${c.optional ?? ""} ${c.name}`).join() + infos.join() + simulation.asked;
   if (key === moved) return;

@@ -17,7 +17,7 @@ export function plan(about, infos, asked) {
     ...about.pv.map((s, i) => ({ name: s.name, signal: s, tall: i < about.sp.length, lines: [...(i < about.sp.length ? [{ column: `sp ${about.sp[i].name}`, label: "SP", kind: "sp" }] : []), ...both("pv", s.name)] })),
     ...about.mv.map((s) => ({ name: s.name, signal: s, tall: true, stepped: true, lines: [...both("mv", s.name), ...wish(s.name)] })),
     ...about.dv.map((s) => ({ name: s.name, signal: s, stepped: true, lines: one(`dv ${s.name}`, "DV") })),
-    ...about.parameters.map((p) => ({ name: p.name, signal: p, stepped: true, optional: "disturbance", lines: one(`p ${p.name}`, "value") })),
+    ...about.parameters.map((p) => ({ name: p.name, signal: p, stepped: true, optional: "parameter", lines: one(`p ${p.name}`, "value") })),
     ...infos.map((name) => ({ name, signal: { name, unit: "" }, stepped: true, optional: "law", lines: both("info", name) })),
   ];
 }
