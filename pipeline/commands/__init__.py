@@ -16,6 +16,7 @@ COMMANDS = {
     "simulate": "close the loop of a controller file over its plant",
     "loop": "run a controller on a plant over OPC UA: init, check, run, export",
     "plant": "serve a simulated plant over OPC UA, to try a loop on",
+    "playground": "try a plant and two of its controllers by hand in a browser",
     "stress": "close the loops of a controller file over many plants drawn at random",
     "inspect": "show what a controller file is and how its validation went",
     "bench": "measure how long a step of a controller file takes here",

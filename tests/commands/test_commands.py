@@ -19,7 +19,7 @@ from pipeline.models import MODELS
 ROOT = Path(__file__).parents[2]
 COMMANDS_OF_TODAY = {
     "new", "run", "check", "results", "simulate", "stress", "inspect", "bench", "laws", "models", "bounds", "registry",
-    "loop", "plant", "keygen", "sign", "verify", "conformance", "fmu",
+    "loop", "plant", "keygen", "sign", "verify", "conformance", "fmu", "playground",
 }  # fmt: skip
 
 

@@ -19,8 +19,13 @@ OPENED = {
     "pipeline/report/templates": {".j2"},
     "pipeline/hosts/c": {".c"},
     "pipeline/hosts/fmu/sources": {".c"},
+    "pipeline/playground/static": {".js", ".css", ".html"},
+    "pipeline/playground/npm": {".json"},
 }
-FEW = {"serving/py.typed", "pipeline/py.typed", "serving/page/static/uPlot-LICENSE"}
+FEW = {
+    *("serving/py.typed", "pipeline/py.typed", "serving/page/static/uPlot-LICENSE"),
+    "pipeline/playground/npm/onnxruntime-LICENSE",
+}
 DIST_INFO = {
     *("METADATA", "WHEEL", "RECORD", "entry_points.txt", "top_level.txt"),
     *("licenses/LICENSE", "licenses/serving/page/static/uPlot-LICENSE"),
