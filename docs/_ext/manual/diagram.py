@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 
-WIDE, HIGH, GAP_X, GAP_Y, MARGIN = 128, 44, 46, 44, 22
+WIDE, HIGH, GAP_Y, MARGIN = 128, 44, 44, 22
+LETTER = 6.3  # width of a label's letter [px]
 ARROW = re.compile(r"^(\S+) > (\S+)( below| above)?(?: : (.+))?$")
 Point = tuple[float, float]
 
@@ -27,12 +28,13 @@ class Cell:
     words: str
     row: int
     column: int
+    gap: float = 46  # between columns [px]
 
     @property
     def centre(self) -> Point:
         """Centre [px]."""
         return (
-            MARGIN + WIDE / 2 + self.column * (WIDE + GAP_X),
+            MARGIN + WIDE / 2 + self.column * (WIDE + self.gap),
             MARGIN + GAP_Y / 2 + HIGH / 2 + self.row * (HIGH + GAP_Y),
         )
 
@@ -57,10 +59,11 @@ def drawn(text: str, words: str) -> str:
     if lines and lines[0] == "floors":
         return _floors(lines[1:], words)
     at = lines.index("--") if "--" in lines else len(lines)
-    cells = {cell.key: cell for row, line in enumerate(lines[:at]) for cell in _cells(row, line)}
+    gap = max([46.0, *(LETTER * len(line.split(" : ")[1]) + 22 for line in lines[at:] if " : " in line)])
+    cells = {cell.key: replace(cell, gap=gap) for row, line in enumerate(lines[:at]) for cell in _cells(row, line)}
     arrows = [_arrow(line, cells) for line in lines[at + 1 :]]
     columns, rows = max(c.column for c in cells.values()) + 1, max(c.row for c in cells.values()) + 1
-    width, height = 2 * MARGIN + columns * (WIDE + GAP_X) - GAP_X, 2 * MARGIN + rows * (HIGH + GAP_Y)
+    width, height = 2 * MARGIN + columns * (WIDE + gap) - gap, 2 * MARGIN + rows * (HIGH + GAP_Y)
     lanes = {"below": 0, "above": 0}
     body = [path for arrow in arrows for path in _path(*arrow, lanes)] + [_shape(c) for c in cells.values()]
     return _svg(body, width, height, words)
@@ -98,12 +101,14 @@ def _path(a: Cell, b: Cell, lane: str, words: str, lanes: dict[str, int]) -> Ite
     elif a.column == b.column:
         start, end = (a.side("bottom"), b.side("top")) if a.row < b.row else (a.side("top"), b.side("bottom"))
         points = [start, end]
+    elif a.row < b.row:
+        start, end = a.side("bottom"), b.side("left" if a.column < b.column else "right")
+        points = [start, (start[0], end[1]), end]
     else:
-        start = a.side("right" if a.column < b.column else "left")
-        end = b.side("top" if a.row < b.row else "bottom")
+        start, end = a.side("right" if a.column < b.column else "left"), b.side("bottom")
         points = [start, (end[0], start[1]), end]
     yield _line(points)
-    (x0, y0), (x1, y1) = points[0], points[1]
+    (x0, y0), (x1, y1) = points[-2] if a.row < b.row and a.column != b.column else points[0], points[-1 if a.row < b.row else 1]
     if words and y0 == y1:
         yield _text((x0 + x1) / 2, y0 - 6, words, "label")
     elif words:
