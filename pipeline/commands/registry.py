@@ -82,7 +82,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     one = command("fetch", _fetch, "write a controller and its manifest into a folder")
     names = "CASE (its champion), CASE-CONTROLLER (its best version), CASE-CONTROLLER@ALIAS or CASE-CONTROLLER/VERSION"
     one.add_argument("controller", help=names)
-    one.add_argument("folder", type=Path)
+    one.add_argument("folder", type=Path, help="where they go")
     one = command("serve", _serve, "open MLflow's UI on this machine only, its job execution off")
     one.add_argument("--port", type=int, default=5000, help="default: %(default)s")
 

@@ -7,9 +7,8 @@ import importlib
 import os
 from collections.abc import Iterator, Sequence
 
-from pipeline.commands import COMMANDS, Parser
-
 from manual.markdown import code, table
+from pipeline.commands import COMMANDS, Parser
 
 Actions = argparse._SubParsersAction
 

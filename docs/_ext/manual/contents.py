@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from manual.commands import commands
+from manual.errors import errors
+from manual.floors import contracts, floors
+from manual.laws import choice, facts, info_names, results
+from manual.markdown import code, prose, table
+from manual.parameters import parameters, whole
 from pipeline.commands.parameters import first_sentence
 from pipeline.config.exports import ExportParams
 from pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams
@@ -15,13 +21,6 @@ from pipeline.models import MODELS
 from pipeline.models.training.fit import TRAINERS
 from serving.manifest import Manifest
 from serving.station.settings import Settings
-
-from manual.commands import commands
-from manual.errors import errors
-from manual.floors import contracts, floors
-from manual.laws import choice, facts, info_names, results
-from manual.markdown import code, prose, table
-from manual.parameters import parameters, whole
 
 SECTIONS = {
     "cases": CaseParams,

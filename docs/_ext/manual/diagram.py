@@ -108,7 +108,10 @@ def _path(a: Cell, b: Cell, lane: str, words: str, lanes: dict[str, int]) -> Ite
         start, end = a.side("right" if a.column < b.column else "left"), b.side("bottom")
         points = [start, (end[0], start[1]), end]
     yield _line(points)
-    (x0, y0), (x1, y1) = points[-2] if a.row < b.row and a.column != b.column else points[0], points[-1 if a.row < b.row else 1]
+    (x0, y0), (x1, y1) = (
+        points[-2] if a.row < b.row and a.column != b.column else points[0],
+        points[-1 if a.row < b.row else 1],
+    )
     if words and y0 == y1:
         yield _text((x0 + x1) / 2, y0 - 6, words, "label")
     elif words:
@@ -145,7 +148,8 @@ def _shape(c: Cell) -> str:
     if c.shape == "sum":
         return f'<circle cx="{x:g}" cy="{y:g}" r="{w:g}"/>' + _text(x, y + 5, c.words, "sum")
     rows = [line.strip() for line in c.words.split("/")]
-    box = f'<rect x="{x - w:g}" y="{y - h:g}" width="{2 * w:g}" height="{2 * h:g}" rx="{22 if c.shape == "plant" else 4}"/>'
+    round_by = 22 if c.shape == "plant" else 4
+    box = f'<rect x="{x - w:g}" y="{y - h:g}" width="{2 * w:g}" height="{2 * h:g}" rx="{round_by}"/>'
     return box + "".join(_text(x, y + 4 + 15 * (i - (len(rows) - 1) / 2), r, "box") for i, r in enumerate(rows))
 
 

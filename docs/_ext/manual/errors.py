@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from manual.markdown import code, prose, table
 from pipeline.evaluation.evidence import NotMeasuredError
 from pipeline.historian.tags import TableError
 from serving.errors import LoopwrightError
-
-from manual.markdown import code, prose, table
 
 ELSEWHERE = (NotMeasuredError, TableError)
 """Errors that stand beside the one module that raises them; their import makes them known."""

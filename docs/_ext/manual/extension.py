@@ -1,4 +1,4 @@
-"""Sphinx extension of the manual: pages that are generated from the code, block diagrams, formulas without a network."""
+"""Sphinx extension of the manual: text that is generated from the code, block diagrams, formulas as MathML."""
 
 from __future__ import annotations
 

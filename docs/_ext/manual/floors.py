@@ -67,7 +67,9 @@ def floors() -> str:
         )
         for name in names
     ]
-    picture = "\n".join(["```{diagram} The floors of the pipeline, the upper ones import from the lower ones", "floors"])
+    picture = "\n".join(
+        ["```{diagram} The floors of the pipeline, the upper ones import from the lower ones", "floors"]
+    )
     picture += "\n" + "\n".join(" | ".join(floor) for floor in layers()) + "\n```"
     return "\n\n".join([picture, table(["folder", "what lives there", "files", "imports"], rows)])
 
@@ -77,7 +79,9 @@ def contracts() -> str:
     rows = []
     for c in linted()["contracts"]:
         about = {
-            "forbidden": lambda c: f"no module of {_names(c['source_modules'])} imports {_names(c['forbidden_modules'])}",
+            "forbidden": lambda c: (
+                f"no module of {_names(c['source_modules'])} imports {_names(c['forbidden_modules'])}"
+            ),
             "protected": lambda c: f"{_names(c['protected_modules'])}: only by {_names(c['allowed_importers'])}",
             "independence": lambda c: f"none of {_names(c['modules'])} imports another one",
             "layers": lambda c: "a folder imports only from floors below its own",

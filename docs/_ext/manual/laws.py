@@ -9,11 +9,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation.validation import FILE, Validation
-from pipeline.laws import LAWS, ControlLaw
-
 from manual.markdown import code, prose, table
 from manual.parameters import parameters
+from pipeline.evaluation.validation import FILE, Validation
+from pipeline.laws import LAWS, ControlLaw
 
 ROOT = Path(__file__).parents[3]
 INFO = Path(__file__).with_name("info.toml")
@@ -28,7 +27,7 @@ def told() -> dict[str, dict[str, str]]:
 
 @cache
 def shipped() -> dict[str, list[tuple[str, str, dict[str, Any]]]]:
-    """law -> (case, controller, manifest) of each file in ``artifacts``."""
+    """Law -> (case, controller, manifest) of each file in ``artifacts``."""
     found: dict[str, list[tuple[str, str, dict[str, Any]]]] = {}
     for path in sorted((ROOT / "artifacts").glob("*/*.json")):
         row = json.loads(path.read_text(encoding="utf-8"))
@@ -150,15 +149,17 @@ def results(name: str) -> str:
     return "\n\n".join(
         [
             table(head, rows),
-            "The score is the law's error over that of the NMPC that knows the plant, a weighted mean over the tests: 1 is "
-            "as good, less is better. [How the evidence is made](../evidence.md) says the rest.",
+            "The score is the law's error over that of the NMPC that knows the plant, a weighted mean over the "
+            "tests: 1 is as good, less is better. [How the evidence is made](../evidence.md) says the rest.",
         ]
     )
 
 
 def _folder(case: str) -> str:
     """The folder of a case's README; a case at another sampling period shares that of its plant."""
-    return next(p.parent.name for p in (ROOT / "pipeline" / "cases").glob("*/README.md") if case.startswith(p.parent.name))
+    return next(
+        p.parent.name for p in (ROOT / "pipeline" / "cases").glob("*/README.md") if case.startswith(p.parent.name)
+    )
 
 
 def _score(score: float | None) -> str:

@@ -40,9 +40,7 @@ def prose(docstring: str | None) -> str:
 def _plain(block: str) -> str:
     """Text with what Markdown would take for markup made harmless, outside backticks."""
     parts = re.split(r"(``.+?``)", " ".join(block.split()))
-    return "".join(
-        f"`{p[2:-2]}`" if p.startswith("``") else re.sub(r"([*_<>\[\]$`])", r"\\\1", p) for p in parts
-    )
+    return "".join(f"`{p[2:-2]}`" if p.startswith("``") else re.sub(r"([*_<>\[\]$`])", r"\\\1", p) for p in parts)
 
 
 def _entries(block: str) -> str:

@@ -14,9 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.commands.parameters import default_of, texts
-
 from manual.markdown import code, prose, table
+from pipeline.commands.parameters import default_of, texts
 
 WORDS = Path(__file__).with_name("words.toml")
 """Words for what no docstring describes: class -> field -> words."""
@@ -45,11 +44,13 @@ def meanings(cls: type[Any]) -> Mapping[str, tuple[str, str]]:
     """Field -> unit and words: of numpydoc's lists, of comments behind the fields, of ``WORDS``; the last ones win."""
     found: dict[str, tuple[str, str]] = {}
     for text in described(cls):
-        for block in re.findall(r"^(?:Parameters|Attributes)\n-+\n((?:\S.*\n(?:    .*(?:\n|$))+)+)", text, re.MULTILINE):
+        for block in re.findall(
+            r"^(?:Parameters|Attributes)\n-+\n((?:\S.*\n(?:    .*(?:\n|$))+)+)", text, re.MULTILINE
+        ):
             for names, about in re.findall(r"^(\S.*)\n((?:    .*(?:\n|$))+)", block, re.MULTILINE):
                 said = prose(" ".join(about.split()))
                 for group, unit in re.findall(r"(\w+(?:, \w+)*)(?: \[([^\]]+)\])?", names):
-                    found.update({name: (unit, said) for name in group.split(", ")})
+                    found.update(dict.fromkeys(group.split(", "), (unit, said)))
     for base in reversed(cls.__mro__):
         if dataclasses.is_dataclass(base):
             source = inspect.getsource(base)
