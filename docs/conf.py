@@ -28,7 +28,9 @@ myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 4
 html_math_renderer = "mathml"
 autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+autodoc_type_aliases = {name: name for name in ("ArrayLike", "Array")}
 
 html_theme = "furo"
 html_title = "Loopwright"

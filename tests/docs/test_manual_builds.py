@@ -43,4 +43,6 @@ def test_formulas_diagrams_and_tables_are_in_the_pages(manual: Path) -> None:
     for law in LAWS:
         text = (manual / "docs" / "theory" / f"{law}.html").read_text(encoding="utf-8")
         assert [part for part in ("<math", "<svg", "closed_loop", '<table class="docutils') if part not in text] == []
+    keys = (manual / "docs" / "reference" / "loop_toml.html").read_text(encoding="utf-8")
+    assert 0 < keys.index("transfer_s") < keys.index("watchdog_scans") < keys.index("recover_after")
     assert "set_sp" in (manual / "docs" / "reference" / "api.html").read_text(encoding="utf-8")

@@ -33,6 +33,11 @@ SECTIONS = {
 """Section of params.yaml -> what an entry of it is read as."""
 
 
+def _file(cls: type) -> str:
+    """A file's keys; a heading comes first, because Sphinx puts text before it behind all sections."""
+    return f"## The whole file\n\n{whole(cls, depth=2)}"
+
+
 def _params() -> str:
     return "\n\n".join(f"## `{name}`\n\n{whole(cls)}" for name, cls in SECTIONS.items())
 
@@ -67,12 +72,12 @@ GENERATED: dict[str, Callable[..., str]] = {
     "info": info_names,
     "law": facts,
     "laws": choice,
-    "loop.toml": lambda: whole(Settings, depth=2),
-    "manifest": lambda: whole(Manifest, depth=2),
+    "loop.toml": lambda: _file(Settings),
+    "manifest": lambda: _file(Manifest),
     "metrics": _metrics,
     "models": _models,
     "params": _params,
     "results": results,
-    "validation": lambda: whole(Validation, depth=2),
+    "validation": lambda: _file(Validation),
 }
 """Name -> function that gives Markdown; ``law`` and ``results`` take the law's name."""

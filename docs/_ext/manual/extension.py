@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from fnmatch import fnmatch
 from pathlib import PurePosixPath
 from typing import Any
@@ -26,6 +27,7 @@ class Generated(SphinxDirective):
         name, *rest = self.arguments
         if name not in GENERATED:
             raise self.error(f"nothing is generated under the name {name!r}; known: {', '.join(sorted(GENERATED))}")
+        self.env.note_reread()  # the code may have changed where the page has not
         return self.parse_text_to_nodes(GENERATED[name](*rest), allow_section_headings=True)
 
 
@@ -59,10 +61,16 @@ def _empty(line: str, folder: PurePosixPath, pages: set[str]) -> bool:
     return not any(fnmatch(page, pattern) for page in pages)
 
 
+def name_aliases(app: Sphinx, what: str, name: str, obj: object, options: object, *shown: str | None) -> Any:
+    """Write an alias of a type by its name in a signature, also within a union."""
+    return tuple(text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in shown)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives and the renderer of formulas."""
     app.add_directive("generated", Generated)
     app.add_directive("diagram", Diagram)
+    app.connect("autodoc-process-signature", name_aliases)
     app.connect("source-read", leave_out_empty_patterns)
     app.add_html_math_renderer("mathml", inline_renderers=(inline_math, None), block_renderers=(block_math, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}
