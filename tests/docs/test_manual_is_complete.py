@@ -74,6 +74,15 @@ def test_a_law_has_its_theory_page(law: str) -> None:
     assert f"\n{law}\n" in (DOCS / "theory" / "index.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("law", LAWS)
+def test_a_theory_page_names_parameters_as_they_are(law: str) -> None:
+    """`name: value` on a page is a setting of the law."""
+    text = (DOCS / "theory" / f"{law}.md").read_text(encoding="utf-8")
+    classes = (LAWS[law].Params, *(part for _, part in parts_of(LAWS[law].Params)))
+    names = {f.name for cls in classes for f in fields(cls)}
+    assert {name for name, _ in re.findall(r"`(\w+): ([\w.]+)`", text)} <= names
+
+
 def test_no_theory_page_is_of_a_law_that_is_gone() -> None:
     assert {page.stem for page in (DOCS / "theory").glob("*.md")} == {*LAWS, "index"}
 

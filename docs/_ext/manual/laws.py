@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from manual.markdown import code, prose, table
-from manual.parameters import parameters
+from manual.parameters import whole
 from pipeline.evaluation.validation import FILE, Validation
 from pipeline.laws import LAWS, ControlLaw
 
@@ -69,9 +69,9 @@ def facts(name: str) -> str:
         [
             table(["", ""], rows),
             "## Parameters",
-            "`_s` in a name: seconds. `None` leaves the choice to the law. A default such as `OfRange` is a share of "
-            "the controlled variable's range.",
-            parameters(law.Params),
+            "`_s` in a name: seconds. `None` leaves the choice to the law. A default such as `0.02 * range` is a "
+            "share of the controlled variable's range.",
+            whole(law.Params),
             "## What it tells",
             info,
         ]

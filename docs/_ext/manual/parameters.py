@@ -83,17 +83,26 @@ def unit_of(cls: type[Any], field: dataclasses.Field[Any]) -> str:
     return next((unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
 
 
-def type_of(field: dataclasses.Field[Any]) -> str:
-    """The type as a person reads it."""
+def type_of(cls: type[Any], field: dataclasses.Field[Any]) -> str:
+    """The type as a person reads it, a name of one written out."""
     text = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
+    hint = typing.get_type_hints(cls)[field.name]
+    if text.isidentifier() and not isinstance(hint, type):
+        text = str(hint)
     text = re.sub(r"\b(?:\w+\.)+(?=\w)", "", text)
-    return re.sub(r"Literal\[(.*?)\]", lambda m: m[1].replace('"', "").replace(", ", " or "), text)
+    return re.sub(r"Literal\[(.*?)\]", lambda m: re.sub("[\"']", "", m[1]).replace(", ", " or "), text)
 
 
 def parameters(cls: type[Any]) -> str:
     """The table of one class, and the words of its docstrings."""
     rows = [
-        (code(f.name), code(type_of(f)), unit_of(cls, f), code(_default(f)), meanings(cls).get(f.name, ("", ""))[1])
+        (
+            code(f.name),
+            code(type_of(cls, f)),
+            unit_of(cls, f),
+            code(_default(f)),
+            meanings(cls).get(f.name, ("", ""))[1],
+        )
         for f in fields(cls)
     ]
     if not rows:
@@ -118,8 +127,10 @@ def _listed(text: str, cls: type[Any]) -> str:
 
 
 def _default(field: dataclasses.Field[Any]) -> str:
-    value = default_of(field)
-    return type(field.default).__name__ + "()" if dataclasses.is_dataclass(field.default) else value or '""'
+    for value in (field.default, field.default_factory):
+        if dataclasses.is_dataclass(value):  # its own defaults stand in its own table
+            return f"{(value if isinstance(value, type) else type(value)).__name__}()"
+    return default_of(field) or '""'
 
 
 def parts_of(cls: type[Any]) -> Iterator[tuple[str, type[Any]]]:
