@@ -18,7 +18,7 @@ include_patterns = [
     "README.md",
     "CONTRIBUTING.md",
     "CHANGELOG.md",
-    "examples/*/README.md",
+    "examples/**/README.md",
     "pipeline/cases/bibliography.md",
     "pipeline/cases/*/README.md",
 ]

@@ -55,7 +55,7 @@ def leave_out_empty_patterns(app: Sphinx, docname: str, source: list[str]) -> No
 
 
 def _empty(line: str, folder: PurePosixPath, pages: set[str]) -> bool:
-    if not line.endswith("*") or " " in line or line.startswith(("*", ":")):
+    if "*" not in line or " " in line or line.startswith(("*", ":")):
         return False
     pattern = (folder.parent / line[3:] if line.startswith("../") else folder / line).as_posix()
     return not any(fnmatch(page, pattern) for page in pages)
