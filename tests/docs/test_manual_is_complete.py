@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 from manual.commands import arguments, parsers, spelled
-from manual.contents import GENERATED, SECTIONS
+from manual.contents import GENERATED, OF_CASES, SECTIONS
 from manual.errors import known
 from manual.floors import imports, layers
 from manual.laws import info_of, shipped, told
@@ -32,6 +32,7 @@ ROOTS: dict[str, type] = {
     **{f"model {kind}": part for kind, part in MODELS.items()},
     **{f"trainer {name}": trainer for name, trainer in TRAINERS.items()},
     **{f"excitation {kind}": excitation for kind, excitation in EXCITATIONS.items()},
+    **{f"kind of a case {kind}": cls for members in OF_CASES.values() for kind, cls in members.items()},
     **{f"section {name}": section for name, section in SECTIONS.items()},
     "manifest": Manifest,
     "validation.json": Validation,
@@ -116,9 +117,9 @@ def test_no_words_are_of_a_parameter_that_is_gone() -> None:
 @pytest.mark.parametrize(
     ("generated", "names"),
     [
-        ("models", [*MODELS, *TRAINERS]),
-        ("excitations", list(EXCITATIONS)),
-        ("metrics", list(METRICS)),
+        ("models", [*MODELS, *TRAINERS, *OF_CASES["models"]]),
+        ("excitations", [*EXCITATIONS, *OF_CASES["excitations"]]),
+        ("metrics", [*METRICS, *(m.name for case in CASES.values() for m in case.own_metrics)]),
         ("errors", [cls.__name__ for cls in known()]),
         ("params", list(SECTIONS)),
         ("floors", [name for floor in layers() for name in floor]),

@@ -10,7 +10,7 @@ from manual.floors import contracts, floors
 from manual.laws import choice, facts, info_names, results
 from manual.markdown import code, prose, table
 from manual.parameters import parameters, whole
-from pipeline.commands.parameters import first_sentence
+from pipeline.cases import CASES, beside
 from pipeline.config.exports import ExportParams
 from pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams
 from pipeline.config.plants import PlantParams
@@ -42,13 +42,29 @@ def _params() -> str:
     return "\n\n".join(f"## `{name}`\n\n{whole(cls)}" for name, cls in SECTIONS.items())
 
 
-def _kinds(members: Mapping[str, type]) -> str:
-    return "\n\n".join(f"## `{kind}`\n\n{parameters(cls)}" for kind, cls in members.items())
+OF_CASES: dict[str, dict[str, type]] = {
+    what: {kind: cls for case in CASES.values() for kind, cls in beside(case, what, what.upper(), {}).items()}
+    for what in ("models", "excitations")
+}
+"""Kinds that a single case has."""
+
+
+def _kinds(members: Mapping[str, type], of_cases: Mapping[str, type]) -> str:
+    own = [f"### `{kind}`\n\n{parameters(cls)}" for kind, cls in of_cases.items()]
+    return "\n\n".join(
+        [
+            *(f"## `{kind}`\n\n{parameters(cls)}" for kind, cls in members.items()),
+            "## Kinds of single cases",
+            "Only records and model sets of their own case take these.",
+            *own,
+        ]
+    )
 
 
 def _models() -> str:
-    trainers = "\n\n".join(f"### `{kind}`\n\n{parameters(cls)}" for kind, cls in TRAINERS.items())
-    return f"{_kinds(MODELS)}\n\n## Trainers\n\nThe `trainer` of a network is one of these.\n\n{trainers}"
+    trainers = [f"### `{kind}`\n\n{parameters(cls)}" for kind, cls in TRAINERS.items()]
+    kinds = _kinds(MODELS, OF_CASES["models"])
+    return "\n\n".join([kinds, "## Trainers", "The `trainer` of a network is one of these.", *trainers])
 
 
 def _metrics() -> str:
@@ -56,18 +72,26 @@ def _metrics() -> str:
         (code(m.name), m.long or m.short, m.unit_of("CV"), m.together, prose(m.floor.text) if m.floor else "")
         for m in METRICS.values()
     ]
-    return table(["metric", "meaning", "unit (CV: the controlled variable's)", "of several loops", "noise floor"], rows)
-
-
-def _list(members: Mapping[str, type]) -> str:
-    return table(["name", "what it is"], [(code(name), prose(first_sentence(cls))) for name, cls in members.items()])
+    head = ["metric", "meaning", "unit (CV: the controlled variable's)", "of several loops", "noise floor"]
+    own = [
+        (code(name), code(m.name), m.long or m.short, m.unit, m.together)
+        for name, case in CASES.items()
+        for m in case.own_metrics
+    ]
+    return "\n\n".join(
+        [
+            table(head, rows),
+            "## Of single cases",
+            table(["case", "metric", "meaning", "unit", "of several loops"], own),
+        ]
+    )
 
 
 GENERATED: dict[str, Callable[..., str]] = {
     "commands": commands,
     "contracts": contracts,
     "errors": errors,
-    "excitations": lambda: _kinds(EXCITATIONS),
+    "excitations": lambda: _kinds(EXCITATIONS, OF_CASES["excitations"]),
     "floors": floors,
     "info": info_names,
     "law": facts,
