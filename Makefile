@@ -38,8 +38,9 @@ check: $(STAMP) ## the static part of make test
 	lint-imports
 
 docs: $(STAMP) ## build the manual into build/docs, under a minute
-	@python -c "import furo, myst_parser" 2> /dev/null || python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
-	python -m sphinx -q -W --keep-going -d build/doctrees -c docs . build/docs
+	@$(BIN)/python -c "import furo, myst_parser" 2> /dev/null || \
+	  $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees -c docs . build/docs
 	@echo "open build/docs/index.html"
 
 coverage: $(STAMP) ## branch coverage of the tests, by file
