@@ -13,14 +13,14 @@ unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check docs coverage registry bench clean
+.PHONY: help setup run test check docs coverage registry bench release clean
 
 help: ## list the targets
 	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(STAMP) ## make the virtual environment .venv (the others call it)
 
-$(STAMP): pyproject.toml constraints.txt tools/setup.sh
+$(STAMP): pyproject.toml constraints.txt serving/version.py tools/setup.sh
 	@PYTHON="$(PYTHON)" bash tools/setup.sh "$(VENV)"
 	@touch $@
 
@@ -51,9 +51,12 @@ registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes
 	loopwright registry publish
 	loopwright registry serve --port $(PORT)
 
-bench: $(STAMP) ## run the benchmarks, about 12 minutes
-	@echo "benchmarks: about 12 minutes; each says beforehand what it measures and how long it takes"
+bench: $(STAMP) ## run the benchmarks, about 15 minutes
+	@echo "benchmarks: about 15 minutes; each says beforehand what it measures and how long it takes"
 	@for script in $(filter-out benchmarks/identification.py,$(wildcard benchmarks/[a-z]*.py)); do echo "== $$script"; python $$script || exit 1; done
 
+release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, and check them
+	@PYTHON=python bash tools/release.sh
+
 clean: ## remove what can be rebuilt (the virtual environment stays)
-	rm -rf work timing receipts published.json mlflow.db mlruns mlartifacts .pytest_cache .mypy_cache .ruff_cache build
+	rm -rf work timing receipts published.json mlflow.db mlruns mlartifacts .pytest_cache .mypy_cache .ruff_cache build dist

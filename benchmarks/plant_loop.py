@@ -44,10 +44,27 @@ SPACE = "nsu=urn:loopwright:plant;s="
 class Watched:
     """Memory of this process over time, and what each scan took."""
 
-    def __init__(self) -> None:
-        self.late, self.whole = list[float](), list[float]()
+    def __init__(self, scans: int = 0) -> None:
+        # Room for all scans is taken before the first one, so that it does not count as growth.
+        self._late, self._whole, self.seen = np.ones(scans), np.ones(scans), 0
         self.memory = list[tuple[float, float]]()
         self.began = time.monotonic()
+
+    def note(self, late: float, whole: float) -> None:
+        """Note how late a scan was and when it was over, in seconds after it was due."""
+        if self.seen < len(self._late):
+            self._late[self.seen], self._whole[self.seen] = late, whole
+            self.seen += 1
+
+    @property
+    def late(self) -> np.ndarray:
+        """Lateness of each scan [s]."""
+        return self._late[: self.seen]
+
+    @property
+    def whole(self) -> np.ndarray:
+        """From when each scan was due to its end [s]."""
+        return self._whole[: self.seen]
 
     def look(self) -> None:
         """Note the present memory, in MB."""
@@ -57,9 +74,10 @@ class Watched:
     def grown(self, after_s: float) -> str:
         """By how much memory grew since a time: up to the greatest and the last."""
         later = [mb for at, mb in self.memory if at >= after_s] or [self.memory[-1][1]]
-        most, last = max(later) - later[0], later[-1] - later[0]
+        most, last, half = max(later) - later[0], later[-1] - later[0], later[-1] - later[len(later) // 2]
         return (
-            f"memory: {later[0]:.1f} MB after {after_s:.0f} s; since then at most {most:+.1f}, at the end {last:+.1f}"
+            f"memory: {later[0]:.1f} MB after {after_s:.0f} s; since then at most {most:+.1f}, at the end {last:+.1f}, "
+            f"of which {half:+.1f} in the second half"
         )
 
 
@@ -77,7 +95,7 @@ class TimedClock(MonotonicClock):
         self.late = (self.now() - time_s) / self.speed
 
 
-def shares(values: list[float]) -> str:
+def shares(values: np.ndarray) -> str:
     """p50, p99, p99.9 and the worst, in milliseconds."""
     p = 1e3 * np.percentile(values, [50, 99, 99.9, 100])
     return f"p50 {p[0]:.2f}, p99 {p[1]:.2f}, p99.9 {p[2]:.2f}, worst {p[3]:.2f} ms"
@@ -166,8 +184,7 @@ def station(folder: Path, speed: float, page: str, watched: Watched) -> Iterator
     made.clock = clock
 
     def seen(_: Sample | None, command: Command) -> None:
-        watched.late.append(clock.late)
-        watched.whole.append((clock.now() - clock.due) / speed)
+        watched.note(clock.late, (clock.now() - clock.due) / speed)
         if command.scan % 200 == 0:
             watched.look()
 
@@ -181,25 +198,25 @@ def station(folder: Path, speed: float, page: str, watched: Watched) -> Iterator
 
 def day(hours: float, speed: float, folder: Path) -> None:
     """A plant's day over OPC UA."""
-    watched = Watched()
+    scans = round(hours * 3600 / Controller(FILE).manifest.period_s)
+    watched = Watched(scans)
     with station(folder, speed, "", watched) as made:
-        n = round(hours * 3600 / made.manifest.period_s)
-        report = made.run(n)
+        report = made.run(scans)
     taken = time.monotonic() - watched.began
     print(f"{hours:g} h of the plant in {taken:.0f} s: {report.scans} scans, {report.missed} periods missed, "
-          f"{report.faults} scans with a fault, {1e3 * taken / n:.2f} ms a period")  # fmt: skip
+          f"{report.faults} scans with a fault, {1e3 * taken / scans:.2f} ms a period")  # fmt: skip
     print(watched.grown(60))
 
 
 def timing(minutes: float, attack: bool, folder: Path) -> None:
     """100 ms with the page open."""
-    watched = Watched()
+    scans = round(60 * minutes / PERIOD_S)
+    watched = Watched(scans)
     with station(folder, Controller(FILE).manifest.period_s / PERIOD_S, "127.0.0.1:0", watched) as made:
-        n = round(60 * minutes / PERIOD_S)
         over = threading.Event()
         thread = threading.Thread(target=_load_beside, args=(made, attack, over), daemon=True)
         thread.start()
-        report = made.run(n)
+        report = made.run(scans)
         over.set()
         thread.join()
     late, whole = watched.late[20:], watched.whole[20:]

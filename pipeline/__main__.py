@@ -8,8 +8,10 @@ import sys
 from collections.abc import Sequence
 
 from pipeline.commands import COMMANDS, Parser
+from pipeline.commands.extras import advice
 from pipeline.engine.command import FAILURES, reason
 from pipeline.errors import nearest
+from serving.version import __version__
 
 EXAMPLES = """examples:
   loopwright run                                   the whole pipeline
@@ -32,22 +34,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:  # `| head`: nobody reads on
             sys.stderr.close()
         return 0
+    if name == "--version":
+        print(f"loopwright {__version__}")
+        return 0
     if name not in COMMANDS:
         print(f"loopwright: unknown command {name!r}{nearest(name, COMMANDS)}", file=sys.stderr)
         return 2
     try:
-        try:
-            command = importlib.import_module(f"pipeline.commands.{name}")
-        except ModuleNotFoundError as error:  # installed for embedding alone
-            print(
-                f"loopwright {name}: {error.name} is not installed; pip install '.[pipeline]' brings it",
-                file=sys.stderr,
-            )
-            return 2
+        command = importlib.import_module(f"pipeline.commands.{name}")
         parser = Parser(prog=f"loopwright {name}", description=COMMANDS[name])
         command.options(parser)
         options = parser.parse_args(words[1:])
         status: int | None = command.run(options)
+    except ModuleNotFoundError as error:  # installed for embedding, or for the plant, alone
+        missing = advice(error.name or "")
+        if missing is None:
+            raise
+        print(f"loopwright {name}: {missing}", file=sys.stderr)
+        return 2
     except FAILURES as error:
         if isinstance(error, BrokenPipeError):  # `| head`: nobody reads on
             sys.stderr.close()
@@ -63,7 +67,8 @@ def _help() -> str:
     width = max(map(len, COMMANDS))
     rows = [f"  {name:{width}}  {words}" for name, words in COMMANDS.items()]
     head = ("usage: loopwright COMMAND [...]", "", "Neural process controllers from plant data.", "", "commands:")
-    return "\n".join([*head, *rows, "", EXAMPLES, "", "`loopwright COMMAND --help` lists what a command takes."])
+    last = "`loopwright COMMAND --help` lists what a command takes, `loopwright --version` prints the version."
+    return "\n".join([*head, *rows, "", EXAMPLES, "", last])
 
 
 if __name__ == "__main__":

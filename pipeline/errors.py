@@ -9,6 +9,7 @@ LoopwrightError (serving)
     +-- LawError          a control law cannot be designed from what it was given
     |   +-- WithheldError  nor for this plant of a person, whose other controllers go on
     +-- ExportError       a law cannot be written as one graph, or the graph differs from the law
+    +-- HostError        a controller file cannot be made ready for another host: no compiler, a name it cannot have
     +-- NotMeasuredError  evaluation.evidence: a check or a picture needs a figure that was not measured
     +-- ReportError       a report lacks a stage's results, or cannot read them
     +-- TrackingError     the MLflow store or registry cannot be read or written
@@ -21,6 +22,7 @@ from serving.fields import nearest
 
 __all__ = [
     "ExportError",
+    "HostError",
     "LawError",
     "ModelError",
     "ParamsError",
@@ -64,6 +66,10 @@ class WithheldError(LawError):
 
 class ExportError(PipelineError):
     """A law cannot be exported, or its graph differs from it."""
+
+
+class HostError(PipelineError):
+    """A controller file cannot be made ready for another host."""
 
 
 class ReportError(PipelineError):

@@ -1,7 +1,7 @@
 """Loopwright's runtime: one .onnx file stepped as a controller. Needs numpy and onnxruntime, nothing else."""
 
 from serving.clock import Clock, MonotonicClock, VirtualClock
-from serving.controller import Controller, Step
+from serving.controller import Step
 from serving.endpoint import Endpoint, SimulatedEndpoint
 from serving.errors import (
     ArtifactError,
@@ -11,12 +11,15 @@ from serving.errors import (
     LoopwrightError,
     OutputError,
     SampleError,
+    SignatureError,
 )
 from serving.fallback import Fallback
 from serving.grid import RunReport
 from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
 from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
+from serving.trust import Controller
+from serving.version import __version__ as __version__
 
 __all__ = [
     "Allowed",
@@ -45,6 +48,7 @@ __all__ = [
     "Sample",
     "SampleError",
     "Signal",
+    "SignatureError",
     "SimulatedEndpoint",
     "Step",
     "VirtualClock",

@@ -1,15 +1,19 @@
-"""``python -m serving inspect FILE`` and ``python -m serving bench FILE``."""
+"""``python -m serving``: inspect, bench, sign and verify a controller file, or write test vectors of it."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from serving.bench import bench, table
 from serving.card import card, card_json
-from serving.controller import Controller
+from serving.conformance.check import check
+from serving.conformance.kit import VECTORS, write_kit
 from serving.errors import LoopwrightError
+from serving.signing import command as signing
+from serving.trust import Controller
 
 
 def inspect_options(parser: argparse.ArgumentParser) -> None:
@@ -17,11 +21,12 @@ def inspect_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="a controller's .onnx file")
     parser.add_argument("--json", action="store_true", help="as JSON, for programs")
     parser.add_argument("--sha256", metavar="HEX", help="refuse any file but this one")
+    parser.add_argument("--key", metavar="PUBLIC", nargs="+", help="refuse a file that none of these keys signed")
 
 
 def run_inspect(options: argparse.Namespace) -> None:
     """Print the controller's card."""
-    controller = Controller(options.file, sha256=options.sha256)
+    controller = Controller(options.file, sha256=options.sha256, trusted=options.key)
     print(card_json(controller) if options.json else card(controller))
 
 
@@ -40,18 +45,55 @@ def run_bench(options: argparse.Namespace) -> None:
     print(table(timings))
 
 
+def conformance_options(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``conformance``."""
+    parser.add_argument("file", metavar="FILE", help="a controller's .onnx file")
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the kit: the file, its manifest, vectors.json")
+    parser.add_argument(
+        "--check", type=Path, metavar="ANSWERS", help="compare a host's answers with the kit in OUT; write nothing"
+    )
+
+
+def run_conformance(options: argparse.Namespace) -> int:
+    """Write the kit, or check answers: 0 if the host passed, 1 if not."""
+    controller = Controller(options.file)
+    if options.check is not None:
+        verdict = check(options.out, options.check, sha256=controller.sha256)
+        print(verdict.text())
+        return 0 if verdict.passed else 1
+    vectors = write_kit(controller, options.out)
+    print(
+        f"{options.out / VECTORS}: {len(vectors['steps'])} steps and {len(vectors['scans'])} scans of {controller.path}"
+    )
+    print("A host passes if:")
+    for words in vectors["pass"]:
+        print(f"- {words}")
+    return 0
+
+
+COMMANDS: dict[str, tuple[str, Callable[[argparse.ArgumentParser], None], Callable[[argparse.Namespace], int | None]]]
+COMMANDS = {
+    "inspect": ("what the controller is, and how its validation went", inspect_options, run_inspect),
+    "bench": ("how long a step takes on this machine", bench_options, run_bench),
+    "conformance": ("test vectors for a host in any language", conformance_options, run_conformance),
+    "keygen": ("make a key to sign controller files with", signing.keygen_options, signing.run_keygen),
+    "sign": ("sign a controller file and its manifest", signing.sign_options, signing.run_sign),
+    "verify": ("which of some keys signed a controller file", signing.verify_options, signing.run_verify),
+}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; 0 if it went well, 2 after one line on standard error."""
+    """Run one command; 0 if it went well, 1 if a host failed, 2 after one line on standard error."""
     parser = argparse.ArgumentParser(prog="python -m serving", description="Look at a controller file.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    inspect_options(commands.add_parser("inspect", help="what the controller is, and how its validation went"))
-    bench_options(commands.add_parser("bench", help="how long a step takes on this machine"))
+    for name, (words, add, _) in COMMANDS.items():
+        add(commands.add_parser(name, help=words))
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help()
         return 0
     try:
-        {"inspect": run_inspect, "bench": run_bench}[options.command](options)
+        return COMMANDS[options.command][2](options) or 0
     except LoopwrightError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

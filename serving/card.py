@@ -7,6 +7,7 @@ from typing import Any
 
 from serving.controller import Controller
 from serving.manifest import Signal
+from serving.trust import signer
 
 SHOWN = {"scenarios", "units", "locked_up", "as_printed"}  # entries of the evidence that have a place of their own
 
@@ -21,6 +22,8 @@ def card(controller: Controller) -> str:
         f"  period    {m.period_s:g} s",
         f"  graph     {graph.nodes} operators, opset {graph.opset}, IR {graph.ir_version}",
     ]
+    if signed := signer(controller):
+        lines.insert(3, f"  signed    by {signed.words}")
     lines[1:1] = _locked_up(m.evidence)
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         lines += _signals(title, m.signals(name))
@@ -36,7 +39,9 @@ def card(controller: Controller) -> str:
 def card_json(controller: Controller) -> str:
     """The manifest and the file's own figures as JSON."""
     graph = controller.summary
-    file = {"path": str(controller.path), "bytes": controller.size_bytes, "sha256": controller.sha256}
+    file: dict[str, Any] = {"path": str(controller.path), "bytes": controller.size_bytes, "sha256": controller.sha256}
+    if signed := signer(controller):
+        file["signed"] = signed.to_dict()
     versions = {"opset": graph.opset, "ir_version": graph.ir_version, "ops": graph.ops}
     return json.dumps({**json.loads(controller.manifest.to_json()), "file": file, "graph": versions}, indent=2)
 

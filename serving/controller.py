@@ -288,6 +288,13 @@ def _session(data: bytes) -> Any:
         raise ArtifactError(f"onnxruntime does not load the graph: {_first_line(error)}") from error
 
 
+def runtime_version() -> str:
+    """The release of onnxruntime that computes the steps."""
+    import onnxruntime as ort
+
+    return str(ort.__version__)
+
+
 def _agree(manifest: Manifest, session: Any) -> None:
     """ArtifactError unless the graph has exactly the inputs and outputs that the manifest tells."""
     sizes = manifest.sizes()

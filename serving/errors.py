@@ -2,6 +2,7 @@
 
 LoopwrightError
 +-- ArtifactError      the file is not a controller: corrupt, truncated, foreign, changed after export
+|   +-- SignatureError the file is unsigned, signed by a foreign key, changed since, or its signature expired
 +-- ContractError      an input has the wrong name, shape or type
 +-- SampleError        a value is not finite, so no manipulated variable may be computed from it
 +-- OutputError        the law gave a value that is not finite or outside its signal's range
@@ -18,6 +19,10 @@ class LoopwrightError(Exception):
 
 class ArtifactError(LoopwrightError):
     """The file is not a controller that this runtime accepts."""
+
+
+class SignatureError(ArtifactError):
+    """The file has no valid signature of a trusted key, or a key or a signature cannot be used."""
 
 
 class ContractError(LoopwrightError):

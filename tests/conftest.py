@@ -9,6 +9,7 @@ from functools import cache
 from typing import Any
 
 import henson_seborg_cstr_parts
+import hypothesis
 import identified_models
 import jacketed_batch_reactor_parts
 import numpy as np
@@ -30,6 +31,10 @@ from pipeline.plants.equations import EquationPlant
 from pipeline.plants.signals import Signals
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_batch
+
+# The same examples on each run, however slow the machine is.
+hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("same")
 
 # A job that a shell puts in the background hears no Ctrl-C, and no program that it starts would.
 signal.signal(signal.SIGINT, signal.default_int_handler)

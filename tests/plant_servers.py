@@ -16,9 +16,9 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
-from asyncua import Client
 from processes import within
 
+from pipeline.simulation import opcua_server
 from serving.journal import JournalReader
 from serving.station.settings import Settings
 from serving.station.station import Station
@@ -136,12 +136,6 @@ class RunningLoop:
 
 def spoil(plant: Plant, tag: str, fault: str) -> None:
     """Spoil a node of a served plant, or mend it with an empty text."""
-
-    async def write() -> None:
-        async with Client(plant.endpoint) as client:
-            index = await client.get_namespace_index("urn:loopwright:plant")
-            await client.get_node(f"ns={index};s=Faults.{tag}").write_value(fault)
-
     # In a thread of its own: a browser that is driven has a loop in this one.
     with ThreadPoolExecutor(1) as apart:
-        apart.submit(asyncio.run, write()).result()
+        apart.submit(asyncio.run, opcua_server.spoil(plant.endpoint, tag, fault)).result()

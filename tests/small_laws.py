@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
+import onnx
 import pytest
 import torch
 from torch import Tensor
 
-from pipeline.export.controller_file import with_evidence
+from pipeline.export.controller_file import assembled, with_evidence
 from pipeline.export.gate import export
 from pipeline.laws import ControlLaw
 from pipeline.plants.signals import Signals
 from serving import Controller, Signal
+from serving.digest import TRAILER_BYTES
 
 SIGNALS = Signals(
     period_s=0.5,
@@ -79,3 +82,23 @@ def pi_file(pi_law: ControlLaw, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.fixture
 def controller(pi_file: Path) -> Controller:
     return Controller(pi_file)
+
+
+def with_feedforward(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
+    """PI with a feedforward of the measured disturbance: state = (sum of errors)."""
+    error = sp - pv[..., :1]
+    total = state + error
+    mv = law.limited(mv_applied + 40.0 * error + 3.0 * total - 4.0 * (dv - 1.5), mv_applied)
+    return mv, total, dv * error
+
+
+@pytest.fixture(scope="session")
+def disobedient_file(make_formula: Callable[..., ControlLaw], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A controller that takes a measured disturbance and leaves its MV's range, which its manifest makes narrower."""
+    path = tmp_path_factory.mktemp("controller") / "disobedient.onnx"
+    export(make_formula(with_feedforward, 1, ("product",)), path, case="tank", provenance={})
+    narrow = replace(Controller(path).manifest, mv=(Signal("valve", "%", 10.0, 90.0),))
+    model = onnx.ModelProto.FromString(path.read_bytes()[:-TRAILER_BYTES])
+    del model.metadata_props[:]
+    path.write_bytes(assembled(model.SerializeToString(), narrow))
+    return path

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from pipeline.cases import CASES
 from pipeline.commands.arguments import positive, whole
 from pipeline.config.params import choose
 from pipeline.errors import PipelineError
+from pipeline.simulation.faults import FAULTS
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -30,14 +32,21 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="refuse clients without a certificate in FOLDER/trusted, and connections in the clear")  # fmt: skip
     add("--log", metavar="FILE", type=Path, help="write there what the actuator gets, a line of JSON each period")
     add("--periods", metavar="N", type=whole(1), help="stop after so many")
+    fault = commands.add_parser("fault", help="spoil a signal of a served plant, or mend it")
+    fault.add_argument("tag", metavar="TAG", help="PV.C_A, MV.T_j, RB.T_j, DV.F, ...")
+    fault.add_argument("kind", metavar="KIND", choices=["ok", *FAULTS[1:]], help=", ".join(["ok", *FAULTS[1:]]))
+    fault.add_argument("--endpoint", default="opc.tcp://127.0.0.1:4840", help="the served plant (%(default)s)")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Serve the plant until Ctrl-C."""
-    try:
-        from pipeline.simulation.opcua_server import PlantServer
-    except ModuleNotFoundError as error:
-        raise PipelineError(f"{error.name} is not installed; pip install 'loopwright[plant]' brings it") from None
+    """Serve the plant until Ctrl-C, or spoil a signal of one that is served."""
+    from pipeline.simulation.opcua_server import PlantServer, spoil
+
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what went wrong is said below, in a line
+    if options.action == "fault":
+        asyncio.run(spoil(options.endpoint, options.tag, "" if options.kind == "ok" else options.kind))
+        print(f"{options.tag}: {options.kind}")
+        return
     case = choose(CASES, options.case, "case", "plant serve")
     test = next(iter(case.scenarios().values()))[0]
     server = PlantServer(

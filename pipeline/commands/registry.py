@@ -13,6 +13,7 @@ from urllib.parse import quote
 from pipeline.errors import TrackingError
 from pipeline.tracking.publish import publish
 from pipeline.tracking.registry import CHAMPION, fetch, promote, registered, versions
+from pipeline.tracking.signing import trusted, words
 from pipeline.tracking.store import store, store_uri
 
 HOST = "127.0.0.1"
@@ -28,7 +29,9 @@ def _list(args: argparse.Namespace) -> None:
                 aliases = " ".join(f"@{a}" for a in version.aliases)
                 score = version.tags.get("gate_score", "-")
                 over = version.tags.get("gate_relative_to", "")  # nothing: the NMPC, as for most cases
-                print(f"{model.name:40} {version.version:>4}  gate {f'{score} {over}':10} {aliases}")
+                signer = words(version.tags)
+                row = f"{model.name:40} {version.version:>4}  gate {f'{score} {over}':10} {aliases}"
+                print(f"{row:70}  signed by {signer}" if signer else row)
         if not models:
             print("the registry is empty; run `dvc repro`, or `loopwright registry publish`")
 
@@ -40,8 +43,10 @@ def _promote(args: argparse.Namespace) -> None:
 
 def _fetch(args: argparse.Namespace) -> None:
     with store() as client:
-        for path in fetch(client, args.controller, args.folder):
-            print(path)
+        files, signer = fetch(client, args.controller, args.folder, trusted(args.key))
+    for path in files:
+        print(path)
+    print(signer, file=sys.stderr)
 
 
 def _serve(args: argparse.Namespace) -> None:
@@ -73,16 +78,19 @@ def options(parser: argparse.ArgumentParser) -> None:
         one.set_defaults(action=action)
         return one
 
-    command("publish", lambda _: publish(Path.cwd()), "write the cached results that the store lacks")
+    publishing = "write the cached results that the store lacks; LOOPWRIGHT_SIGNING_KEY, if set, signs the controllers"
+    command("publish", lambda _: publish(Path.cwd()), publishing)
     command("list", _list, "controllers, versions, gate scores and aliases; the champion of each case first")
     one = command("promote", _promote, "make a version the champion of its case, or move another alias")
     one.add_argument("name", help="registered controller: CASE-CONTROLLER")
     one.add_argument("version", help="its version, a number")
     one.add_argument("--alias", default=CHAMPION, help="default: %(default)s")
-    one = command("fetch", _fetch, "write a controller and its manifest into a folder")
+    one = command("fetch", _fetch, "write a controller, its manifest and its signature into a folder")
     names = "CASE (its champion), CASE-CONTROLLER (its best version), CASE-CONTROLLER@ALIAS or CASE-CONTROLLER/VERSION"
     one.add_argument("controller", help=names)
     one.add_argument("folder", type=Path, help="where they go")
+    known = "write nothing unless one of these public keys signed it (or those of LOOPWRIGHT_TRUSTED)"
+    one.add_argument("--key", metavar="PUBLIC", type=Path, nargs="+", help=known)
     one = command("serve", _serve, "open MLflow's UI on this machine only, its job execution off")
     one.add_argument("--port", type=int, default=5000, help="default: %(default)s")
 

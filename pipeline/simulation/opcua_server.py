@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,28 +12,33 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
-from asyncua import Server, ua
+from asyncua import Client, Server, ua
 from asyncua.crypto.cert_gen import setup_self_signed_certificate
 from asyncua.crypto.truststore import TrustStore
 from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from pipeline.errors import PlantError
-from pipeline.plants.simulator import Array, Simulator
+from pipeline.plants.equations import EquationPlant, rk4_step
+from pipeline.plants.simulator import Advance, Array, Simulator
 from serving.manifest import Signal
 
 NAMESPACE = "urn:loopwright:plant"
 APPLICATION = "urn:loopwright:plant:server"
-FAULTS = ("", "bad", "uncertain", "frozen", "text", "deleted", "int", "nan")
 LOCAL, REMOTE = 0, 1  # who has the plant: its own controller, or whoever writes the MVs
 ALIVE_PERIODS = 3
+PARTS, LEAST_PART_S = 10, 0.025  # a period has so many parts at most, each at least as long by the clock
 KINDS = {"LREAL": ua.VariantType.Double, "REAL": ua.VariantType.Float}
 
 
 @dataclass
 class PlantServer:
-    """One plant, a step each period, ``speed`` times as fast as the clock.
+    """One plant, ``speed`` times as fast as the clock.
+
+    A plant of differential equations moves on, takes its MVs and shows its PVs several times a period, as a real one
+    does without end: when a loop asks does not matter then. Any other one moves once a period.
 
     Nodes ``PV.x``, ``MV.x`` (written by whoever controls), ``RB.x`` (the MV that the actuator has), ``DV.x``, ``SP.x``,
     each with its unit and range; ``Control.Owner`` (0 its own controller, which holds the MVs; 1 the loop),
@@ -63,6 +69,7 @@ class PlantServer:
         self._kinds: dict[str, ua.VariantType] = {}
         self._gone: set[str] = set()
         self._kind = KINDS[self.types]
+        self.parts, self._advance = in_parts(self.plant, self.plant.period_s / self.speed)
         self._out = None if self.log is None else self.log.open("a", encoding="utf-8", buffering=1)
 
     async def run(self, periods: int | None = None) -> None:
@@ -71,11 +78,14 @@ class PlantServer:
         async with self.server:
             self.tell(f"serving {self.plant.name} at {self.endpoint}")
             start = time.monotonic()
+            part_s = self.plant.period_s / self.speed / self.parts
             while periods is None or self.k < periods:
-                await self._period()
+                for part in range(self.parts):
+                    await self._part(first=part == 0)
+                    # On a grid; a machine that is late catches up.
+                    due = start + (self.k * self.parts + part + 1) * part_s
+                    await asyncio.sleep(max(0.0, due - time.monotonic()))
                 self.k += 1
-                # On a grid; a machine that is late catches up.
-                await asyncio.sleep(max(0.0, start + self.k * self.plant.period_s / self.speed - time.monotonic()))
 
     # ------------------------------------------------------------------ address space
     async def _prepare(self) -> None:
@@ -141,6 +151,7 @@ class PlantServer:
         await setup_self_signed_certificate(
             key, certificate, APPLICATION, host, [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH], {}
         )
+        key.chmod(0o600)
         await self.server.load_certificate(str(certificate))
         await self.server.load_private_key(str(key))
         policies = [ua.SecurityPolicyType.NoSecurity, ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt]
@@ -156,21 +167,23 @@ class PlantServer:
         self.server.set_security_policy(policies)
 
     # ------------------------------------------------------------------ a period
-    async def _period(self) -> None:
-        """Take the MVs, advance the plant, publish."""
+    async def _part(self, first: bool) -> None:
+        """Take the MVs, advance the plant, publish; with the first part of a period also what counts periods."""
         p = self.plant
         asked = np.array([await self._number(f"MV.{s.name}", v) for s, v in self._with(p.mv_signals, self.mv)])
         dv = np.array([await self._number(f"DV.{s.name}", v) for s, v in self._with(p.dv_signals, p.dv_nominal)])
         if await self._value("Control.Owner") == REMOTE:
             low, high = (np.array([getattr(s, end) for s in self.plant.mv_signals]) for end in ("low", "high"))
             self.mv = np.clip(asked, low, high)
-        if self._out is not None:
+        if self._out is not None and first:
             row = {"k": self.k, "time": time.time(), "asked": asked.tolist(), "mv": self.mv.tolist()}
             self._out.write(json.dumps(row) + "\n")
-        self.x = p.step(self.x, self.mv, dv, p.parameters())
+        self.x = self._advance(self.x, self.mv, dv, p.parameters())
         if not np.isfinite(self.x).all():
             raise PlantError(f"{self.plant.name} has left what it can compute, with MVs {self.mv.tolist()}")
         await self._publish()
+        if first:
+            await self._count()
 
     async def _publish(self) -> None:
         now = datetime.now(UTC) + timedelta(seconds=float(await self._value("Faults.Clock")))
@@ -182,6 +195,9 @@ class PlantServer:
             for group in ("MV", "DV", "SP"):
                 if f"{group}.{s.name}" in self.start:
                     await self._spoil_alone(f"{group}.{s.name}")
+
+    async def _count(self) -> None:
+        """Show that the server lives, and see whether the loop does."""
         await self._set("Control.Watchdog", ua.Variant(self.k % 30_000, ua.VariantType.Int32))
         beat = await self._value("Control.Heartbeat")
         last, age = self._beat
@@ -253,3 +269,36 @@ class PlantServer:
 
     async def _set(self, tag: str, value: ua.Variant) -> None:
         await self.server.write_attribute_value(self._id(tag), ua.DataValue(value))
+
+
+def in_parts(plant: Simulator, period_s: float) -> tuple[int, Advance]:
+    """In how many parts a plant goes through a period of ``period_s`` by the clock, and its step over one of them."""
+    n = min(PARTS, int(period_s / LEAST_PART_S))
+    if not isinstance(plant, EquationPlant) or n < 2:
+        return 1, plant.step
+    steps = math.ceil(plant.substeps / n)
+    h = plant.period_s / plant.time_unit_s / n / steps
+    x, mv, dv, p = (ca.SX.sym(name, plant.rate.numel_in(i)) for i, name in enumerate(("x", "mv", "dv", "p")))
+    state = x
+    for _ in range(steps):
+        state = rk4_step(lambda at: plant.rate(at, mv, dv, p), state, h)
+    transition = ca.Function("part", [x, mv, dv, p], [ca.densify(state)])
+    return n, lambda x, mv, dv, p: np.array(transition(x, mv, dv, p))[:, 0]
+
+
+async def spoil(endpoint: str, tag: str, fault: str) -> None:
+    """Give a signal of a served plant one of FAULTS. PlantError where no such plant answers, or it has no such tag."""
+    try:
+        async with Client(endpoint, timeout=5) as client:
+            index = await client.get_namespace_index(NAMESPACE)
+            node = client.get_node(ua.NodeId(ua.String(f"Faults.{tag}"), ua.Int16(index)))
+            await node.read_value()  # a node that is not there would be refused as one that may not be written
+            await node.write_value(fault)
+    except ua.uaerrors.BadNodeIdUnknown:
+        words = f"the plant at {endpoint} has no signal {tag!r}; write it as PV.NAME, RB.NAME, MV.NAME or DV.NAME"
+        raise PlantError(words) from None
+    except (OSError, TimeoutError) as error:
+        words = f"no served plant answers at {endpoint} ({type(error).__name__}); `loopwright plant serve` starts one"
+        raise PlantError(words) from None
+    except ValueError:
+        raise PlantError(f"the server at {endpoint} is no `loopwright plant serve`: it has no {NAMESPACE}") from None

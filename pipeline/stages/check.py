@@ -43,6 +43,10 @@ from pipeline.stages.paths import DATA, WORK, record_folder
 from serving.errors import LoopwrightError
 
 REPORT = "screening.json"
+FROM_A_WHEEL = (
+    "loopwright is installed from a wheel, which holds no bounds of cases; "
+    "`pip install -e '.[pipeline]'` in this clone brings them"
+)
 
 
 def mistakes() -> list[str]:
@@ -71,11 +75,14 @@ def notes() -> list[str]:
             case = _case_of(name)
             if bounds_path(case).exists():
                 lines += stored_bounds(case)[1]
+            elif "site-packages" in bounds_path(case).parts:
+                lines.append(FROM_A_WHEEL)
             elif not case.on_models:
                 lines.append(f"case {name!r} has no bounds; run `loopwright bounds {name}`")
         except LoopwrightError as error:
             lines.append(" ".join(str(error).split()))
-    return lines + [line for name in sections("controllers") if (line := _withheld(name))]
+    lines += [line for name in sections("controllers") if (line := _withheld(name))]
+    return list(dict.fromkeys(lines))
 
 
 def _withheld(controller: str) -> str:

@@ -57,9 +57,11 @@ def standing(name: str, law: str, validation: Validation | None, champion: str |
     return place, f"Rank {place}, {ratio}. {best}{none}"
 
 
-def version_description(validation: Validation | None, gate: Gate, run_id: str, picture: str | None) -> str:
-    """A version's description: verdict, closed-loop evidence per scenario, analysis, picture of the loop."""
-    parts = [_verdict(gate), _grounds(validation)]
+def version_description(
+    validation: Validation | None, gate: Gate, run_id: str, picture: str | None, signed: str = ""
+) -> str:
+    """A version's description: verdict, signer, closed-loop evidence per scenario, analysis, picture of the loop."""
+    parts = [_verdict(gate), f"<p>Signed by {escape(signed)}.</p>" if signed else "", _grounds(validation)]
     if validation is not None:
         parts += [_table(validation, gate), _analysis(validation, gate.law)]
     if picture:

@@ -15,6 +15,7 @@ from pipeline.files import sha256
 from pipeline.tracking.notes import experiment_note
 from pipeline.tracking.registry import describe, elect_champion, register, withdraw
 from pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
+from pipeline.tracking.signing import Signer
 from pipeline.tracking.stage_results import StageResult, dataset_hash, datasets, read_lock
 from pipeline.tracking.store import experiment_id, hide_default, store
 
@@ -26,9 +27,12 @@ def publish(root: Path) -> dict[str, Any]:
     run ids, so it is the same after a deleted store was rebuilt. A result whose files on disk are
     not those of dvc.lock (a stage that was killed) is left out, with a line saying so.
 
-    Raises TrackingError where there is no dvc.lock or the store does not answer.
+    Where the environment names a key (see ``pipeline.tracking.signing``), it signs the controllers.
+
+    Raises TrackingError where there is no dvc.lock or the store does not answer, SignatureError where the key cannot
+    be used.
     """
-    results = read_lock(root)
+    results, signer = read_lock(root), Signer.configured()
     by_case: dict[str, list[StageResult]] = {}
     for result in results:
         if result.case is None:
@@ -40,13 +44,18 @@ def publish(root: Path) -> dict[str, Any]:
     receipt: dict[str, Any] = {"stages": {r.name: r.key for own in by_case.values() for r in own}, "controllers": {}}
     with store() as client:
         for case, own in by_case.items():
-            receipt["controllers"] |= _publish_case(client, case, own, results, root)
+            receipt["controllers"] |= _publish_case(client, case, own, results, root, signer)
         hide_default(client)
     return receipt
 
 
 def _publish_case(
-    client: MlflowClient, case: str, own: list[StageResult], results: list[StageResult], root: Path
+    client: MlflowClient,
+    case: str,
+    own: list[StageResult],
+    results: list[StageResult],
+    root: Path,
+    signer: Signer | None,
 ) -> dict[str, str]:
     """Publish a case's own results; returns registered model -> digest of its file."""
     experiment = experiment_id(client, case)
@@ -71,7 +80,7 @@ def _publish_case(
                 refresh(client, known[result.key], law, validation)
             picture = _add_picture(client, run_id, evidence.parent / "figures" / f"closed_loop_{law}.png")
             marks = {**tags[result.name], "stage_key": result.key}
-            line, is_new = register(client, case, path, run_id, validation, picture, marks)
+            line, is_new = register(client, case, path, run_id, validation, picture, marks, signer)
             made += is_new
             _say(line)
             digests[f"{case}-{law}"] = sha256(path)

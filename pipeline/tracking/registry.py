@@ -6,7 +6,7 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -25,9 +25,11 @@ from mlflow.types import Schema, TensorSpec
 from pipeline.errors import TrackingError
 from pipeline.evaluation.validation import Validation
 from pipeline.files import sha256, write_bytes
-from pipeline.tracking import card
+from pipeline.tracking import card, signing
 from pipeline.tracking.gate import Gate
+from pipeline.tracking.signing import Signer
 from pipeline.tracking.store import missing_file
+from serving.errors import SignatureError
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
 BY_HAND = "champion_by"
@@ -67,10 +69,12 @@ def register(
     validation: Validation | None,
     picture: str | None,
     tags: Mapping[str, str],
+    signer: Signer | None = None,
 ) -> tuple[str, bool]:
-    """Register the controller file ``path`` unless its digest is known; refresh its evidence.
+    """Register the controller file ``path`` unless its digest is known; refresh its evidence and its signature.
 
-    ``picture`` is an artifact of the run. Returns one line that says what happened, and whether a version was made.
+    ``picture`` is an artifact of the run. Without a ``signer`` the signature that is there stays. Returns one line that
+    says what happened, and whether a version was made.
     """
     law = path.stem
     name = f"{case}-{law}"
@@ -81,14 +85,16 @@ def register(
     known = next((v for v in versions(client, name) if v.tags.get("sha256") == digest), None)
     manifest = json.loads(path.with_suffix(".json").read_text()) if path.with_suffix(".json").exists() else {}
     own = {"sha256": digest, "law": law, "case": case, "period_s": str(manifest.get("period_s", ""))}
-    description = card.version_description(validation, gate, run_id, picture)
+    before, at = ({}, run_id) if known is None else (dict(known.tags), str(known.run_id))
+    signature = signing.present(before) if signer is None else signer.attach(client, at, path, before)
+    description = card.version_description(validation, gate, run_id, picture, signing.words(signature))
     analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
-    tags = {**gate.tags(), **analysis, **own, **tags}  # in this order they are shown
+    tags = {**gate.tags(), **analysis, **own, **signature, **tags}  # in this order they are shown
     if known is None:
         number, before = _log(client, name, path, run_id, description, tags), tags
         client.set_registered_model_alias(name, CANDIDATE, number)
     else:
-        number, before = str(known.version), dict(known.tags)
+        number = str(known.version)
         if known.description != description:
             client.update_model_version(name, number, description)
     verdict = _elect(client, name, number, gate)
@@ -261,20 +267,44 @@ def promote(client: MlflowClient, name: str, number: str, alias: str) -> str:
     return line
 
 
-def fetch(client: MlflowClient, what: str, folder: Path) -> list[Path]:
-    """Write a registered controller and its manifest into ``folder``, checked against its digest."""
+def fetch(
+    client: MlflowClient, what: str, folder: Path, trusted: Sequence[Path] | None = None
+) -> tuple[list[Path], str]:
+    """Write a registered controller, its manifest and its signature into ``folder``; the files, and who signed.
+
+    The file is checked against its digest. Where public keys are ``trusted``, nothing is written unless one of them
+    signed it: whoever can write the store can write its digest too. SignatureError says why.
+    """
     version = _find(client, what, BEST)
     law = version.tags.get("law", "")
+    suffixes = [".onnx", ".json", *([".onnx.sig"] if signing.FINGERPRINT in version.tags else [])]
     with tempfile.TemporaryDirectory() as draft:
-        files = [_download(client, version, f"{law}{suffix}", draft) for suffix in (".onnx", ".json")]
+        files = [_download(client, version, f"{law}{suffix}", draft) for suffix in suffixes]
         if sha256(files[0]) != version.tags.get("sha256"):
             raise TrackingError(
                 f"{version.name} version {version.version}: the stored {files[0].name} is not the file that was "
                 "registered (its sha256 differs); delete the version and run `make registry`"
             )
+        words = _signer(version, files[0], trusted)
         for file in files:
             write_bytes(folder / file.name, file.read_bytes())
-        return [folder / file.name for file in files]
+        if len(files) < 3:  # of a version that was fetched here before
+            (folder / f"{files[0].name}.sig").unlink(missing_ok=True)
+        return [folder / file.name for file in files], words
+
+
+def _signer(version: ModelVersion, file: Path, trusted: Sequence[Path] | None) -> str:
+    """Who signed a file that came from the store, in words; SignatureError where none of the keys did."""
+    said = signing.words(version.tags)
+    if trusted is None:
+        return f"signed by {said}, as the store says: verify it with --key PUBLIC" if said else "not signed"
+    from serving.signing.verify import verified
+
+    try:
+        return f"signed by {verified(file, trusted).words}: verified"
+    except SignatureError as error:
+        reason = str(error).removeprefix(f"{file}: ")
+        raise SignatureError(f"{version.name} version {version.version}: {reason}") from None
 
 
 def _download(client: MlflowClient, version: ModelVersion, file: str, draft: str) -> Path:

@@ -126,6 +126,10 @@ class JournalReader:
         )
         return [_entry(row) for row in rows]
 
+    def active(self) -> list[Entry]:
+        """The alarms that have not ended, newest first."""
+        return [e for e in self.entries() if e.event.raised and e.over_s is None]
+
     def entry(self, id_: int) -> Entry | None:
         """One event."""
         row = self._base.execute(f"{ENTRY} where e.id = ?", (id_,)).fetchone()

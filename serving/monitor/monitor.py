@@ -15,6 +15,7 @@ from serving.manifest import Manifest
 from serving.monitor.cusum import Drift
 from serving.monitor.error import Swing, harris_index
 from serving.monitor.estimates import Estimates
+from serving.monitor.plight import Plight
 from serving.monitor.residual import Foresight
 from serving.monitor.rest import RestMap
 from serving.monitor.shares import Share
@@ -62,6 +63,7 @@ class Monitor:
         self.foresight = Foresight(m, self.settle, LEARN_BLOCKS)
         self.estimates = Estimates(m.info, 10 * self.settle, LEARN_BLOCKS)
         self.swings = [Swing(BAND * (s.high - s.low)) for s in m.sp]
+        self.plight = Plight(m.mv, 2 * self.settle)
         self.harris = [Share(1, 20) for _ in m.sp]
         self.moves = np.zeros(len(m.mv))
         self._window = [deque[float](maxlen=HARRIS_SCANS) for _ in m.sp]
@@ -104,6 +106,7 @@ class Monitor:
         for i, value in enumerate(error.tolist()):
             self.errors[i].add(abs(value) / self._sp_span[i])
             self.swings[i].add(value)
+        self.plight.add(mv, float(np.max(np.abs(error) / self._sp_span)), time_s)
         self.foresight.add(pv, mv, command.info, time_s)
         self.estimates.add(command.info, time_s)
         if self._sp is None or not np.array_equal(self._sp, command.sp):
@@ -149,6 +152,7 @@ class Monitor:
     def _gap(self) -> None:
         """No sample, or another mode: what follows has nothing to do with what was."""
         self.foresight.forget()
+        self.plight.forget()
         self._sp = self._last_mv = None
         self._still = 0
         self._clear()

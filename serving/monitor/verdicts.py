@@ -4,7 +4,9 @@
 |---|---|
 | saturated, at a rate limit, outside the domain | twice the share of the learning time, at least .2 (domain: .1) |
 | in HOLD | .02 |
-| swing | regularity 1, with errors beyond LOUD times the learning time's at rest |
+| MV at its end beside an error above a tenth of the range | two settling times |
+| MV that turns round | four of five moves, of a twentieth of its range |
+| swing | regularity 1, with errors beyond LOUD times the learning time's at rest (before that: a tenth of the range) |
 | variability | the learning time's scatter at rest (CUSUM); the mean error also against the validation's largest |
 | load, offset, disturbance of the law's info | the learning time's (CUSUM) |
 | MV at rest | the learnt map and its scatter (CUSUM) |
@@ -29,15 +31,34 @@ LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1
 SWINGS = 1.0
 WORSE = 2.0  # times the validation's worst mean error: how often set points move is another matter here
 LOUD = 4.0  # times the error at rest: noise crosses zero regularly too, by chance
+PLAIN = 0.1  # of a set point's range: a swing that needs no measure of what is normal
 GAIN, ERRORS = 0.15, 4.0
 RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a linear model beside it
 
 
 def verdicts(m: Monitor) -> list[Verdict]:
     """All of them."""
-    found = [*_residual(m), *_estimates(m), *_rest(m), *_variability(m), *_swing(m), *_shares(m)]
+    found = [*_plight(m), *_residual(m), *_estimates(m), *_rest(m), *_variability(m), *_swing(m), *_shares(m)]
     if m.trouble:
         found.append(Verdict("monitor", "watch", f"the monitor itself failed: {m.trouble}"))
+    return found
+
+
+def _plight(m: Monitor) -> list[Verdict]:
+    found = []
+    for i, s in enumerate(m.manifest.mv):
+        name, plight = f"{s.name} moves", m.plight
+        if plight.jammed(i):
+            end = "upper" if plight.end[i] > 0 else "lower"
+            since = _when(float(plight.since_s[i]))
+            text = f"{s.name} is at the {end} end of its range since {since}, and the error stays"
+            found.append(Verdict(name, "watch", text, float(plight.stuck[i]), float(plight.patience)))
+        elif plight.flutters(i):
+            size = f"{plight.move[i] * (s.high - s.low):.3g} {_unit(s)}".strip()
+            text = f"{s.name} turns round at nearly every scan, by {size} each time"
+            found.append(Verdict(name, "watch", text, float(plight.turns[i])))
+        else:
+            found.append(Verdict(name, "as validated", "neither stuck at an end nor to and fro at each scan"))
     return found
 
 
@@ -126,9 +147,10 @@ def _swing(m: Monitor) -> list[Verdict]:
     found = []
     for s, swing, drift in zip(m.manifest.sp, m.swings, m.spread, strict=True):
         r, quiet = swing.regularity(), exp(drift.mean / 2) * (s.high - s.low)
-        if not drift.learnt:
+        loud = LOUD * quiet if drift.learnt else PLAIN * (s.high - s.low)
+        if not drift.learnt and not (r > SWINGS and swing.amplitude() > loud):
             found.append(unknown(f"swing of {s.name}", "the error at rest is still measured"))
-        elif r > SWINGS and swing.amplitude() > LOUD * quiet:
+        elif r > SWINGS and swing.amplitude() > loud:
             seconds = swing.period() * m.manifest.period_s
             text = f"{s.name} swings by {swing.amplitude():.3g} {_unit(s)}every {seconds:.3g} s"
             found.append(Verdict(f"swing of {s.name}", "watch", text, r, SWINGS))

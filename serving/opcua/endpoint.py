@@ -27,7 +27,10 @@ from serving.words import first_line, named
 
 Array: TypeAlias = NDArray[np.float64]
 
-LEAD, LONGEST_LEAD_S = 0.3, 0.5  # of a period: so long before the scan values are asked for
+# So long before the scan values are asked for, as a share of the period: a value's age is dead time that no controller
+# was validated with. Twice as long as answers have taken of late, within these bounds.
+LEAST_LEAD, MOST_LEAD, LONGEST_LEAD_S = 0.05, 0.3, 0.5
+FADES = 0.98  # what is remembered of the slowest answer, from scan to scan
 ANSWER, LONGEST_ANSWER_S = 0.8, 5.0  # of a period: so long an answer may take
 SILENT_SCANS = 3  # without any answer: the connection is broken off and made anew
 FIRST_RETRY_S, LAST_RETRY_S, GROWTH = 0.2, 10.0, 1.6
@@ -96,7 +99,7 @@ class OpcUaEndpoint:
         self.speed, self.tell, self.clock = speed, tell, clock
         self.max_age_s, self.period_s = max_age_s / speed, manifest.period_s / speed  # of the machine's time
         self.answer_s = min(ANSWER * self.period_s, LONGEST_ANSWER_S)
-        self.lead_s = min(LEAD * self.period_s, LONGEST_LEAD_S)
+        self._slowest_s = MOST_LEAD * self.period_s  # until answers are known
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
         self.unwritten = ""  # why the last MV did not reach the plant
@@ -111,6 +114,12 @@ class OpcUaEndpoint:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="opcua", daemon=True)
+
+    @property
+    def lead_s(self) -> float:
+        """How long before a scan values are asked for [s of the machine's clock]."""
+        least, most = LEAST_LEAD * self.period_s, min(MOST_LEAD * self.period_s, LONGEST_LEAD_S)
+        return min(max(2 * self._slowest_s, least), most)
 
     # ------------------------------------------------------------------ the loop's side
     def start(self) -> None:
@@ -267,6 +276,7 @@ class OpcUaEndpoint:
                         raise
                     continue
                 silent = 0
+                self._slowest_s = max(self.clock() - now, FADES * self._slowest_s)
                 self.values = self._valued(plan, answers, ages)
                 self.trouble = ""
             else:

@@ -73,14 +73,14 @@ class PageApp:
         """What the loop is."""
         found = await self._asked({"do": "about"})
         card = found["card"]
-        folder = Path(found.pop("folder"))
-        found["candidates"] = await asyncio.to_thread(self._candidates, folder, card["file"])
+        folder, trusted = Path(found.pop("folder")), found.pop("trusted", None)
+        found["candidates"] = await asyncio.to_thread(self._candidates, folder, card["file"], trusted)
         card["picture"] = f"/api/picture/{card['sha256'][:16]}" if card["picture"] else None
         return JSONResponse(found)
 
-    def _candidates(self, folder: Path, in_charge: str) -> list[dict[str, Any]]:
+    def _candidates(self, folder: Path, in_charge: str, trusted: list[str] | None) -> list[dict[str, Any]]:
         try:
-            return candidates(folder, in_charge)
+            return candidates(folder, in_charge, trusted)
         except (LoopwrightError, OSError, KeyError):
             return []  # the file in charge is gone from its folder
 

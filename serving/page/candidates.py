@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from serving.digest import file_digest, unseal
-from serving.errors import LoopwrightError
+from serving.errors import ArtifactError, LoopwrightError
 from serving.graph_audit import MAX_BYTES, audit
 from serving.manifest import MANIFEST_KEY, Manifest
 from serving.successor import require_same_signals
@@ -14,24 +15,36 @@ from serving.successor import require_same_signals
 MOST = 50  # files that are looked at
 
 
-def candidates(folder: Path, in_charge: str) -> list[dict[str, Any]]:
-    """Law, file and sha256 of each controller with the period and the signals of the file ``in_charge``."""
+def candidates(folder: Path, in_charge: str, trusted: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Law, case, file, sha256 and signer of each controller with the period and the signals of the file ``in_charge``.
+
+    Where public keys are ``trusted``, only of files that one of them signed: the loop would refuse any other.
+    """
     found: list[dict[str, Any]] = []
-    now, _ = _described(folder / in_charge)
+    now, _, _ = _described(folder / in_charge, trusted)
     for path in sorted(folder.glob("*.onnx"))[:MOST]:
         try:
-            manifest, sha256 = _described(path)
+            manifest, sha256, signed = _described(path, trusted)
             require_same_signals(now, manifest)
         except (LoopwrightError, OSError, KeyError):
             continue
         if path.name != in_charge:
-            found.append({"law": manifest.law, "file": path.name, "sha256": sha256})
+            row = {"law": manifest.law, "case": manifest.case, "file": path.name, "sha256": sha256, "signed": signed}
+            found.append(row)
     return found
 
 
-def _described(path: Path) -> tuple[Manifest, str]:
-    """Manifest and sha256, without a session; LoopwrightError where the file is no controller."""
+def _described(path: Path, trusted: Sequence[str] | None) -> tuple[Manifest, str, str | None]:
+    """Manifest, sha256 and signer, without a session; LoopwrightError where it is no controller, or not trusted."""
+    signed = None
+    if trusted is not None:
+        from serving.signing.verify import verified  # here: it needs the package cryptography
+
+        signed = verified(path, trusted)
     with path.open("rb") as file:
         data = file.read(MAX_BYTES + 1)
+    sha256 = file_digest(data)
+    if signed is not None and sha256 != signed.sha256:
+        raise ArtifactError(f"{path} was exchanged after its signature was verified")
     unseal(data)
-    return Manifest.from_json(audit(data).metadata[MANIFEST_KEY]), file_digest(data)
+    return Manifest.from_json(audit(data).metadata[MANIFEST_KEY]), sha256, None if signed is None else signed.words

@@ -8,12 +8,13 @@ import json
 import logging
 import signal
 import sys
+from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 
-from serving.controller import Controller
 from serving.errors import LoopError
 from serving.guard import Sample
+from serving.journal import JournalReader
 from serving.loop import Command, Mode
 from serving.manifest import Manifest
 from serving.station.control import ask
@@ -21,6 +22,7 @@ from serving.station.export import export, tag_table
 from serving.station.requests import TRIAL
 from serving.station.settings import Settings
 from serving.station.template import template
+from serving.trust import Controller
 
 SETTINGS = Path("loop.toml")
 
@@ -71,7 +73,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _state(options: argparse.Namespace) -> int:
-    print(json.dumps(ask(Settings.read(options.loop).journal.file, {"do": "state"}), indent=2))
+    journal = Settings.read(options.loop).journal.file
+    state, about = (ask(journal, {"do": do}) for do in ("state", "about"))
+    signals = {group: [s["name"] for s in about["signals"][group]] for group in ("sp", "pv", "mv", "dv")}
+    names = {**signals, **dict.fromkeys(("applied", "law", "beside"), signals["mv"]), "info": about["info"]}
+    for group, of in names.items():
+        if state.get(group) is not None:
+            state[group] = dict(zip(of, state[group], strict=True))
+    print(json.dumps(state, indent=2))
     return 0
 
 
@@ -113,7 +122,9 @@ def _init(options: argparse.Namespace) -> int:
     except ValueError:
         path = options.file.absolute()
     make(folder / "loop-certificate.der", folder / "loop-key.pem")
-    options.out.write_text(template(controller, path, options.endpoint), encoding="utf-8")
+    options.out.write_text(
+        template(controller, path, options.endpoint, f"{options.out.stem}.journal"), encoding="utf-8"
+    )
     print(f"written: {options.out}, and beside it loop-certificate.der (for the server to trust) and loop-key.pem")
     print(f"next: put the plant's node ids in, then `loopwright loop check {options.out}`")
     return 0
@@ -122,7 +133,8 @@ def _init(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     settings = Settings.read(options.file)
     _quiet()
-    manifest = Controller(settings.controller, settings.sha256 or None).manifest
+    controller = Controller(settings.controller, settings.sha256 or None, settings.trusted)
+    manifest = controller.manifest
     from serving.opcua.inspection import Found, inspected
 
     settings.guards.of(manifest, settings.max_age_s(manifest.period_s))
@@ -133,6 +145,8 @@ def _check(options: argparse.Namespace) -> int:
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
     for cells in table:
         print("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
+    if controller.signed is not None:
+        print(f"{controller.path.name}: signed by {controller.signed.words}")
     wrong = [f"{row.signal}: {row.wrong}" for row in rows if row.wrong]
     for note in [f"{row.signal}: {row.note}" for row in rows if row.note] + _warnings(settings):
         print(f"note: {note}")
@@ -146,7 +160,8 @@ def _check(options: argparse.Namespace) -> int:
 def _warnings(settings: Settings) -> list[str]:
     server = settings.server
     return [
-        *["sha256 is not set: any controller in that file would run"] * (not settings.sha256),
+        *["neither sha256 nor trusted is set: any controller in that file would run"]
+        * (not settings.sha256 and settings.trusted is None),
         *["security is None: what is sent can be read and changed on the way"] * (server.security == "None"),
         *["server_certificate is not set: any server at that address is believed"]
         * (server.security != "None" and server.server_certificate is None),
@@ -172,9 +187,19 @@ def _run(options: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: station.end())
     report = station.run(options.scans)
+    if station.last is not None:
+        tell(_left(station.manifest, station.last[1]))
     tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
     tell(f"journal: {settings.journal.file}")
     return 0
+
+
+def _left(manifest: Manifest, last: Command) -> str:
+    """What the plant is left with."""
+    if not last.writes:
+        return f"ended in {last.mode}: nothing was written by this loop"
+    stay = ", ".join(f"{s.name} at {v:.5g} {s.unit}" for s, v in zip(manifest.mv, last.mv.tolist(), strict=True))
+    return f"ended in {last.mode}: the plant keeps {stay}, and this loop moves it no more"
 
 
 class _Lines:
@@ -205,7 +230,10 @@ def _export(options: argparse.Namespace) -> int:
     tags = out.with_name(f"{out.stem}-tags.csv")
     tag_table(options.file, tags)
     print(f"{rows} scans: {out}, its tags: {tags}")
-    print(f"next: `loopwright new NAME {out} --tags {tags}` makes a record of it")
+    with closing(JournalReader(options.file)) as reader:
+        period_s = reader.runs()[-1]["period_s"]
+    # Without the period `new` would choose one, and a controller of another period could not be swapped in.
+    print(f"next: `loopwright new NAME {out} --tags {tags} --period {period_s:g}` makes a record of it")
     return 0
 
 

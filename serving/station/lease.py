@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 import os
+import socket
 from collections.abc import Iterable
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from serving.errors import LoopError
 from serving.station.places import runtime_folder
+
+OPC_UA_PORT = 4840
 
 
 class Lease:
@@ -18,12 +23,13 @@ class Lease:
     """
 
     def __init__(self, endpoint: str, nodes: Iterable[str], folder: Path | None = None) -> None:
-        import fcntl  # not on Windows, where only a lease node keeps loops apart
-
         self._held: list[int] = []
         place = runtime_folder(folder)
+        import fcntl  # which Windows lacks; the line above has said so there
+
+        address = address_of(endpoint)
         for node in nodes:
-            path = place / hashlib.sha256(f"{endpoint} {node}".encode()).hexdigest()[:32]
+            path = place / hashlib.sha256(f"{address} {node}".encode()).hexdigest()[:32]
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -42,3 +48,19 @@ class Lease:
         """Let others have the nodes."""
         while self._held:
             os.close(self._held.pop())
+
+
+def address_of(endpoint: str) -> str:
+    """Where a server listens, however its host is spelt: ``localhost``, 127.0.0.1 and ::1 are the same one."""
+    try:
+        parts = urlsplit(endpoint)
+        host, port = parts.hostname or "", parts.port or OPC_UA_PORT
+    except ValueError:
+        return endpoint
+    try:
+        found = sorted({str(row[4][0]) for row in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)})
+    except OSError:
+        return f"{host}:{port}"
+    if any(ipaddress.ip_address(address.partition("%")[0]).is_loopback for address in found):
+        return f"this machine:{port}"
+    return f"{found[0]}:{port}"

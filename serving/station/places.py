@@ -13,8 +13,11 @@ from serving.errors import LoopError
 def runtime_folder(folder: Path | None = None) -> Path:
     """A folder that only this user may enter, made where it is not there yet.
 
-    Raises LoopError where somebody else made it first, or opened it to others.
+    Raises LoopError where somebody else made it first, or opened it to others, and on a system that tells no users
+    apart and has no Unix sockets.
     """
+    if not hasattr(os, "getuid"):
+        raise LoopError("`loopwright loop` runs on Linux and macOS; on Windows run it in WSL, or embed ControlLoop")
     place = folder or Path(tempfile.gettempdir()) / f"loopwright-{os.getuid()}"
     place.mkdir(mode=0o700, exist_ok=True)
     found = place.lstat()

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from serving.controller import Controller
+from serving.errors import LoopError
 from serving.guard import Sample
-from serving.journal import Event, Journal, Scan
+from serving.journal import Event, Journal, JournalReader, Scan
 from serving.journal.entries import Kind
 from serving.loop import Command, ControlLoop
 from serving.manifest import Manifest
@@ -33,6 +35,12 @@ class Recorder:
         assert self._controller is not None
         return self._controller
 
+    def end_old_alarms(self) -> None:
+        """End the alarms of a loop that was killed: what is wrong now is seen anew."""
+        with suppress(LoopError), closing(JournalReader(self.journal.path)) as reader:
+            for event in [e.event for e in reader.active() if e.event.kind in {"fault", "connection"}]:
+                self.note(event.kind, "loop", "over: the loop begins anew", alarm=event.alarm)
+
     def begin(self, controller: Controller) -> None:
         """What follows is of this controller."""
         self._controller = controller
@@ -51,15 +59,17 @@ class Recorder:
     ) -> None:
         """Write an event down, and say it."""
         self.journal.event(Event(time.time(), kind, who, what, reason, alarm, raised, about))
-        self._say(f"{who}: {what}" + (f" ({reason})" if reason else ""))
+        said = f"acknowledged: {what}" if kind == "acknowledged" else what
+        self._say(f"{who}: {said}" + (f" ({reason})" if reason else ""))
 
     def scan(self, loop: ControlLoop, sample: Sample | None, command: Command, quality: tuple[int, ...]) -> None:
         """Write a scan down, and the fault or the new controller that came with it."""
         numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
         self.journal.scan(Scan(time.time(), command.mode.value, numbers, quality, command.reason))
         if command.reason != self._fault:
-            self._fault = command.reason
-            self.note("fault", "loop", command.reason or "over", alarm="fault", raised=bool(command.reason))
+            before, self._fault = self._fault, command.reason
+            what = command.reason or f"over: {before}"
+            self.note("fault", "loop", what, alarm="fault", raised=bool(command.reason))
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
             self.begin(loop.controller)

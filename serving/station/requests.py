@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import isfinite
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from serving.controller import Controller
 from serving.errors import LoopError
@@ -16,6 +15,9 @@ from serving.loop import ControlLoop, Mode, within
 from serving.manifest import Signal
 from serving.station.recorder import named
 from serving.successor import require_same_signals
+from serving.trust import signer
+
+Opened: TypeAlias = Callable[[str, str | None], Controller]  # file, its pinned SHA-256 or None
 
 LONGEST_NAME, LONGEST_REASON = 60, 300
 TRIAL, LONGEST_TRIAL = 60, 1_000_000  # scans
@@ -59,26 +61,26 @@ class Request:
         return cls(tree["do"], tree.get("value"), who.strip(), reason.strip())
 
 
-def change(request: Request, loop: ControlLoop, folder: Path) -> Change:
+def change(request: Request, loop: ControlLoop, opened: Opened) -> Change:
     """The change of the loop that is asked for; LoopError or ArtifactError where it would be refused.
 
-    A file of another controller is read here, so that no scan waits for it; relative paths lie in ``folder``.
+    A file of another controller is read here, by ``opened``, so that no scan waits for it.
     """
     made = {"mode": _mode, "sp": _sp, "mv": _mv, "swap": _swap, "keep": _keep, "back": _back}.get(request.do)
     if made is None:
         known = ("mode", "sp", "mv", "swap", "keep", "back", "acknowledge", "state", "about")
         raise LoopError(f"the loop cannot {request.do!r}{nearest(request.do, known)}")
-    return made(request, loop, folder)
+    return made(request, loop, opened)
 
 
-def _mode(request: Request, loop: ControlLoop, _: Path) -> Change:
+def _mode(request: Request, loop: ControlLoop, _: Opened) -> Change:
     if request.value not in [m.value for m in Mode]:
         raise LoopError(f"mode is {request.value!r}{nearest(request.value, [m.value for m in Mode])}")
     mode = Mode(request.value)
     return Change(lambda loop: loop.set_mode(mode), f"mode {loop.mode} -> {mode}", request.who, request.reason)
 
 
-def _sp(request: Request, loop: ControlLoop, _: Path) -> Change:
+def _sp(request: Request, loop: ControlLoop, _: Opened) -> Change:
     signals = loop.controller.manifest.sp
     wanted = _numbers(request.value, signals, loop.sp.tolist(), "set point")
     within(wanted, signals, "set point")
@@ -86,7 +88,7 @@ def _sp(request: Request, loop: ControlLoop, _: Path) -> Change:
     return Change(lambda loop: loop.set_sp(wanted), what, request.who, request.reason)
 
 
-def _mv(request: Request, loop: ControlLoop, _: Path) -> Change:
+def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
     signals = loop.controller.manifest.mv
     wanted = _numbers(request.value, signals, loop.mv.tolist(), "MV")
     within(wanted, signals, "MV")
@@ -96,7 +98,7 @@ def _mv(request: Request, loop: ControlLoop, _: Path) -> Change:
     return Change(lambda loop: loop.set_mv(wanted), what, request.who, request.reason)
 
 
-def _swap(request: Request, loop: ControlLoop, folder: Path) -> Change:
+def _swap(request: Request, loop: ControlLoop, opened: Opened) -> Change:
     value = request.value
     if not isinstance(value, Mapping) or not isinstance(value.get("file"), str) or not value["file"]:
         raise LoopError('a swap needs {"file": a controller\'s .onnx, "trial": a number of scans}')
@@ -104,10 +106,10 @@ def _swap(request: Request, loop: ControlLoop, folder: Path) -> Change:
     sha256 = value.get("sha256")
     if not (sha256 is None or isinstance(sha256, str)):
         raise LoopError("sha256 is no text")
-    return _tried(request, loop, Controller(folder / value["file"], sha256), trial)
+    return _tried(request, loop, opened(value["file"], sha256), trial)
 
 
-def _back(request: Request, loop: ControlLoop, _: Path) -> Change:
+def _back(request: Request, loop: ControlLoop, _: Opened) -> Change:
     if loop.replaced is None:
         raise LoopError("no controller was replaced since this loop began")
     trial = request.value.get("trial", TRIAL) if isinstance(request.value, Mapping) else TRIAL
@@ -120,11 +122,13 @@ def _tried(request: Request, loop: ControlLoop, controller: Controller, trial: A
     require_same_signals(loop.controller.manifest, controller.manifest)
     if controller.sha256 == loop.controller.sha256:
         raise LoopError(f"{named(controller)} is in charge already")
-    what = f"{named(controller)} beside {named(loop.controller)} for {trial} scans"
+    signed = signer(controller)
+    by = "" if signed is None else f", signed by {signed.words},"
+    what = f"{named(controller)}{by} beside {named(loop.controller)} for {trial} scans"
     return Change(lambda loop: loop.swap(controller, trial), what, request.who, request.reason, kind="swap")
 
 
-def _keep(request: Request, loop: ControlLoop, _: Path) -> Change:
+def _keep(request: Request, loop: ControlLoop, _: Opened) -> Change:
     if loop.successor is None:
         raise LoopError("no controller is on trial")
     what = f"{named(loop.successor.controller)} is tried no more"

@@ -114,13 +114,15 @@ class JournalSettings:
 class Settings:
     """A loop: controller, plant, guards, fallback, journal, page. Paths are relative to the file that names them.
 
-    ``page`` is HOST:PORT or a table (see ``serving.page.settings``); empty: none.
+    ``trusted`` names public keys: only a controller that one of them signed is loaded, at the start and by a swap
+    (None: any is). ``page`` is HOST:PORT or a table (see ``serving.page.settings``); empty: none.
     """
 
     controller: Path
     server: Server
     nodes: Nodes
     sha256: str = ""
+    trusted: tuple[Path, ...] | None = None
     start: Literal["SHADOW", "MANUAL", "AUTO"] = "SHADOW"
     speed: float = 1.0
     transfer_s: float | None = None
@@ -132,6 +134,8 @@ class Settings:
     def __post_init__(self) -> None:
         if not (isfinite(self.speed) and self.speed > 0):
             raise LoopError(f"speed is {self.speed}; it must be above zero (1 is real time)")
+        if self.trusted == ():
+            raise LoopError("trusted names no public key, so no controller could be loaded; name one, or leave it out")
         if self.hold.then == "hand back" and self.nodes.hand_back is None:
             raise LoopError('hold.then is "hand back", but nodes.hand_back does not say by which node')
         if isinstance(self.page, str) and self.page:
@@ -165,7 +169,10 @@ class Settings:
                 certificate=_under(at, page.certificate),
                 private_key=_under(at, page.private_key),
             )
-        return replace(found, controller=at / found.controller, server=server, journal=journal, page=page)
+        trusted = None if found.trusted is None else tuple(at / key for key in found.trusted)
+        return replace(
+            found, controller=at / found.controller, trusted=trusted, server=server, journal=journal, page=page
+        )
 
     def served(self) -> Page | None:
         """The page that is asked for."""

@@ -7,13 +7,12 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from serving.clock import MonotonicClock
-from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
 from serving.grid import RunReport
 from serving.guard import Sample
@@ -30,7 +29,11 @@ from serving.station.requests import Change, Request, change
 from serving.station.settings import Settings
 from serving.station.views import about, picture, state
 from serving.station.watching import Watching
+from serving.trust import Controller, signer
 from serving.words import first_line
+
+if TYPE_CHECKING:
+    from serving.signing.keys import PublicKey
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -50,7 +53,8 @@ class Station:
 
     def __init__(self, settings: Settings, *, tell: Callable[[str], None] = lambda _: None) -> None:
         self.settings, self.tell = settings, tell
-        self.controller = Controller(settings.controller, settings.sha256 or None)
+        self.trusted = self._public_keys()
+        self.controller = Controller(settings.controller, settings.sha256 or None, self.trusted)
         m = self.manifest
         age = settings.max_age_s(m.period_s)
         self.guards, self.fallback = settings.guards.of(m, age), settings.hold.fallback(m.mv)
@@ -68,6 +72,7 @@ class Station:
             self.lease.release()
             raise
         self.recorder = Recorder(self.journal, tell, settings.speed)
+        self.recorder.end_old_alarms()
         self.watching = Watching(self.controller, self.recorder)
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
@@ -125,7 +130,9 @@ class Station:
                 fallback=self.fallback,
             )
             self.recorder.begin(self.controller)
-            self.recorder.note("change", "loop.toml", f"started in {s.start}")
+            signed = signer(self.controller)
+            by = "" if signed is None else f"; {self.controller.path.name} is signed by {signed.words}"
+            self.recorder.note("change", "loop.toml", f"started in {s.start}{by}")
             report = self.loop.run(n, before=self._before, observe=self._observe, until=lambda _: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
@@ -205,6 +212,18 @@ class Station:
             seen(sample, command)
 
     # ------------------------------------------------------------------ requests
+    def _public_keys(self) -> list[PublicKey] | None:
+        """The keys as they are at the start: whoever changes their files later changes nothing here."""
+        if self.settings.trusted is None:
+            return None
+        from serving.signing.verify import public_keys  # here: it needs the package cryptography
+
+        return public_keys(self.settings.trusted)
+
+    def _opened(self, file: str, sha256: str | None) -> Controller:
+        """A controller that is to be tried; a relative path lies beside the one in charge."""
+        return Controller(self.settings.controller.parent / file, sha256, self.trusted)
+
     def answer(self, tree: Any) -> Answer:
         """What a request gets, from any thread: a view, or the change once a scan has carried it out."""
         if isinstance(tree, dict) and tree.get("do") in {"state", "about", "picture"}:
@@ -214,7 +233,7 @@ class Station:
             return self._acknowledge(request)
         if self.loop is None:
             raise LoopError(f"the loop has not begun yet: {self.endpoint.trouble}")
-        wanted = change(request, self.loop, self.settings.controller.parent)
+        wanted = change(request, self.loop, self._opened)
         said = queue.SimpleQueue[str]()
         self.ask(replace(wanted, done=said.put))
         period = self.manifest.period_s / self.settings.speed

@@ -9,7 +9,7 @@ from serving.controller import Controller
 from serving.manifest import Signal
 
 
-def template(controller: Controller, path: Path, endpoint: str) -> str:
+def template(controller: Controller, path: Path, endpoint: str, journal: str = "loop.journal") -> str:
     """The text of a loop.toml beside which ``path`` lies, for a plant at ``endpoint``."""
     m = controller.manifest
     period = m.period_s
@@ -18,7 +18,9 @@ def template(controller: Controller, path: Path, endpoint: str) -> str:
         "# `loopwright loop check` reads every node and writes none.",
         f'controller = "{path.as_posix()}"',
         f'sha256 = "{controller.sha256}"  # this very file and no other',
+        '# trusted = ["maker.pub"]  # only controllers that one of these public keys signed; see docs/trust.md',
         'start = "SHADOW"  # the law is computed and shown, nothing is written; or MANUAL, AUTO',
+        "# speed = 10  # times the clock, for a plant that is simulated as fast: `loopwright plant serve --speed 10`",
         'page = "127.0.0.1:8080"  # the operator\'s page; leave it out for none',
         f"transfer_s = {20 * period:g}  # [s] in which an MV crosses its range at most once after a change to AUTO",
         "",
@@ -74,7 +76,7 @@ def template(controller: Controller, path: Path, endpoint: str) -> str:
         f"# rate = {_table(m.mv, lambda s: (s.high - s.low) / 60)}  # [unit/s] on the way there",
         "",
         "[journal]",
-        'file = "loop.journal"',
+        f'file = "{journal}"',
         "max_mb = 2000  # the oldest scans go beyond that",
         'fsync = "crash"  # what it survives without loss; "power loss" waits for the disk each time',
         "",

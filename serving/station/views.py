@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from serving.controller import Controller
 from serving.journal import columns
+from serving.trust import signer
 
 if TYPE_CHECKING:
     from serving.station.station import Station
@@ -35,6 +36,7 @@ def about(station: Station) -> View:
         "columns": columns(m),
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
+        "trusted": None if (keys := station.settings.trusted) is None else [str(key.absolute()) for key in keys],
         "warnings": station.warnings,
     }
 
@@ -105,11 +107,13 @@ def _card(controller: Controller) -> View:
     m, evidence = controller.manifest, controller.manifest.evidence
     scenarios = evidence.get("scenarios")
     rows = scenarios if isinstance(scenarios, dict) else {}
+    signed = signer(controller)
     return {
         "law": m.law,
         "case": m.case,
         "file": controller.path.name,
         "sha256": controller.sha256,
+        "signed": None if signed is None else signed.to_dict(),
         "size_bytes": controller.size_bytes,
         "period_s": m.period_s,
         "commit": m.provenance.get("commit"),

@@ -14,6 +14,7 @@ from serving.loop import Command
 from serving.monitor import Monitor
 from serving.station.recorder import Recorder
 
+ALARMING, ALARM = {"watch", "retrain"}, "monitor "
 LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt
 
 
@@ -22,15 +23,16 @@ class Watching:
 
     def __init__(self, controller: Controller, recorder: Recorder) -> None:
         self._recorder = recorder
-        self._levels: dict[str, str] = {}
-        self._looked = self._kept = time.time()
         self._of = controller
+        self._levels = self._active()
+        self._looked = self._kept = time.time()
         self.monitor = self._begun(controller)
 
     def seen(self, controller: Controller, scan: tuple[Sample | None, Command, float]) -> None:
         """A scan, with its time; now and then what the verdicts have become."""
         if controller is not self._of:
             self.keep()
+            self._over(self._levels)
             self._of, self._levels = controller, {}
             self.monitor = self._begun(controller)
         sample, command, time_s = scan
@@ -55,18 +57,36 @@ class Watching:
                 return Monitor.restored(controller.manifest, json.loads(kept))
         return Monitor(controller.manifest, started_s=time.time())
 
+    def _active(self) -> dict[str, str]:
+        """The verdicts whose alarms a loop before this one left active; those of another controller end."""
+        with suppress(LoopError), closing(JournalReader(self._recorder.journal.path)) as reader:
+            active = [e.event for e in reader.active() if e.event.kind == "monitor"]
+            levels = {event.alarm.removeprefix(ALARM): event.what.split(": ")[1] for event in active}
+            runs = reader.runs()
+            if runs and runs[-1]["sha256"] == self._of.sha256:
+                return levels
+            self._over(levels)
+        return {}
+
+    def _over(self, levels: dict[str, str]) -> None:
+        """End the alarms of a controller that has the plant no more."""
+        for name, level in levels.items():
+            if level in ALARMING:
+                what = f"{name}: over, for another controller has the plant"
+                self._recorder.note("monitor", "monitor", what, alarm=f"{ALARM}{name}")
+
     def _look(self) -> None:
         """An alarm for each verdict that has become one, and its end."""
         for verdict in self.monitor.verdicts():
             before = self._levels.get(verdict.name, "")
             self._levels[verdict.name] = verdict.level
-            alarming = verdict.level in {"watch", "retrain"}
-            if verdict.level != before and (alarming or before in {"watch", "retrain"}):
+            alarming = verdict.level in ALARMING
+            if verdict.level != before and (alarming or before in ALARMING):
                 self._recorder.note(
                     "monitor",
                     "monitor",
                     f"{verdict.name}: {verdict.level}: {verdict.text}",
-                    alarm=f"monitor {verdict.name}",
+                    alarm=f"{ALARM}{verdict.name}",
                     raised=alarming,
                 )
 

@@ -19,7 +19,7 @@ from pipeline.models import MODELS
 ROOT = Path(__file__).parents[2]
 COMMANDS_OF_TODAY = {
     "new", "run", "check", "results", "simulate", "stress", "inspect", "bench", "laws", "models", "bounds", "registry",
-    "loop", "plant",
+    "loop", "plant", "keygen", "sign", "verify", "conformance", "fmu",
 }  # fmt: skip
 
 
@@ -49,6 +49,7 @@ def test_every_command_tells_what_it_takes(name: str, capsys: pytest.CaptureFixt
         (["simulat"], "unknown command 'simulat'; did you mean 'simulate'?"),
         (["inspect", "none.onnx"], "none.onnx: the file cannot be read"),
         (["bench", "none.onnx"], "none.onnx: the file cannot be read"),
+        (["conformance", "none.onnx", "kit"], "none.onnx: the file cannot be read"),
         (["results", "--artifacts", "nowhere"], "nowhere holds no validation.json yet"),
         (["laws", "pidd"], "unknown law 'pidd'; did you mean 'pid'?"),
         (["models", "rbff"], "unknown kind of model 'rbff'; did you mean 'rbf'?"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from plant_servers import Plant
+from processes import within
 
 from pipeline.__main__ import main
 from serving import LoopError
@@ -35,7 +37,8 @@ def settings(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     monkeypatch.chdir(tmp_path)
     assert main(["loop", "init", str(PID), "--endpoint", plant.endpoint]) == 0
     path = tmp_path / "loop.toml"
-    path.write_text("speed = 5.0\n" + path.read_text())
+    # Another program may listen at the port that a loop.toml begins with.
+    path.write_text("speed = 5.0\n" + path.read_text().replace("127.0.0.1:8080", "127.0.0.1:0"))
     return path
 
 
@@ -61,9 +64,11 @@ def test_the_way_from_a_controller_to_training_data(
     said = capsys.readouterr().out
     assert "loop.toml: started in AUTO" in said
     assert "25 scans" in said or "missed" in said
+    assert re.search(r"ended in (AUTO|HOLD): the plant keeps T_j at [\d.]+ K, and this loop moves it no more", said)
     for row in plant.actuator()[before:]:
         assert row["asked"] == [float(np.float32(row["asked"][0]))]
     assert main(["loop", "export", "loop.journal"]) == 0
+    assert "`loopwright new NAME loop.csv --tags loop-tags.csv --period 0.5`" in capsys.readouterr().out
     table = pd.read_csv("loop.csv")
     assert list(table.columns) == ["time", "C_A.PV", "T.PV", "T_j.OP", "C_A.SP", "MODE"]
     assert set(table["MODE"]) <= {"AUTO", "HOLD"}
@@ -77,7 +82,9 @@ def test_a_shadow_writes_nothing_but_its_heartbeat(
 ) -> None:
     before = len(plant.actuator())
     assert main(["loop", "run", "--scans", "15"]) == 0
-    assert "(law T_j" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "(law T_j" in said
+    assert "ended in SHADOW: nothing was written by this loop" in said
     assert len({row["asked"][0] for row in plant.actuator()[before:]}) == 1
 
 
@@ -163,3 +170,25 @@ def test_what_is_there_is_not_written_over(settings: Path, capsys: pytest.Captur
     assert settings.read_text() == before
     assert main(["loop", "export", "nowhere.journal"]) == 2
     assert "nowhere.journal is not here" in capsys.readouterr().err
+
+
+def test_a_journal_is_named_after_its_loop(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["loop", "init", str(PID), "--out", "reactor.toml"]) == 0
+    assert Settings.read(Path("reactor.toml")).journal.file.name == "reactor.journal"
+
+
+def test_a_signal_is_spoilt_and_mended_by_a_command(
+    settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at = ["--endpoint", plant.endpoint]
+    assert main(["plant", "fault", "PV.T", "bad", *at]) == 0
+    assert within(5, lambda: main(["loop", "check"]) == 2)
+    assert "PV T: its quality is BadSensorFailure" in capsys.readouterr().err
+    assert main(["plant", "fault", "PV.T", "ok", *at]) == 0
+    assert within(5, lambda: main(["loop", "check"]) == 0)
+    capsys.readouterr()
+    assert main(["plant", "fault", "T", "bad", *at]) == 2
+    assert "has no signal 'T'; write it as PV.NAME" in capsys.readouterr().err
+    assert main(["plant", "fault", "PV.T", "bad", "--endpoint", "opc.tcp://127.0.0.1:1"]) == 2
+    assert "no served plant answers at opc.tcp://127.0.0.1:1" in capsys.readouterr().err

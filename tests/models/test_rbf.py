@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ModelError
@@ -49,7 +49,7 @@ def one_pass(u: np.ndarray, c: int) -> np.ndarray:
     centres: list[tuple[int, ...]] = []
     for sample in u:
         distances = [np.linalg.norm(sample - grid[list(i)]) for i in centres]
-        if not any(d / (half_width * np.sqrt(u.shape[1])) <= 1 + 1e-10 for d in distances):
+        if not any((d / half_width) ** 2 / u.shape[1] <= 1 + 1e-9 for d in distances):
             centres.append(tuple(int(np.argmin(np.abs(grid - v))) for v in sample))
     return np.array(centres)
 
@@ -59,6 +59,10 @@ def one_pass(u: np.ndarray, c: int) -> np.ndarray:
 def test_the_pass_equals_the_loop_over_samples(n_in: int, c: int, n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     u = rng.uniform(-1, 1, (n, n_in)) ** rng.choice([1, 3])
+    # Rounding alone decides on a sample halfway between two grid points.
+    between = (u + 1) * (c - 1) / 2 % 1
+    u = u[(np.abs(between - 0.5) > 1e-9).all(axis=1)]
+    assume(len(u))
     np.testing.assert_array_equal(select_centres(u, c), one_pass(u, c))
 
 

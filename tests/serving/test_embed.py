@@ -10,16 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kits import DAMAGES, kit_of, spoilt, verdict_on
 
 from pipeline.export.gate import export
 from pipeline.laws import ControlLaw
 from serving import Controller
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "embed"
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "examples" / "embed" / "python"
 
 
 def run(example: str, file: Path) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-W", "error", str(EXAMPLES / example), str(file)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 0, done.stderr
@@ -41,7 +43,7 @@ def test_both_examples_give_the_controllers_bits(make_law: object, name: str, tm
     assert np.isfinite(first.mv).all()
 
 
-SHIPPED = sorted((EXAMPLES.parents[2] / "artifacts").glob("*/*.onnx"))
+SHIPPED = sorted((ROOT / "artifacts").glob("*/*.onnx"))
 
 
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
@@ -69,3 +71,16 @@ def test_an_example_without_a_file_says_what_it_wants(example: str) -> None:
     assert done.returncode != 0
     assert done.stderr.startswith("usage: ")
     assert "FILE.onnx" in done.stderr
+
+
+@pytest.mark.parametrize("damage", [None, *DAMAGES])
+def test_python_s_conformance_run_passes_the_kit_and_no_damaged_one(damage: str | None, tmp_path: Path) -> None:
+    file = next(f for f in SHIPPED if f.parent.name == "jacketed_batch_reactor")  # one of its MVs is discrete
+    kit = kit_of(file) if damage is None else spoilt(file, tmp_path, DAMAGES[damage])
+    command = [sys.executable, str(EXAMPLES / "conformance.py"), str(kit), str(tmp_path / "answers.json")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == (damage is not None), done.stderr
+    verdict = verdict_on(file, tmp_path / "answers.json")
+    assert verdict.passed  # what it answers is right: it is the kit that is damaged
+    assert verdict.same_bits == verdict.steps

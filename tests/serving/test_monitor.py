@@ -12,6 +12,7 @@ from serving import Command, Controller, Manifest, Mode, Sample, Signal
 from serving.monitor import Monitor
 from serving.monitor.cusum import Cusum, Drift
 from serving.monitor.error import Swing, harris_index
+from serving.monitor.plight import Plight
 from serving.monitor.residual import Foresight
 from serving.monitor.rest import RestMap
 
@@ -229,3 +230,36 @@ def test_every_shipped_controller_has_a_monitor(controller: Controller) -> None:
     monitor = Monitor(controller.manifest, started_s=0.0)
     assert {v.level for v in monitor.verdicts()} <= {"not known yet", "as validated"}
     assert all(v.text for v in monitor.verdicts())
+
+
+def watched(mv: np.ndarray, error: float, patience: int = 50) -> Plight:
+    made = Plight([Signal("u", "%", 0.0, 100.0)], patience)
+    for k, value in enumerate(mv):
+        made.add(np.array([value]), error, float(k))
+    return made
+
+
+def test_an_mv_that_stays_at_its_end_beside_an_error_is_jammed_and_one_without_error_is_not() -> None:
+    way = np.r_[np.linspace(40, 100, 20), np.full(60, 100.0)]
+    jammed = watched(way, 0.4)
+    assert jammed.jammed(0)
+    assert jammed.end[0] == 1
+    assert jammed.since_s[0] == 19
+    assert not watched(way, 0.05).jammed(0)
+    assert not watched(way[:60], 0.4).jammed(0)
+    assert not watched(np.r_[way, 99.0], 0.4).jammed(0)
+
+
+def test_an_mv_that_turns_round_at_each_scan_flutters_and_noise_does_not() -> None:
+    rng = np.random.default_rng(3)
+    to_and_fro = 50 + 10 * (-1.0) ** np.arange(100)
+    assert watched(to_and_fro, 0.0).flutters(0)
+    assert not watched(to_and_fro[:30], 0.0).flutters(0)
+    assert not watched(50 + 0.1 * (to_and_fro - 50), 0.0).flutters(0)
+    # Independent values turn round at two of three scans, steps of a walk at half of them.
+    assert not watched(50 + 10 * rng.normal(size=2_000), 0.0).flutters(0)
+    assert not watched(50 + 5 * np.sin(np.arange(2_000) / 5) + rng.normal(size=2_000), 0.0).flutters(0)
+    discrete = Plight([Signal("v", "-", 0.0, 1.0, values=(0.0, 1.0))], 50)
+    for k in range(100):
+        discrete.add(np.array([float(k % 2)]), 0.0, float(k))
+    assert not discrete.flutters(0)

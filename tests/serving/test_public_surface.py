@@ -10,7 +10,7 @@ SURFACE = {
     "Allowed", "ArtifactError", "Clock", "Command", "Complete", "ContractError", "ControlLoop", "Controller",
     "Endpoint", "EndpointError", "Fallback", "Fresh", "Frozen", "Guard", "InRange", "LoopError", "LoopwrightError",
     "Manifest", "Mode", "MonotonicClock", "OutputError", "Rate", "RunReport", "Sample", "SampleError", "Signal",
-    "SimulatedEndpoint", "Step", "VirtualClock", "default_guards",
+    "SignatureError", "SimulatedEndpoint", "Step", "VirtualClock", "default_guards",
 }  # fmt: skip
 
 

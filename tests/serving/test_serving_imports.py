@@ -71,3 +71,19 @@ def test_the_command_line_runs_there_too(pi_file: Path) -> None:
     code = "from serving.__main__ import main; sys.exit(main(sys.argv[1:]))"
     card = run(code, {"numpy", "onnxruntime"}, "inspect", str(pi_file))
     assert "valve  0 .. 100 %" in card
+
+
+def test_trust_without_cryptography_says_what_to_install(pi_file: Path) -> None:
+    """The runtime needs none of it until a signature is asked for."""
+    code = """
+        from serving import Controller, SignatureError
+        Controller(sys.argv[1])
+        try:
+            Controller(sys.argv[1], trusted=["anna.pub"])
+        except SignatureError as error:
+            print(error)
+        from serving.__main__ import main
+        print(main(["verify", sys.argv[1], "--key", "anna.pub"]))
+        """
+    said = run(code, {"numpy", "onnxruntime"}, str(pi_file)).splitlines()
+    assert said == ["signatures need the package cryptography: pip install 'loopwright[sign]'", "2"]

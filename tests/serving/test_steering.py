@@ -61,7 +61,7 @@ def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixtu
     assert loopwright(capsys, "sp", "C_A=0.5", *who)[0] == 0
     assert loopwright(capsys, "mode", "auto", *who)[0] == 0
     state = json.loads(loopwright(capsys, "state")[1])
-    assert (state["mode"], state["sp"], state["quality"]) == ("AUTO", [0.5], ["Good", "Good", "Good"])
+    assert (state["mode"], state["sp"], state["quality"]) == ("AUTO", {"C_A": 0.5}, ["Good", "Good", "Good"])
     for words, refusal in (
         (("mode", "fast"), "mode is 'FAST'; "),
         (("sp", "C_A=2"), "the set point C_A = 2.0 mol/l is outside [0, 1] mol/l"),
@@ -125,7 +125,7 @@ def test_an_alarm_is_acknowledged_once(loop: RunningLoop, plant: Plant, capsys: 
     spoil(plant, "PV.T", "bad")
     assert within(20, lambda: any("PV T: BadSensorFailure" in event for event in loop.events()))
     spoil(plant, "PV.T", "")
-    assert within(20, lambda: loop.events()[-1] == "fault loop: over")
+    assert within(20, lambda: loop.events()[-1] == "fault loop: over: PV T: BadSensorFailure")
     journal = loop.settings.journal.file
     with closing(JournalReader(journal)) as reader:
         (alarm,) = [e for e in reader.entries() if e.event.raised]

@@ -14,10 +14,11 @@ from plant_servers import Plant, RunningLoop
 from processes import within
 
 from serving import Mode
+from serving.errors import LoopError
 from serving.opcua.lease import SCANS, NodeLease
 from serving.station import station
 from serving.station.control import ask
-from serving.station.lease import Lease
+from serving.station.lease import Lease, address_of
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
 LOOP = """
@@ -131,3 +132,22 @@ def test_a_lease_is_judged_by_whether_it_moves() -> None:
     assert node.held
     node.seen("other:1:b 1")
     assert not node.held
+
+
+def test_a_system_without_unix_users_is_told_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delattr("os.getuid")
+    with pytest.raises(LoopError, match="runs on Linux and macOS; on Windows run it in WSL"):
+        Lease("opc.tcp://plant", ["ns=2;s=MV.u"], tmp_path / "locks")
+    assert not (tmp_path / "locks").exists()
+
+
+def test_another_spelling_of_the_host_is_the_same_plant(tmp_path: Path) -> None:
+    nodes = ["ns=2;s=MV.u"]
+    one = Lease("opc.tcp://127.0.0.1:4841", nodes, tmp_path / "locks")
+    for same in ("opc.tcp://localhost:4841", "opc.tcp://[::1]:4841/path"):
+        with pytest.raises(LoopError, match="is written by another loop"):
+            Lease(same, nodes, tmp_path / "locks")
+    other = Lease("opc.tcp://localhost:4842", nodes, tmp_path / "locks")
+    for lease in (one, other):
+        lease.release()
+    assert address_of("opc.tcp://no.such.host.invalid") == "no.such.host.invalid:4840"

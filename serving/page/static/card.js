@@ -16,6 +16,7 @@ export function describe(about) {
     ["case", c.case],
     ["file", c.file],
     ["sha256", digest],
+    ["signed by", c.signed ? signer(c.signed) : "not checked: trusted is not set"],
     ["period", `${c.period_s} s`],
     ["size", `${Math.round(c.size_bytes / 1024)} KiB`],
     ["commit", c.commit ? c.commit.slice(0, 12) : "–"],
@@ -26,6 +27,11 @@ export function describe(about) {
   const picture = c.picture && element("img", { src: c.picture, alt: "closed loop of its validation", loading: "lazy" });
   const notes = (about.warnings || []).map((words) => element("p", { class: "note" }, `◆ ${words}`));
   $("card-body").replaceChildren(list, ...notes, scenarios(c), picture || "", candidates(about));
+}
+
+function signer(signed) {
+  const until = signed.expires ? `, until ${signed.expires.slice(0, 10)}` : "";
+  return element("span", { title: `key ${signed.fingerprint}` }, `${signed.name} (key ${signed.fingerprint.slice(0, 16)})${until}`);
 }
 
 async function copy(event) {
@@ -65,14 +71,13 @@ function scenarios(c) {
 }
 
 function candidates(about) {
-  const box = element("div", { id: "candidates" }, element("h3", {}, "Swap the controller"));
+  const box = element("div", { id: "candidates" }, element("h3", {}, "Swap the controller"), element("div", { id: "back", hidden: true }));
   if (!about.candidates.length) box.append(element("p", { class: "calm" }, "No other controller with these signals lies beside this one's file."));
   for (const other of about.candidates) {
     box.append(
-      element("div", { class: "candidate" }, `${other.law} (${other.file}) `, element("button", { type: "button", "data-file": other.file, onclick: () => swap(about, other) }, "Try…")),
+      element("div", { class: "candidate" }, `${other.law} for ${other.case} (${other.file}, ${other.sha256.slice(0, 8)}${other.signed ? `, signed by ${other.signed}` : ""}) `, element("button", { type: "button", "data-file": other.file, onclick: () => swap(about, other) }, "Try…")),
     );
   }
-  box.append(element("div", { id: "back", hidden: true }));
   return box;
 }
 
@@ -100,7 +105,7 @@ export function show(state) {
           fields: [trialField],
           request: (values) => ({ do: "back", value: { trial: values.trial } }),
         });
-      back.replaceChildren(element("button", { id: "put-back", type: "button", onclick: act }, `Put ${state.replaced.law} back…`));
+      back.replaceChildren(element("button", { id: "put-back", type: "button", onclick: act }, `Put ${state.replaced.law} (${state.replaced.sha256.slice(0, 8)}) back…`));
     }
   }
   const verdicts = state.verdicts || [];

@@ -28,8 +28,8 @@ export function show(found) {
   $("reason").hidden = !state.reason;
   say($("reason"), state.reason ? `▲ ${state.reason}` : "");
   for (const button of $("modes").children) button.setAttribute("aria-pressed", button.dataset.mode === state.mode);
-  $("change-sp").disabled = false;
-  $("change-mv").disabled = state.mode !== "MANUAL";
+  $("change-sp").disabled = !about; // without the signals a click would do nothing
+  $("change-mv").disabled = !about || state.mode !== "MANUAL";
   $("change-mv").title = state.mode === "MANUAL" ? "" : "in MANUAL only";
   if (about && state.pv !== undefined) $("values").replaceChildren(...rows());
   trial();

@@ -84,5 +84,5 @@ function happened(e) {
 
 function happenedTo(e) {
   if (e.kind === "acknowledged") return `acknowledged: ${e.what}`;
-  return e.what === "over" ? `the ${e.kind} is over` : e.what;
+  return e.what.startsWith("over") ? `the ${e.kind} is ${e.what}` : e.what;
 }

@@ -1,0 +1,71 @@
+"""The kit's vectors through this package, on any machine and release: ``python conformance.py KIT [ANSWERS.json]``."""
+
+import json
+import sys
+import time
+from math import inf
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from serving import Controller, ControlLoop, Mode, OutputError, Sample, SampleError
+
+OUTPUTS = ("mv", "state_next", "info")
+kit = Path(sys.argv[1] if sys.argv[1:] else sys.exit("usage: python conformance.py KIT [ANSWERS.json]"))
+vectors = json.loads((kit / "vectors.json").read_text())
+controller = Controller(kit / vectors["file"], sha256=vectors["sha256"])
+differences, wrong, took = [0.0], 0, []
+
+
+def numbers(texts):
+    return None if texts is None else np.array([float.fromhex(text) for text in texts])
+
+
+def answer(name, ours, theirs):
+    """Our numbers as text; their difference from the kit's counts where the kit gives some."""
+    if theirs is not None:
+        differences.extend((np.abs(ours - numbers(theirs)) / numbers(vectors["scale"][name])).tolist())
+    return [value.hex() for value in ours.tolist()]
+
+
+state, steps = controller.cold_state(), []
+for row in vectors["steps"]:
+    given = dict.fromkeys(("sp", "pv", "mv_applied")) | {name: numbers(texts) for name, texts in row["given"].items()}
+    state = controller.cold_state() if row["cold"] else state
+    began = time.perf_counter()
+    try:
+        result = controller.step(**given, state=state)
+    except (SampleError, OutputError) as error:
+        steps.append({"refused": "input" if isinstance(error, SampleError) else "output"})
+    else:
+        took.append(1e6 * (time.perf_counter() - began))
+        state = result.state
+        of = row.get("gives", {})
+        steps.append({name: answer(name, ours, of.get(name)) for name, ours in zip(OUTPUTS, result, strict=True)})
+    wrong += steps[-1].get("refused") != row.get("refused")
+
+begin, scans = vectors["loop"], []
+setting = {name: begin[name] for name in ("recover_after", "max_gap")}
+loop = ControlLoop(controller, sp=numbers(begin["sp"]), mv=numbers(begin["mv"]), mode=Mode.AUTO, **setting)
+for row in vectors["scans"]:
+    if row["set_mode"]:
+        loop.set_mode(Mode(row["set_mode"]))
+    if row["missed"]:
+        loop.gap(row["missed"])
+    if row["sample"] is None:
+        command = loop.miss("the plant cannot be read")
+    else:
+        sample = {name: numbers(row["sample"][name]) for name in ("pv", "mv_applied", "dv")}
+        command = loop.scan(Sample(**sample, age_s=float.fromhex(row["sample"]["age_s"])))
+    found = {"mode": str(command.mode), "fault": bool(command.reason), "mv": answer("mv", command.mv, row["mv"])}
+    wrong += any(found[name] != row[name] for name in ("mode", "fault"))
+    scans.append(found)
+
+largest, p50 = max(inf if d != d else d for d in differences), float(np.median(took))
+said = f"{len(steps)} steps, {len(scans)} scans, largest difference {largest:.3g}, {wrong} wrong"
+print(f"Python, onnxruntime {onnxruntime.__version__}: {said}, step p50 {p50:.1f} us")
+if sys.argv[2:]:
+    answers = {"host": "Python", "onnxruntime": onnxruntime.__version__, "sha256": controller.sha256, "p50_us": p50}
+    Path(sys.argv[2]).write_text(json.dumps(answers | {"steps": steps, "scans": scans}))
+sys.exit(largest > float.fromhex(vectors["tolerance"]) or wrong > 0)

@@ -1,0 +1,42 @@
+"""Packages that a command needs beside numpy and onnxruntime, and the extra of loopwright that brings each."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import PackageNotFoundError, requires
+
+NAME = "loopwright"
+# Packages that are imported under another name than they are installed under.
+INSTALLED_AS = {"cvxpy": "cvxpy-base", "dask": "distributed", "sklearn": "scikit-learn", "yaml": "pyyaml"}
+OWN = ("dev",)  # which tests loopwright itself
+
+
+def advice(module: str) -> str | None:
+    """Which extra brings a module that is not installed, as the end of an error; None where no extra does."""
+    extra = extra_of(module)
+    return f"{module.partition('.')[0]} is not installed; pip install '{NAME}[{extra}]' brings it" if extra else None
+
+
+def extra_of(module: str) -> str | None:
+    """The first extra whose requirements name the package that holds ``module``."""
+    top = module.partition(".")[0]
+    package = _canonical(INSTALLED_AS.get(top, top))
+    return next((extra for extra, required in _required() if required == package and extra not in OWN), None)
+
+
+def _required() -> list[tuple[str, str]]:
+    """Extra and package of each requirement, in the order of pyproject.toml."""
+    try:
+        lines = requires(NAME) or []
+    except PackageNotFoundError:  # run from its sources, and not installed
+        return []
+    found = []
+    for line in lines:
+        package, extra = re.match(r"[\w.-]+", line), re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", line)
+        if package and extra:
+            found.append((extra[1], _canonical(package[0])))
+    return found
+
+
+def _canonical(package: str) -> str:
+    return re.sub(r"[-_.]+", "-", package).lower()

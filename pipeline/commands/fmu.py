@@ -1,0 +1,56 @@
+"""A controller file as a Functional Mock-up Unit for co-simulation."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from pathlib import Path
+
+from pipeline.errors import HostError
+from pipeline.files import draft_of
+from pipeline.hosts.fmu.compiling import toolchain
+from pipeline.hosts.fmu.folder import pack, write_folder
+from pipeline.hosts.fmu.gate import check, problems
+from serving.controller import Controller
+
+MEGABYTE = 1e6
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    add = parser.add_argument
+    add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
+    add("--out", metavar="FILE.fmu", type=Path, help="what to write (the controller's name with .fmu, here)")
+    add("--fmi", choices=(2, 3), type=int, default=3, help="version of FMI: 2 for 2.0, 3 for 3.0 (3)")
+    add("--onnxruntime", metavar="FOLDER", type=Path, help="onnxruntime's header lies there or in its include/")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the FMU, unless it differs from the controller by a bit."""
+    controller = Controller(options.file)
+    out: Path = Path(f"{options.file.stem}.fmu") if options.out is None else options.out
+    _require_free(out)
+    tools = toolchain(options.onnxruntime)
+    with draft_of(out) as draft, tempfile.TemporaryDirectory(prefix="loopwright-fmu-") as made:
+        folder = Path(made)
+        write_folder(controller, folder, options.fmi, tools)
+        pack(folder, draft)
+        wrong = problems(draft)
+        if wrong:
+            raise HostError(f"the FMU's description is not valid FMI {options.fmi}.0: {'; '.join(wrong)}")
+        steps = check(controller, draft, folder)
+    size = out.stat().st_size / MEGABYTE
+    print(f"{out}: FMI {options.fmi}.0, {size:.1f} MB, {steps} steps give the same bits as the controller file")
+
+
+def _require_free(out: Path) -> None:
+    """HostError, before anything is compiled, for a file that cannot be written."""
+    if out.suffix != ".fmu":
+        raise HostError(f"{out} does not end in .fmu, by which tools know an FMU")
+    if out.exists():
+        raise HostError(f"{out} is there already; remove it, or name another file with --out")
+    if not out.parent.is_dir():
+        raise HostError(f"{out.parent} is no folder, so {out.name} cannot be written there")
+    if not os.access(out.parent, os.W_OK):
+        raise HostError(f"{out.parent} is not writable, so {out.name} cannot be written there")

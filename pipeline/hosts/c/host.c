@@ -1,0 +1,841 @@
+/* A Loopwright controller file in C11, on onnxruntime's C API and POSIX clocks.
+
+     host FILE.onnx [SCANS [PERIOD_S]]            a loop on a made-up plant; put yours into plant_read and plant_write
+     host --conformance KIT [ANSWERS.json]        the kit of `loopwright conformance FILE.onnx KIT`
+
+   The parts: JSON, SHA-256, controller, loop, plant, run, conformance, main. To use the controller and the loop in a
+   program of your own, define LOOPWRIGHT_NO_MAIN and include this file. Nothing is allocated after
+   controller_open. No function sets the locale; strtod needs the "C" one, which a C program starts with. */
+
+#define _POSIX_C_SOURCE 200809L
+#include <errno.h>
+#include <math.h>
+#include <stdarg.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "onnxruntime_c_api.h"
+
+enum { MAX_BYTES = 64 << 20, MAX_DEPTH = 24, LINE = 64, WORDS = 512 };
+
+/* ------------------------------------------------------------------ JSON: a tree, strictly enough for our own files */
+typedef struct Json Json;
+struct Json {
+  enum { J_NULL, J_FALSE, J_TRUE, J_NUMBER, J_TEXT, J_LIST, J_OBJECT } kind;
+  double number;
+  char *text;
+  Json *items; /* of a list or an object */
+  char **keys; /* of an object */
+  size_t n;
+};
+
+static void json_free(Json *j) {
+  for (size_t i = 0; i < j->n; i++) {
+    json_free(&j->items[i]);
+    if (j->keys) free(j->keys[i]);
+  }
+  free(j->items);
+  free(j->keys);
+  free(j->text);
+  memset(j, 0, sizeof *j);
+}
+
+static const char *blanks(const char *p) { return p + strspn(p, " \t\r\n"); }
+
+/* The text behind an opening quote. Escapes beyond ASCII become '?': they stand in names for people only. */
+static const char *json_text(const char *p, char **text) {
+  const char *end = p;
+  while (*end && *end != '"') end += *end == '\\' && end[1] ? 2 : 1;
+  char *to = *text = malloc((size_t)(end - p) + 1);
+  if (!to || *end != '"') return NULL;
+  while (p < end) {
+    if (*p != '\\') {
+      *to++ = *p++;
+      continue;
+    }
+    const char *from = strchr("\"\\/bfnrt", p[1]), *plain = "\"\\/\b\f\n\r\t";
+    if (p[1] == 'u') {
+      unsigned code = 0;
+      if (end - p < 6 || sscanf(p + 2, "%4x", &code) != 1) return NULL;
+      *to++ = code && code < 128 ? (char)code : '?';
+      p += 6;
+    } else if (from) {
+      *to++ = plain[from - "\"\\/bfnrt"];
+      p += 2;
+    } else {
+      return NULL;
+    }
+  }
+  *to = 0;
+  return end + 1;
+}
+
+static const char *json_value(const char *p, Json *j, int depth);
+
+static const char *json_items(const char *p, Json *j, int depth, char end) {
+  size_t room = 0;
+  p = blanks(p);
+  if (*p == end) return p + 1;
+  for (;;) {
+    if (j->n == room) {
+      room = room ? 2 * room : 8;
+      Json *items = realloc(j->items, room * sizeof *items);
+      if (!items) return NULL;
+      j->items = items;
+      if (j->kind == J_OBJECT) {
+        char **keys = realloc(j->keys, room * sizeof *keys);
+        if (!keys) return NULL;
+        j->keys = keys;
+      }
+    }
+    memset(&j->items[j->n], 0, sizeof *j->items);
+    if (j->kind == J_OBJECT) {
+      j->keys[j->n] = NULL;
+      p = blanks(p);
+      j->n++; /* from here on json_free sees it */
+      if (*p != '"' || !(p = json_text(p + 1, &j->keys[j->n - 1])) || *(p = blanks(p)) != ':') return NULL;
+      p++;
+    } else {
+      j->n++;
+    }
+    if (!(p = json_value(p, &j->items[j->n - 1], depth + 1))) return NULL;
+    p = blanks(p);
+    if (*p == end) return p + 1;
+    if (*p++ != ',') return NULL;
+  }
+}
+
+static const char *json_value(const char *p, Json *j, int depth) {
+  static const struct { const char *word; int kind; } WORD[] = {{"null", J_NULL}, {"false", J_FALSE}, {"true", J_TRUE}};
+  p = blanks(p);
+  if (depth > MAX_DEPTH) return NULL;
+  if (*p == '"') {
+    j->kind = J_TEXT;
+    return json_text(p + 1, &j->text);
+  }
+  if (*p == '[' || *p == '{') {
+    j->kind = *p == '[' ? J_LIST : J_OBJECT;
+    return json_items(p + 1, j, depth, *p == '[' ? ']' : '}');
+  }
+  for (size_t i = 0; i < 3; i++) {
+    if (!strncmp(p, WORD[i].word, strlen(WORD[i].word))) {
+      j->kind = WORD[i].kind;
+      return p + strlen(WORD[i].word);
+    }
+  }
+  char *end;
+  j->kind = J_NUMBER;
+  j->number = strtod(p, &end);
+  return end > p ? end : NULL;
+}
+
+static const Json *json_get(const Json *j, const char *key) {
+  for (size_t i = 0; j && j->kind == J_OBJECT && i < j->n; i++)
+    if (!strcmp(j->keys[i], key)) return &j->items[i];
+  return NULL;
+}
+
+static const char *json_word(const Json *j, const char *key) {
+  const Json *found = json_get(j, key);
+  return found && found->kind == J_TEXT ? found->text : "";
+}
+
+/* A number, or a hexadecimal float as text; NAN where there is neither. */
+static double json_number(const Json *j) {
+  if (j && j->kind == J_NUMBER) return j->number;
+  if (!j || j->kind != J_TEXT) return NAN;
+  char *end;
+  double value = strtod(j->text, &end);
+  return end > j->text && !*end ? value : NAN;
+}
+
+/* ------------------------------------------------------------------ files, and SHA-256 (FIPS 180-4) */
+static char *read_file(const char *path, size_t *size) {
+  FILE *file = fopen(path, "rb");
+  if (!file) return NULL;
+  char *bytes = malloc(MAX_BYTES + 1), *fit = NULL;
+  if (bytes) {
+    *size = fread(bytes, 1, MAX_BYTES, file);
+    bool whole = *size < MAX_BYTES && !ferror(file);
+    bytes[*size] = 0;
+    fit = whole ? realloc(bytes, *size + 1) : NULL;
+    if (!fit) free(bytes);
+  }
+  fclose(file);
+  return fit;
+}
+
+static bool read_json(const char *path, Json *j, char *words) {
+  size_t size = 0;
+  char *text = read_file(path, &size);
+  memset(j, 0, sizeof *j);
+  if (!text) {
+    snprintf(words, WORDS, "%.300s cannot be read: %s", path, strerror(errno));
+    return false;
+  }
+  const char *end = strlen(text) == size ? json_value(text, j, 0) : NULL;
+  bool good = end && !*blanks(end) && j->kind == J_OBJECT;
+  free(text);
+  if (!good) {
+    snprintf(words, WORDS, "%.300s is no JSON object", path);
+    json_free(j);
+  }
+  return good;
+}
+
+static uint32_t turned(uint32_t x, int n) { return x >> n | x << (32 - n); }
+
+static void sha256(const uint8_t *data, size_t size, char hex[65]) {
+  static const uint32_t K[64] = {
+      0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4, 0xab1c5ed5,
+      0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe, 0x9bdc06a7, 0xc19bf174,
+      0xe49b69c1, 0xefbe4786, 0x0fc19dc6, 0x240ca1cc, 0x2de92c6f, 0x4a7484aa, 0x5cb0a9dc, 0x76f988da,
+      0x983e5152, 0xa831c66d, 0xb00327c8, 0xbf597fc7, 0xc6e00bf3, 0xd5a79147, 0x06ca6351, 0x14292967,
+      0x27b70a85, 0x2e1b2138, 0x4d2c6dfc, 0x53380d13, 0x650a7354, 0x766a0abb, 0x81c2c92e, 0x92722c85,
+      0xa2bfe8a1, 0xa81a664b, 0xc24b8b70, 0xc76c51a3, 0xd192e819, 0xd6990624, 0xf40e3585, 0x106aa070,
+      0x19a4c116, 0x1e376c08, 0x2748774c, 0x34b0bcb5, 0x391c0cb3, 0x4ed8aa4a, 0x5b9cca4f, 0x682e6ff3,
+      0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2};
+  uint32_t h[8] = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a, 0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
+  size_t blocks = (size + 8) / 64 + 1;
+  for (size_t b = 0; b < blocks; b++) {
+    uint32_t w[64];
+    for (size_t i = 0; i < 16; i++) {
+      w[i] = 0;
+      for (size_t k = 0; k < 4; k++) {
+        size_t at = 64 * b + 4 * i + k;
+        uint8_t byte = at < size ? data[at] : at == size ? 0x80 : 0;
+        if (b == blocks - 1 && 4 * i + k >= 56) byte = (uint8_t)((uint64_t)size * 8 >> 8 * (63 - (4 * i + k)));
+        w[i] = w[i] << 8 | byte;
+      }
+    }
+    for (size_t i = 16; i < 64; i++) {
+      uint32_t a = w[i - 15], e = w[i - 2];
+      w[i] = w[i - 16] + (turned(a, 7) ^ turned(a, 18) ^ a >> 3) + w[i - 7] + (turned(e, 17) ^ turned(e, 19) ^ e >> 10);
+    }
+    uint32_t v[8];
+    memcpy(v, h, sizeof v);
+    for (size_t i = 0; i < 64; i++) {
+      uint32_t s1 = turned(v[4], 6) ^ turned(v[4], 11) ^ turned(v[4], 25);
+      uint32_t s0 = turned(v[0], 2) ^ turned(v[0], 13) ^ turned(v[0], 22);
+      uint32_t t1 = v[7] + s1 + ((v[4] & v[5]) ^ (~v[4] & v[6])) + K[i] + w[i];
+      uint32_t t2 = s0 + ((v[0] & v[1]) ^ (v[0] & v[2]) ^ (v[1] & v[2]));
+      memmove(v + 1, v, 7 * sizeof *v);
+      v[4] += t1;
+      v[0] = t1 + t2;
+    }
+    for (size_t i = 0; i < 8; i++) h[i] += v[i];
+  }
+  for (size_t i = 0; i < 8; i++) snprintf(hex + 8 * i, 9, "%08x", (unsigned)h[i]);
+}
+
+/* ------------------------------------------------------------------ the controller */
+typedef struct {
+  const char *name, *unit; /* in the manifest */
+  double low, high;
+  double *values; /* of a discrete signal */
+  size_t n_values;
+} Signal;
+
+typedef struct {
+  Signal *at;
+  size_t n;
+} Signals;
+
+enum { SP, PV, DV, MV, STATE, INPUTS };
+enum { OUT_MV, OUT_STATE, OUT_INFO, OUTPUTS };
+static const char *const INPUT[INPUTS] = {"sp", "pv", "dv", "mv_applied", "state"};
+static const char *const OUTPUT[OUTPUTS] = {"mv", "state_next", "info"};
+
+typedef enum { STEPPED, REFUSED_INPUT, REFUSED_OUTPUT } Outcome;
+
+typedef struct {
+  Json manifest;
+  Signals signals[STATE]; /* sp, pv, dv, mv */
+  size_t n_in[INPUTS], n_out[OUTPUTS];
+  bool uses[INPUTS];
+  double period_s;
+  double *state;       /* what the law remembers: the last step's state_next; zeros: no past */
+  double *in[INPUTS];  /* the session reads here */
+  double *out[OUTPUTS]; /* and writes here: mv, state_next and info of the last step */
+  const OrtApi *ort;
+  OrtEnv *env;
+  OrtSession *session;
+  OrtValue *in_value[INPUTS], *out_value[OUTPUTS];
+  char words[WORDS]; /* why the last call failed */
+} Controller;
+
+static bool failed(Controller *c, const char *format, ...) {
+  va_list arguments;
+  va_start(arguments, format);
+  vsnprintf(c->words, WORDS, format, arguments);
+  va_end(arguments);
+  return false;
+}
+
+static bool good(Controller *c, OrtStatus *status) {
+  if (!status) return true;
+  failed(c, "onnxruntime: %s", c->ort->GetErrorMessage(status));
+  c->words[strcspn(c->words, "\r\n")] = 0;
+  c->ort->ReleaseStatus(status);
+  return false;
+}
+
+/* State zero means: no past. Also right after any gap. */
+static void controller_cold(Controller *c) { memset(c->state, 0, c->n_in[STATE] * sizeof *c->state); }
+
+static double middle(const Signal *s) {
+  double at = (s->low + s->high) / 2, best = at;
+  for (size_t i = 0; i < s->n_values; i++)
+    if (!i || fabs(s->values[i] - at) < fabs(best - at)) best = s->values[i];
+  return best;
+}
+
+static bool among(const Signal *s, double value) {
+  for (size_t i = 0; i < s->n_values; i++)
+    if (s->values[i] == value) return true;
+  return false;
+}
+
+/* Whether a signal may have this value; `margin` widens its range by a share on both sides. NaN: false. */
+static bool may_be(const Signal *s, double value, double margin) {
+  double slack = margin * (s->high - s->low);
+  return s->low - slack <= value && value <= s->high + slack;
+}
+
+static bool read_signals(Controller *c, const char *key, Signals *signals) {
+  const Json *list = json_get(&c->manifest, key);
+  if (!list || list->kind != J_LIST) return failed(c, "the manifest has no list %s", key);
+  signals->n = list->n;
+  if (!(signals->at = calloc(list->n + 1, sizeof *signals->at))) return failed(c, "no memory");
+  for (size_t i = 0; i < list->n; i++) {
+    Signal *s = &signals->at[i];
+    const Json *row = &list->items[i], *values = json_get(row, "values");
+    *s = (Signal){.name = json_word(row, "name"), .unit = json_word(row, "unit")};
+    s->low = json_number(json_get(row, "low"));
+    s->high = json_number(json_get(row, "high"));
+    if (!(s->low < s->high) || !isfinite(s->high - s->low)) return failed(c, "%s %s has no range", key, s->name);
+    if (!values || values->kind != J_LIST) continue;
+    if (!(s->values = calloc(values->n + 1, sizeof *s->values))) return failed(c, "no memory");
+    s->n_values = values->n;
+    for (size_t k = 0; k < values->n; k++) s->values[k] = json_number(&values->items[k]);
+  }
+  return true;
+}
+
+static bool read_manifest(Controller *c, const char *digest) {
+  static const char *const KEY[STATE] = {"sp", "pv", "dv", "mv"};
+  const Json *m = &c->manifest, *inputs = json_get(m, "inputs"), *info = json_get(m, "info");
+  if (json_number(json_get(m, "schema")) != 1) return failed(c, "the manifest's schema is not 1, which this host reads");
+  if (strcmp(json_word(m, "sha256"), digest))
+    return failed(c, "the file's SHA-256 is %s, its manifest's %.64s", digest, json_word(m, "sha256"));
+  for (int i = 0; i < STATE; i++) {
+    if (!read_signals(c, KEY[i], &c->signals[i])) return false;
+    c->n_in[i] = c->signals[i].n;
+  }
+  double n_state = json_number(json_get(m, "n_state"));
+  c->period_s = json_number(json_get(m, "period_s"));
+  if (!(n_state >= 0 && n_state <= 1e6 && n_state == floor(n_state))) return failed(c, "the manifest has no n_state");
+  if (!(c->period_s >= 1e-6 && c->period_s <= 1e9)) return failed(c, "the manifest has no period");
+  if (!inputs || inputs->kind != J_LIST || !info || info->kind != J_LIST || !c->n_in[MV])
+    return failed(c, "the manifest lacks inputs, info or mv");
+  c->n_in[STATE] = c->n_out[OUT_STATE] = (size_t)n_state;
+  c->n_out[OUT_MV] = c->n_in[MV];
+  c->n_out[OUT_INFO] = info->n;
+  for (size_t k = 0; k < inputs->n; k++) {
+    int i = 0;
+    while (i < INPUTS && (inputs->items[k].kind != J_TEXT || strcmp(inputs->items[k].text, INPUT[i]))) i++;
+    if (i == INPUTS) return failed(c, "the manifest names an input that no controller has");
+    c->uses[i] = true;
+  }
+  return true;
+}
+
+/* One vector of the graph: a buffer on a cache line of its own, bound to an onnxruntime value for good. */
+static bool bind(Controller *c, const OrtMemoryInfo *where, size_t n, double **buffer, OrtValue **value) {
+  size_t bytes = (n * sizeof **buffer / LINE + 1) * LINE;
+  if (!(*buffer = aligned_alloc(LINE, bytes))) return failed(c, "no memory");
+  memset(*buffer, 0, bytes);
+  int64_t shape[1] = {(int64_t)n};
+  return !n || good(c, c->ort->CreateTensorWithDataAsOrtValue(where, *buffer, n * sizeof **buffer, shape, 1,
+                                                              ONNX_TENSOR_ELEMENT_DATA_TYPE_DOUBLE, value));
+}
+
+static bool open_session(Controller *c, const void *bytes, size_t size) {
+  OrtSessionOptions *options = NULL;
+  bool made = good(c, c->ort->CreateEnv(ORT_LOGGING_LEVEL_FATAL, "loopwright", &c->env)) &&
+              good(c, c->ort->CreateSessionOptions(&options)) &&
+              good(c, c->ort->SetIntraOpNumThreads(options, 1)) && good(c, c->ort->SetInterOpNumThreads(options, 1)) &&
+              good(c, c->ort->SetSessionExecutionMode(options, ORT_SEQUENTIAL)) &&
+              good(c, c->ort->SetSessionGraphOptimizationLevel(options, ORT_ENABLE_ALL)) &&
+              good(c, c->ort->AddSessionConfigEntry(options, "session.intra_op.allow_spinning", "0")) &&
+              good(c, c->ort->AddSessionConfigEntry(options, "session.load_model_format", "ONNX")) &&
+              good(c, c->ort->CreateSessionFromArray(c->env, bytes, size, options, &c->session));
+  if (options) c->ort->ReleaseSessionOptions(options);
+  return made;
+}
+
+/* Whether the graph has as many inputs and outputs as the manifest names; onnxruntime checks names and shapes. */
+static bool agrees(Controller *c) {
+  size_t has[2] = {0}, wanted[2] = {0};
+  for (int i = 0; i < INPUTS; i++) wanted[0] += c->uses[i];
+  for (int i = 0; i < OUTPUTS; i++) wanted[1] += c->n_out[i] > 0;
+  if (!good(c, c->ort->SessionGetInputCount(c->session, &has[0])) ||
+      !good(c, c->ort->SessionGetOutputCount(c->session, &has[1])))
+    return false;
+  if (has[0] == wanted[0] && has[1] == wanted[1]) return true;
+  return failed(c, "the graph has %zu inputs and %zu outputs, its manifest %zu and %zu", has[0], has[1], wanted[0],
+                wanted[1]);
+}
+
+static bool run_graph(Controller *c) {
+  const char *in[INPUTS], *out[OUTPUTS];
+  const OrtValue *given[INPUTS];
+  OrtValue *result[OUTPUTS];
+  size_t n = 0, m = 0;
+  for (int i = 0; i < INPUTS; i++)
+    if (c->uses[i]) in[n] = INPUT[i], given[n++] = c->in_value[i];
+  for (int i = 0; i < OUTPUTS; i++)
+    if (c->n_out[i]) out[m] = OUTPUT[i], result[m++] = c->out_value[i];
+  return good(c, c->ort->Run(c->session, NULL, in, given, n, out, m, result));
+}
+
+static void controller_close(Controller *c) {
+  for (int i = 0; i < INPUTS; i++) {
+    if (c->in_value[i]) c->ort->ReleaseValue(c->in_value[i]);
+    free(c->in[i]);
+  }
+  for (int i = 0; i < OUTPUTS; i++) {
+    if (c->out_value[i]) c->ort->ReleaseValue(c->out_value[i]);
+    free(c->out[i]);
+  }
+  for (int i = 0; i < STATE; i++) {
+    for (size_t k = 0; c->signals[i].at && k < c->signals[i].n; k++) free(c->signals[i].at[k].values);
+    free(c->signals[i].at);
+  }
+  if (c->session) c->ort->ReleaseSession(c->session);
+  if (c->env) c->ort->ReleaseEnv(c->env);
+  free(c->state);
+  json_free(&c->manifest);
+}
+
+/* Load FILE.onnx and the FILE.json beside it. On false, c->words says why; close it all the same. */
+static bool controller_open(Controller *c, const char *path) {
+  memset(c, 0, sizeof *c);
+  size_t size = 0, stem = strlen(path);
+  char beside[4096], digest[65];
+  if (stem < 6 || stem >= sizeof beside || strcmp(path + stem - 5, ".onnx"))
+    return failed(c, "%s is no path of a .onnx file", path);
+  snprintf(beside, sizeof beside, "%.*s.json", (int)stem - 5, path);
+  c->ort = OrtGetApiBase()->GetApi(ORT_API_VERSION);
+  if (!c->ort) return failed(c, "onnxruntime %s is older than its header", OrtGetApiBase()->GetVersionString());
+  if (!read_json(beside, &c->manifest, c->words)) return false;
+  char *bytes = read_file(path, &size);
+  if (!bytes) return failed(c, "%s cannot be read: %s", path, strerror(errno));
+  sha256((const uint8_t *)bytes, size, digest);
+  bool made = read_manifest(c, digest) && open_session(c, bytes, size) && agrees(c);
+  free(bytes);
+  OrtMemoryInfo *cpu = NULL;
+  made = made && good(c, c->ort->CreateCpuMemoryInfo(OrtArenaAllocator, OrtMemTypeDefault, &cpu));
+  for (int i = 0; made && i < INPUTS; i++) made = bind(c, cpu, c->n_in[i], &c->in[i], &c->in_value[i]);
+  for (int i = 0; made && i < OUTPUTS; i++) made = bind(c, cpu, c->n_out[i], &c->out[i], &c->out_value[i]);
+  if (cpu) c->ort->ReleaseMemoryInfo(cpu);
+  if (!made) return false;
+  if (!(c->state = calloc(c->n_in[STATE] + 1, sizeof *c->state))) return failed(c, "no memory");
+  for (int i = 0; i < STATE; i++)
+    for (size_t k = 0; k < c->n_in[i]; k++) c->in[i][k] = middle(&c->signals[i].at[k]);
+  return run_graph(c); /* a first step, discarded: a wrong shape shows now, and code and weights are warm */
+}
+
+/* One step on given[SP], [PV], [DV], [MV] (the MV that the plant received). The state stays as it was if refused. */
+static Outcome controller_step(Controller *c, const double *const given[STATE]) {
+  for (int i = 0; i < INPUTS; i++) {
+    const double *values = i == STATE ? c->state : given[i];
+    for (size_t k = 0; c->uses[i] && k < c->n_in[i]; k++) {
+      if (!isfinite(values[k])) {
+        failed(c, "%s[%zu] is %g; no MV is computed from it", INPUT[i], k, values[k]);
+        return REFUSED_INPUT;
+      }
+      c->in[i][k] = values[k];
+    }
+  }
+  if (!run_graph(c)) return REFUSED_OUTPUT;
+  for (int i = 0; i < OUTPUTS; i++) {
+    for (size_t k = 0; k < c->n_out[i]; k++) {
+      if (!isfinite(c->out[i][k])) {
+        failed(c, "the law gave %s[%zu] = %g, which is not finite", OUTPUT[i], k, c->out[i][k]);
+        return REFUSED_OUTPUT;
+      }
+    }
+  }
+  for (size_t k = 0; k < c->n_in[MV]; k++) {
+    const Signal *s = &c->signals[MV].at[k];
+    double value = c->out[OUT_MV][k];
+    if (!may_be(s, value, 0) || (s->values && !among(s, value))) {
+      failed(c, "the law gave %s = %.17g %s, which it may not have", s->name, value, s->unit);
+      return REFUSED_OUTPUT;
+    }
+  }
+  memcpy(c->state, c->out[OUT_STATE], c->n_in[STATE] * sizeof *c->state);
+  return STEPPED;
+}
+
+/* ------------------------------------------------------------------ the loop: modes, limits, faults */
+#define PV_MARGIN 0.05        /* share of a PV's range beyond which the sensor is broken */
+#define READ_BACK_MARGIN 0.02 /* share of an MV's range by which scaling may carry a sound read-back over its ends */
+
+typedef enum { MANUAL, AUTO, HOLD } Mode; /* the MV is the operator's, the law's, the last one after a fault */
+static const char *const MODE[] = {"MANUAL", "AUTO", "HOLD"};
+
+typedef struct {
+  const double *pv, *dv, *mv_applied; /* mv_applied NULL: there is no read-back */
+  double age_s;
+} Sample;
+
+typedef struct {
+  Controller *c;
+  Mode mode;
+  bool fault;        /* a fault changed the mode to HOLD */
+  int recover_after; /* good samples after which HOLD returns to AUTO; 0: only the operator returns it */
+  int good;
+  double max_gap; /* missed periods in a row after which the law starts cold */
+  double *sp, *mv, *applied, *before;
+  char reason[WORDS]; /* of the last scan; empty: no fault */
+} Loop;
+
+static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
+  *l = (Loop){.c = c, .mode = mode, .recover_after = recover_after, .max_gap = 3};
+  l->sp = calloc(c->n_in[SP] + 1, sizeof *l->sp);
+  l->mv = calloc(c->n_in[MV] + 1, sizeof *l->mv);
+  l->applied = calloc(c->n_in[MV] + 1, sizeof *l->applied);
+  l->before = calloc(c->n_in[MV] + 1, sizeof *l->before);
+  for (size_t i = 0; l->sp && i < c->n_in[SP]; i++) l->sp[i] = middle(&c->signals[SP].at[i]);
+  for (size_t i = 0; l->mv && i < c->n_in[MV]; i++) l->mv[i] = middle(&c->signals[MV].at[i]);
+  return l->sp && l->mv && l->applied && l->before;
+}
+
+static void loop_close(Loop *l) {
+  free(l->sp);
+  free(l->mv);
+  free(l->applied);
+  free(l->before);
+}
+
+/* Set points (SP) or, in MANUAL, the MV (MV) from an operator; false, and nothing changed, outside the ranges. */
+static bool loop_set(Loop *l, int which, const double *values) {
+  const Signals *signals = &l->c->signals[which];
+  for (size_t i = 0; i < signals->n; i++) {
+    const Signal *s = &signals->at[i];
+    if (!may_be(s, values[i], 0) || (s->values && !among(s, values[i])))
+      return failed(l->c, "%s = %g %s is not allowed", s->name, values[i], s->unit);
+  }
+  memcpy(which == SP ? l->sp : l->mv, values, signals->n * sizeof *values);
+  return true;
+}
+
+static void loop_set_mode(Loop *l, Mode mode) {
+  l->mode = mode;
+  l->fault = false;
+  l->good = 0;
+}
+
+/* So many periods passed without a scan. */
+static void loop_gap(Loop *l, double periods) {
+  if (periods > l->max_gap) controller_cold(l->c);
+}
+
+/* A fault: no past any more. In AUTO the MV is held until recover_after good samples, or until the operator acts. */
+static void loop_fault(Loop *l, const char *reason) {
+  snprintf(l->reason, WORDS, "%s", reason);
+  controller_cold(l->c);
+  l->good = 0;
+  if (l->mode == AUTO || l->fault) {
+    l->mode = HOLD;
+    l->fault = true;
+  }
+}
+
+/* The last MV never reached the plant: the one before it stays. */
+static void loop_unwritten(Loop *l, const char *reason) {
+  if (l->mode != MANUAL) memcpy(l->mv, l->before, l->c->n_in[MV] * sizeof *l->mv);
+  loop_fault(l, reason);
+}
+
+/* Why not to act on a sample, in c->words; true if there is no reason. */
+static bool trusted(Controller *c, const Sample *sample) {
+  const double *const values[STATE] = {[PV] = sample->pv, [DV] = c->uses[DV] ? sample->dv : NULL, [MV] = sample->mv_applied};
+  for (int i = PV; i <= MV; i++)
+    for (size_t k = 0; values[i] && k < c->n_in[i]; k++)
+      if (!isfinite(values[i][k])) return failed(c, "%s %s is %g", INPUT[i], c->signals[i].at[k].name, values[i][k]);
+  for (size_t k = 0; sample->mv_applied && k < c->n_in[MV]; k++) {
+    const Signal *s = &c->signals[MV].at[k];
+    double value = sample->mv_applied[k];
+    if (s->values ? !among(s, value) : !may_be(s, value, READ_BACK_MARGIN))
+      return failed(c, "applied MV %s is %g %s, which no actuator can hold", s->name, value, s->unit);
+  }
+  for (size_t k = 0; k < c->n_in[PV]; k++) {
+    const Signal *s = &c->signals[PV].at[k];
+    if (!may_be(s, sample->pv[k], PV_MARGIN))
+      return failed(c, "PV %s is %g %s, outside its range", s->name, sample->pv[k], s->unit);
+  }
+  if (!(sample->age_s >= 0 && sample->age_s <= c->period_s))
+    return failed(c, "the sample is %g s old; allowed are %g s", sample->age_s, c->period_s);
+  return true;
+}
+
+/* One period: l->mv is what to write, l->mode and l->reason say why. sample NULL: the plant cannot be read. */
+static void loop_scan(Loop *l, const Sample *sample) {
+  Controller *c = l->c;
+  size_t n = c->n_in[MV];
+  memcpy(l->before, l->mv, n * sizeof *l->mv);
+  if (!sample || !trusted(c, sample)) {
+    loop_fault(l, sample ? c->words : "the plant cannot be read");
+    return;
+  }
+  memcpy(l->applied, sample->mv_applied ? sample->mv_applied : l->mv, n * sizeof *l->mv);
+  for (size_t k = 0; k < n; k++) l->applied[k] = fmin(fmax(l->applied[k], c->signals[MV].at[k].low), c->signals[MV].at[k].high);
+  const double *const given[STATE] = {[SP] = l->sp, [PV] = sample->pv, [DV] = sample->dv, [MV] = l->applied};
+  if (controller_step(c, given) != STEPPED) {
+    if (l->mode == AUTO) memcpy(l->mv, l->applied, n * sizeof *l->mv);
+    loop_fault(l, c->words);
+    return;
+  }
+  if (l->fault && ++l->good == l->recover_after) loop_set_mode(l, AUTO);
+  if (l->mode == AUTO) memcpy(l->mv, c->out[OUT_MV], n * sizeof *l->mv);
+  if (!l->fault) l->reason[0] = 0;
+}
+
+#ifndef LOOPWRIGHT_NO_MAIN
+/* ------------------------------------------------------------------ the plant: put yours here */
+typedef struct {
+  const Controller *c;
+  double *pv, *dv, *mv;
+  int k;
+} Plant;
+
+/* Read PVs, disturbances and the MV that the plant received; false if you cannot. Here the PVs wander over their ranges. */
+static bool plant_read(Plant *p, Sample *sample) {
+  double at = p->k++ % 10 / 10.0;
+  for (size_t i = 0; i < p->c->n_in[PV]; i++) {
+    const Signal *s = &p->c->signals[PV].at[i];
+    p->pv[i] = s->low + (s->high - s->low) * at;
+  }
+  for (size_t i = 0; i < p->c->n_in[DV]; i++) p->dv[i] = middle(&p->c->signals[DV].at[i]);
+  *sample = (Sample){p->pv, p->dv, p->mv, 0.0};
+  return true;
+}
+
+static bool plant_write(Plant *p, const double *mv) {
+  memcpy(p->mv, mv, p->c->n_in[MV] * sizeof *mv);
+  return true;
+}
+
+/* ------------------------------------------------------------------ an absolute time grid */
+static double seconds(void) {
+  struct timespec now;
+  clock_gettime(CLOCK_MONOTONIC, &now);
+  return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+static void sleep_until(double at) {
+  struct timespec until = {.tv_sec = (time_t)at};
+  until.tv_nsec = (long)(1e9 * (at - (double)until.tv_sec));
+  while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL) == EINTR) {
+  }
+}
+
+/* Scan at start + k period: lateness never becomes drift, and a period that has passed whole is skipped. */
+static int control(const char *path, long scans, double period) {
+  Controller c;
+  Loop loop = {0};
+  int status = 2;
+  if (!controller_open(&c, path) || !loop_open(&loop, &c, AUTO, 5)) {
+    fprintf(stderr, "error: %s\n", c.words);
+  } else {
+    Plant plant = {&c, calloc(c.n_in[PV] + 1, sizeof(double)), calloc(c.n_in[DV] + 1, sizeof(double)),
+                   calloc(c.n_in[MV] + 1, sizeof(double)), 0};
+    plant_write(&plant, loop.mv);
+    if (period <= 0) period = c.period_s;
+    double start = seconds();
+    for (long k = 0; k < scans; k++) {
+      sleep_until(start + (double)k * period);
+      double late = fmax(0, seconds() - (start + (double)k * period)), missed = floor(late / period);
+      if (missed > 0) {
+        loop_gap(&loop, missed);
+        k += (long)missed;
+        late -= missed * period;
+      }
+      Sample sample;
+      loop_scan(&loop, plant_read(&plant, &sample) ? &sample : NULL);
+      if (!plant_write(&plant, loop.mv)) loop_unwritten(&loop, "the plant cannot be written");
+      printf("%ld %.2f ms late %s", k, 1e3 * late, MODE[loop.mode]);
+      for (size_t i = 0; i < c.n_in[MV]; i++) printf(" %.17g", loop.mv[i]);
+      printf(" %s\n", loop.reason);
+    }
+    free(plant.pv);
+    free(plant.dv);
+    free(plant.mv);
+    status = 0;
+  }
+  loop_close(&loop);
+  controller_close(&c);
+  return status;
+}
+
+/* ------------------------------------------------------------------ the conformance kit */
+typedef struct {
+  double largest;
+  int wrong;
+  size_t n_us;
+  double *us;
+} Tally;
+
+/* n hexadecimal floats of a list; NULL if it is none of that length. */
+static double *numbers(const Json *list, size_t n, double *to) {
+  if (!list || list->kind != J_LIST || list->n != n) return NULL;
+  for (size_t i = 0; i < n; i++) to[i] = json_number(&list->items[i]);
+  return to;
+}
+
+static void compare(Tally *t, const Json *scale, const Json *wanted, const char *name, const double *ours, size_t n) {
+  const Json *theirs = json_get(wanted, name), *of = json_get(scale, name);
+  for (size_t i = 0; theirs && of && i < n && i < theirs->n && i < of->n; i++) {
+    double share = fabs(ours[i] - json_number(&theirs->items[i])) / json_number(&of->items[i]);
+    t->largest = share <= t->largest ? t->largest : isnan(share) ? INFINITY : share;
+  }
+}
+
+static void put(FILE *out, const char *name, const double *values, size_t n, const char *after) {
+  if (!out) return;
+  fprintf(out, "\"%s\": [", name);
+  for (size_t i = 0; i < n; i++) fprintf(out, "%s\"%a\"", i ? ", " : "", values[i]);
+  fprintf(out, "]%s", after);
+}
+
+static bool kit_step(Controller *c, const Json *row, const Json *scale, double *room[STATE], FILE *out, Tally *t) {
+  const double *given[STATE] = {0};
+  for (int i = 0; i < STATE; i++)
+    if (c->uses[i] && !(given[i] = numbers(json_get(json_get(row, "given"), INPUT[i]), c->n_in[i], room[i])))
+      return failed(c, "a step of the kit lacks %s", INPUT[i]);
+  const Json *cold = json_get(row, "cold");
+  if (cold && cold->kind == J_TRUE) controller_cold(c);
+  static const char *const BECAUSE[] = {"", "input", "output"};
+  double began = seconds();
+  Outcome outcome = controller_step(c, given);
+  if (outcome == STEPPED) t->us[t->n_us++] = 1e6 * (seconds() - began);
+  t->wrong += strcmp(BECAUSE[outcome], json_word(row, "refused")) != 0;
+  if (outcome != STEPPED) {
+    if (out) fprintf(out, "{\"refused\": \"%s\"}", BECAUSE[outcome]);
+    return true;
+  }
+  if (out) fprintf(out, "{");
+  for (int i = 0; i < OUTPUTS; i++) {
+    compare(t, scale, json_get(row, "gives"), OUTPUT[i], c->out[i], c->n_out[i]);
+    put(out, OUTPUT[i], c->out[i], c->n_out[i], i + 1 < OUTPUTS ? ", " : "}");
+  }
+  return true;
+}
+
+static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[STATE], FILE *out, Tally *t) {
+  Controller *c = l->c;
+  const Json *given = json_get(row, "sample");
+  for (int i = 0; i < 3; i++)
+    if (!strcmp(json_word(row, "set_mode"), MODE[i])) loop_set_mode(l, (Mode)i);
+  double missed = json_number(json_get(row, "missed"));
+  if (missed > 0) loop_gap(l, missed);
+  Sample sample = {numbers(json_get(given, "pv"), c->n_in[PV], room[PV]), numbers(json_get(given, "dv"), c->n_in[DV], room[DV]),
+                   numbers(json_get(given, "mv_applied"), c->n_in[MV], room[MV]), json_number(json_get(given, "age_s"))};
+  bool read = given && given->kind == J_OBJECT;
+  if (read && (!sample.pv || !sample.dv)) return failed(c, "a scan of the kit lacks pv or dv");
+  loop_scan(l, read ? &sample : NULL);
+  const Json *fault = json_get(row, "fault");
+  bool faulty = l->reason[0] != 0;
+  t->wrong += strcmp(MODE[l->mode], json_word(row, "mode")) != 0 || !fault || faulty != (fault->kind == J_TRUE);
+  compare(t, scale, row, "mv", l->mv, c->n_in[MV]);
+  if (out) fprintf(out, "{\"mode\": \"%s\", \"fault\": %s, ", MODE[l->mode], faulty ? "true" : "false");
+  put(out, "mv", l->mv, c->n_in[MV], "}");
+  return true;
+}
+
+static int by_size(const void *a, const void *b) {
+  double x = *(const double *)a, y = *(const double *)b;
+  return (x > y) - (x < y);
+}
+
+static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t) {
+  const Json *steps = json_get(kit, "steps"), *scans = json_get(kit, "scans"), *scale = json_get(kit, "scale");
+  const Json *begin = json_get(kit, "loop");
+  double *room[STATE] = {0};
+  bool done = steps && scans && steps->kind == J_LIST && scans->kind == J_LIST && steps->n > 0;
+  if (!done) failed(c, "the kit has no steps and scans");
+  if (done && strcmp(json_word(kit, "sha256"), json_word(&c->manifest, "sha256")))
+    done = failed(c, "the kit is of another controller file");
+  if (done && !(t->us = calloc(steps->n, sizeof *t->us))) done = failed(c, "no memory");
+  for (int i = 0; i < STATE; i++) room[i] = calloc(c->n_in[i] + 1, sizeof **room);
+  const char *version = OrtGetApiBase()->GetVersionString();
+  if (out && done)
+    fprintf(out, "{\"host\": \"C\", \"onnxruntime\": \"%s\", \"sha256\": \"%s\", \"steps\": [", version, json_word(kit, "sha256"));
+  for (size_t k = 0; done && k < steps->n; k++) {
+    if (out && k) fprintf(out, ",\n");
+    done = kit_step(c, &steps->items[k], scale, room, out, t);
+  }
+  controller_cold(c);
+  if (done) {
+    l->recover_after = (int)json_number(json_get(begin, "recover_after"));
+    l->max_gap = json_number(json_get(begin, "max_gap"));
+    const double *sp = numbers(json_get(begin, "sp"), c->n_in[SP], room[SP]);
+    const double *mv = numbers(json_get(begin, "mv"), c->n_in[MV], room[MV]);
+    done = sp && mv ? loop_set(l, SP, sp) && loop_set(l, MV, mv) : failed(c, "the kit has no start of its loop");
+  }
+  if (out && done) fprintf(out, "],\n\"scans\": [");
+  for (size_t k = 0; done && k < scans->n; k++) {
+    if (out && k) fprintf(out, ",\n");
+    done = kit_scan(l, &scans->items[k], scale, room, out, t);
+  }
+  if (t->n_us) qsort(t->us, t->n_us, sizeof *t->us, by_size);
+  double p50 = t->n_us ? t->us[t->n_us / 2] : NAN;
+  if (out && done) fprintf(out, "], \"p50_us\": %.3f}\n", p50);
+  if (done)
+    printf("C, onnxruntime %s: %zu steps, %zu scans, largest difference %.3g, %d wrong, step p50 %.1f us\n", version,
+           steps->n, scans->n, t->largest, t->wrong, p50);
+  for (int i = 0; i < STATE; i++) free(room[i]);
+  free(t->us);
+  return done;
+}
+
+static int conformance(const char *folder, const char *answers) {
+  Controller c = {0};
+  Loop loop = {0};
+  Tally tally = {0};
+  Json kit;
+  char path[4096];
+  snprintf(path, sizeof path, "%s/vectors.json", folder);
+  if (!read_json(path, &kit, c.words)) {
+    fprintf(stderr, "error: %s\n", c.words);
+    return 2;
+  }
+  snprintf(path, sizeof path, "%s/%s", folder, json_word(&kit, "file"));
+  FILE *out = NULL;
+  bool done = controller_open(&c, path) && loop_open(&loop, &c, AUTO, 1);
+  if (done && answers && !(out = fopen(answers, "w"))) done = failed(&c, "%s cannot be written: %s", answers, strerror(errno));
+  done = done && run_kit(&c, &loop, &kit, out, &tally);
+  if (out && (ferror(out) | fclose(out))) done = failed(&c, "%s cannot be written", answers);
+  if (!done) fprintf(stderr, "error: %s\n", c.words);
+  bool passed = done && !tally.wrong && tally.largest <= json_number(json_get(&kit, "tolerance"));
+  loop_close(&loop);
+  controller_close(&c);
+  json_free(&kit);
+  return !done ? 2 : passed ? 0 : 1;
+}
+
+int main(int n, char **words) {
+  if (n >= 3 && n <= 4 && !strcmp(words[1], "--conformance")) return conformance(words[2], n > 3 ? words[3] : NULL);
+  if (n >= 2 && n <= 4 && words[1][0] != '-')
+    return control(words[1], n > 2 ? strtol(words[2], NULL, 10) : 20, n > 3 ? strtod(words[3], NULL) : 0);
+  fprintf(stderr, "usage: host FILE.onnx [SCANS [PERIOD_S]] | host --conformance KIT [ANSWERS.json]\n");
+  return 2;
+}
+#endif

@@ -1,0 +1,128 @@
+"""The kit on disk: the controller file, its manifest, and ``vectors.json``."""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from serving.conformance.numbers import written
+from serving.conformance.scans import Scanned, scanned, start
+from serving.conformance.steps import Answer, answered
+from serving.controller import Controller, runtime_version
+from serving.errors import LoopwrightError
+from serving.guard import READ_BACK_MARGIN, InRange, Sample
+
+KIT = 1  # version of the format
+VECTORS = "vectors.json"
+TOLERANCE = 1e-6  # share of an entry's scale
+PASS = (
+    "Start with a state of zeros. A step with cold = true starts from zeros again, every other from the state_next "
+    "of the last step that was not refused.",
+    "A step with refused = input must be refused because a value is not finite, one with refused = output because "
+    "the law's result may not be used. The state stays as it was, as the next step shows.",
+    f"Difference: |yours - ours| / scale, of every entry of mv, state_next and info. At most {TOLERANCE:g} passes.",
+    "The same release of onnxruntime on the same kind of processor must give the same bits: the difference is 0. "
+    "Between releases, processors and WebAssembly the last digits differ, which the 300 chained steps may amplify.",
+    "A scan is one period of the loop around the controller. Mode and fault must be equal, mv as above. "
+    "sample = null: the plant could not be read. mv_applied = null: there is no read-back. "
+    "missed: so many periods passed before the scan without one.",
+    "Every number is a hexadecimal float as C's printf writes it with %a and strtod reads it, or nan, inf, -inf.",
+)
+
+
+def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
+    """Write the kit into ``folder``, which is made if it is not there, and return what ``vectors.json`` holds.
+
+    Raises LoopwrightError if the folder cannot be written.
+    """
+    vectors = vectors_of(controller)
+    manifest = json.loads(controller.manifest.to_json()) | {"sha256": controller.sha256}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        copy = folder / controller.path.name
+        if not (copy.exists() and copy.samefile(controller.path)):
+            shutil.copyfile(controller.path, copy)
+        copy.with_suffix(".json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+        rows = json.dumps(vectors, allow_nan=False).replace('{"part"', '\n{"part"').replace('{"what"', '\n{"what"')
+        (folder / VECTORS).write_text(rows + "\n", encoding="utf-8")
+    except OSError as error:
+        raise LoopwrightError(f"the kit cannot be written to {folder}: {error.strerror or error}") from error
+    return vectors
+
+
+def vectors_of(controller: Controller) -> dict[str, Any]:
+    """The content of ``vectors.json``, ready for JSON."""
+    m, steps, scans, begin = controller.manifest, answered(controller), scanned(controller), start(controller.manifest)
+    return {
+        "kit": KIT,
+        "case": m.case,
+        "law": m.law,
+        "file": controller.path.name,
+        "sha256": controller.sha256,
+        "made_with": {
+            "onnxruntime": runtime_version(),
+            "processor": platform.machine(),
+            "system": platform.system(),
+        },
+        "pass": list(PASS),
+        "tolerance": TOLERANCE.hex(),
+        "scale": _scale(controller, steps),
+        "steps": [_step_row(m.inputs, answer) for answer in steps],
+        "loop": {
+            "sp": written(begin.sp),
+            "mv": written(begin.mv),
+            "recover_after": begin.recover_after,
+            "max_gap": begin.max_gap,
+            "pv_margin": InRange(m.pv).margin.hex(),
+            "read_back_margin": READ_BACK_MARGIN.hex(),
+            "max_age_s": m.period_s.hex(),
+        },
+        "scans": [_scan_row(row) for row in scans],
+    }
+
+
+def _scale(controller: Controller, answers: list[Answer]) -> dict[str, list[str]]:
+    """By what each entry's difference is divided: an MV's range, else the entry's largest magnitude in the vectors."""
+    taken = [answer.step for answer in answers if answer.step is not None]
+    scale = {"mv": written(s.high - s.low for s in controller.manifest.mv)}
+    for name, rows in (("state_next", [s.state for s in taken]), ("info", [s.info for s in taken])):
+        largest = np.abs(rows).max(axis=0)
+        scale[name] = written(np.where(largest > 0, largest, 1.0).tolist())
+    return scale
+
+
+def _step_row(inputs: tuple[str, ...], answer: Answer) -> dict[str, Any]:
+    given = answer.given
+    row: dict[str, Any] = {"part": given.part, "cold": given.cold}
+    row["given"] = {name: written(given.inputs[name]) for name in inputs if name != "state"}
+    if answer.step is None:
+        return row | {"refused": answer.refused}
+    mv, state, info = answer.step
+    return row | {"gives": {"mv": written(mv), "state_next": written(state), "info": written(info)}}
+
+
+def _scan_row(row: Scanned) -> dict[str, Any]:
+    scan, command = row.scan, row.command
+    return {
+        "what": scan.what,
+        "set_mode": None if scan.set_mode is None else str(scan.set_mode),
+        "missed": scan.missed,
+        "sample": None if scan.sample is None else _sample_row(scan.sample),
+        "mode": str(command.mode),
+        "fault": bool(command.reason),
+        "mv": written(command.mv),
+    }
+
+
+def _sample_row(sample: Sample) -> dict[str, Any]:
+    return {
+        "pv": written(sample.pv),
+        "dv": written(sample.dv),
+        "mv_applied": None if sample.mv_applied is None else written(sample.mv_applied),
+        "age_s": float(sample.age_s).hex(),
+    }

@@ -1,0 +1,181 @@
+"""Scans of a loop for a host to repeat: good samples, and every kind of sample that the default guards refuse."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field, replace
+from math import inf, nan
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.controller import Controller
+from serving.guard import READ_BACK_MARGIN, InRange, Sample
+from serving.loop import Command, ControlLoop, Mode
+from serving.manifest import Manifest, Signal
+
+Array: TypeAlias = NDArray[np.float64]
+
+RECOVER_AFTER = 3
+MAX_GAP = 3
+SURE = 0.4  # share of a margin by which a value lies inside or outside it
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """What happens before and at one scan. ``sample`` None: the plant cannot be read.
+
+    ``set_mode`` is what the operator sets before it, ``missed`` the periods that passed without a scan before it.
+    """
+
+    what: str
+    sample: Sample | None
+    set_mode: Mode | None = None
+    missed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """How the loop of the scans starts: in AUTO, at set points (n_sp,) and an MV (n_mv,)."""
+
+    sp: Array
+    mv: Array
+    recover_after: int = RECOVER_AFTER
+    max_gap: int = MAX_GAP
+
+
+@dataclass(frozen=True, slots=True)
+class Scanned:
+    """A scan with the command that this runtime gives."""
+
+    scan: Scan
+    command: Command
+
+
+@dataclass(frozen=True, slots=True)
+class _Course:
+    """Good samples: PVs and disturbances that wander around the middle of their ranges."""
+
+    manifest: Manifest
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
+
+    def sample(self, mv: Array) -> Sample:
+        m = self.manifest
+        return Sample(pv=self._near(m.pv), mv_applied=mv.copy(), dv=self._near(m.dv))
+
+    def _near(self, signals: tuple[Signal, ...]) -> Array:
+        at = [s.middle if s.values else s.middle + 0.2 * self.rng.uniform(-1, 1) * (s.high - s.low) for s in signals]
+        return np.array(at, dtype=np.float64)
+
+
+def start(manifest: Manifest) -> Start:
+    """The loop of the scans at its start: all in the middle of the ranges."""
+    sp, mv = (np.array([s.middle for s in of], dtype=np.float64) for of in (manifest.sp, manifest.mv))
+    return Start(sp, mv)
+
+
+def scanned(controller: Controller) -> list[Scanned]:
+    """All scans of the kit, with this runtime's commands."""
+    begin = start(controller.manifest)
+    loop = ControlLoop(
+        controller,
+        sp=begin.sp,
+        mv=begin.mv,
+        mode=Mode.AUTO,
+        recover_after=begin.recover_after,
+        max_gap=begin.max_gap,
+    )
+    course, done = _Course(controller.manifest), []
+    scans = _scans(controller.manifest, course.sample(begin.mv))
+    scan = next(scans)
+    while True:
+        if scan.set_mode is not None:
+            loop.set_mode(scan.set_mode)
+        if scan.missed:
+            loop.gap(scan.missed)
+        command = loop.miss("the plant cannot be read") if scan.sample is None else loop.scan(scan.sample)
+        done.append(Scanned(scan, command))
+        try:
+            scan = scans.send(course.sample(command.mv))
+        except StopIteration:
+            return done
+
+
+def _scans(m: Manifest, good: Sample) -> Generator[Scan, Sample, None]:
+    """Each scan; ``send`` takes a good sample for the next one."""
+
+    def some(n: int, what: str = "good") -> Generator[Scan, Sample, None]:
+        nonlocal good
+        for _ in range(n):
+            good = yield Scan(what, good)
+
+    recovery = RECOVER_AFTER + 1
+    yield from some(5)
+    for what, spoilt in _doubtful(m):
+        good = yield Scan(what, spoilt(good))
+        yield from some(recovery, f"after: {what}")
+    good = yield Scan("the plant cannot be read", None)
+    yield from some(recovery, "after the plant could not be read")
+    for missed in (1, MAX_GAP, MAX_GAP + 1):
+        good = yield Scan(f"{missed} periods missed", good, missed=missed)
+        yield from some(2)
+    good = yield Scan("by hand", good, set_mode=Mode.MANUAL)
+    yield from some(2, "by hand")
+    good = yield Scan("a fault by hand", _with(good, "pv", 0, nan))
+    yield from some(2, "by hand")
+    good = yield Scan("back to AUTO", good, set_mode=Mode.AUTO)
+    yield from some(3)
+    good = yield Scan("two faults in a row", None)
+    good = yield Scan("two faults in a row", None)
+    good = yield Scan("a good sample between faults", good)
+    good = yield Scan("a fault while it recovers", None)
+    yield from some(recovery + 2, "the last recovery")
+
+
+def _doubtful(m: Manifest) -> Iterator[tuple[str, _Spoil]]:
+    """Samples at and beyond each limit, as functions of a good one."""
+    for i, s in enumerate(m.pv):
+        for bad in (nan, inf, -inf):
+            yield f"PV {s.name} {bad}", _Spoil("pv", i, bad)
+        yield from _around("PV", "pv", i, s, InRange(m.pv).margin)
+    for i, s in enumerate(m.dv if "dv" in m.inputs else ()):
+        yield f"DV {s.name} not finite", _Spoil("dv", i, nan)
+    for i, s in enumerate(m.mv):
+        yield f"applied MV {s.name} not finite", _Spoil("mv_applied", i, nan)
+        if s.values is None:
+            yield from _around("applied MV", "mv_applied", i, s, READ_BACK_MARGIN)
+        elif len(s.values) > 1:
+            between = (s.values[0] + s.values[1]) / 2
+            yield f"applied MV {s.name} between two values", _Spoil("mv_applied", i, between)
+    yield "no read-back", _Spoil("mv_applied", None, nan)
+    for age in (0.9, 1.1, -0.5, nan):
+        yield f"age {age} periods", _Spoil("age_s", None, age * m.period_s)
+
+
+def _around(label: str, name: str, i: int, s: Signal, margin: float) -> Iterator[tuple[str, _Spoil]]:
+    for share, words in ((1 - SURE, "within its margin"), (1 + SURE, "beyond its margin")):
+        slack = share * margin * (s.high - s.low)
+        yield f"{label} {s.name} below, {words}", _Spoil(name, i, s.low - slack)
+        yield f"{label} {s.name} above, {words}", _Spoil(name, i, s.high + slack)
+
+
+@dataclass(frozen=True, slots=True)
+class _Spoil:
+    name: str
+    index: int | None
+    value: float
+
+    def __call__(self, sample: Sample) -> Sample:
+        if self.name == "age_s":
+            return replace(sample, age_s=self.value)
+        if self.index is None:
+            return replace(sample, mv_applied=None)
+        return _with(sample, self.name, self.index, self.value)
+
+
+def _with(sample: Sample, name: str, index: int, value: float) -> Sample:
+    vector = np.array(getattr(sample, name), dtype=np.float64)
+    vector[index] = value
+    changed: dict[str, Any] = {name: vector}
+    return replace(sample, **changed)

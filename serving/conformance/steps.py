@@ -1,0 +1,147 @@
+"""Steps of a controller for a host to repeat: a chain of 300, cold starts, and inputs to refuse."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from math import inf, nan
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.controller import Controller, Step
+from serving.errors import OutputError, SampleError
+from serving.manifest import Manifest, Signal
+
+Array: TypeAlias = NDArray[np.float64]
+
+COURSE = 0.03  # share of a range that an input moves at most from step to step while it follows a course
+COLD_STARTS = 10
+DRAWS = 40  # tried for a step whose MV lies inside its range
+AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the range
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """The inputs of one step without the state. ``cold``: it starts from a state of zeros, else from the last one."""
+
+    part: str
+    inputs: dict[str, Array]  # sp (n_sp,), pv (n_pv,), dv (n_dv,), mv_applied (n_mv,)
+    cold: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The result of one step; where it is refused, ``refused`` says because of the input or of the output."""
+
+    given: Given
+    step: Step | None
+    refused: str = ""
+
+
+def answered(controller: Controller) -> list[Answer]:
+    """All steps of the kit, as this runtime answers them; a refused step leaves the state as it was."""
+    state, last, answers = controller.cold_state(), _middle(controller.manifest.mv), []
+    drawn = _drawn(controller.manifest)
+    choices = next(drawn)
+    while True:
+        for given in choices:
+            answer = _answer(controller, given, state)
+            if answer.step is not None and _inside(controller.manifest.mv, answer.step.mv):
+                break
+        answers.append(answer)
+        if answer.step is not None:
+            state, last = answer.step.state, answer.step.mv
+        try:
+            choices = drawn.send((answer.given, last))
+        except StopIteration:
+            return answers
+
+
+def _answer(controller: Controller, given: Given, state: Array) -> Answer:
+    try:
+        step = controller.step(**given.inputs, state=controller.cold_state() if given.cold else state)
+    except SampleError:
+        return Answer(given, None, "input")
+    except OutputError:
+        return Answer(given, None, "output")
+    return Answer(given, step)
+
+
+def _inside(signals: tuple[Signal, ...], mv: Array) -> bool:
+    """Whether each continuous MV (n_mv,) lies inside its range: at an end, a wrong digit would not show."""
+    return all(s.values is not None or s.low < value < s.high for s, value in zip(signals, mv.tolist(), strict=True))
+
+
+def _drawn(m: Manifest) -> Generator[list[Given], tuple[Given, Array], None]:
+    """Choices of inputs for each step: the first with an MV inside its range is taken, or the last.
+
+    ``send`` takes what was taken and the last MV (n_mv,), which is the applied one of most steps.
+    """
+    rng = np.random.default_rng(0)
+    signals = {name: m.signals(name) for name in ("sp", "pv", "dv", "mv_applied")}
+
+    def anywhere() -> dict[str, Array]:
+        return {name: _anywhere(rng, of) for name, of in signals.items()}
+
+    def moved(old: dict[str, Array]) -> dict[str, Array]:
+        return {name: _moved(rng, old[name], of) for name, of in signals.items()}
+
+    last = _middle(m.mv)
+    for k in range(60):
+        _, last = yield [Given("anywhere", anywhere() | ({"mv_applied": last} if k % 3 else {}), cold=k == 0)]
+    for _ in range(60):
+        taken, last = yield [Given("inside", anywhere() | {"mv_applied": last}) for _ in range(DRAWS)]
+    course = taken.inputs
+    for k in range(80):
+        course = moved(course) | {"sp": course["sp"]}
+        if k % 20 == 19:
+            course["sp"] = _anywhere(rng, m.sp)
+        _, last = yield [Given("course", course | {"mv_applied": last})]
+    low, high = ({name: _ends(of)[end] for name, of in signals.items()} for end in (0, 1))
+    for k in range(50):
+        one, other = (low, high) if k < 25 else (high, low)
+        _, last = yield [Given("saturation", {**low, "sp": one["sp"], "pv": other["pv"], "mv_applied": last})]
+    stuck = _anywhere(rng, m.mv)
+    for _ in range(50):
+        course = moved(course)
+        _, last = yield [Given("stuck actuator", course | {"mv_applied": stuck})]
+    for k in range(3 * COLD_STARTS):
+        _, last = yield [Given("cold start", anywhere(), cold=k % 3 == 0) for _ in range(DRAWS)]
+    for name in (n for n in m.inputs if n != "state"):
+        for i in range(len(signals[name])):
+            for bad in (nan, inf, -inf):
+                spoilt = course[name].copy()
+                spoilt[i] = bad
+                yield [Given("not finite", course | {name: spoilt})]
+                _, last = yield [Given("after a refusal", course | {"mv_applied": last})]
+
+
+def _anywhere(rng: np.random.Generator, signals: tuple[Signal, ...]) -> Array:
+    """A value anywhere in each range (n,), some at its ends; of a discrete signal one of its values."""
+    values = []
+    for s in signals:
+        value = rng.choice([s.low, s.high]) if rng.uniform() < AT_AN_END else rng.uniform(s.low, s.high)
+        values.append(value if s.values is None else rng.choice(s.values))
+    return np.array(values, dtype=np.float64)
+
+
+def _moved(rng: np.random.Generator, old: Array, signals: tuple[Signal, ...]) -> Array:
+    """``old`` (n,) moved a little within each range; a discrete signal stays."""
+    moved = [
+        min(max(value + COURSE * rng.uniform(-1, 1) * (s.high - s.low), s.low), s.high) if s.values is None else value
+        for value, s in zip(old.tolist(), signals, strict=True)
+    ]
+    return np.array(moved, dtype=np.float64)
+
+
+def _middle(signals: tuple[Signal, ...]) -> Array:
+    return np.array([s.middle for s in signals], dtype=np.float64)
+
+
+def _ends(signals: tuple[Signal, ...]) -> tuple[Array, Array]:
+    """Both ends (n,) of each range; of a discrete signal its first and last value."""
+    ends = [(s.low, s.high) if s.values is None else (s.values[0], s.values[-1]) for s in signals]
+    low, high = np.array(ends, dtype=np.float64).reshape(-1, 2).T
+    return low.copy(), high.copy()

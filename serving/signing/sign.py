@@ -1,0 +1,82 @@
+"""Signing a controller's file: only one that is a controller, with a manifest beside it that is its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from datetime import UTC, datetime
+from os import PathLike
+from pathlib import Path
+
+from serving import graph_audit
+from serving.digest import file_digest, unseal
+from serving.errors import ArtifactError, SignatureError
+from serving.manifest import MANIFEST_KEY, Manifest
+from serving.signing import bundle
+from serving.signing.keys import PrivateKey
+from serving.signing.reading import contents
+from serving.signing.statement import Statement
+from serving.signing.verify import MAX_SIDECAR, signature_of
+
+
+def sign(
+    path: str | PathLike[str], key: PrivateKey, *, expires: datetime | None = None, now: datetime | None = None
+) -> Path:
+    """Write the signature of a controller's file and of its manifest's JSON file; the signature's file.
+
+    ``expires`` is when the signature ends (None: never), ``now`` when it was made (None: by this machine's clock).
+
+    Raises ArtifactError where the file is no controller, and SignatureError where the JSON file beside it is not its
+    manifest or ``expires`` lies in the past.
+    """
+    path, now = Path(path), now or datetime.now(UTC)
+    if expires is not None and expires <= now:
+        raise SignatureError(f"the signature would have expired on {expires:%Y-%m-%d %H:%M} UTC; give a day to come")
+    statement = Statement(path.name, _files(path), now.replace(microsecond=0), expires)
+    target = signature_of(path)
+    payload = statement.to_json(target.name)
+    envelope = bundle.Envelope(payload, key.sign(bundle.pae(payload)), key.public.fingerprint)
+    _replace(target, bundle.written(envelope))
+    return target
+
+
+def _files(path: Path) -> dict[str, str]:
+    """Name -> SHA-256 of the controller's file and of its manifest's JSON file, where there is one."""
+    try:
+        data = contents(path, graph_audit.MAX_BYTES)
+    except FileNotFoundError:
+        raise SignatureError(f"{path} does not exist; give a controller's .onnx file") from None
+    try:
+        unseal(data)
+        manifest = Manifest.from_json(graph_audit.audit(data).metadata.get(MANIFEST_KEY, ""))
+    except ArtifactError as error:
+        raise ArtifactError(f"{path}: {error}") from None
+    files = {path.name: file_digest(data)}
+    sidecar = path.with_suffix(".json")
+    try:
+        text = contents(sidecar, MAX_SIDECAR)
+    except FileNotFoundError:
+        return files
+    if not _tells_of(text, manifest, files[path.name]):
+        raise SignatureError(f"{sidecar} is not the manifest of {path.name}; get both from one place, or remove it")
+    return {**files, sidecar.name: file_digest(text)}
+
+
+def _tells_of(text: bytes, manifest: Manifest, sha256: str) -> bool:
+    """Whether a JSON file repeats the manifest, and names the file by its SHA-256."""
+    try:
+        return bool(json.loads(text) == {**json.loads(manifest.to_json()), "sha256": sha256})
+    except (ValueError, RecursionError):
+        return False
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write a file as a whole or not at all."""
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            draft = Path(folder) / path.name
+            draft.write_bytes(data)
+            os.replace(draft, path)
+    except OSError as error:
+        raise SignatureError(f"{path} cannot be written: {error.strerror}") from None

@@ -1,0 +1,62 @@
+"""The Controller of a host: loaded from a file, and if wanted only from one that a trusted key signed.
+
+Apart from ``serving.controller``, because what steps a controller decides results of the pipeline's stages, and who
+signed its file decides none of them.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import TYPE_CHECKING
+
+from serving import controller
+from serving.errors import ArtifactError
+
+if TYPE_CHECKING:
+    from serving.signing.verify import Signed, Trusted
+
+
+class Controller(controller.Controller):
+    """A control law in one file: ``(sp, pv, dv, mv_applied, state) -> (mv, state_next, info)``.
+
+    Parameters
+    ----------
+    path
+        The .onnx file that the pipeline exported.
+    sha256
+        The file's own SHA-256, if the host wants this very file and no other. The digest inside
+        the file finds damage and careless edits; only a pinned digest or a signature finds a forged file.
+    trusted
+        Public keys (PEM files), if the host wants only files that one of them signed. The signature lies beside the
+        file, ``<path>.sig``. It is verified before anything else of the file is read. None: nobody is asked.
+
+    Raises
+    ------
+    SignatureError
+        The file is unsigned, signed by none of ``trusted``, or changed since; or its signature expired.
+    ArtifactError
+        The file is corrupt, truncated, foreign or changed, holds what a controller may not
+        (see ``serving.graph_audit``), or its manifest and its graph disagree.
+
+    Notes
+    -----
+    ``signed`` says who signed the file; None where nobody was asked.
+    A step holds a lock, because its buffers are bound to the session once and used by every step.
+    """
+
+    def __init__(self, path: str | PathLike[str], sha256: str | None = None, trusted: Trusted | None = None) -> None:
+        self.signed: Signed | None = None
+        if trusted is not None:
+            from serving.signing.verify import verified  # here: it needs the package cryptography
+
+            self.signed = verified(path, trusted)
+            if sha256 is not None and sha256.lower() != self.signed.sha256:
+                raise ArtifactError(f"{path}: the file's SHA-256 is {self.signed.sha256}, not the pinned {sha256}")
+            # The signature gives the pin: bytes that somebody puts there meanwhile are not those that were verified.
+            sha256 = self.signed.sha256
+        super().__init__(path, sha256)
+
+
+def signer(loaded: controller.Controller) -> Signed | None:
+    """Who signed a controller's file; None where nobody was asked."""
+    return loaded.signed if isinstance(loaded, Controller) else None

@@ -1,0 +1,104 @@
+"""The browser host in a real browser: shipped controllers of every case within the kit's tolerance, and its loop.
+
+`npm ci` in examples/embed/browser brings onnxruntime-web, Debian's chromium is the browser; without them it is skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from kits import DAMAGES, EMBED, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+if CHROMIUM is None:
+    pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
+if not (EMBED / "browser" / "node_modules").is_dir():
+    pytest.skip("onnxruntime-web is missing (npm ci in examples/embed/browser)", allow_module_level=True)
+
+from playwright.sync_api import Page, expect, sync_playwright  # noqa: E402
+
+PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
+expect.set_options(timeout=30_000)
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *words: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    """The page from a server of files alone; whatever it says of errors fails the tests."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=EMBED))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    said: list[str] = []
+    with sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        made = browser.new_page()
+        made.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+        made.on("pageerror", lambda error: said.append(str(error)))
+        made.goto(f"http://127.0.0.1:{server.server_port}/browser/")
+        expect(made.locator("body")).to_have_attribute("data-ready", "yes")
+        yield made
+        browser.close()
+    server.shutdown()
+    server.server_close()
+    thread.join()
+    assert said == []
+
+
+def conform(page: Page, kit: Path) -> str:
+    page.set_input_files("#files", [str(file) for file in kit.iterdir()])
+    page.click("#conform")
+    expect(page.locator("#conform")).to_be_enabled()
+    expect(page.locator("#said")).not_to_be_empty()
+    return page.locator("#said").text_content() or ""
+
+
+@pytest.mark.parametrize("file", SOME, ids=name)
+def test_the_browser_passes_the_kit(page: Page, file: Path, tmp_path: Path) -> None:
+    assert "0 wrong" in conform(page, kit_of(file))
+    (tmp_path / "answers.json").write_text(json.dumps(page.evaluate("window.answers")))
+    verdict = verdict_on(file, tmp_path / "answers.json")
+    assert verdict.passed, verdict.text()
+    assert verdict.steps > 300
+    assert verdict.largest < 1e-8  # measured: 4e-10
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_the_browser_does_not_pass_a_damaged_kit(page: Page, damage: str, tmp_path: Path) -> None:
+    said = conform(page, spoilt(PID, tmp_path, DAMAGES[damage]))
+    assert "FAILED" in said
+    assert ("0.00100, 0 wrong" if damage in {"mv", "state"} else "1 wrong") in said
+
+
+def test_the_browser_s_loop_scans_once_a_period(page: Page) -> None:
+    page.set_input_files("#files", [str(kit_of(PID) / f"pid{suffix}") for suffix in (".onnx", ".json")])
+    page.fill("#period", "0.03")
+    page.click("#control")
+    expect(page.locator("#control")).to_be_enabled()
+    rows = [line.split() for line in (page.locator("#said").text_content() or "").splitlines()]
+    places = [int(row[0]) for row in rows]
+    assert places[0] == 0
+    assert places == sorted(set(places))
+    assert all(0 <= float(row[1]) < 30 for row in rows)
+    assert {row[4] for row in rows} == {"AUTO"}
+
+
+def test_a_missing_file_is_named_in_the_browser(page: Page, tmp_path: Path) -> None:
+    page.set_input_files("#files", [str(kit_of(PID) / "pid.onnx")])
+    page.click("#conform")
+    expect(page.locator("#said")).to_have_text("error: pid.json is not among the chosen files\n")
+    shutil.copy(kit_of(PID) / "pid.json", tmp_path)
+    (tmp_path / "pid.onnx").write_bytes(PID.read_bytes() + b"x")
+    page.set_input_files("#files", [str(file) for file in tmp_path.iterdir()])
+    page.click("#control")
+    expect(page.locator("#said")).to_contain_text("error: the file's SHA-256 is")

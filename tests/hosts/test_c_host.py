@@ -1,0 +1,138 @@
+"""The C host: built with sanitizers, every shipped controller to the bit, and damaged kits that it must not pass.
+
+`tools/onnxruntime_c.sh build/onnxruntime` makes its header and library; ONNXRUNTIME_DIR names another folder.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from kits import DAMAGES, EMBED, ROOT, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
+
+ONNXRUNTIME = Path(os.environ.get("ONNXRUNTIME_DIR", ROOT / "build" / "onnxruntime"))
+CMAKE = shutil.which("cmake")
+if CMAKE is None or shutil.which("cc") is None:
+    pytest.skip("cmake or a C compiler is missing (apt install cmake gcc)", allow_module_level=True)
+if not (ONNXRUNTIME / "include" / "onnxruntime_c_api.h").is_file():
+    pytest.skip("onnxruntime's C header is missing (tools/onnxruntime_c.sh build/onnxruntime)", allow_module_level=True)
+
+pytest_plugins = ["small_laws"]
+PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
+SANITIZERS = "-O1 -g -Werror -fsanitize=address,undefined -fno-sanitize-recover=all"
+
+
+def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(w) for w in words], capture_output=True, text=True, timeout=120)
+
+
+def built(source: Path, folder: Path) -> Path:
+    assert CMAKE is not None
+    made = run(CMAKE, "-S", source, "-B", folder, f"-DONNXRUNTIME_DIR={ONNXRUNTIME}", f"-DCMAKE_C_FLAGS={SANITIZERS}")
+    assert made.returncode == 0, made.stderr
+    made = run(CMAKE, "--build", folder)
+    assert made.returncode == 0, made.stdout + made.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def host(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(EMBED / "c", tmp_path_factory.mktemp("c")) / "host"
+
+
+@pytest.mark.parametrize("file", SOME, ids=name)
+def test_c_gives_the_bits_of_our_runtime(host: Path, file: Path, tmp_path: Path) -> None:
+    done = run(host, "--conformance", kit_of(file), tmp_path / "answers.json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "largest difference 0, 0 wrong" in done.stdout
+    verdict = verdict_on(file, tmp_path / "answers.json")
+    assert verdict.passed, verdict.text()
+    assert verdict.same_bits == verdict.steps > 300
+
+
+def test_c_refuses_results_and_takes_measured_disturbances(host: Path, disobedient_file: Path, tmp_path: Path) -> None:
+    """No shipped controller has measured disturbances or leaves its range; this one does both."""
+    vectors = json.loads((kit_of(disobedient_file) / "vectors.json").read_text())
+    refused = Counter(row.get("refused", "") for row in vectors["steps"])
+    assert min(refused["output"], refused["input"], refused[""]) >= 15
+    done = run(host, "--conformance", kit_of(disobedient_file), tmp_path / "answers.json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = verdict_on(disobedient_file, tmp_path / "answers.json")
+    assert verdict.passed, verdict.text()
+    assert verdict.same_bits == verdict.steps
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_c_does_not_pass_a_damaged_kit(host: Path, damage: str, tmp_path: Path) -> None:
+    done = run(host, "--conformance", spoilt(PID, tmp_path, DAMAGES[damage]))
+    assert done.returncode == 1, done.stdout + done.stderr
+    expected = "largest difference 0.001, 0 wrong" if damage in {"mv", "state"} else "largest difference 0, 1 wrong"
+    assert expected in done.stdout
+
+
+def test_the_c_loop_scans_once_a_period(host: Path) -> None:
+    began = time.monotonic()
+    done = run(host, kit_of(PID) / "pid.onnx", "8", "0.02")
+    assert time.monotonic() - began >= 7 * 0.02
+    assert done.returncode == 0, done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    places = [int(row[0]) for row in rows]
+    assert places == sorted(set(places))
+    assert places[0] == 0
+    assert all(float(row[1]) < 20 for row in rows)  # a later scan is one of the next period
+    assert {row[4] for row in rows} == {"AUTO"}
+    assert all(0 <= float(row[5]) <= 500 for row in rows)
+
+
+def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:
+    """Write failures, operators' mistakes and gaps, which no vector holds: tests/hosts/loop_faults.c."""
+    (tmp_path / "CMakeLists.txt").write_text((EMBED / "c" / "CMakeLists.txt").read_text())
+    (tmp_path / "host.c").write_text(Path(__file__).with_name("loop_faults.c").read_text())
+    shutil.copy(EMBED / "c" / "host.c", tmp_path / "embedded.h")
+    done = run(built(tmp_path, tmp_path / "build") / "host", kit_of(PID) / "pid.onnx")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout == "all as it must be\n"
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("cut", "pid.json is no JSON object"),
+        ("foreign", "the file's SHA-256 is"),
+        ("changed", "the file's SHA-256 is"),
+        ("schema", "the manifest's schema is not 1"),
+        ("sizes", "onnxruntime: "),
+        ("missing", "cannot be read: No such file or directory"),
+    ],
+)
+def test_a_file_that_is_not_right_is_one_line_of_the_c_host(host: Path, what: str, words: str, tmp_path: Path) -> None:
+    for suffix in (".onnx", ".json"):
+        shutil.copy(kit_of(PID) / f"pid{suffix}", tmp_path)
+    manifest, file = tmp_path / "pid.json", tmp_path / "pid.onnx"
+    text = manifest.read_text()
+    {
+        "cut": lambda: manifest.write_text(text[:700]),
+        "foreign": lambda: shutil.copy(next(f for f in SHIPPED if f.stem == "inc").with_suffix(".json"), manifest),
+        "changed": lambda: file.write_bytes(file.read_bytes() + b"x"),
+        "schema": lambda: manifest.write_text(text.replace('"schema": 1', '"schema": 2')),
+        "sizes": lambda: manifest.write_text(text.replace('"n_state": 7', '"n_state": 8')),
+        "missing": manifest.unlink,
+    }[what]()
+    done = run(host, file, "1", "0.01")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr
+
+
+def test_the_c_host_says_how_it_is_called(host: Path) -> None:
+    done = run(host)
+    assert done.returncode == 2
+    assert done.stderr.startswith("usage: ")

@@ -1,0 +1,133 @@
+"""`loopwright fmu`: what it writes, and one line for what it cannot."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from controller_fmus import MISSING, ONNXRUNTIME, file_of
+from kits import ROOT
+
+from pipeline.__main__ import main
+from pipeline.commands import Parser
+from pipeline.commands.fmu import options
+from pipeline.hosts.fmu.compiling import HOSTS, SOURCES
+from pipeline.hosts.fmu.variables import variables_of
+from serving import Controller
+
+if MISSING:
+    pytest.skip(MISSING, allow_module_level=True)
+fmpy = pytest.importorskip("fmpy")
+
+Capture = pytest.CaptureFixture[str]
+PID = file_of("thiosulfate_cstr/pid")
+
+
+def refused(capsys: Capture, *words: str | Path) -> str:
+    """The one line of a command that ends with 2."""
+    try:
+        status = main(["fmu", *map(str, words)])
+    except SystemExit as end:
+        status = int(end.code or 0)
+    told = capsys.readouterr()
+    assert status == 2
+    assert told.out == ""
+    assert told.err.startswith("loopwright fmu: ")
+    assert told.err.count("\n") == 1
+    return told.err
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_the_command_writes_an_fmu(fmi: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(PID, tmp_path / "my loop-1.onnx")
+    words = ["fmu", "my loop-1.onnx", "--onnxruntime", str(ONNXRUNTIME)]
+    assert main(words if fmi == 3 else [*words, "--fmi", "2"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith(f"my loop-1.fmu: FMI {fmi}.0, ")
+    assert told.endswith(" steps give the same bits as the controller file\n")
+    model = fmpy.read_model_description("my loop-1.fmu")
+    assert model.fmiVersion == f"{fmi}.0"
+    assert model.coSimulation.modelIdentifier == "my_loop_1"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["my loop-1.fmu", "my loop-1.onnx"]  # and no draft
+    assert "my loop-1.fmu is there already; remove it" in refused(capsys, *words[1:])
+
+
+def test_a_file_that_is_no_controller_is_refused(tmp_path: Path, capsys: Capture) -> None:
+    out = ("--out", tmp_path / "x.fmu")
+    text, cut = tmp_path / "text.onnx", tmp_path / "cut.onnx"
+    text.write_text("not a controller")
+    cut.write_bytes(PID.read_bytes()[:-100])
+    for file in (text, cut, tmp_path / "none.onnx", PID.with_suffix(".json")):
+        assert str(file) in refused(capsys, file, *out)
+    assert not (tmp_path / "x.fmu").exists()
+
+
+def test_an_output_that_cannot_be_is_refused(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "there.fmu").write_text("")
+    for name, words in (
+        ("there.fmu", "is there already; remove it, or name another file with --out"),
+        ("x.zip", "does not end in .fmu"),
+        ("none/x.fmu", "is no folder"),
+        ("there.fmu/x.fmu", "is no folder"),
+    ):
+        assert words in refused(capsys, PID, "--out", tmp_path / name)
+    assert (tmp_path / "there.fmu").read_text() == ""
+    if sys.platform == "linux":  # where not even root can write
+        assert "/proc" in refused(capsys, PID, "--out", "/proc/x.fmu", "--onnxruntime", ONNXRUNTIME)
+
+
+def test_a_version_of_fmi_that_there_is_none_of_is_refused(capsys: Capture) -> None:
+    assert "invalid choice: 1 (choose from 2, 3)" in refused(capsys, PID, "--fmi", "1")
+
+
+def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    words = (PID, "--out", tmp_path / "x.fmu", "--onnxruntime", ONNXRUNTIME)
+    with monkeypatch.context() as here:
+        here.setenv("CC", "no-such-compiler -O2")
+        assert "no C compiler is installed: CC names 'no-such-compiler'" in refused(capsys, *words)
+    with monkeypatch.context() as here:
+        here.delenv("CC", raising=False)
+        here.setenv("PATH", str(tmp_path))
+        assert "none of cc, gcc, clang is there; apt-get install gcc brings one" in refused(capsys, *words)
+    with monkeypatch.context() as here:
+        here.setitem(sys.modules, "fmpy", None)
+        assert "needs the package fmpy, which is not installed: pip install" in refused(capsys, *words)
+    with monkeypatch.context() as here:
+        here.setattr(sys, "platform", "win32")
+        assert "an FMU is built on Linux" in refused(capsys, *words)
+    told = refused(capsys, *words[:-1], tmp_path)
+    assert "onnxruntime_c_api.h, which is not found in" in told
+    assert "--onnxruntime FOLDER" in told
+
+
+def test_a_compiler_that_fails_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    (tmp_path / "onnxruntime_c_api.h").write_text("#error this is no header of onnxruntime\n")
+    told = refused(capsys, PID, "--out", tmp_path / "x.fmu", "--onnxruntime", tmp_path)
+    assert "cannot compile the FMU: " in told
+    assert "this is no header of onnxruntime" in told
+    assert [path.name for path in tmp_path.iterdir()] == ["onnxruntime_c_api.h"]
+
+
+def test_the_page_names_every_option_and_variable() -> None:
+    page = (ROOT / "docs" / "fmu.md").read_text()
+    parser = Parser()
+    options(parser)
+    names = {name for action in parser._actions for name in action.option_strings} - {"-h", "--help"}
+    assert names == {"--out", "--fmi", "--onnxruntime"}
+    assert all(f"{name} " in page for name in names)
+    groups = {row.group for row in variables_of(Controller(PID).manifest)} - {"time"}
+    assert groups == {"sp", "pv", "mv_applied", "mv_start", "mv", "info", "fault", "use_mv_applied"}
+    assert all(f"`{group}" in page for group in (*groups, "dv."))
+    assert "**Not tested: Simulink, OpenModelica, Dymola" in page
+
+
+def test_the_package_ships_what_is_compiled() -> None:
+    """The globs of package data name every file that the command reads."""
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["pipeline"]
+    shipped = {path for glob in data for path in (ROOT / "pipeline").glob(glob)}
+    assert {HOSTS / "c" / "host.c", *SOURCES.iterdir()} <= shipped
+    assert (ROOT / "examples" / "embed" / "c" / "host.c").resolve() == HOSTS / "c" / "host.c"

@@ -1,0 +1,162 @@
+"""The Node host: shipped controllers of every case to the bit, damaged kits, and its loop on a clock of the test's.
+
+`npm ci` in examples/embed/node brings onnxruntime-node; without it these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from kits import DAMAGES, EMBED, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
+
+NODE = shutil.which("node")
+if NODE is None or not (EMBED / "node" / "node_modules").is_dir():
+    pytest.skip("node or its packages are missing (npm ci in examples/embed/node)", allow_module_level=True)
+
+pytest_plugins = ["small_laws"]
+PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
+
+
+def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [str(NODE), str(EMBED / "node" / "host.mjs"), *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize("file", SOME, ids=name)
+def test_node_gives_the_bits_of_our_runtime(file: Path, tmp_path: Path) -> None:
+    """On another release of onnxruntime than ours, too."""
+    done = run("--conformance", kit_of(file), tmp_path / "answers.json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "largest difference 0.00, 0 wrong" in done.stdout
+    verdict = verdict_on(file, tmp_path / "answers.json")
+    assert verdict.passed, verdict.text()
+    assert verdict.same_bits == verdict.steps > 300
+
+
+def test_node_refuses_results_and_takes_measured_disturbances(disobedient_file: Path, tmp_path: Path) -> None:
+    """No shipped controller has measured disturbances or leaves its range; this one does both."""
+    vectors = json.loads((kit_of(disobedient_file) / "vectors.json").read_text())
+    refused = Counter(row.get("refused", "") for row in vectors["steps"])
+    assert min(refused["output"], refused["input"], refused[""]) >= 15
+    done = run("--conformance", kit_of(disobedient_file), tmp_path / "answers.json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = verdict_on(disobedient_file, tmp_path / "answers.json")
+    assert verdict.passed, verdict.text()
+    assert verdict.same_bits == verdict.steps
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_node_does_not_pass_a_damaged_kit(damage: str, tmp_path: Path) -> None:
+    done = run("--conformance", spoilt(PID, tmp_path, DAMAGES[damage]))
+    assert done.returncode == 1, done.stdout + done.stderr
+    expected = "0.00100, 0 wrong" if damage in {"mv", "state"} else "0.00, 1 wrong"
+    assert f"largest difference {expected}" in done.stdout
+
+
+def test_the_node_loop_scans_once_a_period() -> None:
+    done = run(kit_of(PID) / "pid.onnx", "8", "0.02")
+    assert done.returncode == 0, done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    places = [int(row[0]) for row in rows]
+    assert places[0] == 0
+    assert places == sorted(set(places))
+    assert all(0 <= float(row[1]) < 20 for row in rows)
+    assert {row[4] for row in rows} == {"AUTO"}
+
+
+LOOP = """
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+const [host, file] = process.argv.slice(1);
+const ort = createRequire(host)("onnxruntime-node");
+const { Controller, Loop, MadeUpPlant, run, start } = await import(host.replace("node/host", "javascript/controller"));
+const manifest = JSON.parse(readFileSync(file.replace("onnx", "json")));
+const controller = await Controller.load(ort, readFileSync(file), manifest, "cpu");
+const { sp, mv } = start(controller.manifest);
+const loop = new Loop(controller, { sp, mv, mode: "AUTO", recoverAfter: 2 });
+class Plant extends MadeUpPlant {
+  read() {
+    const sample = super.read();
+    if (this.k === 4) throw new Error("no answer");
+    return { ...sample, pv: [0.499, 300] };
+  }
+  write(mv) {
+    if (this.k === 10) throw new Error("no way");
+    super.write(mv);
+  }
+}
+let time = 100, scans = [];
+await run(loop, new Plant(controller.manifest, mv), {
+  scans: 30,
+  period: 1,
+  now: () => time,
+  sleep: async (seconds) => { time += seconds * 0.7 + (seconds < 1e-3 ? 0.25 : 0); }, // early at first, late in the end
+  seen: ({ k, late, mode, mv, reason }) => {
+    scans.push({ k, late, mode, mv: [...mv], reason, state: [...controller.state] });
+    if (k === 15) time += 2.5; // a whole period passes
+    if (k === 20) time += 7.5; // six of them
+  },
+});
+let refused = [];
+for (const bad of [[2], [NaN], [], [0.1, 0.2]])
+  try { loop.setSp(bad); } catch (error) { refused.push(error.message); }
+console.log(JSON.stringify({ scans, refused, sp: [...loop.sp] }));
+"""
+
+
+@pytest.fixture(scope="module")
+def told() -> dict[str, Any]:
+    """A loop on a clock of the test's, a plant that fails to be read once and to be written once, and two gaps."""
+    host, file = EMBED / "node" / "host.mjs", kit_of(PID) / "pid.onnx"
+    command = [str(NODE), "--input-type=module", "-e", LOOP, str(host), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def test_lateness_does_not_become_drift_in_node(told: dict[str, Any]) -> None:
+    places = [scan["k"] for scan in told["scans"]]
+    assert places == [k for k in range(30) if k not in {16, *range(21, 27)}]
+    assert all(0 <= scan["late"] < 1 for scan in told["scans"])
+    assert sum(scan["late"] > 0.2 for scan in told["scans"]) > 20  # each is late, none the later for it
+
+
+def test_faults_hold_the_mv_in_node(told: dict[str, Any]) -> None:
+    scans = {scan["k"]: scan for scan in told["scans"]}
+    assert [k for k, scan in scans.items() if scan["mode"] == "HOLD"] == [3, 4, 9, 10]
+    assert scans[3]["reason"] == "the plant cannot be read"
+    assert scans[9]["reason"] == "the plant cannot be written: no way"
+    for fault in (3, 9):
+        assert scans[fault]["mv"] == scans[fault + 1]["mv"] == scans[fault - 1]["mv"]
+        assert scans[fault - 1]["mv"] != scans[fault - 2]["mv"]  # the law was moving it
+        assert not any(scans[fault]["state"])
+
+
+def test_what_an_operator_may_not_set_is_refused_in_node(told: dict[str, Any]) -> None:
+    assert len(told["refused"]) == 4
+    assert told["sp"] == [0.5]
+
+
+@pytest.mark.parametrize("what", ["changed", "missing", "foreign"])
+def test_a_file_that_is_not_right_is_one_line_of_the_node_host(what: str, tmp_path: Path) -> None:
+    for suffix in (".onnx", ".json"):
+        shutil.copy(kit_of(PID) / f"pid{suffix}", tmp_path)
+    file, manifest = tmp_path / "pid.onnx", tmp_path / "pid.json"
+    if what == "changed":
+        file.write_bytes(file.read_bytes() + b"x")
+    elif what == "missing":
+        manifest.unlink()
+    else:
+        shutil.copy(next(f for f in SHIPPED if f.stem == "inc").with_suffix(".json"), manifest)
+    done = run(file, "1", "0.01")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert ("no such file" if what == "missing" else "the file's SHA-256 is") in done.stderr

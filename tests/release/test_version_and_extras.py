@@ -1,0 +1,79 @@
+"""One version everywhere, and one line with the extra that brings what a command lacks."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+import grimp
+import pytest
+
+import serving
+from pipeline.__main__ import main
+from pipeline.commands.extras import advice, extra_of
+from pipeline.stages import check
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def test_the_version_is_the_same_everywhere(capsys: pytest.CaptureFixture[str]) -> None:
+    """The installed one goes into every controller's provenance; ``make setup`` installs anew where it changed."""
+    assert PROJECT["dynamic"] == ["version"]
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"loopwright {serving.__version__}\n"
+    assert version("loopwright") == serving.__version__
+    assert re.search(rf"^## {re.escape(serving.__version__)}\b", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+
+
+def test_every_package_that_the_sources_import_is_asked_for_by_an_extra() -> None:
+    graph = grimp.build_graph("serving", "pipeline", include_external_packages=True, cache_dir=None)
+    imported = {m for m in graph.modules if graph.is_module_squashed(m)} - sys.stdlib_module_names
+    base = {re.split(r"[<>=]", line)[0] for line in PROJECT["dependencies"]}
+    brought = {module: extra_of(module) for module in imported - base}
+    assert {"torch", "asyncua", "sklearn"} <= set(brought)
+    # asyncua brings cryptography
+    assert {module for module, extra in brought.items() if extra is None} <= {"cryptography"}
+    assert {extra_of(m) for m in ("torch", "sklearn", "yaml", "mlflow.onnx")} == {"pipeline"}
+    assert {extra_of(m) for m in ("asyncua", "starlette", "uvicorn")} == {"plant"}
+    assert extra_of("fmpy") == "fmu"
+    assert extra_of("pytest") is None  # the developers' own
+
+
+@pytest.mark.parametrize(
+    ("words", "blocked", "extra"),
+    [("simulate x.onnx", "casadi", "pipeline"), ("loop check", "asyncua", "plant"), ("laws", "torch", "pipeline")],
+)
+def test_a_command_without_its_packages_names_the_extra_in_one_line(words: str, blocked: str, extra: str) -> None:
+    code = f"""import sys
+sys.modules[{blocked!r}] = None
+from pipeline.__main__ import main
+sys.exit(main({words.split()!r}))"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    name = words.split()[0]
+    assert done.returncode == 2
+    assert (
+        done.stderr == f"loopwright {name}: {blocked} is not installed; pip install 'loopwright[{extra}]' brings it\n"
+    )
+
+
+def test_a_missing_module_of_our_own_is_a_fault_and_stays_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pipeline.commands.inspect", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pipeline\.commands\.inspect"):
+        main(["inspect", "x.onnx"])
+    assert advice("pipeline.commands.inspect") is None
+
+
+def test_check_says_once_that_a_wheel_holds_no_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And does not ask for what would be computed into site-packages."""
+    monkeypatch.chdir(ROOT)
+    wheel = Path("/venv/lib/python3.11/site-packages/pipeline/cases")
+    monkeypatch.setattr(check, "bounds_path", lambda case: wheel / case.name / "bounds.json")
+    said = [line for line in check.notes() if "bounds" in line]
+    assert said == [check.FROM_A_WHEEL]
+    monkeypatch.setattr(check, "bounds_path", lambda case: ROOT / "pipeline/cases" / case.name / "none.json")
+    assert any("run `loopwright bounds" in line for line in check.notes())

@@ -1,0 +1,248 @@
+"""The conformance kit: what it holds, that it is this runtime's answer, and that its check finds what is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from serving import Controller, LoopwrightError
+from serving.__main__ import main
+from serving.conformance.check import check
+from serving.conformance.kit import PASS, VECTORS, write_kit
+from serving.conformance.numbers import read, written
+
+pytest_plugins = ["small_laws"]
+Capture = pytest.CaptureFixture[str]
+Json = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def kit(pi_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("kit")
+    write_kit(Controller(pi_file), folder)
+    return folder
+
+
+@pytest.fixture
+def vectors(kit: Path) -> Json:
+    row: Json = json.loads((kit / VECTORS).read_text())
+    return row
+
+
+@pytest.fixture
+def answers(vectors: Json) -> Json:
+    """The answers of a host that does all as it must."""
+    steps = [{"refused": row["refused"]} if "refused" in row else row["gives"] for row in vectors["steps"]]
+    scans = [{name: row[name] for name in ("mode", "fault", "mv")} for row in vectors["scans"]]
+    return {"host": "Perfect", "onnxruntime": "0", "sha256": vectors["sha256"], "steps": steps, "scans": scans}
+
+
+def chain(vectors: Json) -> list[Json]:
+    parts = {"anywhere", "inside", "course", "saturation", "stuck actuator"}
+    return [row for row in vectors["steps"] if row["part"] in parts]
+
+
+def test_300_steps_are_chained_over_the_whole_ranges(pi_file: Path, vectors: Json) -> None:
+    m, rows = Controller(pi_file).manifest, chain(vectors)
+    assert len(rows) == 300
+    assert [row["cold"] for row in rows] == [True] + [False] * 299
+    for name in ("sp", "pv", "mv_applied"):
+        values = np.array([read(row["given"][name], name) for row in rows])
+        low, high = np.array([(s.low, s.high) for s in m.signals(name)]).T
+        assert (values.min(axis=0) == low).all()
+        assert (values.max(axis=0) == high).all()
+        assert (np.unique(values, axis=0).shape[0]) > 40
+    mv = np.array([read(row["gives"]["mv"], "mv")[0] for row in rows])
+    assert {0.0, 100.0} <= set(mv)  # saturated at both ends
+    assert ((mv > 0) & (mv < 100)).sum() > 100  # and elsewhere a wrong digit shows
+
+
+def test_each_value_that_is_not_finite_is_refused_and_the_next_step_follows_the_last_good_one(
+    pi_file: Path, vectors: Json
+) -> None:
+    controller, spoilt = Controller(pi_file), []
+    state = controller.cold_state()
+    for row in vectors["steps"]:
+        inputs = {name: read(texts, name) for name, texts in row["given"].items()}
+        if "refused" in row:
+            spoilt += [(n, i, str(v)) for n, vs in inputs.items() for i, v in enumerate(vs) if not math.isfinite(v)]
+            continue
+        step = controller.step(**inputs, state=controller.cold_state() if row["cold"] else state)
+        assert written(step.mv) == row["gives"]["mv"]
+        assert written(step.state) == row["gives"]["state_next"]
+        state = step.state
+    places = [("sp", 0), ("pv", 0), ("pv", 1), ("mv_applied", 0)]
+    assert Counter(spoilt) == Counter((n, i, bad) for n, i in places for bad in ("nan", "inf", "-inf"))
+
+
+def test_cold_starts_stand_beside_the_chain(vectors: Json) -> None:
+    assert sum(row["cold"] for row in vectors["steps"]) == 1 + 10
+
+
+def test_the_scans_hold_what_the_guards_refuse(vectors: Json) -> None:
+    rows = {row["what"]: row for row in vectors["scans"]}
+    for what in (
+        "PV level nan",
+        "PV T above, beyond its margin",
+        "applied MV valve below, beyond its margin",
+        "applied MV valve not finite",
+        "age 1.1 periods",
+        "age nan periods",
+        "the plant cannot be read",
+        "a fault while it recovers",
+    ):
+        assert rows[what]["fault"], what
+        assert rows[what]["mode"] == "HOLD", what
+    for what in ("PV T above, within its margin", "applied MV valve below, within its margin", "no read-back"):
+        assert not rows[what]["fault"], what
+        assert rows[what]["mode"] == "AUTO", what
+    assert rows["a fault by hand"] | {"mode": "MANUAL", "fault": True} == rows["a fault by hand"]
+    assert [row["missed"] for row in vectors["scans"] if row["missed"]] == [1, 3, 4]
+
+
+def test_a_host_that_does_all_as_it_must_passes(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
+    verdict = judged(pi_file, kit, answers, tmp_path)
+    assert verdict.passed
+    assert verdict.largest == 0
+    assert verdict.same_bits == verdict.steps > 300
+    assert verdict.text().startswith("Perfect, onnxruntime 0: passed\n  same bits in")
+
+
+def judged(file: Path, kit: Path, answers: Json, tmp_path: Path) -> Any:
+    path = tmp_path / "answers.json"
+    path.write_text(json.dumps(answers))
+    return check(kit, path, Controller(file).sha256)
+
+
+@pytest.mark.parametrize(
+    ("share", "passes"), [(1e-9, True), (0.9e-6, True), (1.1e-6, False), (1e-3, False), (math.nan, False)]
+)
+@pytest.mark.parametrize("name", ["mv", "state_next", "info"])
+def test_a_difference_counts_as_a_share_of_the_scale(
+    pi_file: Path, kit: Path, vectors: Json, answers: Json, tmp_path: Path, name: str, share: float, passes: bool
+) -> None:
+    scale, old = float.fromhex(vectors["scale"][name][-1]), float.fromhex(answers["steps"][200][name][-1])
+    answers["steps"][200][name][-1] = (old + share * scale).hex()
+    verdict = judged(pi_file, kit, answers, tmp_path)
+    assert verdict.passed is passes
+    assert verdict.same_bits == verdict.steps - 1
+    assert verdict.largest == pytest.approx(share if math.isfinite(share) else math.inf, rel=1e-3)
+    assert verdict.where.startswith("step 200 (")
+    assert f": {name}[" in verdict.where
+
+
+def changed_last_bit(answers: Json) -> None:
+    text = answers["steps"][100]["mv"][0]
+    answers["steps"][100]["mv"][0] = math.nextafter(float.fromhex(text), math.inf).hex()
+
+
+def test_one_bit_is_seen(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
+    changed_last_bit(answers)
+    verdict = judged(pi_file, kit, answers, tmp_path)
+    assert verdict.passed
+    assert verdict.same_bits == verdict.steps - 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a["steps"][-2].pop("refused"), "computed, but must be refused because of the input"),
+        (lambda a: a["steps"].__setitem__(5, {"refused": "output"}), "refused because of the output, but must be"),
+        (lambda a: a["steps"][-2].update(refused="output"), "of the output, but must be refused because of the input"),
+        (lambda a: a["steps"].pop(), "steps are answered instead of"),
+        (lambda a: a["scans"].pop(), "scans are answered instead of"),
+        (lambda a: a["steps"][7]["mv"].append("0x0p+0"), "2 numbers instead of 1"),
+        (lambda a: a["scans"][5].update(mode="AUTO"), "mode is 'AUTO', but must be 'HOLD'"),
+        (lambda a: a["scans"][5].update(fault=False), "fault is False, but must be True"),
+    ],
+)
+def test_what_no_tolerance_excuses(
+    pi_file: Path, kit: Path, answers: Json, tmp_path: Path, change: Any, words: str
+) -> None:
+    change(answers)
+    verdict = judged(pi_file, kit, answers, tmp_path)
+    assert not verdict.passed
+    assert words in verdict.text()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.update(sha256="0" * 64), "is for the controller with the SHA-256 000"),
+        (lambda a: a.update(steps="all"), "the answers have no list of objects 'steps'"),
+        (lambda a: a["steps"][3].update(mv=["1.5 K"]), "step 3 (anywhere): mv holds no hexadecimal float"),
+        (lambda a: a["steps"][3].pop("info"), "step 3 (anywhere): info is 'None'; it must be a list"),
+    ],
+)
+def test_answers_that_are_none_are_one_line(
+    pi_file: Path, kit: Path, answers: Json, tmp_path: Path, capsys: Capture, change: Any, words: str
+) -> None:
+    change(answers)
+    path = tmp_path / "answers.json"
+    path.write_text(json.dumps(answers))
+    assert main(["conformance", str(pi_file), str(kit), "--check", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+
+
+def test_the_command_writes_and_checks(
+    pi_file: Path, answers: Json, tmp_path: Path, kit: Path, capsys: Capture
+) -> None:
+    out, path = tmp_path / "new" / "kit", tmp_path / "answers.json"
+    assert main(["conformance", str(pi_file), str(out)]) == 0
+    said = capsys.readouterr().out
+    assert all(words in said for words in PASS)
+    assert {file.name for file in out.iterdir()} == {pi_file.name, pi_file.with_suffix(".json").name, VECTORS}
+    assert (out / pi_file.name).read_bytes() == pi_file.read_bytes()
+    assert (out / VECTORS).read_text() == (kit / VECTORS).read_text()  # the same every time
+    manifest = json.loads((out / pi_file.with_suffix(".json").name).read_text())
+    assert manifest["sha256"] == Controller(pi_file).sha256
+    path.write_text(json.dumps(answers))
+    assert main(["conformance", str(pi_file), str(out), "--check", str(path)]) == 0
+    answers["scans"][5]["mode"] = "AUTO"
+    path.write_text(json.dumps(answers))
+    assert main(["conformance", str(pi_file), str(out), "--check", str(path)]) == 1
+    assert "FAILED" in capsys.readouterr().out
+
+
+def test_a_kit_beside_the_file_leaves_the_file_alone(pi_file: Path, tmp_path: Path) -> None:
+    file = tmp_path / "law.onnx"
+    file.write_bytes(pi_file.read_bytes())
+    assert main(["conformance", str(file), str(tmp_path)]) == 0
+    assert file.read_bytes() == pi_file.read_bytes()
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(pi_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["conformance", str(pi_file), str(tmp_path / "file" / "kit")]) == 2
+    said = capsys.readouterr().err
+    assert "the kit cannot be written to" in said
+    assert said.count("\n") == 1
+
+
+def test_a_kit_of_another_version_or_none_is_refused(pi_file: Path, kit: Path, vectors: Json, tmp_path: Path) -> None:
+    path, digest = tmp_path / VECTORS, Controller(pi_file).sha256
+    for text, words in (
+        (json.dumps(vectors | {"kit": 9}), "has the version 9"),
+        ("[]", "is no JSON object"),
+        ("{", "cannot be read"),
+    ):
+        path.write_text(text)
+        with pytest.raises(LoopwrightError, match=words):
+            check(tmp_path, path, digest)
+
+
+@given(st.lists(st.floats(width=64)))
+def test_numbers_come_back_to_the_bit(values: list[float]) -> None:
+    back = read(written(values), "here").tolist()
+    assert all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(values, back, strict=True))
+    assert [math.copysign(1, v) for v in back if v == 0] == [math.copysign(1, v) for v in values if v == 0]
