@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check coverage registry bench release clean
+.PHONY: help setup run test check docs coverage registry bench release clean
 
 help: ## list the targets
 	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -36,6 +36,12 @@ check: $(STAMP) ## the static part of make test
 	ruff check .
 	mypy
 	lint-imports
+
+docs: $(STAMP) ## build the manual into build/docs, under a minute
+	@$(BIN)/python -c "import furo, myst_parser" 2> /dev/null || \
+	  $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees -c docs . build/docs
+	@echo "open build/docs/index.html"
 
 coverage: $(STAMP) ## branch coverage of the tests, by file
 	@PYTHON=python bash tools/runtime_venvs.sh build/runtime

@@ -88,7 +88,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     one = command("fetch", _fetch, "write a controller, its manifest and its signature into a folder")
     names = "CASE (its champion), CASE-CONTROLLER (its best version), CASE-CONTROLLER@ALIAS or CASE-CONTROLLER/VERSION"
     one.add_argument("controller", help=names)
-    one.add_argument("folder", type=Path)
+    one.add_argument("folder", type=Path, help="where they go")
     known = "write nothing unless one of these public keys signed it (or those of LOOPWRIGHT_TRUSTED)"
     one.add_argument("--key", metavar="PUBLIC", type=Path, nargs="+", help=known)
     one = command("serve", _serve, "open MLflow's UI on this machine only, its job execution off")

@@ -35,13 +35,13 @@ def options(parser: argparse.ArgumentParser) -> None:
     init.add_argument("--endpoint", default="opc.tcp://127.0.0.1:4840", help="the plant's server (%(default)s)")
     init.add_argument("--out", metavar="FILE", type=Path, default=SETTINGS, help="where it goes (%(default)s)")
     check = commands.add_parser("check", help="connect, read every node once, and say what would stop the loop")
-    check.add_argument("file", metavar="LOOP.TOML", type=Path, nargs="?", default=SETTINGS)
+    check.add_argument("file", metavar="LOOP.TOML", type=Path, nargs="?", default=SETTINGS, help="which (%(default)s)")
     run = commands.add_parser("run", help="run the loop until Ctrl-C")
-    run.add_argument("file", metavar="LOOP.TOML", type=Path, nargs="?", default=SETTINGS)
+    run.add_argument("file", metavar="LOOP.TOML", type=Path, nargs="?", default=SETTINGS, help="which (%(default)s)")
     run.add_argument("--scans", metavar="N", type=int, help="stop after so many")
     _asking(commands)
     out = commands.add_parser("export", help="write a journal's scans as a CSV that `loopwright new` reads")
-    out.add_argument("file", metavar="JOURNAL", type=Path)
+    out.add_argument("file", metavar="JOURNAL", type=Path, help="the journal's file, also of a loop that runs")
     out.add_argument("--out", metavar="FILE", type=Path, help="where it goes (JOURNAL.csv)")
 
 
@@ -57,7 +57,7 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     mode.add_argument("mode", metavar="MODE", type=str.upper, help=", ".join(Mode))
     for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL")):
         values = commands.add_parser(name, help=f"change {words}")
-        values.add_argument("values", metavar="NAME=VALUE", nargs="+")
+        values.add_argument("values", metavar="NAME=VALUE", nargs="+", help="of one or more signals, in their units")
     state = commands.add_parser("state", help="how the loop stands, as JSON")
     for parser in (swap, mode, *(commands.choices[name] for name in ("sp", "mv")), state):
         parser.add_argument("--loop", metavar="LOOP.TOML", type=Path, default=SETTINGS, help="which (%(default)s)")

@@ -1,0 +1,153 @@
+"""Code of the manual runs: Python as it stands, commands through the real parsers, settings through the real readers.
+
+A block that does not run here says why in a comment right above it: ``<!-- not run: REASON -->``, or
+``<!-- run by: FILE -->`` with the test that runs it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+import types
+from pathlib import Path
+
+import pytest
+import yaml
+from manual.commands import parser_of
+from pages import PAGES, ROOT, Block, blocks
+
+from pipeline.commands import COMMANDS
+from pipeline.config.exports import ExportParams
+from pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams, parse
+from pipeline.excitation import EXCITATIONS
+from pipeline.laws import LAWS
+from pipeline.models import MODELS
+from serving.page.settings import Page
+
+LANGUAGES = {"python", "sh", "bash", "yaml", "toml", "text", "", "{generated}", "{diagram}", "{toctree}", "{eval-rst}"}
+ALL = [block for page in PAGES for block in blocks(page)]
+# Programs that a page may call, beside `loopwright` and Python: what they are given is for a person to see.
+OTHERS = {"cd", "git", "source", "export", "dask", "docker", "cp", "mlflow", "dvc", "curl", "openssl"}
+
+
+def of(*languages: str) -> list[Block]:
+    return [block for block in ALL if block.language in languages]
+
+
+def test_each_block_has_a_language_that_is_tested() -> None:
+    assert {block.where: block.language for block in ALL if block.language not in LANGUAGES} == {}
+
+
+def test_who_does_not_run_says_why() -> None:
+    for block in ALL:
+        if block.mark:
+            kind, words = block.mark
+            assert len(words) > 10, block.where
+            if kind == "run by":
+                assert block.page.name in (ROOT / words).read_text(encoding="utf-8"), block.where
+
+
+def pages_with_python() -> list[Path]:
+    return [page for page in PAGES if any(b.language == "python" and not b.mark for b in blocks(page))]
+
+
+@pytest.mark.parametrize("page", pages_with_python(), ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All blocks in their order, as one program; in a tutorial, a block below the name of a file is that file."""
+    for name in ("artifacts", "params.yaml"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    found = [block for block in blocks(page) if block.language == "python" and not block.mark]
+    if page.parent.name == "tutorials":
+        lines = page.read_text(encoding="utf-8").splitlines()
+        for block in found:
+            name = re.findall(r"`(\w+\.py)`", " ".join(lines[block.line - 4 : block.line - 1]))[0]
+            (tmp_path / name).write_text(block.text, encoding="utf-8")
+            _run(name, tmp_path)
+        return
+    module = types.ModuleType("page")
+    monkeypatch.setitem(sys.modules, "page", module)
+    monkeypatch.chdir(tmp_path)
+    exec(compile("\n".join(block.text for block in found), str(page), "exec"), module.__dict__)
+
+
+def _run(file: str, folder: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, file], cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{file}: {done.stderr[-2000:]}"
+
+
+def commands_of(block: Block) -> list[list[str]]:
+    """The words of each command of a shell block; comments and continued lines as a shell has them."""
+    lines = block.text.replace("\\\n", " ").splitlines()
+    return [found for line in lines for part in line.split(" | ") if (found := shlex.split(part, comments=True))]
+
+
+@pytest.mark.parametrize("block", of("sh", "bash"), ids=lambda b: b.where)
+def test_commands_are_those_that_there_are(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    if block.mark:
+        return
+    for found in commands_of(block):
+        while found and re.fullmatch(r"[A-Z_]+=.*", found[0]):
+            found = found[1:]
+        program, *rest = found or ["export"]
+        if program == "loopwright":
+            assert rest[0] in COMMANDS, block.where
+            try:
+                parser_of(rest[0]).parse_args([w for w in rest[1:] if w not in {"...", "&"}])
+            except SystemExit:
+                pytest.fail(f"{block.where}: {shlex.join(found)}: {capsys.readouterr().err}")
+        elif program in {"python", "python3"}:
+            _check_python(rest, block)
+        elif program == "make":
+            targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+            assert {w for w in rest if "=" not in w} <= targets, block.where
+        elif program == "pip":
+            assert rest[0] == "install", block.where
+            extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+            for asked in re.findall(r"\[([\w,]+)\]", " ".join(rest)):
+                assert set(asked.split(",")) <= set(extras["optional-dependencies"]), block.where
+        else:
+            assert program in OTHERS, f"{block.where}: {program} is not known; add it, or say why it does not run"
+
+
+def _check_python(rest: list[str], block: Block) -> None:
+    if rest[0] == "-m":
+        assert rest[1] in {"venv", "serving", "pipeline.engine.start"}, block.where
+    else:
+        made = {name for b in blocks(block.page) for name in re.findall(r"`(\w+\.py)`", b.page.read_text("utf-8"))}
+        assert (ROOT / rest[0]).exists() or rest[0] in made, f"{block.where}: no {rest[0]}"
+
+
+@pytest.mark.parametrize("block", of("yaml"), ids=lambda b: b.where)
+def test_yaml_is_what_params_yaml_takes(block: Block) -> None:
+    if block.mark:
+        return
+    tree = yaml.safe_load(block.text)
+    readers = {"exports": ExportParams, "cases": CaseParams, "models": ModelParams}
+    assert set(tree) <= {*readers, "records", "controllers"}, block.where
+    for section, entries in tree.items():
+        for name, entry in entries.items():
+            if section in readers:
+                parse(readers[section], entry, name)
+            cls = {"records": RecordParams, "controllers": ControllerParams}.get(section)
+            if cls is not None:
+                assert {"case"} <= set(entry), block.where
+            page = block.page.read_text(encoding="utf-8")
+            for part in entry.get("parts", {}).values():
+                assert part["kind"] in MODELS or f'"{part["kind"]}"' in page, block.where
+            for key, known in (("law", LAWS), ("kind", EXCITATIONS)):
+                word = entry.get(key)
+                assert word is None or word in known or f'"{word}"' in page, block.where
+
+
+@pytest.mark.parametrize("block", of("toml"), ids=lambda b: b.where)
+def test_toml_is_what_loop_toml_takes(block: Block) -> None:
+    if block.mark:
+        return
+    tree = tomllib.loads(block.text)
+    assert set(tree) <= {"page"}, f"{block.where}: add the reader of these keys"
+    parse(Page, tree["page"], block.where)
