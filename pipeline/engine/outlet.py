@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Iterator
 
-END = b"\0"
+END_BYTES = 16  # drawn at random: no program writes them by chance
 
 
 @contextlib.contextmanager
@@ -17,25 +17,32 @@ def outlet(stopped: threading.Event) -> Iterator[int]:
     Once ``stopped``, no more comes out: workers that are ended while they start complain of what they did not get, at
     a time of their own, and the last line of a stopped run is to be the one that says how to go on.
     """
-    real, (source, into), ended = os.dup(2), os.pipe(), threading.Event()
+    real, (source, into), end = os.dup(2), os.pipe(), os.urandom(END_BYTES)
     os.dup2(into, 2)
-    passing = threading.Thread(target=_pass_on, args=(source, real, stopped, ended), daemon=True)
+    passing = threading.Thread(target=_pass_on, args=(source, real, stopped, end), daemon=True)
     passing.start()
     try:
         yield real
     finally:
         if not stopped.is_set():  # else a worker that is only now started would write to the terminal again
             os.dup2(real, 2)
-        ended.set()
-        os.write(into, END)  # behind all that was written; who still writes does so into nothing
+        os.write(into, end)  # behind all that was written; who still writes does so into nothing
         passing.join()
         os.close(into)
 
 
-def _pass_on(source: int, to: int, stopped: threading.Event, ended: threading.Event) -> None:
-    text = b""
-    while not (ended.is_set() and END in text):  # who writes on may have written behind the end already
-        text = os.read(source, 65_536)
+def _pass_on(source: int, to: int, stopped: threading.Event, end: bytes) -> None:
+    kept, over = b"", False
+    while not over:  # who writes on may have written behind the end already
+        text, found, _ = (kept + os.read(source, 65_536)).partition(end)
+        over = bool(found)
+        begun = 0 if over else _begun(text, end)
+        text, kept = text[: len(text) - begun], text[len(text) - begun :]
         if not stopped.is_set():
             with contextlib.suppress(OSError):  # nobody reads any more; unread here, it would stop those who write
-                os.write(to, text.partition(END)[0] if ended.is_set() else text)
+                os.write(to, text)
+
+
+def _begun(text: bytes, end: bytes) -> int:
+    """How many of the last bytes may be the beginning of the end."""
+    return next((n for n in range(len(end) - 1, 0, -1) if text.endswith(end[:n])), 0)

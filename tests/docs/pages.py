@@ -13,7 +13,7 @@ PAGES = sorted(
         *(p for p in DOCS.rglob("*.md") if not any(part.startswith("_") for part in p.relative_to(DOCS).parts)),
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
-        *(ROOT / "examples").rglob("README.md"),
+        *(p for p in (ROOT / "examples").rglob("README.md") if "node_modules" not in p.parts),
         *(ROOT / "pipeline" / "cases").glob("*/README.md"),
     ]
 )

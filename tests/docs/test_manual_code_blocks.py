@@ -116,7 +116,7 @@ def test_commands_are_those_that_there_are(block: Block, capsys: pytest.CaptureF
 
 def _check_python(rest: list[str], block: Block) -> None:
     if rest[0] == "-m":
-        assert rest[1] in {"venv", "serving", "pipeline.engine.start"}, block.where
+        assert rest[1] in {"venv", "serving", "pipeline.engine.start", "pipeline.playground.web_runtime"}, block.where
     else:
         made = {name for b in blocks(block.page) for name in re.findall(r"`(\w+\.py)`", b.page.read_text("utf-8"))}
         assert (ROOT / rest[0]).exists() or rest[0] in made, f"{block.where}: no {rest[0]}"

@@ -35,4 +35,6 @@ def test_the_card_shows_who_signed_and_offers_what_is_trusted(card_page: Page) -
     expect(card).to_contain_text(re.compile(r"signed by\s*anna \(key [0-9a-f]{16}\)"))
     buttons = card_page.locator("#candidates .candidate")
     expect(buttons).to_have_count(1)
-    expect(buttons).to_contain_text(re.compile(r"inverse_dob \(inverse_dob\.onnx, signed by anna \(key"))
+    expect(buttons).to_contain_text(
+        re.compile(r"inverse_dob for thiosulfate_cstr \(inverse_dob\.onnx, [0-9a-f]{8}, signed by anna \(key")
+    )
