@@ -1,7 +1,7 @@
 """What each extra of loopwright brings, read from the packages installed here: ``python closure.py > closure.json``.
 
 A row is a package with its version, the extras that bring it ("runtime" is no extra), and what its metadata says of its
-licence. Extras of ``extra == "dev"`` are left out: no user installs them.
+licence. The extras dev and docs are left out: they are for who works on the repository.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-NAME, RUNTIME, DEVELOPERS = "loopwright", "runtime", "dev"
+NAME, RUNTIME, DEVELOPERS = "loopwright", "runtime", ("dev", "docs")
 LICENCE = "License :: "
 
 
 def closure() -> list[dict[str, Any]]:
     """A row for each package, by name. Raises SystemExit where one that an extra asks for is not installed here."""
     ours = distribution(NAME)
-    extras = [e for e in ours.metadata.get_all("Provides-Extra") or [] if e != DEVELOPERS]
+    extras = [e for e in ours.metadata.get_all("Provides-Extra") or [] if e not in DEVELOPERS]
     brought = {name: brings(ours, extra) for name, extra in ((RUNTIME, ""), *((e, e) for e in extras))}
     return [
         {"name": package, "by": [extra for extra, names in brought.items() if package in names], **_said(package)}
