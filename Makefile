@@ -11,6 +11,8 @@ export DO_NOT_TRACK := 1
 # Python keeps what it has compiled: else each process of the tests compiles all sources again, 10 s for some.
 unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
+# Tests of loops, servers and browsers wait as much as they compute: one worker more than there are cores.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run test check docs coverage registry bench release clean
@@ -29,7 +31,7 @@ run: $(STAMP) ## run the whole pipeline: screen, excite, fit, design, validate, 
 
 test: check ## formatting, lint, types, import rules, tests
 	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
-	python -m pytest -n logical --dist loadfile --no-loadscope-reorder
+	python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP) ## the static part of make test
 	ruff format --check .
@@ -45,7 +47,7 @@ docs: $(STAMP) ## build the manual into build/docs, under a minute
 
 coverage: $(STAMP) ## branch coverage of the tests, by file
 	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
-	python -m pytest -n logical --dist loadfile --no-loadscope-reorder --cov=serving --cov=pipeline --cov-branch --cov-report=term:skip-covered
+	python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --cov=serving --cov=pipeline --cov-branch --cov-report=term:skip-covered
 
 registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes first what the store lacks
 	loopwright registry publish
