@@ -152,6 +152,7 @@ class ControlLoop:
         self._ranges = [(s.low, s.high, s.values) for s in manifest.mv]
         self._mode = mode
         self._fault = ""  # the fault that changed the mode to HOLD; empty without one
+        self._blind = ""  # why the last sample was refused; empty after a good one, and before the first
         self._good = 0
         self._held = 0  # scans since that fault began
         self._scan = 0
@@ -184,7 +185,12 @@ class ControlLoop:
         return self._fault
 
     def set_mode(self, mode: Mode) -> None:
-        """Set the mode; it takes effect at the next scan."""
+        """Set the mode; it takes effect at the next scan.
+
+        LoopError where a shadow that knows no good sample now is to move the plant: where the MV stands is not known.
+        """
+        if self._mode is Mode.SHADOW and mode is not Mode.SHADOW and self._blind:
+            raise LoopError(f"the last sample was refused ({self._blind}), so where the MV stands is not known; wait")
         if mode is not self._mode:
             self._transfer.begin()
         self._mode, self._fault, self._good, self._held = mode, "", 0, 0
@@ -221,6 +227,7 @@ class ControlLoop:
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         reason = self._refusal(sample)
+        self._blind = ""
         if reason:
             return self.miss(reason)
         applied = self._mv
@@ -248,7 +255,7 @@ class ControlLoop:
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
-        reason = reason or "a fault without a reason"
+        self._blind = reason = reason or "a fault without a reason"
         self._lose(reason)
         self._lasting()
         return self._command(None, None, reason)

@@ -62,6 +62,10 @@ def require_same_signals(a: Manifest, b: Manifest) -> None:
     """
     if a.period_s != b.period_s:
         raise LoopError(f"the new controller has a period of {b.period_s:g} s; the loop runs at {a.period_s:g} s")
+    if "dv" in b.inputs and "dv" not in a.inputs:
+        raise LoopError(
+            "the new controller uses measured disturbances, which this loop does not judge; restart with it"
+        )
     for name, words in (("sp", "set points"), ("pv", "PVs"), ("dv", "measured disturbances"), ("mv", "MVs")):
         now, then, ranged = a.signals(name), b.signals(name), name == "mv"
         if [_what(s, ranged) for s in now] != [_what(s, ranged) for s in then]:

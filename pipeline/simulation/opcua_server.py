@@ -302,3 +302,5 @@ async def spoil(endpoint: str, tag: str, fault: str) -> None:
         raise PlantError(words) from None
     except ValueError:
         raise PlantError(f"the server at {endpoint} is no `loopwright plant serve`: it has no {NAMESPACE}") from None
+    except ua.UaError as error:
+        raise PlantError(f"the plant at {endpoint} refuses: {type(error).__name__}") from None

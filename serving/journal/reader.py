@@ -128,7 +128,8 @@ class JournalReader:
 
     def active(self) -> list[Entry]:
         """The alarms that have not ended, newest first."""
-        return [e for e in self.entries() if e.event.raised and e.over_s is None]
+        rows = self._base.execute(f"{ENTRY} where e.raised and over is null order by e.id desc")
+        return [_entry(row) for row in rows]
 
     def entry(self, id_: int) -> Entry | None:
         """One event."""

@@ -157,10 +157,12 @@ class OpcUaEndpoint:
             return
         if self._outbox:
             refused = refused or "the MV of the scan before is still on its way"
+        if refused:
+            # The loop holds the MV before this one, so this one must not go out.
+            self.unwritten, self._written = "", None
+            raise EndpointError(refused)
         self._outbox.append(np.array(mv))
         self._stir()
-        if refused:
-            raise EndpointError(refused)
 
     def _stands(self, mv: Array) -> bool:
         """Whether this very MV was passed on less than ``rewrite_s`` ago, and at each scan since."""
@@ -331,7 +333,9 @@ class OpcUaEndpoint:
         """The answers as values, with the first thing that is wrong with them."""
         arrived, fault, found = self.clock(), "", dict[str, float]()
         for (name, point, judged), answer in zip(plan.points, answers, strict=False):
-            found[name] = point.scale * answer.number + point.offset
+            usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
+            # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good.
+            found[name] = point.scale * answer.number + point.offset if judged or usable else np.nan
             if fault or not judged:
                 continue
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
@@ -364,7 +368,8 @@ class OpcUaEndpoint:
     def _dead(self, watchdog: float) -> str:
         """Why the server's side counts as dead; empty while its watchdog moves."""
         last, scans = self._watched
-        self._watched = (watchdog, 0 if watchdog != last else scans + 1)
+        moves = watchdog != last and not np.isnan(watchdog)  # one that is gone has stopped, too
+        self._watched = (watchdog, 0 if moves else scans + 1)
         if self._watched[1] < self.nodes.watchdog_scans:
             return ""
         return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"

@@ -6,6 +6,7 @@ import argparse
 import getpass
 import json
 import logging
+import os
 import signal
 import sys
 from contextlib import closing
@@ -62,7 +63,7 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     for parser in (swap, mode, *(commands.choices[name] for name in ("sp", "mv")), state):
         parser.add_argument("--loop", metavar="LOOP.TOML", type=Path, default=SETTINGS, help="which (%(default)s)")
         if parser is not state:
-            parser.add_argument("--who", default=getpass.getuser(), help="written down (%(default)s)")
+            parser.add_argument("--who", default=_user(), help="written down (%(default)s)")
             parser.add_argument("--reason", default="", help="written down")
 
 
@@ -100,6 +101,14 @@ def _ask(options: argparse.Namespace) -> int:
     if do in {"swap", "back"}:
         print(f"once it has the plant: {options.loop} still names the old file; a restart brings that one")
     return 0
+
+
+def _user() -> str:
+    """Who asks; a user without a name, as in a container, by number."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return f"uid {os.getuid()}"
 
 
 def _pair(text: str) -> tuple[str, float]:

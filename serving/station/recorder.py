@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
@@ -19,6 +20,8 @@ from serving.loop import Command, ControlLoop
 from serving.manifest import Manifest
 
 Array: TypeAlias = NDArray[np.float64]
+
+NUMBER = re.compile(r"(?<!\w)[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w)")
 
 
 class Recorder:
@@ -66,7 +69,8 @@ class Recorder:
         """Write a scan down, and the fault or the new controller that came with it."""
         numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
         self.journal.scan(Scan(time.time(), command.mode.value, numbers, quality, command.reason))
-        if command.reason != self._fault:
+        # A reason whose numbers change, such as an age, is the same fault.
+        if kind_of(command.reason) != kind_of(self._fault):
             before, self._fault = self._fault, command.reason
             what = command.reason or f"over: {before}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.reason))
@@ -81,6 +85,11 @@ class Recorder:
         if reason and reason != self._trial and loop.successor is not None:
             self.note("swap", "loop", f"the trial of {named(loop.successor.controller)} begins anew", reason)
         self._trial = reason
+
+
+def kind_of(reason: str) -> str:
+    """A reason without its numbers."""
+    return NUMBER.sub("#", reason)
 
 
 def named(controller: Controller) -> str:

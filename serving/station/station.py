@@ -152,18 +152,19 @@ class Station:
     def _first_values(self) -> Values | None:
         """The plant as it is. A loop that is to write waits for it; a shadow may begin without."""
         waited, limit = 0.0, self.settings.server.connect_s + 1
-        while self.endpoint.values is None and not self.ended:
+        while not _usable(self.endpoint.values) and not self.ended:
             if self.settings.start == "SHADOW" and waited >= limit:
                 return None
             time.sleep(POLL_S)
             waited += POLL_S
-        return self.endpoint.values
+        return self.endpoint.values if _usable(self.endpoint.values) else None
 
     def _before(self, k: int) -> None:
         """Changes that were asked for, here or on the plant's side."""
         assert self.loop is not None
         self.missed = k - self.scans
-        while not self.changes.empty():
+        # Before the first scan nobody knows where the MV stands.
+        while self.scans and not self.changes.empty():
             change = self.changes.get()
             try:
                 change.act(self.loop)
@@ -176,16 +177,17 @@ class Station:
             change.done("")
             self.recorder.note(change.kind, change.who, change.what, change.reason)
         values = self.endpoint.values
-        if values is not None:
+        if values is not None and self.scans:
             self._plant_side(self.loop, values)
 
     def _plant_side(self, loop: ControlLoop, values: Values) -> None:
         """Set points and mode, where the plant's own operator changed them."""
-        if values.asked_sp and values.asked_sp != self._asked_sp:
-            self._asked_sp = dict(values.asked_sp)
+        changed = {name: v for name, v in values.asked_sp.items() if self._asked_sp.get(name) != v}
+        if changed:
+            self._asked_sp.update(changed)
             wanted = loop.sp
             for i, s in enumerate(self.manifest.sp):
-                wanted[i] = values.asked_sp.get(s.name, wanted[i])
+                wanted[i] = changed.get(s.name, wanted[i])
             self._from_plant(lambda: loop.set_sp(wanted), f"set point {_shown(wanted, self.manifest.sp)}")
         if values.asked_mode and values.asked_mode != self._asked_mode:
             wish, self._asked_mode = self._asked_mode is not None, values.asked_mode
@@ -270,6 +272,13 @@ class Station:
     def _connection(self, what: str) -> None:
         up = what.startswith("connected")
         self.recorder.note("connection", "opcua", what, alarm="connection", raised=not up)
+
+
+def _usable(values: Values | None) -> bool:
+    """Whether a loop may begin where these values say that the plant is."""
+    return (
+        values is not None and not values.fault and bool(np.isfinite(values.pv).all() and np.isfinite(values.mv).all())
+    )
 
 
 def _near(values: Array | None, signals: tuple[Signal, ...]) -> list[float]:

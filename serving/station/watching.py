@@ -61,7 +61,7 @@ class Watching:
         """The verdicts whose alarms a loop before this one left active; those of another controller end."""
         with suppress(LoopError), closing(JournalReader(self._recorder.journal.path)) as reader:
             active = [e.event for e in reader.active() if e.event.kind == "monitor"]
-            levels = {event.alarm.removeprefix(ALARM): event.what.split(": ")[1] for event in active}
+            levels = {event.alarm.removeprefix(ALARM): [*event.what.split(": "), ""][1] for event in active}
             runs = reader.runs()
             if runs and runs[-1]["sha256"] == self._of.sha256:
                 return levels

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,9 +64,17 @@ def test_whoever_had_the_plant_meanwhile_it_is_written_again(controller: Control
     made.unwritten = "the server refuses"
     with pytest.raises(Exception, match="the server refuses"):
         written(made, clock, [1.0])
-    assert made._outbox
+    assert not made._outbox  # the loop holds the MV before it, so it must not go out
+    assert written(made, clock, [1.0]) == [True]
 
 
 def test_a_time_that_is_none_is_refused() -> None:
     with pytest.raises(LoopError, match="rewrite_s is -1"):
         Server("opc.tcp://h:1", security="None", insecure=True, rewrite_s=-1)
+
+
+def test_a_watchdog_that_is_gone_has_stopped(controller: Controller) -> None:
+    made = endpoint(controller, 2.0, Clock())
+    made.nodes = replace(made.nodes, watchdog="ns=2;s=W", watchdog_scans=3)
+    assert [bool(made._dead(value)) for value in (1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 4.0)] == [False] * 5 + [True, False]
+    assert [bool(made._dead(math.nan)) for _ in range(4)] == [False, False, True, True]

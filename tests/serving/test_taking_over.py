@@ -78,6 +78,22 @@ def test_a_shadow_sees_faults_and_stays_a_shadow(make_loop: Callable[..., Contro
     assert loop.scan(sample()).mode is Mode.SHADOW
 
 
+@pytest.mark.parametrize("mode", [Mode.AUTO, Mode.MANUAL, Mode.HOLD])
+def test_a_shadow_that_does_not_know_where_the_mv_stands_moves_nothing(
+    make_loop: Callable[..., ControlLoop], mode: Mode
+) -> None:
+    loop = make_loop(mode=Mode.SHADOW)
+    loop.scan(sample(fault="PV level: Bad"))
+    with pytest.raises(LoopError, match=r"the last sample was refused \(PV level: Bad\), so where the MV stands"):
+        loop.set_mode(mode)
+    loop.miss("no answer")
+    with pytest.raises(LoopError, match="no answer"):
+        loop.set_mode(mode)
+    loop.scan(sample(mv=55.0))
+    loop.set_mode(mode)
+    assert loop.scan(sample(mv=55.0, fault="PV level: Bad")).mv.tolist() == [55.0]
+
+
 def test_an_endpoint_that_does_not_trust_its_sample_is_a_fault(make_loop: Callable[..., ControlLoop]) -> None:
     loop = make_loop(guards=())
     command = loop.scan(sample(mv=55.0, fault="DV inflow: Uncertain"))
