@@ -121,6 +121,9 @@ def _require_ours(folder: Path) -> None:
         for p in (sorted(folder.iterdir()) if folder.is_dir() else ())
         if p.name not in {PAGE, "static", "onnxruntime-web"} and not (p / "case.json").is_file()
     ]
+    # Many a web site has an index.html and a folder `static`, too.
+    if not strange and (folder / "static").exists() and not (folder / "static" / "playground.css").is_file():
+        strange = ["static"]
     if strange:
         raise PipelineError(f"{folder} holds {strange[0]}, which no playground wrote; give --out a folder of its own")
 

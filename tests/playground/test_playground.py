@@ -130,6 +130,13 @@ def test_a_folder_of_something_else_is_left_alone(cstr: Playground, stand_in: Pa
     assert [p.name for p in folder.iterdir()] == ["thesis.tex"]
     with pytest.raises(PipelineError, match="is a file; --out takes a folder"):
         write_folder(folder / "thesis.tex", [cstr], stand_in)
+    site = tmp_path / "site"
+    (site / "static").mkdir(parents=True)
+    (site / "index.html").write_text("a site of somebody")
+    (site / "static" / "site.css").write_text("")
+    with pytest.raises(PipelineError, match="holds static, which no playground wrote"):
+        write_folder(site, [cstr], stand_in)
+    assert (site / "static" / "site.css").is_file()
 
 
 def test_a_file_server_gives_each_file_its_type(cstr: Playground, stand_in: Path, tmp_path: Path) -> None:
