@@ -108,7 +108,7 @@ class OpcUaEndpoint:
         self._beats, self._scans, self._next_s, self._wrote = 0, 0, 0.0, 0
         self._written: tuple[Array, float] | None = None  # the last MV that was passed on, and when
         self._called = 0  # the scan of the last call to write
-        self.lease = NodeLease()
+        self.lease = NodeLease(self.period_s)
         self._handed_back, self._watched = False, (float("nan"), 0)
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None

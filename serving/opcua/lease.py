@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 import socket
@@ -11,22 +12,28 @@ from asyncua import ua
 from serving.errors import EndpointError
 from serving.opcua.link import Link
 
-SCANS = 5  # without a renewal: the loop that had the lease is gone
+SCANS = 5  # of the slower loop, without a renewal: the one that had the lease is gone
 
 
 class NodeLease:
-    """A text node that holds ``OWNER COUNT`` of the loop that writes, renewed at each reading, empty without one.
+    """A text node that holds ``OWNER PERIOD COUNT`` of the loop that writes, renewed at each reading, empty without one.
 
-    Whether another owner lives is judged by whether its count moves, not by clocks. A loop takes the lease only to
+    PERIOD is that loop's, in seconds: a fast loop waits for as long as a slow one needs. Whether another owner lives is judged by whether its count moves, not by clocks. A loop takes the lease only to
     write, and once it reads back its own name: of two that take it in one moment the later one has it, and the other
     finds that out at its next reading.
+
+    Parameters
+    ----------
+    period_s
+        Between two readings of this loop [s].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, period_s: float) -> None:
+        self.period_s = period_s
         self.owner = f"{socket.gethostname()}:{os.getpid()}:{secrets.token_hex(3)}"
         self.held = False
         self._count = 0
-        self._text, self._still = "", SCANS  # of the node, and for how many readings it has stood so
+        self._text, self._still = "", 0  # of the node, and for how many readings it has stood so
 
     def seen(self, text: str) -> None:
         """What the node holds at a reading."""
@@ -39,7 +46,8 @@ class NodeLease:
     def other(self) -> str:
         """The other loop that has the lease and lives; empty: nobody."""
         owner = _owner(self._text)
-        return owner if owner not in {"", self.owner} and self._still < SCANS else ""
+        slower = max(1.0, _period(self._text, self.period_s) / self.period_s)
+        return owner if owner not in {"", self.owner} and self._still < SCANS * slower else ""
 
     async def take(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
         """Have the lease. EndpointError while another loop has it."""
@@ -57,7 +65,7 @@ class NodeLease:
     async def renew(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
         """Write the next count."""
         self._count = (self._count + 1) % 1_000_000
-        await self._write(link, node, f"{self.owner} {self._count}", timeout_s)
+        await self._write(link, node, f"{self.owner} {self.period_s:g} {self._count}", timeout_s)
 
     async def give_back(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
         """Let others have it at once."""
@@ -70,4 +78,14 @@ class NodeLease:
 
 
 def _owner(text: str) -> str:
-    return text.rpartition(" ")[0]
+    return text.partition(" ")[0]
+
+
+def _period(text: str, otherwise: float) -> float:
+    """The period that a lease tells [s]; ``otherwise`` where it tells none."""
+    words = text.split(" ")
+    try:
+        period_s = float(words[1]) if len(words) == 3 else otherwise
+    except ValueError:
+        return otherwise
+    return period_s if math.isfinite(period_s) and period_s > 0 else otherwise

@@ -117,7 +117,7 @@ def test_a_lease_of_a_loop_that_was_killed_is_taken_over(
 
 
 def test_a_lease_is_judged_by_whether_it_moves() -> None:
-    node = NodeLease()
+    node = NodeLease(0.1)
     assert node.other == ""
     node.seen("other:1:a 1")
     assert node.other == "other:1:a"
@@ -132,6 +132,21 @@ def test_a_lease_is_judged_by_whether_it_moves() -> None:
     assert node.held
     node.seen("other:1:b 1")
     assert not node.held
+
+
+def test_a_fast_loop_waits_as_long_as_a_slow_one_needs() -> None:
+    """At 0.1 s beside a loop of 10 s, which renews once in a hundred readings."""
+    node = NodeLease(0.1)
+    for k in range(1_000):
+        node.seen(f"slow:1:a 10 {k // 100}")
+        assert node.other == "slow:1:a"
+    for _ in range(SCANS * 100):
+        node.seen("slow:1:a 10 9")
+    assert node.other == ""
+    for wrong in ("slow:1:a nan 1", "slow:1:a -3 1", "slow:1:a inf 1", "slow:1:a x 1"):
+        for _ in range(SCANS + 1):
+            node.seen(wrong)
+        assert node.other == ""
 
 
 def test_a_system_without_unix_users_is_told_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
