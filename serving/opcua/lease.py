@@ -16,11 +16,11 @@ SCANS = 5  # of the slower loop, without a renewal: the one that had the lease i
 
 
 class NodeLease:
-    """A text node that holds ``OWNER PERIOD COUNT`` of the loop that writes, renewed at each reading, empty without one.
+    """A text node: ``OWNER PERIOD COUNT`` of the loop that writes, renewed at each of its readings; empty without one.
 
-    PERIOD is that loop's, in seconds: a fast loop waits for as long as a slow one needs. Whether another owner lives is judged by whether its count moves, not by clocks. A loop takes the lease only to
-    write, and once it reads back its own name: of two that take it in one moment the later one has it, and the other
-    finds that out at its next reading.
+    PERIOD is that loop's, in seconds: a fast loop waits for as long as a slow one needs. Whether another owner lives is
+    judged by whether its count moves, not by clocks. A loop takes the lease only to write, and once it reads back its
+    own name: of two that take it in one moment the later one has it, and the other finds that out at its next reading.
 
     Parameters
     ----------
