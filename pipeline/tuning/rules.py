@@ -48,7 +48,7 @@ class PidSettings:
         """Time constant with which the request follows a saturated actuator.
 
         sqrt(Ti Td), and Ti without a derivative: shorter than the integral's, longer than the
-        derivative's, so that neither the wind-up nor a kick of the derivative decides.
+        derivative's, so that neither a saturated integral nor a kick of the derivative decides.
         Source: Astrom and Hagglund, Advanced PID Control, section 3.5.
         """
         if self.tracking_s is not None:

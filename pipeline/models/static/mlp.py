@@ -17,7 +17,7 @@ from pipeline.plants.simulator import Array
 
 
 class MLP(Model):
-    """Feed-forward network with tanh hidden layers and a linear output.
+    """Feedforward network with tanh hidden layers and a linear output.
 
         a_0 = (x - x_center) / x_scale,   a_l = tanh(a_{l-1} W_l + b_l),   l = 1..L
         y   = y_center + y_scale (a_L W_{L+1} + b_{L+1})  [+ x_residual]
