@@ -15,7 +15,7 @@ PORT ?= 5000
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check docs coverage registry bench release clean
+.PHONY: help setup run test check quick docs coverage registry bench release clean
 
 help: ## list the targets
 	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,14 +29,15 @@ $(STAMP): pyproject.toml constraints.txt serving/version.py tools/setup.sh
 run: $(STAMP) ## run the whole pipeline: screen, excite, fit, design, validate, report, publish
 	@loopwright run
 
-test: check ## formatting, lint, types, import rules, tests
-	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
-	python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+test: quick ## formatting, lint, types, import rules, tests
+	@bash tools/tests.sh -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-check: $(STAMP) ## the static part of make test
+check: quick ## the static part of make test
+	mypy
+
+quick: $(STAMP) # what takes seconds
 	ruff format --check .
 	ruff check .
-	mypy
 	lint-imports
 
 docs: $(STAMP) ## build the manual into build/docs, under a minute
@@ -46,7 +47,6 @@ docs: $(STAMP) ## build the manual into build/docs, under a minute
 	@echo "open build/docs/index.html"
 
 coverage: $(STAMP) ## branch coverage of the tests, by file
-	@PYTHON=python bash tools/runtime_venvs.sh build/runtime
 	python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --cov=serving --cov=pipeline --cov-branch --cov-report=term:skip-covered
 
 registry: $(STAMP) ## open MLflow's UI on localhost, port PORT (5000); publishes first what the store lacks

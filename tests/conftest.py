@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import signal
 from collections.abc import Callable
 from functools import cache
@@ -17,6 +18,7 @@ import pytest
 import reversible_cstr_parts
 import torch
 from shipped import required
+from threadpoolctl import threadpool_limits
 
 from pipeline.cases import PLANTS
 from pipeline.laws import LAWS, ControlLaw
@@ -38,6 +40,12 @@ hypothesis.settings.load_profile("same")
 
 # A job that a shell puts in the background hears no Ctrl-C, and no program that it starts would.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Models and matrices of the tests are small, and each core has a worker: more threads spend up to half of a test's CPU
+# time on waiting for each other. Here, and in the processes that a test starts.
+torch.set_num_threads(1)
+threadpool_limits(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
 QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
@@ -103,12 +111,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The long files first; xdist must be told to keep the order (``--no-loadscope-reorder``)."""
     rank = {name: i for i, name in enumerate(LONG_FILES)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _one_thread() -> None:
-    """The models of the tests are small: threads only add their own cost."""
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,13 @@
+#!/usr/bin/env bash
+# tests.sh ARGUMENT...: mypy and pytest side by side. mypy computes on one core for 40 s, and tests wait now and then.
+# Fails if either does; what mypy finds is printed when it ends.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+said=$(mktemp)
+(mypy > "$said" 2>&1 || { status=$?; cat "$said" >&2; exit "$status"; }) &
+types=$!
+trap 'kill "$types" 2> /dev/null; rm -f "$said"' EXIT
+python -m pytest "$@"
+status=$?
+wait "$types" || { echo "tests.sh: mypy failed, see above" >&2; status=1; }
+exit "$status"
