@@ -83,10 +83,11 @@ const READ_BACK_MARGIN = 0.02; // share of an MV's range by which scaling may ca
 
 export class Loop {
   // mode: MANUAL the operator's MV, AUTO the law's, HOLD the last one after a fault. `sp` and `mv` lie in their ranges.
-  constructor(controller, { sp, mv, mode = "MANUAL", recoverAfter = null, maxGap = 3 }) {
+  // `mv` is what the plant has now; null: not known, so nothing is written until a good sample has a read-back.
+  constructor(controller, { sp, mv = null, mode = "MANUAL", recoverAfter = null, maxGap = 3 }) {
     Object.assign(this, { controller, mode, recoverAfter, maxGap, fault: "", good: 0 });
     this.sp = this.#within(sp, controller.manifest.sp, "set point");
-    this.mv = this.#within(mv, controller.manifest.mv, "MV");
+    this.mv = mv && this.#within(mv, controller.manifest.mv, "MV");
   }
 
   setMode(mode) {
@@ -103,10 +104,12 @@ export class Loop {
   }
 
   // One period. sample: {pv, dv, mv_applied or null, age_s}, or null where the plant could not be read.
+  // The command's mv is null while it is not known where the MV stands: then write nothing.
   async scan(sample) {
     let reason = sample === null ? "the plant cannot be read" : this.#refusal(sample);
     if (!reason) {
       const applied = sample.mv_applied === null ? this.mv : this.#clipped(sample.mv_applied);
+      this.mv ??= applied;
       try {
         const { mv } = await this.controller.step({ sp: this.sp, pv: sample.pv, dv: sample.dv, mv_applied: applied });
         if (this.fault && ++this.good === this.recoverAfter) this.setMode("AUTO");
@@ -144,6 +147,8 @@ export class Loop {
       const bad = signals.findIndex((s, i) => !Number.isFinite(values[i]));
       if (bad >= 0) return `${label} ${signals[bad].name} is ${values[bad]}`;
     }
+    if (!mv_applied && !this.mv)
+      return "there is no read-back, so where the MV stands is not known and nothing is written";
     for (const [i, s] of m.mv.entries())
       if (mv_applied && (s.values ? !s.values.includes(mv_applied[i]) : beyond(s, mv_applied[i], READ_BACK_MARGIN)))
         return `applied MV ${s.name} is ${mv_applied[i]} ${s.unit}, which no actuator can hold`;
@@ -194,7 +199,7 @@ export async function run(loop, plant, { scans, now, sleep, period = loop.contro
     }
     let command = await loop.scan(sample);
     try {
-      await plant.write(command.mv);
+      if (command.mv) await plant.write(command.mv);
     } catch (error) {
       command = loop.unwritten(before, `the plant cannot be written: ${error.message}`);
     }
@@ -204,8 +209,8 @@ export async function run(loop, plant, { scans, now, sleep, period = loop.contro
 
 // Stands for your plant until you read yours: the PVs wander over their ranges, the MV is read back as it was written.
 export class MadeUpPlant {
-  constructor(manifest, mv) {
-    Object.assign(this, { m: manifest, mv, k: 0 });
+  constructor(manifest) {
+    Object.assign(this, { m: manifest, mv: manifest.mv.map(middle), k: 0 }); // where its actuators stand
   }
 
   read() {
@@ -219,4 +224,5 @@ export class MadeUpPlant {
   }
 }
 
-export const start = (manifest) => ({ sp: manifest.sp.map(middle), mv: manifest.mv.map(middle) });
+// Set points to begin with; give those of your plant.
+export const start = (manifest) => ({ sp: manifest.sp.map(middle) });

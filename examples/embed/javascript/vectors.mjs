@@ -86,8 +86,9 @@ export async function conform(ort, provider, bytes, manifest, vectors, host, ver
     const { pv, dv, mv_applied, age_s } = row.sample ?? {};
     const sample = row.sample && { pv: numbers(pv), dv: numbers(dv), mv_applied: numbers(mv_applied), age_s: fromHex(age_s) };
     const command = await loop.scan(sample);
-    const answer = { mode: command.mode, fault: command.reason !== "", mv: compared("mv", command.mv, row.mv) };
-    if (answer.mode !== row.mode || answer.fault !== row.fault) wrong++;
+    const mv = command.mv && compared("mv", command.mv, row.mv);
+    const answer = { mode: command.mode, fault: command.reason !== "", mv };
+    if (answer.mode !== row.mode || answer.fault !== row.fault || !mv !== !row.mv) wrong++;
     scans.push(answer);
   }
 
