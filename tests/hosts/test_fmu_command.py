@@ -143,3 +143,6 @@ def test_the_package_ships_what_is_compiled() -> None:
     assert "#define ORT_API_VERSION 21\n" in (SHIPPED / HEADER).read_text()
     assert "MIT License" in (SHIPPED / "LICENSE").read_text()
     assert (ROOT / "examples" / "embed" / "c" / "host.c").resolve() == HOSTS / "c" / "host.c"
+    shared = ROOT / "examples" / "embed" / "javascript" / "controller.mjs"
+    assert shared.resolve() == HOSTS / "javascript" / "controller.mjs"
+    assert shared.resolve() in shipped

@@ -80,7 +80,8 @@ import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 const [host, file, unread, unwritten] = process.argv.slice(1).map((w) => (isNaN(w) ? w : Number(w)));
 const ort = createRequire(host)("onnxruntime-node");
-const { Controller, Loop, MadeUpPlant, run, start } = await import(host.replace("node/host", "javascript/controller"));
+const { Controller, Loop } = await import(host.replace("node/host", "javascript/controller"));
+const { MadeUpPlant, run, start } = await import(host.replace("node/host", "javascript/run"));
 const manifest = JSON.parse(readFileSync(file.replace("onnx", "json")));
 const controller = await Controller.load(ort, readFileSync(file), manifest, "cpu");
 const loop = new Loop(controller, { ...start(controller.manifest), mode: "AUTO", recoverAfter: 2 });
@@ -106,7 +107,7 @@ await run(loop, plant, {
   now: () => time,
   sleep: async (seconds) => { time += seconds * 0.7 + (seconds < 1e-3 ? 0.25 : 0); }, // early at first, late in the end
   seen: ({ k, late, mode, mv, reason }) => {
-    scans.push({ k, late, mode, mv: mv && [...mv], reason, state: [...controller.state] });
+    scans.push({ k, late, mode, mv: mv && [...mv], reason, state: [...loop.state] });
     if (k === 15) time += 2.5; // a whole period passes
     if (k === 20) time += 7.5; // six of them
   },

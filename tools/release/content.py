@@ -19,6 +19,7 @@ OPENED = {
     "pipeline/report/templates": {".j2"},
     "pipeline/hosts/c": {".c"},
     "pipeline/hosts/c/onnxruntime": {".h"},
+    "pipeline/hosts/javascript": {".mjs"},
     "pipeline/hosts/fmu/sources": {".c"},
     "pipeline/playground/static": {".js", ".css", ".html"},
     "pipeline/playground/npm": {".json"},

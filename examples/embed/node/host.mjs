@@ -4,7 +4,8 @@ import { readFileSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { join } from "node:path";
 import * as ort from "onnxruntime-node";
-import { Controller, Loop, MadeUpPlant, run, start } from "../javascript/controller.mjs";
+import { Controller, Loop } from "../javascript/controller.mjs";
+import { MadeUpPlant, run, start } from "../javascript/run.mjs";
 import { conform } from "../javascript/vectors.mjs";
 
 const version = createRequire(import.meta.url)("onnxruntime-node/package.json").version;
