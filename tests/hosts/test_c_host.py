@@ -97,16 +97,36 @@ def test_c_reads_a_kit_of_version_1(host: Path, tmp_path: Path) -> None:
 
 def test_the_c_loop_scans_once_a_period(host: Path) -> None:
     began = time.monotonic()
-    done = run(host, kit_of(PID) / "pid.onnx", "8", "0.02")
-    assert time.monotonic() - began >= 7 * 0.02
+    done = run(host, kit_of(PID) / "pid.onnx", "40", "0.02")
+    assert time.monotonic() - began >= 39 * 0.02
     assert done.returncode == 0, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
     places = [int(row[0]) for row in rows]
-    assert places == sorted(set(places))
-    assert places[0] == 0
+    assert places == sorted(set(places))  # a busy machine leaves some out, also at the start
+    assert places[0] >= 0
+    assert len(places) > 1
     assert all(float(row[1]) < 20 for row in rows)  # a later scan is one of the next period
     assert {row[4] for row in rows} == {"AUTO"}
     assert all(0 <= float(row[5]) <= 500 for row in rows)
+
+
+def test_the_c_loop_writes_nothing_before_it_has_read_the_plant(tmp_path: Path) -> None:
+    """The loop as it is shipped, on a plant that cannot be read at the first two scans and tells of each write."""
+    text = (EMBED / "c" / "host.c").read_text()
+    for place, more in (
+        ("static bool plant_read(Plant *p, Sample *sample) {\n", "  if (p->k < 2) return p->k++, false;\n"),
+        ("static bool plant_write(Plant *p, const double *mv) {\n", '  printf("written %g\\n", mv[0]);\n'),
+    ):
+        assert text.count(place) == 1
+        text = text.replace(place, place + more)
+    (tmp_path / "CMakeLists.txt").write_text((EMBED / "c" / "CMakeLists.txt").read_text())
+    (tmp_path / "host.c").write_text(text)
+    done = run(built(tmp_path, tmp_path / "build") / "host", kit_of(PID) / "pid.onnx", "60", "0.02")
+    assert done.returncode == 0, done.stderr
+    first, second, third, *_ = done.stdout.splitlines()
+    assert first.endswith("HOLD - the plant cannot be read")
+    assert second.endswith("HOLD - the plant cannot be read")
+    assert third == "written 250"  # the read-back: where the made-up plant's actuator stands
 
 
 def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:

@@ -97,10 +97,11 @@ def test_python_s_conformance_run_reads_a_kit_of_version_1(tmp_path: Path) -> No
 def test_the_example_loop_runs_once_a_period_and_begins_where_the_plant_is() -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     file = ROOT / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
-    command = [sys.executable, "-W", "error", str(EXAMPLES / "control_loop.py"), str(file), "6", "0.05"]
+    command = [sys.executable, "-W", "error", str(EXAMPLES / "control_loop.py"), str(file), "20", "0.05"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 0, done.stderr
     *rows, report = done.stdout.splitlines()
+    assert rows
     assert "faults=0" in report
     assert all(row.split()[1] == "AUTO" for row in rows)
     controller = Controller(file)
