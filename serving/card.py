@@ -7,7 +7,7 @@ from typing import Any
 
 from serving.controller import Controller
 from serving.manifest import Signal
-from serving.trust import signer
+from serving.trust import ending, signer
 
 SHOWN = {"scenarios", "units", "locked_up", "as_printed"}  # entries of the evidence that have a place of their own
 
@@ -23,7 +23,7 @@ def card(controller: Controller) -> str:
         f"  graph     {graph.nodes} operators, opset {graph.opset}, IR {graph.ir_version}",
     ]
     if signed := signer(controller):
-        lines.insert(3, f"  signed    by {signed.words}")
+        lines[3:3] = [f"  signed    by {signed.words}", *(f"            {words}" for words in ending(controller))]
     lines[1:1] = _locked_up(m.evidence)
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         lines += _signals(title, m.signals(name))

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from math import inf
+from math import inf, isnan, nan
 from typing import TypeAlias
 
 import numpy as np
@@ -45,14 +45,15 @@ class Mode(StrEnum):
 class Command:
     """The result of one scan. ``reason`` names a fault; it is empty without one.
 
-    A host that runs the loop itself writes ``mv`` unless the mode is SHADOW. Where ``hand_back`` is true, it gives the
-    plant back to the plant's own controller, and then sets the mode to SHADOW.
+    A host that runs the loop itself writes ``mv`` where ``writes`` is true: not in SHADOW, and not while ``mv`` is NaN
+    because no sample has told yet where the MV stands. Where ``hand_back`` is true, it gives the plant back to the
+    plant's own controller, and then sets the mode to SHADOW.
     """
 
     scan: int
     mode: Mode
     sp: Array  # shape: (n_sp,)
-    mv: Array  # shape: (n_mv,), to be written
+    mv: Array  # shape: (n_mv,), to be written; NaN while it is not known where the MV stands
     law_mv: Array | None  # the law's MV, also in MANUAL; None if the law was not stepped or its step failed
     info: Array | None  # shape: (n_info,)
     reason: str = ""
@@ -62,7 +63,7 @@ class Command:
     @property
     def writes(self) -> bool:
         """Whether ``mv`` is to be written."""
-        return self.mode is not Mode.SHADOW
+        return self.mode is not Mode.SHADOW and not isnan(self.mv[0])  # all of it is known, or none
 
 
 class ControlLoop:
@@ -74,7 +75,7 @@ class ControlLoop:
     HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
     lasts is for ``fallback``. After a gap the law starts cold (state = 0).
 
-    Every commanded MV lies in its range, in every mode and with any guards; a discrete MV has one
+    Every written MV lies in its range, in every mode and with any guards; a discrete MV has one
     of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
     it is clipped to the range, for the law and for HOLD. A larger excess is a fault.
 
@@ -87,7 +88,8 @@ class ControlLoop:
     sp
         Set points (n_sp,).
     mv
-        The MV that the plant has now (n_mv,): the start value of HOLD and MANUAL.
+        The MV that the plant has now (n_mv,): the start value of HOLD and MANUAL. None: it is not known. The loop then
+        writes nothing until a good sample has a read-back, and begins from there.
     mode
         Mode at the start.
     guards
@@ -118,7 +120,7 @@ class ControlLoop:
         endpoint: Endpoint | None = None,
         *,
         sp: ArrayLike,
-        mv: ArrayLike,
+        mv: ArrayLike | None = None,
         mode: Mode = Mode.MANUAL,
         guards: Sequence[Guard] | None = None,
         recover_after: int | None = None,
@@ -148,7 +150,7 @@ class ControlLoop:
             if len(fallback.rate) != len(manifest.mv):
                 raise LoopError(f"the fallback has {len(fallback.rate)} rates; it needs {len(manifest.mv)}, one an MV")
         self._sp = within(sp, manifest.sp, "set point")
-        self._mv = within(mv, manifest.mv, "MV")
+        self._mv = np.full(len(manifest.mv), nan) if mv is None else within(mv, manifest.mv, "MV")
         self._ranges = [(s.low, s.high, s.values) for s in manifest.mv]
         self._mode = mode
         self._fault = ""  # the fault that changed the mode to HOLD; empty without one
@@ -176,7 +178,7 @@ class ControlLoop:
 
     @property
     def mv(self) -> Array:
-        """Last commanded MV, shape (n_mv,)."""
+        """Last commanded MV, shape (n_mv,); NaN while it is not known where the MV stands."""
         return self._mv.copy()
 
     @property
@@ -233,6 +235,8 @@ class ControlLoop:
         applied = self._mv
         try:
             applied = self._read_back(sample)
+            if isnan(self._mv[0]):
+                self._mv = applied.copy()
             step = self.controller.step(sp=self._sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
             if self._past.maxlen:
                 self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
@@ -326,10 +330,12 @@ class ControlLoop:
     def _read_back(self, sample: Sample) -> Array:
         """The applied MV (n_mv,) within its range; the last command if there is no read-back.
 
-        Raises ContractError for a wrong shape and SampleError for an implausible value. HOLD
+        Raises ContractError for a wrong shape, and SampleError for an implausible value or where there is neither. HOLD
         commands the read-back, so this check does not depend on the guards.
         """
         if sample.mv_applied is None:
+            if isnan(self._mv[0]):
+                raise SampleError("there is no read-back, so where the MV stands is not known and nothing is written")
             return self._mv
         applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
         if applied.shape != self._mv.shape:

@@ -60,3 +60,10 @@ class Controller(controller.Controller):
 def signer(loaded: controller.Controller) -> Signed | None:
     """Who signed a controller's file; None where nobody was asked."""
     return loaded.signed if isinstance(loaded, Controller) else None
+
+
+def ending(loaded: controller.Controller) -> list[str]:
+    """A line for a person where the signature of a controller's file ends soon, or has ended."""
+    signed = signer(loaded)
+    words = "" if signed is None else signed.ending()
+    return [words] if words else []

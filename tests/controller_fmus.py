@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import os
 import shutil
 from functools import cache
 from pathlib import Path
@@ -11,7 +10,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
-from kits import ROOT, SHIPPED
+from kits import SHIPPED
 from numpy.typing import NDArray
 
 from pipeline.hosts.fmu.compiling import Toolchain, toolchain
@@ -21,15 +20,8 @@ from serving import Controller
 from serving.conformance.steps import Answer, answered
 
 Array = NDArray[np.float64]
-ONNXRUNTIME = Path(os.environ.get("ONNXRUNTIME_DIR", ROOT / "build" / "onnxruntime"))
 BOOLEAN = {"fault", "use_mv_applied"}
-MISSING = (
-    "a C compiler is missing (apt install gcc)"
-    if shutil.which("cc") is None
-    else "onnxruntime's C header is missing (tools/onnxruntime_c.sh build/onnxruntime)"
-    if not (ONNXRUNTIME / "include" / "onnxruntime_c_api.h").is_file()
-    else ""
-)
+MISSING = "" if shutil.which("cc") else "a C compiler is missing (apt install gcc)"
 
 
 def file_of(name: str) -> Path:
@@ -52,7 +44,7 @@ def answers_of(name: str) -> list[Answer]:
 @cache
 def tools() -> Toolchain:
     """This machine's compiler, headers and library."""
-    return toolchain(ONNXRUNTIME)
+    return toolchain()
 
 
 @cache

@@ -77,4 +77,25 @@ def another_mode(vectors: dict[str, Any]) -> None:
     row["mode"] = "AUTO"
 
 
-DAMAGES = {"mv": another_mv, "state": another_state, "refusal": no_refusal, "mode": another_mode}
+def a_start_without_information(vectors: dict[str, Any]) -> None:
+    """The loop seems to write an MV before it knows where it stands."""
+    row = vectors["scans"][0]
+    assert row["mv"] is None
+    row["mv"] = vectors["scans"][4]["mv"]
+
+
+def as_version_1(vectors: dict[str, Any]) -> None:
+    """The kit as it was: its loop is told where the MV stands, and holds it from the first scan on."""
+    vectors["kit"], stands = 1, vectors["scans"][4]["mv"]
+    vectors["loop"]["mv"] = stands
+    for row in vectors["scans"][:4]:
+        row["mv"] = stands
+
+
+DAMAGES = {
+    "mv": another_mv,
+    "state": another_state,
+    "refusal": no_refusal,
+    "mode": another_mode,
+    "start": a_start_without_information,
+}

@@ -23,7 +23,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
     add("--out", metavar="FILE.fmu", type=Path, help="what to write (the controller's name with .fmu, here)")
     add("--fmi", choices=(2, 3), type=int, default=3, help="version of FMI: 2 for 2.0, 3 for 3.0 (3)")
-    add("--onnxruntime", metavar="FOLDER", type=Path, help="onnxruntime's header lies there or in its include/")
+    add("--onnxruntime", metavar="FOLDER", type=Path, help="another header of onnxruntime than the shipped one")
 
 
 def run(options: argparse.Namespace) -> None:

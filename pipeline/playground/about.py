@@ -109,7 +109,8 @@ def _controller(controller: Controller, validation: Validation | None) -> dict[s
         "title": title if title.casefold() != short.casefold() else "",
         "file": controller.path.name,
         "sha256": controller.sha256,
-        **{key: manifest[key] for key in ("law", "period_s", "sp", "pv", "dv", "mv", "n_state", "info", "inputs")},
+        **{key: manifest[key] for key in ("schema", "law", "period_s", "n_state", "info", "inputs")},
+        **{key: manifest[key] for key in ("sp", "pv", "dv", "mv")},
     }
 
 

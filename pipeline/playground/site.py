@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pipeline.hosts
 import serving.page
 from pipeline.errors import PipelineError
 from pipeline.export.plant_graphs import PlantGraphs
@@ -21,6 +22,8 @@ from pipeline.playground.web_runtime import LICENCE, MODULE, WASM
 from serving.controller import Controller
 
 STATIC = Path(__file__).parent / "static"
+# The step and the loop are those of the hosts in Node and the browser.
+LOOP = Path(pipeline.hosts.__file__).parent / "javascript" / "controller.mjs"
 # The operator's page has the same look, and the only copy of uPlot.
 OPERATORS = Path(serving.page.__file__).parent / "static"
 SHARED = ("page.css", "uPlot.min.css", "uPlot.iife.min.js", "uPlot-LICENSE", "format.js", "icon.svg")
@@ -76,7 +79,7 @@ def write_one_file(path: Path, page: Playground, runtime: Path) -> None:
     text = re.sub(
         r'<link rel="icon"[^>]*>', f'<link rel="icon" href="{_data("image/svg+xml", OPERATORS / "icon.svg")}">', text
     )
-    text = re.sub(r'"\.\./static/([^"]+\.js)"', lambda m: f'"{_data("text/javascript", _place(m[1]))}"', text)
+    text = re.sub(r'"\.\./static/([^"]+\.m?js)"', lambda m: f'"{_data("text/javascript", _place(m[1]))}"', text)
     text = text.replace(f'"../onnxruntime-web/{MODULE}"', f'"{_data("text/javascript", runtime / MODULE)}"')
     files = {**page.files(), WASM: (runtime / WASM).read_bytes()}
     # Compressed, as the runtime is 14 MB; a browser can undo it.
@@ -88,7 +91,7 @@ def write_one_file(path: Path, page: Playground, runtime: Path) -> None:
 
 def _static() -> list[Path]:
     own = [p for p in sorted(STATIC.iterdir()) if p.is_file() and p.name != PAGE]
-    return [*own, *(OPERATORS / name for name in SHARED)]
+    return [*own, LOOP, *(OPERATORS / name for name in SHARED)]
 
 
 def _place(name: str) -> Path:

@@ -16,6 +16,11 @@ from serving.conformance.numbers import Array, read, read_all
 from serving.errors import ContractError, LoopwrightError
 
 OUTPUTS = ("mv", "state_next", "info")
+READS = (1, KIT)  # versions of the kit
+OLD = (
+    "the kit has the version 1: it does not show that the host writes nothing before it knows the plant; "
+    "write it again with loopwright conformance FILE OUT"
+)
 SHOWN = 5  # mistakes named one by one
 
 
@@ -25,7 +30,7 @@ class Verdict:
 
     ``largest`` is the largest difference, a share of the entry's scale, and ``where`` its place. ``same_bits`` counts
     the steps whose numbers are all equal to the bit, and ``steps`` those that give numbers. ``mistakes`` are what no
-    tolerance excuses: a value that should have been refused, another mode.
+    tolerance excuses: a value that should have been refused, another mode. ``note`` says what the kit does not show.
     """
 
     host: str
@@ -36,6 +41,7 @@ class Verdict:
     largest: float = 0.0
     where: str = ""
     mistakes: list[str] = field(default_factory=list)
+    note: str = ""
 
     @property
     def passed(self) -> bool:
@@ -53,6 +59,8 @@ class Verdict:
         lines += [f"  {mistake}" for mistake in self.mistakes[:SHOWN]]
         if len(self.mistakes) > SHOWN:
             lines.append(f"  and {len(self.mistakes) - SHOWN} more")
+        if self.note:
+            lines.append(f"  {self.note}")
         return "\n".join(lines)
 
     def compare(self, where: str, ours: Array, theirs: Array, scale: Array) -> bool:
@@ -77,9 +85,9 @@ def check(folder: Path, answers: Path, sha256: str) -> Verdict:
     Raises LoopwrightError if either cannot be read, or the answers are those of another controller.
     """
     kit, theirs = _json(folder / VECTORS, "the kit"), _json(answers, "the answers")
-    if kit.get("kit") != KIT:
+    if kit.get("kit") not in READS:
         raise LoopwrightError(
-            f"{folder / VECTORS} has the version {kit.get('kit')}; this release reads {KIT}: "
+            f"{folder / VECTORS} has the version {kit.get('kit')}; this release reads {' and '.join(map(str, READS))}: "
             "write it again with loopwright conformance FILE OUT"
         )
     for path, found in ((folder / VECTORS, kit.get("sha256")), (answers, theirs.get("sha256"))):
@@ -87,6 +95,7 @@ def check(folder: Path, answers: Path, sha256: str) -> Verdict:
             raise LoopwrightError(f"{path} is for the controller with the SHA-256 {found}; this file's is {sha256}")
     tolerance = float.fromhex(kit["tolerance"])
     verdict = Verdict(str(theirs.get("host", "a host")), str(theirs.get("onnxruntime", "unknown")), tolerance)
+    verdict.note = "" if kit["kit"] == KIT else OLD
     scale = read_all(kit["scale"], "scale")
     for k, (row, answer) in enumerate(_pairs(kit, theirs, "steps", verdict)):
         _check_step(verdict, f"step {k} ({row['part']})", row, answer, scale)
@@ -124,7 +133,13 @@ def _check_scan(v: Verdict, where: str, row: Mapping[str, Any], answer: Mapping[
     for name in ("mode", "fault"):
         if answer.get(name) != row[name]:
             v.mistakes.append(f"{where}: {name} is {answer.get(name)!r}, but must be {row[name]!r}")
-    v.compare(f"{where}: mv", read(row["mv"], where), read(answer.get("mv"), f"{where}: mv"), scale)
+    wanted, found = row["mv"], answer.get("mv")
+    if wanted is None and found is not None:
+        v.mistakes.append(f"{where}: an MV is written, but where it stands is not known yet: mv must be null")
+    elif wanted is not None and found is None:
+        v.mistakes.append(f"{where}: no MV is written, but one must be")
+    elif wanted is not None:
+        v.compare(f"{where}: mv", read(wanted, where), read(found, f"{where}: mv"), scale)
 
 
 def _refused(reason: str) -> str:

@@ -1,4 +1,4 @@
-"""Scans of a loop for a host to repeat: good samples, and every kind of sample that the default guards refuse."""
+"""Scans of a loop for a host to repeat: a start without information, good samples, and every kind of refused sample."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 RECOVER_AFTER = 3
 MAX_GAP = 3
+STANDS = 0.3  # share of its range at which an actuator stands before the loop's first command: not its middle
 SURE = 0.4  # share of a margin by which a value lies inside or outside it
 
 
@@ -37,10 +38,9 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How the loop of the scans starts: in AUTO, at set points (n_sp,) and an MV (n_mv,)."""
+    """How the loop of the scans starts: in AUTO, at set points (n_sp,). Nobody tells where the MV stands."""
 
     sp: Array
-    mv: Array
     recover_after: int = RECOVER_AFTER
     max_gap: int = MAX_GAP
 
@@ -70,9 +70,14 @@ class _Course:
 
 
 def start(manifest: Manifest) -> Start:
-    """The loop of the scans at its start: all in the middle of the ranges."""
-    sp, mv = (np.array([s.middle for s in of], dtype=np.float64) for of in (manifest.sp, manifest.mv))
-    return Start(sp, mv)
+    """The loop of the scans at its start: the set points in the middle of their ranges."""
+    return Start(np.array([s.middle for s in manifest.sp], dtype=np.float64))
+
+
+def actuators(manifest: Manifest) -> Array:
+    """Where the MVs (n_mv,) stand before the loop's first command."""
+    at = [s.low + STANDS * (s.high - s.low) if s.values is None else s.values[-1] for s in manifest.mv]
+    return np.array(at, dtype=np.float64)
 
 
 def scanned(controller: Controller) -> list[Scanned]:
@@ -81,13 +86,12 @@ def scanned(controller: Controller) -> list[Scanned]:
     loop = ControlLoop(
         controller,
         sp=begin.sp,
-        mv=begin.mv,
         mode=Mode.AUTO,
         recover_after=begin.recover_after,
         max_gap=begin.max_gap,
     )
-    course, done = _Course(controller.manifest), []
-    scans = _scans(controller.manifest, course.sample(begin.mv))
+    course, stands, done = _Course(controller.manifest), actuators(controller.manifest), []
+    scans = _scans(controller.manifest, course.sample(stands))
     scan = next(scans)
     while True:
         if scan.set_mode is not None:
@@ -96,8 +100,9 @@ def scanned(controller: Controller) -> list[Scanned]:
             loop.gap(scan.missed)
         command = loop.miss("the plant cannot be read") if scan.sample is None else loop.scan(scan.sample)
         done.append(Scanned(scan, command))
+        stands = command.mv if command.writes else stands
         try:
-            scan = scans.send(course.sample(command.mv))
+            scan = scans.send(course.sample(stands))
         except StopIteration:
             return done
 
@@ -111,6 +116,13 @@ def _scans(m: Manifest, good: Sample) -> Generator[Scan, Sample, None]:
             good = yield Scan(what, good)
 
     recovery = RECOVER_AFTER + 1
+    good = yield Scan("the plant cannot be read at first", None)
+    good = yield Scan("a PV at first not finite", _with(good, "pv", 0, nan))
+    good = yield Scan("an applied MV at first not finite", _with(good, "mv_applied", 0, nan))
+    good = yield Scan("no read-back at first", replace(good, mv_applied=None))
+    yield from some(1, "the first good sample")
+    good = yield Scan("the plant cannot be read after the first good sample", None)
+    yield from some(RECOVER_AFTER - 1, "before the first command of the law")
     yield from some(5)
     for what, spoilt in _doubtful(m):
         good = yield Scan(what, spoilt(good))

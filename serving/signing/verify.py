@@ -19,6 +19,7 @@ from serving.signing.statement import Statement
 
 SUFFIX = ".sig"
 MAX_SIDECAR = 16 * 2**20
+ENDS_SOON = timedelta(days=30)  # before a signature's end: the maker is asked for another one
 SLACK = timedelta(minutes=5)  # by which two clocks may differ
 
 Trusted: TypeAlias = Sequence["str | PathLike[str] | PublicKey"]
@@ -48,6 +49,14 @@ class Signed:
         on = "" if self.signed is None else f" on {self.signed:%Y-%m-%d}"
         until = "" if self.expires is None else f", until {self.expires:%Y-%m-%d}"
         return f"{self.name} (key {self.fingerprint[:16]}){on}{until}"
+
+    def ending(self, now: datetime | None = None) -> str:
+        """That the signature ends within ``ENDS_SOON``, or has ended, in one line; else empty."""
+        left = None if self.expires is None else self.expires - (now or datetime.now(UTC))
+        if left is None or left > ENDS_SOON:
+            return ""
+        when = f"{'ends' if left >= timedelta(0) else 'ended'} on {self.expires:%Y-%m-%d}"
+        return f"the file's signature {when}; after that a loop runs on, but none starts: have the file signed again"
 
 
 def signature_of(path: Path) -> Path:

@@ -23,7 +23,7 @@ from serving.station.export import export, tag_table
 from serving.station.requests import TRIAL
 from serving.station.settings import Settings
 from serving.station.template import template
-from serving.trust import Controller
+from serving.trust import Controller, ending
 
 SETTINGS = Path("loop.toml")
 
@@ -157,7 +157,7 @@ def _check(options: argparse.Namespace) -> int:
     if controller.signed is not None:
         print(f"{controller.path.name}: signed by {controller.signed.words}")
     wrong = [f"{row.signal}: {row.wrong}" for row in rows if row.wrong]
-    for note in [f"{row.signal}: {row.note}" for row in rows if row.note] + _warnings(settings):
+    for note in [f"{row.signal}: {row.note}" for row in rows if row.note] + _warnings(settings) + ending(controller):
         print(f"note: {note}")
     for line in wrong:
         print(f"would stop the loop: {line}", file=sys.stderr)
@@ -190,7 +190,7 @@ def _run(options: argparse.Namespace) -> int:
 
     station = Station(settings, tell=tell)
     station.warnings = _warnings(settings)
-    for line in station.warnings:
+    for line in station.warnings + ending(station.controller):
         tell(f"note: {line}")
     station.watch(_Lines(station.manifest).show)
     for number in (signal.SIGINT, signal.SIGTERM):

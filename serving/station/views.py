@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from serving.controller import Controller
 from serving.journal import columns
-from serving.trust import signer
+from serving.trust import ending, signer
 
 if TYPE_CHECKING:
     from serving.station.station import Station
@@ -37,7 +37,7 @@ def about(station: Station) -> View:
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
         "trusted": None if (keys := station.settings.trusted) is None else [str(key.absolute()) for key in keys],
-        "warnings": station.warnings,
+        "warnings": [*station.warnings, *ending(controller)],
     }
 
 
@@ -55,6 +55,7 @@ def state(station: Station) -> View:
             "connection": trouble,
             "sha256": station.controller.sha256,
             "verdicts": [],
+            "warnings": ending(station.controller),
         }
     sample, command, seen_s = last
     applied = None if sample is None else sample.mv_applied
@@ -84,6 +85,7 @@ def state(station: Station) -> View:
         "faults": station.faults,
         "verdicts": [asdict(v) for v in station.watching.monitor.verdicts()],
         "numbers": station.watching.monitor.numbers(),
+        "warnings": ending(loop.controller),
     }
 
 

@@ -110,6 +110,42 @@ static int get(void *i, Reference first, size_t n, double *x) {
   return worst;
 }
 
+/* Bytes of a state with one number changed: refused, and the instance as it was. */
+static void forge(void *i, const Byte *bytes, size_t size, size_t entry, double value) {
+  Byte *forged = malloc(size + 1), *before = malloc(size);
+  State state = NULL, other = NULL;
+  NEED(forged && before && GET_STATE(i, &state) == 0 && WRITE_STATE(i, state, before, size) == 0);
+  memcpy(forged + 1, bytes, size); /* at an odd address */
+  memcpy(forged + 1 + sizeof(Saved) + entry * sizeof value, &value, sizeof value);
+  NEED(READ_STATE(i, forged + 1, size, &other) != 0 && !other);
+  NEED(READ_STATE(i, bytes, size, &other) == 0 && other);
+  ((Saved *)other)->numbers[entry] = value; /* and past the bytes */
+  NEED(SET_STATE(i, other) != 0);
+  NEED(GET_STATE(i, &state) == 0 && WRITE_STATE(i, state, forged, size) == 0 && !memcmp(forged, before, size));
+  NEED(FREE_STATE(i, &state) == 0 && FREE_STATE(i, &other) == 0);
+  free(forged);
+  free(before);
+}
+
+static void forgeries(void *i, const Byte *bytes, size_t size) {
+  const Instance *in = i;
+  double high = in->c.signals[MV].at[0].high, low = in->c.signals[MV].at[0].low;
+  const double bad[] = {NAN, INFINITY, -INFINITY, high + (high - low), low - 1e-9 * (high - low)};
+  for (size_t k = 0; k < sizeof bad / sizeof *bad; k++) {
+    forge(i, bytes, size, in->at[G_MV], bad[k]);
+    forge(i, bytes, size, in->at[G_START], bad[k]);
+  }
+  for (size_t k = 0; k < 3; k++) {
+    if (in->n[G_INFO]) forge(i, bytes, size, in->at[G_INFO], bad[k]);
+    if (in->c.n_in[STATE]) forge(i, bytes, size, in->n_memory - 1, bad[k]);
+    for (int entry = PHASE; entry < OWN; entry++) forge(i, bytes, size, (size_t)entry, bad[k]);
+  }
+  forge(i, bytes, size, SAMPLES, in->memory[SAMPLES] + 0.5);
+  forge(i, bytes, size, SAMPLES, -9e15);
+  forge(i, bytes, size, PHASE, INSTANTIATED);
+  forge(i, bytes, size, FAULT, 2);
+}
+
 /* The state through bytes into this and another instance, and back. */
 static void carry(void *i, void *other) {
   State state = NULL, copy = NULL;
@@ -120,6 +156,7 @@ static void carry(void *i, void *other) {
   NEED(bytes && WRITE_STATE(i, state, bytes, size) == 0);
   NEED(WRITE_STATE(i, state, bytes, size - 1) != 0);
   NEED(READ_STATE(other, bytes, size, &copy) == 0 && SET_STATE(other, copy) == 0);
+  if (((Instance *)i)->memory[SAMPLES] > 0) forgeries(other, bytes, size);
   bytes[0] ^= 1;
   NEED(READ_STATE(other, bytes, size, &copy) != 0 && READ_STATE(other, bytes, size - 8, &copy) != 0);
   NEED(SET_STATE(i, state) == 0);
@@ -164,7 +201,7 @@ int main(int n, char **words) {
     NEED(get_boolean_of(i, VR_FAULT, &fault) == 0 && !fault == !refused);
     NEED(said == (before += refused));
     if (played++ % 50 == 0) carry(i, other);
-    before = said;
+    before = said; /* refusals of states are told, too */
   }
   fclose(steps);
   NEED(get(i, first_out + (Reference)n_out, 1, found) != 0 && get(i, 4000000000u, 1, found) != 0);

@@ -1,27 +1,28 @@
 """The C host: built with sanitizers, every shipped controller to the bit, and damaged kits that it must not pass.
 
-`tools/onnxruntime_c.sh build/onnxruntime` makes its header and library; ONNXRUNTIME_DIR names another folder.
+tools/onnxruntime_c.sh makes the folder with its header and library; ONNXRUNTIME_DIR names another one.
 """
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import shutil
 import subprocess
+import sys
 import time
 from collections import Counter
+from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 
 import pytest
-from kits import DAMAGES, EMBED, ROOT, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
+from kits import DAMAGES, EMBED, ROOT, SHIPPED, SOME, as_version_1, kit_of, name, spoilt, verdict_on
 
-ONNXRUNTIME = Path(os.environ.get("ONNXRUNTIME_DIR", ROOT / "build" / "onnxruntime"))
 CMAKE = shutil.which("cmake")
 if CMAKE is None or shutil.which("cc") is None:
     pytest.skip("cmake or a C compiler is missing (apt install cmake gcc)", allow_module_level=True)
-if not (ONNXRUNTIME / "include" / "onnxruntime_c_api.h").is_file():
-    pytest.skip("onnxruntime's C header is missing (tools/onnxruntime_c.sh build/onnxruntime)", allow_module_level=True)
 
 pytest_plugins = ["small_laws"]
 PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
@@ -32,9 +33,22 @@ def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([str(w) for w in words], capture_output=True, text=True, timeout=120)
 
 
+@cache
+def onnxruntime() -> Path:
+    """A folder with include/ and lib/, as a release archive has them."""
+    if "ONNXRUNTIME_DIR" in os.environ:
+        return Path(os.environ["ONNXRUNTIME_DIR"])
+    folder = Path(mkdtemp(prefix="onnxruntime-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    words = ["bash", str(ROOT / "tools" / "onnxruntime_c.sh"), str(folder)]
+    made = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "PYTHON": sys.executable})
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
 def built(source: Path, folder: Path) -> Path:
     assert CMAKE is not None
-    made = run(CMAKE, "-S", source, "-B", folder, f"-DONNXRUNTIME_DIR={ONNXRUNTIME}", f"-DCMAKE_C_FLAGS={SANITIZERS}")
+    made = run(CMAKE, "-S", source, "-B", folder, f"-DONNXRUNTIME_DIR={onnxruntime()}", f"-DCMAKE_C_FLAGS={SANITIZERS}")
     assert made.returncode == 0, made.stderr
     made = run(CMAKE, "--build", folder)
     assert made.returncode == 0, made.stdout + made.stderr
@@ -76,18 +90,43 @@ def test_c_does_not_pass_a_damaged_kit(host: Path, damage: str, tmp_path: Path) 
     assert expected in done.stdout
 
 
+def test_c_reads_a_kit_of_version_1(host: Path, tmp_path: Path) -> None:
+    done = run(host, "--conformance", spoilt(PID, tmp_path, as_version_1))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_c_loop_scans_once_a_period(host: Path) -> None:
     began = time.monotonic()
-    done = run(host, kit_of(PID) / "pid.onnx", "8", "0.02")
-    assert time.monotonic() - began >= 7 * 0.02
+    done = run(host, kit_of(PID) / "pid.onnx", "40", "0.02")
+    assert time.monotonic() - began >= 39 * 0.02
     assert done.returncode == 0, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
     places = [int(row[0]) for row in rows]
-    assert places == sorted(set(places))
-    assert places[0] == 0
+    assert places == sorted(set(places))  # a busy machine leaves some out, also at the start
+    assert places[0] >= 0
+    assert len(places) > 1
     assert all(float(row[1]) < 20 for row in rows)  # a later scan is one of the next period
     assert {row[4] for row in rows} == {"AUTO"}
     assert all(0 <= float(row[5]) <= 500 for row in rows)
+
+
+def test_the_c_loop_writes_nothing_before_it_has_read_the_plant(tmp_path: Path) -> None:
+    """The loop as it is shipped, on a plant that cannot be read at the first two scans and tells of each write."""
+    text = (EMBED / "c" / "host.c").read_text()
+    for place, more in (
+        ("static bool plant_read(Plant *p, Sample *sample) {\n", "  if (p->k < 2) return p->k++, false;\n"),
+        ("static bool plant_write(Plant *p, const double *mv) {\n", '  printf("written %g\\n", mv[0]);\n'),
+    ):
+        assert text.count(place) == 1
+        text = text.replace(place, place + more)
+    (tmp_path / "CMakeLists.txt").write_text((EMBED / "c" / "CMakeLists.txt").read_text())
+    (tmp_path / "host.c").write_text(text)
+    done = run(built(tmp_path, tmp_path / "build") / "host", kit_of(PID) / "pid.onnx", "60", "0.02")
+    assert done.returncode == 0, done.stderr
+    first, second, third, *_ = done.stdout.splitlines()
+    assert first.endswith("HOLD - the plant cannot be read")
+    assert second.endswith("HOLD - the plant cannot be read")
+    assert third == "written 250"  # the read-back: where the made-up plant's actuator stands
 
 
 def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:

@@ -295,6 +295,60 @@ def test_bytes_that_are_no_state_of_this_fmu_are_refused(fmi: int, opened: ExitS
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+def test_a_forged_state_is_refused_and_the_instance_goes_on(fmi: int, opened: ExitStack) -> None:
+    """The MV beyond its range, or a number of the law that no step can give: nothing of it becomes an output."""
+    of = "jacketed_batch_reactor/fuzzy_feedforward_observer"  # two MVs, one of set values
+    m, u, other = controller_of(of).manifest, unit(opened, of, fmi).begin(), unit(opened, of, fmi)
+    for pv in drawn(of, 5):
+        u.set(pv=pv)
+        u.step(m.period_s)
+    content = u.written()
+    # Behind 72 bytes of digest and count: 7 numbers of the FMU's own, then the groups, then the law's state.
+    groups = [len(m.sp), len(m.pv), len(m.dv) if "dv" in m.inputs else 0, len(m.mv) if "mv_applied" in m.inputs else 0]
+    start = 7 + sum(groups)
+    mv, info = start + len(m.mv), start + 2 * len(m.mv)
+    law = info + len(m.info)
+    assert len(content) == 72 + 8 * (law + m.n_state)
+    (allowed,) = [s for s in m.mv if s.values is not None]
+    discrete = m.mv.index(allowed)
+    wrong = [
+        *((mv + i, v) for i, s in enumerate(m.mv) for v in (np.nan, s.high + 1.0, s.low - 1e-6)),
+        (start, np.inf),
+        (mv + discrete, allowed.values[0] / 3 + allowed.values[1] * 2 / 3),
+        (info, np.nan),
+        (law, np.nan),
+        (law + m.n_state - 1, -np.inf),
+        *((flag, v) for flag in (4, 5, 6) for v in (0.5, np.nan)),
+    ]
+    for place, value in wrong:
+        at = 72 + 8 * place
+        with pytest.raises(Exception, match="failed"):
+            u.read(content[:at] + np.float64(value).tobytes() + content[at + 8 :])
+        assert "the saved state has" in u.said[-1]
+        assert u.written() == content
+    other.read(content)
+    other.now = u.now
+    for pv in drawn(of, 5, seed=1):
+        for each in (u, other):
+            each.set(pv=pv)
+            each.step(m.period_s)
+        assert u.written() == other.written()
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_state_before_the_initialization_can_be_restored(fmi: int, opened: ExitStack) -> None:
+    """Its MV is what the tool set, allowed or not; the end of the initialization checks it."""
+    u = unit(opened, fmi=fmi)
+    u.set(mv_start=9e3)
+    content = u.written()
+    u.set(mv_start=300.0)
+    u.read(content)
+    with pytest.raises(Exception, match="failed"):
+        u.begin()
+    assert "mv_start.T_j = 9000 K is not allowed" in u.said[-1]
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
 def test_instances_do_not_disturb_each_other(fmi: int, opened: ExitStack) -> None:
     period, n = controller_of(PID).manifest.period_s, 40
     courses = [drawn(PID, n, seed) for seed in (1, 2)]

@@ -50,6 +50,18 @@ def test_each_host_has_a_short_page_that_says_the_same_four_things(host: str) ->
         assert what in text
 
 
+@pytest.mark.parametrize("host", ["c", "node", "browser", "python"])
+def test_each_page_says_how_a_loop_begins_and_what_a_host_lacks(host: str) -> None:
+    text = (EMBED / host / "README.md").read_text().casefold()
+    assert (
+        "before the first good sample with a read-back" in text
+        or "**start**, **fault**, what is **not here**: as in node" in text
+    )
+    assert (
+        "a ramp after a change to auto" in text and "a fault that lasts" in text
+    ) or "**not here**: as in node" in text
+
+
 @pytest.mark.parametrize(("host", "package"), [("node", "onnxruntime-node"), ("browser", "onnxruntime-web")])
 def test_versions_are_pinned_and_named(host: str, package: str) -> None:
     version = json.loads((EMBED / host / "package.json").read_text())["dependencies"][package]

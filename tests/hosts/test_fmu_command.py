@@ -5,16 +5,17 @@ from __future__ import annotations
 import shutil
 import sys
 import tomllib
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
-from controller_fmus import MISSING, ONNXRUNTIME, file_of
+from controller_fmus import MISSING, file_of
 from kits import ROOT
 
 from pipeline.__main__ import main
 from pipeline.commands import Parser
 from pipeline.commands.fmu import options
-from pipeline.hosts.fmu.compiling import HOSTS, SOURCES
+from pipeline.hosts.fmu.compiling import HEADER, HOSTS, SHIPPED, SHIPPED_SHA256, SOURCES
 from pipeline.hosts.fmu.variables import variables_of
 from serving import Controller
 
@@ -44,7 +45,7 @@ def refused(capsys: Capture, *words: str | Path) -> str:
 def test_the_command_writes_an_fmu(fmi: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(PID, tmp_path / "my loop-1.onnx")
-    words = ["fmu", "my loop-1.onnx", "--onnxruntime", str(ONNXRUNTIME)]
+    words = ["fmu", "my loop-1.onnx"]
     assert main(words if fmi == 3 else [*words, "--fmi", "2"]) == 0
     told = capsys.readouterr().out
     assert told.startswith(f"my loop-1.fmu: FMI {fmi}.0, ")
@@ -77,7 +78,7 @@ def test_an_output_that_cannot_be_is_refused(tmp_path: Path, capsys: Capture) ->
         assert words in refused(capsys, PID, "--out", tmp_path / name)
     assert (tmp_path / "there.fmu").read_text() == ""
     if sys.platform == "linux":  # where not even root can write
-        assert "/proc" in refused(capsys, PID, "--out", "/proc/x.fmu", "--onnxruntime", ONNXRUNTIME)
+        assert "/proc" in refused(capsys, PID, "--out", "/proc/x.fmu")
 
 
 def test_a_version_of_fmi_that_there_is_none_of_is_refused(capsys: Capture) -> None:
@@ -85,7 +86,7 @@ def test_a_version_of_fmi_that_there_is_none_of_is_refused(capsys: Capture) -> N
 
 
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    words = (PID, "--out", tmp_path / "x.fmu", "--onnxruntime", ONNXRUNTIME)
+    words = (PID, "--out", tmp_path / "x.fmu")
     with monkeypatch.context() as here:
         here.setenv("CC", "no-such-compiler -O2")
         assert "no C compiler is installed: CC names 'no-such-compiler'" in refused(capsys, *words)
@@ -99,8 +100,15 @@ def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with monkeypatch.context() as here:
         here.setattr(sys, "platform", "win32")
         assert "an FMU is built on Linux" in refused(capsys, *words)
-    told = refused(capsys, *words[:-1], tmp_path)
-    assert "onnxruntime_c_api.h, which is not found in" in told
+    with monkeypatch.context() as here:
+        here.setattr("pipeline.hosts.fmu.compiling._library", lambda: Path("/x/libonnxruntime.so.1.20.1"))
+        told = refused(capsys, *words)
+        assert "onnxruntime here is 1.20, older than its header of 1.21; pip install 'onnxruntime>=1.21'" in told
+    with monkeypatch.context() as here:
+        here.setattr("importlib.util.find_spec", lambda name: None)
+        assert "the Python package onnxruntime here has no libonnxruntime.so" in refused(capsys, *words)
+    told = refused(capsys, *words, "--onnxruntime", tmp_path)
+    assert "onnxruntime_c_api.h is not found in" in told
     assert "--onnxruntime FOLDER" in told
 
 
@@ -129,5 +137,12 @@ def test_the_package_ships_what_is_compiled() -> None:
     """The globs of package data name every file that the command reads."""
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["pipeline"]
     shipped = {path for glob in data for path in (ROOT / "pipeline").glob(glob)}
-    assert {HOSTS / "c" / "host.c", *SOURCES.iterdir()} <= shipped
+    assert {HOSTS / "c" / "host.c", *SHIPPED.iterdir(), *SOURCES.iterdir()} <= shipped
+    assert {path.name for path in SHIPPED.iterdir()} == {HEADER, "LICENSE"}
+    assert sha256((SHIPPED / HEADER).read_bytes()).hexdigest() == SHIPPED_SHA256
+    assert "#define ORT_API_VERSION 21\n" in (SHIPPED / HEADER).read_text()
+    assert "MIT License" in (SHIPPED / "LICENSE").read_text()
     assert (ROOT / "examples" / "embed" / "c" / "host.c").resolve() == HOSTS / "c" / "host.c"
+    shared = ROOT / "examples" / "embed" / "javascript" / "controller.mjs"
+    assert shared.resolve() == HOSTS / "javascript" / "controller.mjs"
+    assert shared.resolve() in shipped

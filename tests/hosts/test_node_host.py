@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kits import DAMAGES, EMBED, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
+from kits import DAMAGES, EMBED, SHIPPED, SOME, as_version_1, kit_of, name, spoilt, verdict_on
 
 NODE = shutil.which("node")
 if NODE is None or not (EMBED / "node" / "node_modules").is_dir():
@@ -59,13 +59,19 @@ def test_node_does_not_pass_a_damaged_kit(damage: str, tmp_path: Path) -> None:
     assert f"largest difference {expected}" in done.stdout
 
 
+def test_node_reads_a_kit_of_version_1(tmp_path: Path) -> None:
+    done = run("--conformance", spoilt(PID, tmp_path, as_version_1))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_node_loop_scans_once_a_period() -> None:
-    done = run(kit_of(PID) / "pid.onnx", "8", "0.02")
+    done = run(kit_of(PID) / "pid.onnx", "40", "0.02")
     assert done.returncode == 0, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
     places = [int(row[0]) for row in rows]
-    assert places[0] == 0
-    assert places == sorted(set(places))
+    assert places == sorted(set(places))  # a busy machine leaves some out, also at the start
+    assert places[0] >= 0
+    assert len(places) > 1
     assert all(0 <= float(row[1]) < 20 for row in rows)
     assert {row[4] for row in rows} == {"AUTO"}
 
@@ -73,32 +79,36 @@ def test_the_node_loop_scans_once_a_period() -> None:
 LOOP = """
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
-const [host, file] = process.argv.slice(1);
+const [host, file, unread, unwritten] = process.argv.slice(1).map((w) => (isNaN(w) ? w : Number(w)));
 const ort = createRequire(host)("onnxruntime-node");
-const { Controller, Loop, MadeUpPlant, run, start } = await import(host.replace("node/host", "javascript/controller"));
+const { Controller, Loop } = await import(host.replace("node/host", "javascript/controller"));
+const { MadeUpPlant, run, start } = await import(host.replace("node/host", "javascript/run"));
 const manifest = JSON.parse(readFileSync(file.replace("onnx", "json")));
 const controller = await Controller.load(ort, readFileSync(file), manifest, "cpu");
-const { sp, mv } = start(controller.manifest);
-const loop = new Loop(controller, { sp, mv, mode: "AUTO", recoverAfter: 2 });
+const loop = new Loop(controller, { ...start(controller.manifest), mode: "AUTO", recoverAfter: 2 });
+let written = [];
 class Plant extends MadeUpPlant {
   read() {
     const sample = super.read();
+    if (this.k <= unread) throw new Error("no answer yet");
     if (this.k === 4) throw new Error("no answer");
     return { ...sample, pv: [0.499, 300] };
   }
   write(mv) {
-    if (this.k === 10) throw new Error("no way");
+    if (this.k === unwritten) throw new Error("no way");
+    written.push([...mv]);
     super.write(mv);
   }
 }
 let time = 100, scans = [];
-await run(loop, new Plant(controller.manifest, mv), {
+const plant = new Plant(controller.manifest);
+await run(loop, plant, {
   scans: 30,
   period: 1,
   now: () => time,
   sleep: async (seconds) => { time += seconds * 0.7 + (seconds < 1e-3 ? 0.25 : 0); }, // early at first, late in the end
   seen: ({ k, late, mode, mv, reason }) => {
-    scans.push({ k, late, mode, mv: [...mv], reason, state: [...controller.state] });
+    scans.push({ k, late, mode, mv: mv && [...mv], reason, state: [...loop.state] });
     if (k === 15) time += 2.5; // a whole period passes
     if (k === 20) time += 7.5; // six of them
   },
@@ -106,19 +116,38 @@ await run(loop, new Plant(controller.manifest, mv), {
 let refused = [];
 for (const bad of [[2], [NaN], [], [0.1, 0.2]])
   try { loop.setSp(bad); } catch (error) { refused.push(error.message); }
-console.log(JSON.stringify({ scans, refused, sp: [...loop.sp] }));
+console.log(JSON.stringify({ scans, refused, written, sp: [...loop.sp] }));
 """
 
 
-@pytest.fixture(scope="module")
-def told() -> dict[str, Any]:
-    """A loop on a clock of the test's, a plant that fails to be read once and to be written once, and two gaps."""
+def ran(unread: int, unwritten: int) -> dict[str, Any]:
+    """A loop on a clock of the test's, two gaps, and a plant that is not read at the first ``unread`` scans.
+
+    Nor can it be read at the fourth one, nor written at the one of the number ``unwritten``.
+    """
     host, file = EMBED / "node" / "host.mjs", kit_of(PID) / "pid.onnx"
-    command = [str(NODE), "--input-type=module", "-e", LOOP, str(host), str(file)]
+    command = [str(NODE), "--input-type=module", "-e", LOOP, str(host), str(file), str(unread), str(unwritten)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
     return found
+
+
+@pytest.fixture(scope="module")
+def told() -> dict[str, Any]:
+    return ran(0, 10)
+
+
+def test_nothing_is_written_in_node_before_the_plant_is_known() -> None:
+    """Not read at two scans; the first command after that does not arrive, and the fourth scan is a fault again."""
+    found = ran(2, 3)
+    scans = {scan["k"]: scan for scan in found["scans"]}
+    assert [scans[k]["mv"] for k in range(4)] == [None] * 4
+    assert all(scans[k]["mode"] == "HOLD" for k in range(5))
+    stands = scans[4]["mv"]
+    assert stands == [250.0]  # the read-back
+    assert found["written"][0] == stands
+    assert scans[5]["mode"] == "AUTO"
 
 
 def test_lateness_does_not_become_drift_in_node(told: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import sha256
 from pipeline.playground import web_runtime as runtime
 from pipeline.playground.server import file_server
-from pipeline.playground.site import OPERATORS, SHARED, STATIC, Playground, write_folder, write_one_file
+from pipeline.playground.site import LOOP, OPERATORS, SHARED, STATIC, Playground, write_folder, write_one_file
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 CASE = "reversible_cstr"
@@ -99,9 +99,9 @@ def test_a_folder_has_all_that_its_pages_name_and_one_copy_of_what_they_share(
 def test_every_script_is_in_the_import_map_and_names_no_other_machine() -> None:
     text = (STATIC / "index.html").read_text()
     mapped = set(json.loads(re.search(r'importmap">(.*?)</script>', text, re.S)[1])["imports"])  # type: ignore[index]
-    scripts = [p for p in STATIC.glob("*.js") if p.name != "theme.js"]
+    scripts = [LOOP, *(p for p in STATIC.glob("*.js") if p.name != "theme.js")]
     assert {f"loopwright/{p.stem}" for p in scripts} | {"loopwright/format", "onnxruntime-web"} == mapped
-    for path in STATIC.iterdir():
+    for path in (LOOP, *STATIC.iterdir()):
         assert re.findall(r"https?://", path.read_text()) == []
     for path in scripts:
         assert set(re.findall(r'from "([^"]+)"', path.read_text())) <= mapped

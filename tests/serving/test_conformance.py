@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kits import as_version_1
 
 from serving import Controller, LoopwrightError
 from serving.__main__ import main
@@ -108,6 +109,42 @@ def test_the_scans_hold_what_the_guards_refuse(vectors: Json) -> None:
     assert [row["missed"] for row in vectors["scans"] if row["missed"]] == [1, 3, 4]
 
 
+def test_the_scans_begin_without_information(pi_file: Path, vectors: Json) -> None:
+    """Nothing is written until a good sample with a read-back; the loop begins from there, and not from the middle."""
+    assert vectors["loop"]["mv"] is None
+    rows = vectors["scans"]
+    known = next(k for k, row in enumerate(rows) if row["mv"] is not None)
+    assert [row["what"] for row in rows[:known]] == [
+        "the plant cannot be read at first",
+        "a PV at first not finite",
+        "an applied MV at first not finite",
+        "no read-back at first",
+    ]
+    assert all(row["fault"] and row["mode"] == "HOLD" for row in rows[:known])
+    assert rows[known]["mv"] == rows[known]["sample"]["mv_applied"]
+    (valve,) = Controller(pi_file).manifest.mv
+    assert float.fromhex(rows[known]["mv"][0]) != valve.middle
+    assert rows[known + 1]["sample"] is None  # a fault after that holds it
+    assert rows[known + 1]["mv"] == rows[known]["mv"]
+    assert all(row["mv"] is not None for row in rows[known:])
+
+
+def test_an_old_kit_is_read_and_its_verdict_says_what_it_does_not_show(
+    pi_file: Path, kit: Path, answers: Json, tmp_path: Path
+) -> None:
+    old = tmp_path / "old"
+    old.mkdir()
+    vectors = json.loads((kit / VECTORS).read_text())
+    as_version_1(vectors)
+    (old / VECTORS).write_text(json.dumps(vectors))
+    for row, wanted in zip(answers["scans"], vectors["scans"], strict=True):
+        row["mv"] = wanted["mv"]
+    verdict = judged(pi_file, old, answers, tmp_path)
+    assert verdict.passed
+    assert "it does not show that the host writes nothing before it knows the plant" in verdict.text()
+    assert not judged(pi_file, kit, answers, tmp_path).passed  # and such a host fails the present kit
+
+
 def test_a_host_that_does_all_as_it_must_passes(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
     verdict = judged(pi_file, kit, answers, tmp_path)
     assert verdict.passed
@@ -162,6 +199,8 @@ def test_one_bit_is_seen(pi_file: Path, kit: Path, answers: Json, tmp_path: Path
         (lambda a: a["steps"][7]["mv"].append("0x0p+0"), "2 numbers instead of 1"),
         (lambda a: a["scans"][5].update(mode="AUTO"), "mode is 'AUTO', but must be 'HOLD'"),
         (lambda a: a["scans"][5].update(fault=False), "fault is False, but must be True"),
+        (lambda a: a["scans"][0].update(mv=a["scans"][4]["mv"]), "an MV is written, but where it stands is not known"),
+        (lambda a: a["scans"][4].update(mv=None), "no MV is written, but one must be"),
     ],
 )
 def test_what_no_tolerance_excuses(

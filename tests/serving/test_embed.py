@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kits import DAMAGES, kit_of, spoilt, verdict_on
+from kits import DAMAGES, as_version_1, kit_of, spoilt, verdict_on
 
 from pipeline.export.gate import export
 from pipeline.laws import ControlLaw
@@ -65,7 +65,7 @@ def test_the_plain_example_needs_nothing_of_ours() -> None:
     assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
 
 
-@pytest.mark.parametrize("example", ["python_runtime.py", "plain_onnxruntime.py"])
+@pytest.mark.parametrize("example", ["python_runtime.py", "plain_onnxruntime.py", "control_loop.py"])
 def test_an_example_without_a_file_says_what_it_wants(example: str) -> None:
     done = subprocess.run([sys.executable, str(EXAMPLES / example)], capture_output=True, text=True, timeout=60)
     assert done.returncode != 0
@@ -84,3 +84,26 @@ def test_python_s_conformance_run_passes_the_kit_and_no_damaged_one(damage: str 
     verdict = verdict_on(file, tmp_path / "answers.json")
     assert verdict.passed  # what it answers is right: it is the kit that is damaged
     assert verdict.same_bits == verdict.steps
+
+
+def test_python_s_conformance_run_reads_a_kit_of_version_1(tmp_path: Path) -> None:
+    kit = spoilt(SHIPPED[0], tmp_path, as_version_1)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(EXAMPLES / "conformance.py"), str(kit)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_example_loop_runs_once_a_period_and_begins_where_the_plant_is() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    file = ROOT / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+    command = [sys.executable, "-W", "error", str(EXAMPLES / "control_loop.py"), str(file), "20", "0.05"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == 0, done.stderr
+    *rows, report = done.stdout.splitlines()
+    assert rows
+    assert "faults=0" in report
+    assert all(row.split()[1] == "AUTO" for row in rows)
+    controller = Controller(file)
+    first = controller.step(sp=0.5, pv=[0.0, 200.0], mv_applied=250.0, state=controller.cold_state())
+    assert float(rows[0].split()[2]) == first.mv[0]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -16,6 +18,7 @@ from serving import LoopError
 from serving.page.candidates import candidates
 from serving.station.control import ask
 from serving.station.settings import Settings
+from serving.trust import signer
 
 pytest_plugins = ["signed_files", "signed_loop"]
 
@@ -92,6 +95,23 @@ def test_a_swap_to_a_trusted_file_is_written_down_with_its_signer(trusting: Path
     assert "signed by anna (key " in done["done"]
     assert within(20, lambda: ask(journal, {"do": "about"})["card"]["law"] == "inverse_dob")
     assert ask(journal, {"do": "about"})["card"]["signed"]["name"] == "anna"
+
+
+@pytest.mark.parametrize(("days", "told"), [(40, 0), (20, 1), (-1, 1)])
+def test_the_operator_sees_before_it_that_a_signature_ends(
+    trusting_loop: RunningLoop, monkeypatch: pytest.MonkeyPatch, days: int, told: int
+) -> None:
+    assert within(20, lambda: trusting_loop.station.last is not None)
+    loop, journal = trusting_loop.station.loop, trusting_loop.settings.journal.file
+    assert loop is not None
+    signed = signer(loop.controller)
+    assert signed is not None
+    end = datetime.now(UTC) + timedelta(days=days)
+    monkeypatch.setattr(loop.controller, "signed", replace(signed, expires=end))
+    for view in ("about", "state"):
+        lines = [line for line in ask(journal, {"do": view})["warnings"] if "signature" in line]
+        assert len(lines) == told
+        assert all(f"{end:%Y-%m-%d}" in line and "have the file signed again" in line for line in lines)
 
 
 @pytest.mark.parametrize("action", ["check", "run"])

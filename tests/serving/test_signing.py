@@ -10,7 +10,7 @@ import re
 import shutil
 import stat
 from collections.abc import Callable
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +176,27 @@ def test_a_signature_ends_with_its_last_second(unsigned: Path, private: Private,
     refused(
         unsigned, public("anna"), now=late, words=r"expired on 2026-05-02 12:00 UTC .*ask its maker to sign it anew"
     )
+
+
+@pytest.mark.parametrize(
+    ("left", "words"),
+    [
+        (timedelta(days=31), ""),
+        (timedelta(days=29), "ends on 2027-01-31; after that a loop runs on, but none starts"),
+        (timedelta(days=-2), "ended on 2027-01-31; after that a loop runs on, but none starts"),
+    ],
+)
+def test_a_signature_that_ends_soon_says_so(
+    unsigned: Path, private: Private, public: Public, left: timedelta, words: str
+) -> None:
+    expires = datetime(2027, 1, 31, 23, 59, 59, tzinfo=UTC)
+    sign(unsigned, private("anna"), now=NOW, expires=expires)
+    found = verified(unsigned, [public("anna")], now=NOW)
+    said = found.ending(expires - left)
+    assert words in said
+    assert bool(said) == bool(words)
+    sign(unsigned, private("anna"), now=NOW)
+    assert verified(unsigned, [public("anna")], now=NOW).ending(expires) == ""  # for ever
 
 
 def test_a_clock_before_the_signature_cannot_tell_whether_it_expired(

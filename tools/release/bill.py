@@ -20,10 +20,11 @@ from licences import BSD, Kind, UnclearError, has_choice, kind, licence, reviewe
 
 ROOT = Path(__file__).parents[2]
 NAME, OURS = "loopwright", "Apache-2.0 AND MIT"
-STATIC = ROOT / "serving/page/static"
+STATIC, C_HEADER = ROOT / "serving/page/static", ROOT / "pipeline/hosts/c/onnxruntime"
 BROUGHT, LIES_IN = "loopwright:brought-by", "loopwright:lies-in"
 ABOUT = """What pip brings with loopwright {version} and each of its extras, in the versions of constraints.txt{python}.
-"runtime" is `pip install loopwright` alone. The page's uPlot lies in loopwright's own wheel.
+"runtime" is `pip install loopwright` alone. The page's uPlot and onnxruntime's C header lie in
+loopwright's own wheel.
 
 The list goes by what each package states of itself. A package may bundle libraries, whose licences lie in its own
 folder. On Linux PyTorch can come with NVIDIA's CUDA packages (`nvidia-*`), which are proprietary and not listed:
@@ -78,17 +79,31 @@ def uplot() -> dict[str, Any]:
     found = re.match(r"/\*! https://github\.com/leeoniya/uPlot \(v([\d.]+)\)", script.read_text(encoding="utf-8"))
     if found is None or "MIT License" not in (STATIC / "uPlot-LICENSE").read_text(encoding="utf-8"):
         raise UnclearError("serving/page/static: uPlot's version or licence is not where it was")
+    return _vendored("uPlot", found[1], f"pkg:npm/uplot@{found[1]}", script)
+
+
+def header() -> dict[str, Any]:
+    """The component onnxruntime_c_api.h, which lies in the wheel: it names the release of its interface."""
+    file = C_HEADER / "onnxruntime_c_api.h"
+    found = re.search(r"#define ORT_API_VERSION (\d+)", file.read_text(encoding="utf-8"))
+    if found is None or "MIT License" not in (C_HEADER / "LICENSE").read_text(encoding="utf-8"):
+        raise UnclearError("pipeline/hosts/c/onnxruntime: the header's version or licence is not where it was")
+    version = f"1.{found[1]}"
+    return _vendored("onnxruntime_c_api.h", version, f"pkg:github/microsoft/onnxruntime@v{version}.0", file)
+
+
+def _vendored(name: str, version: str, purl: str, file: Path) -> dict[str, Any]:
     return {
-        "bom-ref": f"uPlot=={found[1]}",
+        "bom-ref": f"{name}=={version}",
         "type": "library",
-        "name": "uPlot",
-        "version": found[1],
-        "purl": f"pkg:npm/uplot@{found[1]}",
+        "name": name,
+        "version": version,
+        "purl": purl,
         "licenses": [{"expression": "MIT"}],
-        "hashes": [{"alg": "SHA-256", "content": hashlib.sha256(script.read_bytes()).hexdigest()}],
+        "hashes": [{"alg": "SHA-256", "content": hashlib.sha256(file.read_bytes()).hexdigest()}],
         "properties": [
             {"name": BROUGHT, "value": "runtime"},
-            {"name": LIES_IN, "value": script.relative_to(ROOT).as_posix()},
+            {"name": LIES_IN, "value": file.relative_to(ROOT).as_posix()},
         ],
     }
 
@@ -132,7 +147,7 @@ def _canonical(name: str) -> str:
 def main(closure: str, environment: str, folder: str) -> int:
     """Write both files; 2 after a line on standard error where a licence is unclear or the bill is not valid."""
     try:
-        packages, vendored = rows(json.loads(Path(closure).read_text())), [uplot()]
+        packages, vendored = rows(json.loads(Path(closure).read_text())), [uplot(), header()]
     except UnclearError as error:
         print(f"bill: {error}", file=sys.stderr)
         return 2

@@ -18,17 +18,20 @@ OPENED = {
     "serving/page/static": {".js", ".css", ".html", ".svg"},
     "pipeline/report/templates": {".j2"},
     "pipeline/hosts/c": {".c"},
+    "pipeline/hosts/c/onnxruntime": {".h"},
+    "pipeline/hosts/javascript": {".mjs"},
     "pipeline/hosts/fmu/sources": {".c"},
     "pipeline/playground/static": {".js", ".css", ".html"},
     "pipeline/playground/npm": {".json"},
 }
 FEW = {
     *("serving/py.typed", "pipeline/py.typed", "serving/page/static/uPlot-LICENSE"),
-    "pipeline/playground/npm/onnxruntime-LICENSE",
+    *("pipeline/playground/npm/onnxruntime-LICENSE", "pipeline/hosts/c/onnxruntime/LICENSE"),
 }
 DIST_INFO = {
     *("METADATA", "WHEEL", "RECORD", "entry_points.txt", "top_level.txt"),
     *("licenses/LICENSE", "licenses/serving/page/static/uPlot-LICENSE"),
+    "licenses/pipeline/hosts/c/onnxruntime/LICENSE",
 }
 
 

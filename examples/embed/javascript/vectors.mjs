@@ -61,12 +61,14 @@ export async function conform(ort, provider, bytes, manifest, vectors, host, ver
   };
 
   const steps = [];
+  let state = controller.cold();
   for (const row of vectors.steps) {
     const given = Object.fromEntries(Object.entries(row.given).map(([name, texts]) => [name, numbers(texts)]));
-    if (row.cold) controller.cold();
+    if (row.cold) state = controller.cold();
     try {
-      const result = await controller.step(given);
-      last = given;
+      const result = await controller.step({ ...given, state });
+      last = { ...given, state };
+      state = result.state_next;
       steps.push(Object.fromEntries(OUTPUTS.map((name) => [name, compared(name, result[name], row.gives?.[name])])));
       if (row.refused) wrong++;
     } catch (error) {
@@ -76,7 +78,6 @@ export async function conform(ort, provider, bytes, manifest, vectors, host, ver
     }
   }
 
-  controller.cold();
   const { sp, mv, recover_after: recoverAfter, max_gap: maxGap } = vectors.loop;
   const loop = new Loop(controller, { sp: numbers(sp), mv: numbers(mv), mode: "AUTO", recoverAfter, maxGap });
   const scans = [];
@@ -86,8 +87,9 @@ export async function conform(ort, provider, bytes, manifest, vectors, host, ver
     const { pv, dv, mv_applied, age_s } = row.sample ?? {};
     const sample = row.sample && { pv: numbers(pv), dv: numbers(dv), mv_applied: numbers(mv_applied), age_s: fromHex(age_s) };
     const command = await loop.scan(sample);
-    const answer = { mode: command.mode, fault: command.reason !== "", mv: compared("mv", command.mv, row.mv) };
-    if (answer.mode !== row.mode || answer.fault !== row.fault) wrong++;
+    const mv = command.mv && compared("mv", command.mv, row.mv);
+    const answer = { mode: command.mode, fault: command.reason !== "", mv };
+    if (answer.mode !== row.mode || answer.fault !== row.fault || !mv !== !row.mv) wrong++;
     scans.push(answer);
   }
 

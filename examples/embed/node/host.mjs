@@ -4,7 +4,8 @@ import { readFileSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { join } from "node:path";
 import * as ort from "onnxruntime-node";
-import { Controller, Loop, MadeUpPlant, run, start } from "../javascript/controller.mjs";
+import { Controller, Loop } from "../javascript/controller.mjs";
+import { MadeUpPlant, run, start } from "../javascript/run.mjs";
 import { conform } from "../javascript/vectors.mjs";
 
 const version = createRequire(import.meta.url)("onnxruntime-node/package.json").version;
@@ -24,14 +25,13 @@ async function conformance(kit, out) {
 
 async function control(file, scans = 20, period) {
   const controller = await Controller.load(ort, readFileSync(file), json(file.replace(/\.onnx$/, ".json")), "cpu");
-  const { sp, mv } = start(controller.manifest);
-  const loop = new Loop(controller, { sp, mv, mode: "AUTO", recoverAfter: 5 });
-  await run(loop, new MadeUpPlant(controller.manifest, mv), {
+  const loop = new Loop(controller, { ...start(controller.manifest), mode: "AUTO", recoverAfter: 5 });
+  await run(loop, new MadeUpPlant(controller.manifest), {
     scans: Number(scans),
     ...(period && { period: Number(period) }),
     now: () => performance.now() / 1e3,
     sleep: (seconds) => new Promise((resume) => setTimeout(resume, 1e3 * seconds)),
-    seen: ({ k, late, mode, mv, reason }) => console.log(`${k} ${(1e3 * late).toFixed(2)} ms late ${mode} ${[...mv]} ${reason}`),
+    seen: ({ k, late, mode, mv, reason }) => console.log(`${k} ${(1e3 * late).toFixed(2)} ms late ${mode} ${mv ?? "-"} ${reason}`),
   });
   return 0;
 }

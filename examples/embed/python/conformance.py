@@ -58,8 +58,9 @@ for row in vectors["scans"]:
     else:
         sample = {name: numbers(row["sample"][name]) for name in ("pv", "mv_applied", "dv")}
         command = loop.scan(Sample(**sample, age_s=float.fromhex(row["sample"]["age_s"])))
-    found = {"mode": str(command.mode), "fault": bool(command.reason), "mv": answer("mv", command.mv, row["mv"])}
-    wrong += any(found[name] != row[name] for name in ("mode", "fault"))
+    found = {"mode": str(command.mode), "fault": bool(command.reason)}
+    wrong += any(found[name] != row[name] for name in found) or command.writes == (row["mv"] is None)
+    found["mv"] = answer("mv", command.mv, row["mv"]) if command.writes else None
     scans.append(found)
 
 largest, p50 = max(inf if d != d else d for d in differences), float(np.median(took))

@@ -12,7 +12,7 @@ options.intra_op_num_threads = 1
 session = ort.InferenceSession(file, options, providers=["CPUExecutionProvider"])
 m = json.loads(session.get_modelmeta().custom_metadata_map["loopwright.manifest"])
 names = [output.name for output in session.get_outputs()]
-state, mv = np.zeros(m["n_state"]), np.array([s["low"] for s in m["mv"]])
+state, mv = np.zeros(m["n_state"]), np.array([s["low"] for s in m["mv"]])  # mv stands for your read-back
 for k in range(100):  # once every m["period_s"] seconds
     given = {n: np.array([(s["low"] + s["high"]) / 2 for s in m[n]]) for n in ("sp", "dv")}
     pv = np.array([s["low"] + (s["high"] - s["low"]) * (k % 10) / 10 for s in m["pv"]])

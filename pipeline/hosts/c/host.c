@@ -502,9 +502,12 @@ typedef struct {
   int recover_after; /* good samples after which HOLD returns to AUTO; 0: only the operator returns it */
   int good;
   double max_gap; /* missed periods in a row after which the law starts cold */
-  double *sp, *mv, *applied, *before;
+  double *sp, *mv, *applied, *before; /* mv is NAN while nobody knows where it stands */
   char reason[WORDS]; /* of the last scan; empty: no fault */
 } Loop;
+
+/* Whether l->mv may be written: before the first good sample with a read-back, or loop_set, nothing may. */
+static bool loop_writes(const Loop *l) { return !isnan(l->mv[0]); }
 
 static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
   *l = (Loop){.c = c, .mode = mode, .recover_after = recover_after, .max_gap = 3};
@@ -513,7 +516,7 @@ static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
   l->applied = calloc(c->n_in[MV] + 1, sizeof *l->applied);
   l->before = calloc(c->n_in[MV] + 1, sizeof *l->before);
   for (size_t i = 0; l->sp && i < c->n_in[SP]; i++) l->sp[i] = middle(&c->signals[SP].at[i]);
-  for (size_t i = 0; l->mv && i < c->n_in[MV]; i++) l->mv[i] = middle(&c->signals[MV].at[i]);
+  for (size_t i = 0; l->mv && i < c->n_in[MV]; i++) l->mv[i] = NAN;
   return l->sp && l->mv && l->applied && l->before;
 }
 
@@ -524,7 +527,8 @@ static void loop_close(Loop *l) {
   free(l->before);
 }
 
-/* Set points (SP) or, in MANUAL, the MV (MV) from an operator; false, and nothing changed, outside the ranges. */
+/* Set points (SP) or the MV (MV) from an operator, in MANUAL, or that the plant has, at the start. False, and nothing
+   changed, outside the ranges. */
 static bool loop_set(Loop *l, int which, const double *values) {
   const Signals *signals = &l->c->signals[which];
   for (size_t i = 0; i < signals->n; i++) {
@@ -586,7 +590,8 @@ static bool trusted(Controller *c, const Sample *sample) {
   return true;
 }
 
-/* One period: l->mv is what to write, l->mode and l->reason say why. sample NULL: the plant cannot be read. */
+/* One period: l->mv is what to write if loop_writes, l->mode and l->reason say why. sample NULL: the plant cannot be
+   read. */
 static void loop_scan(Loop *l, const Sample *sample) {
   Controller *c = l->c;
   size_t n = c->n_in[MV];
@@ -595,8 +600,13 @@ static void loop_scan(Loop *l, const Sample *sample) {
     loop_fault(l, sample ? c->words : "the plant cannot be read");
     return;
   }
+  if (!sample->mv_applied && !loop_writes(l)) {
+    loop_fault(l, "there is no read-back, so where the MV stands is not known and nothing is written");
+    return;
+  }
   memcpy(l->applied, sample->mv_applied ? sample->mv_applied : l->mv, n * sizeof *l->mv);
   for (size_t k = 0; k < n; k++) l->applied[k] = fmin(fmax(l->applied[k], c->signals[MV].at[k].low), c->signals[MV].at[k].high);
+  if (!loop_writes(l)) memcpy(l->mv, l->applied, n * sizeof *l->mv);
   const double *const given[STATE] = {[SP] = l->sp, [PV] = sample->pv, [DV] = sample->dv, [MV] = l->applied};
   if (controller_step(c, given) != STEPPED) {
     if (l->mode == AUTO) memcpy(l->mv, l->applied, n * sizeof *l->mv);
@@ -657,7 +667,7 @@ static int control(const char *path, long scans, double period) {
   } else {
     Plant plant = {&c, calloc(c.n_in[PV] + 1, sizeof(double)), calloc(c.n_in[DV] + 1, sizeof(double)),
                    calloc(c.n_in[MV] + 1, sizeof(double)), 0};
-    plant_write(&plant, loop.mv);
+    for (size_t i = 0; i < c.n_in[MV]; i++) plant.mv[i] = middle(&c.signals[MV].at[i]); /* where its actuators stand */
     if (period <= 0) period = c.period_s;
     double start = seconds();
     for (long k = 0; k < scans; k++) {
@@ -670,10 +680,10 @@ static int control(const char *path, long scans, double period) {
       }
       Sample sample;
       loop_scan(&loop, plant_read(&plant, &sample) ? &sample : NULL);
-      if (!plant_write(&plant, loop.mv)) loop_unwritten(&loop, "the plant cannot be written");
+      if (loop_writes(&loop) && !plant_write(&plant, loop.mv)) loop_unwritten(&loop, "the plant cannot be written");
       printf("%ld %.2f ms late %s", k, 1e3 * late, MODE[loop.mode]);
-      for (size_t i = 0; i < c.n_in[MV]; i++) printf(" %.17g", loop.mv[i]);
-      printf(" %s\n", loop.reason);
+      for (size_t i = 0; loop_writes(&loop) && i < c.n_in[MV]; i++) printf(" %.17g", loop.mv[i]);
+      printf("%s %s\n", loop_writes(&loop) ? "" : " -", loop.reason);
     }
     free(plant.pv);
     free(plant.dv);
@@ -751,12 +761,14 @@ static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[S
   bool read = given && given->kind == J_OBJECT;
   if (read && (!sample.pv || !sample.dv)) return failed(c, "a scan of the kit lacks pv or dv");
   loop_scan(l, read ? &sample : NULL);
-  const Json *fault = json_get(row, "fault");
-  bool faulty = l->reason[0] != 0;
-  t->wrong += strcmp(MODE[l->mode], json_word(row, "mode")) != 0 || !fault || faulty != (fault->kind == J_TRUE);
-  compare(t, scale, row, "mv", l->mv, c->n_in[MV]);
+  const Json *fault = json_get(row, "fault"), *mv = json_get(row, "mv");
+  bool faulty = l->reason[0] != 0, silent = mv && mv->kind == J_NULL; /* nothing may be written */
+  t->wrong += strcmp(MODE[l->mode], json_word(row, "mode")) != 0 || !fault || faulty != (fault->kind == J_TRUE) ||
+              silent == loop_writes(l);
+  if (loop_writes(l)) compare(t, scale, row, "mv", l->mv, c->n_in[MV]);
   if (out) fprintf(out, "{\"mode\": \"%s\", \"fault\": %s, ", MODE[l->mode], faulty ? "true" : "false");
-  put(out, "mv", l->mv, c->n_in[MV], "}");
+  if (loop_writes(l)) put(out, "mv", l->mv, c->n_in[MV], "}");
+  else if (out) fprintf(out, "\"mv\": null}");
   return true;
 }
 
@@ -787,8 +799,10 @@ static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t
     l->recover_after = (int)json_number(json_get(begin, "recover_after"));
     l->max_gap = json_number(json_get(begin, "max_gap"));
     const double *sp = numbers(json_get(begin, "sp"), c->n_in[SP], room[SP]);
-    const double *mv = numbers(json_get(begin, "mv"), c->n_in[MV], room[MV]);
-    done = sp && mv ? loop_set(l, SP, sp) && loop_set(l, MV, mv) : failed(c, "the kit has no start of its loop");
+    const Json *told = json_get(begin, "mv"); /* null: nobody tells where the MV stands */
+    bool untold = told && told->kind == J_NULL;
+    const double *mv = untold ? l->mv : numbers(told, c->n_in[MV], room[MV]);
+    done = sp && mv ? loop_set(l, SP, sp) && (untold || loop_set(l, MV, mv)) : failed(c, "the kit has no start of its loop");
   }
   if (out && done) fprintf(out, "],\n\"scans\": [");
   for (size_t k = 0; done && k < scans->n; k++) {

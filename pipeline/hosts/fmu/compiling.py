@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -17,9 +18,11 @@ from pipeline.plants.fmu.description import fmpy
 HOSTS = Path(__file__).parents[1]
 SOURCES = Path(__file__).parent / "sources"
 HEADER = "onnxruntime_c_api.h"
+# onnxruntime's own, of release 1.21.0 as in Debian 13; MIT, its licence lies beside it. The Python package has none.
+# Any library that is no older serves it, and the host in C uses nothing newer, so it need not follow each release.
+SHIPPED = HOSTS / "c" / "onnxruntime"
+SHIPPED_SHA256 = "7783e9664bdb0b1b36145b5c8587dd1bc9a399aa000edf2e3dd03003cafc6882"
 COMPILERS = ("cc", "gcc", "clang")
-# Also where tools/onnxruntime_c.sh puts the header when it is run in the repository, and where a Debian package does.
-PLACES = (HOSTS.parents[1] / "build" / "onnxruntime", Path("/usr/include/onnxruntime"), Path("/usr/local"))
 FLAGS = ("-std=c11", "-O2", "-fPIC", "-ffp-contract=off", "-fvisibility=hidden")
 LINKED = ("-shared", "-s", "-Wl,-z,defs", "-Wl,-rpath,$ORIGIN", "-lm")
 
@@ -49,7 +52,7 @@ class Toolchain:
 
 
 def toolchain(onnxruntime: Path | None = None) -> Toolchain:
-    """What this machine has; ``onnxruntime``: a folder with include/onnxruntime_c_api.h.
+    """What this machine has; ``onnxruntime``: a folder with a header of its own in place of the one that is shipped.
 
     Raises HostError, or PlantError for fmpy, naming what is missing.
     """
@@ -57,7 +60,9 @@ def toolchain(onnxruntime: Path | None = None) -> Toolchain:
     if sys.platform != "linux":
         raise HostError(f"an FMU is built on Linux, because the host in C is made for it; this is {sys.platform}")
     headers = Path(str(package.__file__)).parent / "c-code"
-    return Toolchain(_compiler(), (_header(onnxruntime), headers), _library())
+    compiler, header, library = _compiler(), _header(onnxruntime), _library()
+    _require_no_older(library, header / HEADER)
+    return Toolchain(compiler, (header, headers), library)
 
 
 def _compiler() -> tuple[str, ...]:
@@ -71,14 +76,14 @@ def _compiler() -> tuple[str, ...]:
 
 
 def _header(onnxruntime: Path | None) -> Path:
-    for place in PLACES if onnxruntime is None else (onnxruntime,):
-        for folder in (place / "include", place / "include" / "onnxruntime", place):
-            if (folder / HEADER).is_file():
-                return folder
-    where = "on this machine" if onnxruntime is None else f"in {onnxruntime} or its include/"
+    if onnxruntime is None:
+        return SHIPPED
+    for folder in (onnxruntime / "include", onnxruntime / "include" / "onnxruntime", onnxruntime):
+        if (folder / HEADER).is_file():
+            return folder
     raise HostError(
-        f"an FMU is compiled with {HEADER}, which is not found {where}; unpack a release archive of onnxruntime, or "
-        "run tools/onnxruntime_c.sh FOLDER, and name that folder with --onnxruntime FOLDER"
+        f"{HEADER} is not found in {onnxruntime} or its include/; name an unpacked release archive of onnxruntime with "
+        "--onnxruntime FOLDER, or leave it away: a header is shipped"
     )
 
 
@@ -93,3 +98,14 @@ def _library() -> Path:
             "pip install --force-reinstall onnxruntime brings it"
         )
     return found[0]
+
+
+def _require_no_older(library: Path, header: Path) -> None:
+    """A library serves the headers of its own release and of those before it."""
+    release = re.search(r"\.so\.(\d+)\.(\d+)", library.name)
+    wanted = re.search(r"#define ORT_API_VERSION (\d+)", header.read_text(encoding="utf-8", errors="replace"))
+    if release and wanted and (int(release[1]), int(release[2])) < (1, int(wanted[1])):
+        raise HostError(
+            f"onnxruntime here is {release[1]}.{release[2]}, older than its header of 1.{wanted[1]}; "
+            f"pip install 'onnxruntime>=1.{wanted[1]}' brings one that an FMU can hold"
+        )

@@ -1,10 +1,11 @@
 // Two controllers on one plant, sample by sample: read, scan, write, and one period of the plant.
-import { Loop } from "loopwright/loop";
+import { Loop } from "loopwright/controller";
 import { Noise } from "loopwright/noise";
 
 export const LANES = ["A", "B"];
 const MOST_ROWS = 20000;
 const GONE = 2000; // rows that go at a time
+const RECOVER_AFTER = 5; // good samples that end HOLD
 
 export class Simulation {
   constructor(about, plant, controllers) {
@@ -42,7 +43,7 @@ export class Simulation {
         name,
         x: [...test.x0],
         mv: [...test.mv0],
-        loop: new Loop(this.controllers[this.chosen[i]], { sp: this.sp, mv: test.mv0 }),
+        loop: new Loop(this.controllers[this.chosen[i]], { sp: this.sp, mv: test.mv0, mode: "AUTO", recoverAfter: RECOVER_AFTER }),
         error: 0,
       }));
       await this.#measure();
@@ -71,7 +72,7 @@ export class Simulation {
       for (const lane of this.lanes) {
         lane.measured = lane.pv.map((v, i) => (this.broken[i] ? NaN : v + noise[i]));
         const before = lane.loop.mode;
-        lane.scan = await lane.loop.scan({ pv: lane.measured, dv: this.dv, mv_applied: lane.mv });
+        lane.scan = await lane.loop.scan({ pv: lane.measured, dv: this.dv, mv_applied: lane.mv, age_s: 0 });
         lane.mv = lane.scan.mv.map((v, i) => (this.stuck[i] ? lane.mv[i] : v));
         this.asked ||= this.stuck.some(Boolean);
         lane.error += this.sp.reduce((sum, sp, i) => sum + Math.abs(sp - lane.pv[i]), 0) / this.sp.length;

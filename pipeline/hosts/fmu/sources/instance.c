@@ -241,9 +241,44 @@ static bool is_ours(Instance *i, const void *bytes, size_t size) {
   return REFUSE(i, "the saved state is of another controller file");
 }
 
+static bool finite_all(const double *values, size_t n) {
+  for (size_t k = 0; k < n; k++)
+    if (!isfinite(values[k])) return false;
+  return true;
+}
+
+static bool allowed_mv(const Instance *i, const double *values) {
+  for (size_t k = 0; k < i->n[G_MV]; k++) {
+    const Signal *s = &i->c.signals[MV].at[k];
+    if (!may_be(s, values[k], 0) || (s->values && !among(s, values[k]))) return false;
+  }
+  return true;
+}
+
+/* Whether an instance can have remembered these numbers. Inputs may be anything: a sample refuses them by itself. */
+static bool plausible(Instance *i, const double *m) {
+  double phase = m[PHASE], samples = m[SAMPLES];
+  const double *start = m + i->at[G_START], *mv = m + i->at[G_MV];
+  bool begun = phase == STEPPING || phase == TERMINATED;
+  bool untouched = !memcmp(start, mv, i->n[G_MV] * sizeof *mv); /* no sample yet: set_real keeps both the same */
+  if (!begun && phase != INSTANTIATED && phase != INITIALIZING) return REFUSE(i, "the saved state has no phase");
+  for (int k = FAULT; k < OWN; k++)
+    if (m[k] != 0 && m[k] != 1) return REFUSE(i, "the saved state has a flag of %g", m[k]);
+  /* A wrong count of samples would never end. */
+  if (!isfinite(m[BEGINS]) || !isfinite(m[NOW]) || !(begun ? samples >= 0 && samples == floor(samples) : samples == 0) ||
+      (phase == STEPPING && !(fabs((m[NOW] - m[BEGINS]) / i->c.period_s - samples) <= 2)))
+    return REFUSE(i, "the times of the saved state do not agree");
+  /* Before the end of the initialization mv_start is as the tool set it, and checked then. */
+  if (phase == STEPPING ? !allowed_mv(i, start) || !allowed_mv(i, mv) : !untouched && !(begun && allowed_mv(i, mv)))
+    return REFUSE(i, "the saved state has an MV that is not allowed");
+  if (!finite_all(m + i->at[G_INFO], i->n_memory - i->at[G_INFO])) /* info, and the law's state behind it */
+    return REFUSE(i, "the saved state has info or a state of the law that is not finite");
+  return true;
+}
+
 static bool instance_restore(Instance *i, const Saved *from) {
   if (!from) return REFUSE(i, "no state is given");
-  if (!is_ours(i, from, saved_size(i))) return false;
+  if (!is_ours(i, from, saved_size(i)) || !plausible(i, from->numbers)) return false;
   size_t n_state = i->c.n_in[STATE];
   memcpy(i->memory, from->numbers, i->n_memory * sizeof *i->memory);
   memcpy(i->c.state, i->memory + i->n_memory - n_state, n_state * sizeof *i->memory);
@@ -256,16 +291,15 @@ static bool instance_write(Instance *i, const Saved *from, void *bytes, size_t s
   return true;
 }
 
-/* A state's bytes may come from a file, so its numbers are not believed: a wrong count of samples would never end. */
+/* A state's bytes may come from a file, so its numbers are not believed. They may also lie at any address. */
 static bool instance_read(Instance *i, const void *bytes, size_t size, Saved **to) {
   if (!is_ours(i, bytes, size)) return false;
-  double own[OWN];
-  memcpy(own, (const char *)bytes + sizeof(Saved), sizeof own);
-  if (!(own[PHASE] == INSTANTIATED || own[PHASE] == INITIALIZING || own[PHASE] == STEPPING || own[PHASE] == TERMINATED) ||
-      !isfinite(own[BEGINS]) || !isfinite(own[NOW]) ||
-      !(fabs((own[NOW] - own[BEGINS]) / i->c.period_s - own[SAMPLES]) <= 2))
-    return REFUSE(i, "the saved state is damaged");
-  if (!*to && !(*to = malloc(size))) return REFUSE(i, "no memory");
-  memcpy(*to, bytes, size);
-  return true;
+  Saved *copy = malloc(size);
+  if (!copy) return REFUSE(i, "no memory");
+  memcpy(copy, bytes, size);
+  bool good_one = plausible(i, copy->numbers);
+  if (good_one && *to) memcpy(*to, copy, size);
+  if (good_one && !*to) *to = copy;
+  else free(copy);
+  return good_one;
 }

@@ -1,0 +1,205 @@
+// A controller file in JavaScript: the step, and the loop around it, with the limits and refusals of Loopwright's runtime
+// (serving/controller.py, loop.py, guard.py). Node, the browser and the playground share this file; it imports nothing,
+// and each brings its own onnxruntime as `ort`.
+
+// because: "input" or "output" of a step, else empty.
+export class Refused extends Error {
+  constructor(words, because = "") {
+    super(words);
+    this.because = because;
+  }
+}
+
+const INPUTS = ["sp", "pv", "dv", "mv_applied", "state"];
+const OUTPUTS = ["mv", "state_next", "info"];
+const hex = (bytes) => [...new Uint8Array(bytes)].map((b) => b.toString(16).padStart(2, "0")).join("");
+const same = (a, b) => [...a].sort().join() === [...b].sort().join();
+
+export class Controller {
+  // `bytes` is the .onnx file, `manifest` the parsed .json beside it; the digest ties one to the other.
+  // `provider` is "cpu" in Node and "wasm" in a browser.
+  static async load(ort, bytes, manifest, provider) {
+    if (manifest.schema !== 1) throw new Refused(`the manifest has schema ${manifest.schema}; this host reads 1`);
+    const digest = hex(await crypto.subtle.digest("SHA-256", bytes));
+    if (digest !== manifest.sha256) throw new Refused(`the file's SHA-256 is ${digest}, its manifest's ${manifest.sha256}`);
+    return Controller.undigested(ort, bytes, manifest, provider);
+  }
+
+  // The same without the digest, for a page whose browser computes none: over plain HTTP from another machine.
+  static async undigested(ort, bytes, manifest, provider) {
+    const session = await ort.InferenceSession.create(bytes, {
+      executionProviders: [provider],
+      graphOptimizationLevel: "all",
+      executionMode: "sequential",
+      intraOpNumThreads: 1,
+      interOpNumThreads: 1,
+      logSeverityLevel: 4,
+    });
+    return new Controller(ort, session, manifest);
+  }
+
+  constructor(ort, session, manifest) {
+    Object.assign(this, { session, manifest, buffers: {}, feeds: {} });
+    this.signals = { sp: manifest.sp, pv: manifest.pv, dv: manifest.dv, mv_applied: manifest.mv };
+    const sizes = { mv: manifest.mv.length, state_next: manifest.n_state, info: manifest.info.length };
+    if (!same(session.inputNames, manifest.inputs) || !same(session.outputNames, OUTPUTS.filter((name) => sizes[name])))
+      throw new Refused("the graph has other inputs or outputs than the manifest says");
+    for (const name of INPUTS.filter((n) => manifest.inputs.includes(n))) {
+      const n = name === "state" ? manifest.n_state : this.signals[name].length;
+      this.buffers[name] = new Float64Array(n);
+      this.feeds[name] = new ort.Tensor("float64", this.buffers[name], [n]);
+    }
+  }
+
+  // State zero means: no past. Also right after any gap.
+  cold() {
+    return new Float64Array(this.manifest.n_state);
+  }
+
+  // One step: {sp, pv, dv, mv_applied, state} -> {mv, state_next, info}; Refused where no MV may be computed or used.
+  // Keep state_next for the next step, and the old state after a refusal. One step at a time.
+  async step(given) {
+    for (const [name, buffer] of Object.entries(this.buffers)) {
+      const values = given[name];
+      if (values?.length !== buffer.length) throw new Error(`${name} has ${values?.length} values; it needs ${buffer.length}`);
+      const bad = values.findIndex((value) => !Number.isFinite(value));
+      if (bad >= 0) {
+        const s = this.signals[name]?.[bad];
+        const label = s ? `${s.name} [${s.unit}]` : `entry ${bad}`;
+        throw new Refused(`${name}: ${label} is ${word(values[bad])}; no MV is computed from a value that is not finite`, "input");
+      }
+      buffer.set(values);
+    }
+    const result = await this.session.run(this.feeds);
+    const [mv, state_next, info] = OUTPUTS.map((name) => Float64Array.from(result[name]?.data ?? []));
+    this.#refuse({ mv, state_next, info });
+    return { mv, state_next, info };
+  }
+
+  #refuse(outputs) {
+    for (const [name, values] of Object.entries(outputs)) {
+      const bad = values.findIndex((value) => !Number.isFinite(value));
+      if (bad >= 0) throw new Refused(`the law gave ${name}[${bad}] = ${word(values[bad])}, which is not finite`, "output");
+    }
+    for (const [i, s] of this.manifest.mv.entries()) {
+      const value = outputs.mv[i];
+      if (!(s.low <= value && value <= s.high)) throw new Refused(`the law gave ${s.name} = ${value} ${s.unit}, outside its range [${s.low}, ${s.high}] ${s.unit}`, "output");
+      if (s.values && !s.values.includes(value)) throw new Refused(`the law gave ${s.name} = ${value}; it may be one of ${s.values.join(", ")}`, "output");
+    }
+  }
+}
+
+const PV_MARGIN = 0.05; // share of a PV's range beyond which the sensor is broken
+const READ_BACK_MARGIN = 0.02; // share of an MV's range by which scaling may carry a sound read-back over its ends
+const DIGITS = 6;
+const UNKNOWN = "there is no read-back, so where the MV stands is not known and nothing is written";
+
+export class Loop {
+  // mode: MANUAL the operator's MV, AUTO the law's, HOLD the last one after a fault. `sp` and `mv` lie in their ranges.
+  // `mv` is what the plant has now; null: not known, so nothing is written until a good sample has a read-back.
+  // recoverAfter: good samples after which HOLD returns to AUTO; null: only the operator returns it.
+  constructor(controller, { sp, mv = null, mode = "MANUAL", recoverAfter = null, maxGap = 3 }) {
+    Object.assign(this, { controller, mode, recoverAfter, maxGap, fault: "", good: 0, state: controller.cold() });
+    this.sp = within(sp, controller.manifest.sp, "set point");
+    this.mv = mv && within(mv, controller.manifest.mv, "MV");
+  }
+
+  setMode(mode) {
+    Object.assign(this, { mode, fault: "", good: 0 });
+  }
+
+  setSp(sp) {
+    this.sp = within(sp, this.controller.manifest.sp, "set point");
+  }
+
+  setMv(mv) {
+    if (this.mode !== "MANUAL") throw new Refused(`the MV is set by hand in MANUAL only; the loop is in ${this.mode}`);
+    this.mv = within(mv, this.controller.manifest.mv, "MV");
+  }
+
+  // Another controller takes over; it has no past.
+  replace(controller) {
+    Object.assign(this, { controller, state: controller.cold() });
+  }
+
+  // So many periods passed without a scan: after more than maxGap the law starts cold.
+  gap(periods) {
+    if (periods > this.maxGap) this.state = this.controller.cold();
+  }
+
+  // One period. sample: {pv, dv, mv_applied or null, age_s}, or null where the plant could not be read.
+  // -> {mode, mv, law, info, reason}; mv is null while it is not known where the MV stands: then write nothing.
+  async scan(sample) {
+    const reason = sample === null ? "the plant cannot be read" : this.#refusal(sample);
+    if (reason) return this.#miss(reason);
+    const applied = sample.mv_applied === null ? this.mv : this.#clipped(sample.mv_applied);
+    this.mv ??= applied;
+    let step;
+    try {
+      step = await this.controller.step({ sp: this.sp, pv: sample.pv, dv: sample.dv, mv_applied: applied, state: this.state });
+    } catch (error) {
+      if (this.mode === "AUTO") this.mv = applied;
+      return this.#miss(error.message);
+    }
+    this.state = step.state_next;
+    if (this.fault && ++this.good === this.recoverAfter) this.setMode("AUTO");
+    if (this.mode === "AUTO") this.mv = Array.from(step.mv);
+    return { mode: this.mode, mv: [...this.mv], law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault };
+  }
+
+  // The command in place of the last one, which never reached the plant: the MV before it stays.
+  unwritten(before, reason) {
+    if (this.mode !== "MANUAL") this.mv = before;
+    return this.#miss(reason);
+  }
+
+  // No past any more. In AUTO a fault: the MV is held until recoverAfter good samples, or until the operator acts.
+  #miss(reason) {
+    Object.assign(this, { state: this.controller.cold(), good: 0 });
+    if (this.mode === "AUTO" || this.fault) Object.assign(this, { mode: "HOLD", fault: reason });
+    return { mode: this.mode, mv: this.mv && [...this.mv], law: null, info: null, reason };
+  }
+
+  #refusal({ pv, dv, mv_applied, age_s }) {
+    const m = this.controller.manifest;
+    const vectors = [["PV", m.pv, pv], ...(m.inputs.includes("dv") ? [["DV", m.dv, dv]] : []), ["applied MV", m.mv, mv_applied]];
+    for (const [label, signals, values] of vectors) {
+      if (values === null && signals === m.mv) continue;
+      if (values?.length !== signals.length) return `${label} has ${values?.length} values instead of ${signals.length}`;
+      const bad = signals.findIndex((_, i) => !Number.isFinite(values[i]));
+      if (bad >= 0) return `${label} ${signals[bad].name} is ${word(values[bad])}`;
+    }
+    for (const [i, s] of m.mv.entries()) {
+      if (mv_applied === null) continue;
+      if (s.values && !s.values.includes(mv_applied[i])) return `applied MV ${s.name} is ${short(mv_applied[i])}, none of ${s.values.join(", ")}`;
+      if (!s.values && beyond(s, mv_applied[i], READ_BACK_MARGIN)) return `applied MV ${outside(s, mv_applied[i])}`;
+    }
+    const out = m.pv.findIndex((s, i) => beyond(s, pv[i], PV_MARGIN));
+    if (out >= 0) return `PV ${outside(m.pv[out], pv[out])}`;
+    if (!(age_s >= 0 && age_s <= m.period_s)) return `the sample is ${age_s} s old; allowed are ${m.period_s} s`;
+    return mv_applied === null && !this.mv ? UNKNOWN : "";
+  }
+
+  #clipped(applied) {
+    return this.controller.manifest.mv.map((s, i) => Math.min(Math.max(applied[i], s.low), s.high));
+  }
+}
+
+// The values, where each lies in its signal's range; Refused says what is allowed.
+export function within(values, signals, what) {
+  if (values.length !== signals.length) throw new Refused(`the ${what} has ${values.length} values; it needs ${signals.length}`);
+  signals.forEach((s, i) => {
+    const value = values[i];
+    const unit = s.unit === "-" ? "" : ` ${s.unit}`;
+    if (!Number.isFinite(value)) throw new Refused(`the ${what} ${s.name} is no finite number; give one from ${short(s.low)} to ${short(s.high)}${unit}`);
+    if (s.values && !s.values.includes(value)) throw new Refused(`the ${what} ${s.name} = ${short(value)} is none of ${s.values.join(", ")}`);
+    if (!(s.low <= value && value <= s.high)) throw new Refused(`the ${what} ${s.name} = ${value}${unit} is outside [${short(s.low)}, ${short(s.high)}]${unit}`);
+  });
+  return [...values];
+}
+
+const beyond = (s, value, margin) => value < s.low - margin * (s.high - s.low) || value > s.high + margin * (s.high - s.low);
+const outside = (s, value) => `${s.name} is ${short(value)} ${s.unit}, outside its range [${short(s.low)}, ${short(s.high)}] ${s.unit}`;
+const short = (value) => String(+value.toPrecision(DIGITS));
+// A value that is not finite, as the runtime writes it.
+const word = (value) => (Number.isNaN(value) ? "nan" : value > 0 ? "inf" : "-inf");

@@ -1,0 +1,105 @@
+"""A loop that is not told where the MV stands: it writes nothing until the plant says so, and begins from there."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from serving import Controller, ControlLoop, EndpointError, Fallback, Mode, Sample, VirtualClock
+
+pytest_plugins = ["small_laws"]
+STANDS = 63.0
+
+
+def sample(level: float = 0.8, mv: float | None = STANDS) -> Sample:
+    read_back = None if mv is None else np.array([mv])
+    return Sample(pv=np.array([level, 300.0]), mv_applied=read_back, dv=np.zeros(1))
+
+
+def loop_on(pi_file: Path, endpoint: Any = None, **options: Any) -> ControlLoop:
+    """At rest on its set point, so that the law of AUTO leaves the MV where it is."""
+    wanted = {"sp": 0.8, "mode": Mode.AUTO, "recover_after": 2, "clock": VirtualClock(), "warm_lead_s": 0, **options}
+    return ControlLoop(Controller(pi_file), endpoint, **wanted)
+
+
+@pytest.mark.parametrize("mode", [Mode.AUTO, Mode.MANUAL, Mode.HOLD])
+def test_nothing_is_written_before_a_good_sample_with_a_read_back(mode: Mode, pi_file: Path) -> None:
+    loop = loop_on(pi_file, mode=mode)
+    for blind in (None, sample(math.nan), sample(mv=math.nan), sample(mv=200.0), sample(mv=None)):
+        command = loop.miss("no route") if blind is None else loop.scan(blind)
+        assert not command.writes
+        assert np.isnan(command.mv).all()
+        assert command.reason
+    command = loop.scan(sample())
+    assert command.writes
+    assert command.mv.tolist() == [STANDS]
+    after = loop.miss("no route")
+    assert after.writes
+    assert after.mv.tolist() == [STANDS]
+
+
+def test_a_good_first_sample_begins_at_once_from_the_read_back(pi_file: Path) -> None:
+    command = loop_on(pi_file).scan(sample())
+    assert (command.mode, command.writes, command.mv.tolist()) == (Mode.AUTO, True, [STANDS])
+    moved = loop_on(pi_file, sp=0.9).scan(sample())
+    told = loop_on(pi_file, sp=0.9, mv=[STANDS]).scan(sample())
+    assert moved.mv.tolist() == told.mv.tolist() != [STANDS]
+
+
+def test_a_missing_read_back_is_named_until_there_is_one(pi_file: Path) -> None:
+    loop = loop_on(pi_file)
+    assert "there is no read-back" in loop.scan(sample(mv=None)).reason
+    assert loop.scan(sample()).mv.tolist() == [STANDS]
+    assert loop.scan(sample(mv=None)).writes  # from now on the last command counts as applied
+
+
+def test_what_the_operator_sets_by_hand_is_written(pi_file: Path) -> None:
+    loop = loop_on(pi_file, mode=Mode.MANUAL)
+    loop.set_mv([20.0])
+    command = loop.miss("no route")
+    assert (command.writes, command.mv.tolist()) == (True, [20.0])
+
+
+def test_a_lasting_fault_moves_no_mv_that_is_not_known(pi_file: Path) -> None:
+    loop = loop_on(pi_file, fallback=Fallback(after_s=0.0, mv=(10.0,), rate=(1.0,)))
+    assert not any(loop.miss("no route").writes for _ in range(5))
+    assert loop.scan(sample()).mv[0] < STANDS  # known now, the fault still there: towards the safe MV
+
+
+class Plant:
+    """Cannot be read at some scans, and written at others; ``written`` is what reaches it."""
+
+    def __init__(self, unread: set[int], unwritten: set[int]) -> None:
+        self.unread, self.unwritten, self.reads, self.tried = unread, unwritten, 0, 0
+        self.written: list[float] = []
+
+    def read(self) -> Sample:
+        self.reads += 1
+        if self.reads - 1 in self.unread:
+            raise EndpointError("no route")
+        return sample()
+
+    def write(self, mv: np.ndarray) -> None:
+        self.tried += 1
+        if self.tried - 1 in self.unwritten:
+            raise EndpointError("no way")
+        self.written.append(float(mv[0]))
+
+
+def test_a_run_writes_from_the_first_good_sample_on(pi_file: Path) -> None:
+    plant = Plant({0, 1}, set())
+    report = loop_on(pi_file, plant).run(6)
+    assert (report.scans, report.faults) == (6, 3)
+    assert plant.written == [STANDS] * 4
+
+
+def test_after_a_first_command_that_did_not_arrive_nothing_is_known(pi_file: Path) -> None:
+    plant = Plant({1}, {0})
+    seen: list[bool] = []
+    loop_on(pi_file, plant).run(4, observe=lambda _, command: seen.append(command.writes))
+    assert seen == [False, False, True, True]
+    assert plant.written == [STANDS] * 2
