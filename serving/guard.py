@@ -23,7 +23,7 @@ class Sample:
     """Values of the plant's side at one scan, in engineering units.
 
     ``mv_applied`` is the MV that the plant really received over the last period, read back; None
-    where it cannot be read. ``age_s`` is the time since the PVs were measured. ``fault`` says why
+    where it cannot be read now: a loop that lost its plant goes on from the next one. ``age_s`` is the time since the PVs were measured. ``fault`` says why
     the endpoint does not trust its own sample; empty: it does.
     """
 

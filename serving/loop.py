@@ -20,6 +20,7 @@ from serving.fallback import Fallback
 from serving.grid import RunReport, run_on_grid
 from serving.guard import Guard, Sample, default_guards, implausible
 from serving.manifest import Signal
+from serving.standing import Standing
 from serving.successor import Successor, require_same_signals
 from serving.transfer import Transfer
 from serving.words import first_line
@@ -73,6 +74,10 @@ class ControlLoop:
     nothing: the law is stepped on what others do with the plant. A fault in AUTO changes the mode to
     HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
     lasts is for ``fallback``. After a gap the law starts cold (state = 0).
+
+    A command that did not reach the plant (``unwritten``) leaves it unknown where the MV stands: others may move it
+    meanwhile. The next read-back tells, also that of a sample which is refused for another reason. HOLD, MANUAL and
+    the fallback go on from there, and nothing writes an old MV over it.
 
     Every commanded MV lies in its range, in every mode and with any guards; a discrete MV has one
     of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
@@ -157,6 +162,8 @@ class ControlLoop:
         self._held = 0  # scans since that fault began
         self._scan = 0
         self._state = controller.cold_state()
+        self._standing, self._given = Standing(manifest.mv, self._mv), self._mv
+        self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
         self.successor: Successor | None = None  # tried beside the controller, see ``swap``
@@ -200,9 +207,14 @@ class ControlLoop:
         self._sp = within(sp, self.controller.manifest.sp, "set point")
 
     def set_mv(self, mv: ArrayLike) -> None:
-        """Set the MV (n_mv,) in MANUAL; LoopError outside its range or in another mode."""
+        """Set the MV (n_mv,) in MANUAL; LoopError outside its range or in another mode.
+
+        LoopError too after a command that did not reach the plant, until it is known where the MV stands.
+        """
         if self._mode is not Mode.MANUAL:
             raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self._mode}")
+        if self._standing.lost:
+            raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
         self._mv = within(mv, self.controller.manifest.mv, "MV")
 
     def hand_back(self) -> None:
@@ -228,8 +240,9 @@ class ControlLoop:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         reason = self._refusal(sample)
         self._blind = ""
+        self._stands(sample, refused=bool(reason))
         if reason:
-            return self.miss(reason)
+            return self._missed(reason)
         applied = self._mv
         try:
             applied = self._read_back(sample)
@@ -239,7 +252,7 @@ class ControlLoop:
         except Exception as error:  # the plant needs an MV after any error
             if self._mode in {Mode.AUTO, Mode.SHADOW}:
                 self._mv = applied
-            return self.miss(first_line(error))
+            return self._missed(first_line(error))
         self._state = step.state
         if self._fault:
             self._good += 1
@@ -255,15 +268,24 @@ class ControlLoop:
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
+        self._standing.commanded(self._given)
+        self.found = None
+        return self._missed(reason)
+
+    def _missed(self, reason: str) -> Command:
         self._blind = reason = reason or "a fault without a reason"
         self._lose(reason)
         self._lasting()
         return self._command(None, None, reason)
 
     def unwritten(self, before: Array, reason: str) -> Command:
-        """The command in place of the last one, which never reached the plant: the MV ``before`` it (n_mv,) stays."""
+        """The command in place of the last one, which never reached the plant: the MV ``before`` it (n_mv,) stays.
+
+        Where the scan has found that the MV stands elsewhere, it stays there.
+        """
         if self._mode is not Mode.MANUAL:
-            self._mv = before
+            self._mv = np.array(before if self.found is None else self.found, dtype=np.float64)
+        self._standing.lost = True
         self._lose(reason)
         self._scan -= 1
         return self._command(None, None, reason)
@@ -344,8 +366,30 @@ class ControlLoop:
                 return np.clip(applied, lows, highs)
         return applied
 
+    def _stands(self, sample: Sample, *, refused: bool) -> None:
+        """Where the MV stands, as far as the sample tells: ``found`` where that was not known.
+
+        A refused sample without a read-back tells nothing; a good one says that nothing is read back at all.
+        """
+        self._standing.commanded(self._given)
+        self.found = None
+        try:
+            given = sample.mv_applied
+            if given is not None and np.asarray(given).dtype.kind not in "fiu":
+                return
+            applied = None if given is None else self._read_back(sample)
+        except Exception:  # no sample, or no MV that any actuator can have
+            return
+        if applied is not None:
+            self.found = self._standing.seen(applied)
+        elif not refused:
+            self._standing.lost = False
+        if self.found is not None:
+            self._mv = self.found.copy()
+
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
+        self._given = self._mv.copy()
         hand_back = self._overdue() and self.fallback is not None and self.fallback.hand_back
         return Command(
             self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, hand_back

@@ -206,12 +206,20 @@ class Station:
         """Write the scan down, and show it."""
         assert self.loop is not None
         values = self.endpoint.values
+        self._moved(self.loop)
         self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
         self.last = sample, command, time.time()
         self.watching.seen(self.recorder.controller, self.last)
         self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
         for seen in self._watchers:
             seen(sample, command)
+
+    def _moved(self, loop: ControlLoop) -> None:
+        """Say where an MV stands that somebody else moved while the loop could not write."""
+        if loop.found is None or self.last is None or np.array_equal(loop.found, self.last[1].mv):
+            return
+        found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self.last[1].mv))
+        self.recorder.note("change", "plant", f"the MV stands at {found}, not at {left}: the loop goes on from there")
 
     # ------------------------------------------------------------------ requests
     def _public_keys(self) -> list[PublicKey] | None:
