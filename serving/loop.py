@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf
@@ -17,11 +17,12 @@ from serving.controller import Controller
 from serving.endpoint import Endpoint, HandsBack
 from serving.errors import ContractError, LoopError, SampleError
 from serving.fallback import Fallback
+from serving.fitted import fitted
 from serving.grid import RunReport, run_on_grid
-from serving.guard import Guard, Sample, default_guards, implausible
-from serving.manifest import Signal
+from serving.guard import Guard, Sample, default_guards, implausible, refused
+from serving.manifest import Manifest, Signal
 from serving.standing import Standing
-from serving.successor import Successor, require_same_signals
+from serving.successor import Successor
 from serving.transfer import Transfer
 from serving.words import first_line
 
@@ -96,7 +97,8 @@ class ControlLoop:
     mode
         Mode at the start.
     guards
-        Checks that can refuse a sample; ``default_guards`` unless given.
+        Checks that can refuse a sample, or what makes them for a controller's manifest: they are then made anew for
+        each controller that takes over. ``default_guards`` unless given.
     recover_after
         Good samples after which HOLD returns to AUTO after a fault; None: only the operator returns it.
     clock
@@ -125,7 +127,7 @@ class ControlLoop:
         sp: ArrayLike,
         mv: ArrayLike,
         mode: Mode = Mode.MANUAL,
-        guards: Sequence[Guard] | None = None,
+        guards: Sequence[Guard] | Callable[[Manifest], Sequence[Guard]] | None = None,
         recover_after: int | None = None,
         clock: Clock | None = None,
         warm_lead_s: float = WARM_LEAD_S,
@@ -139,8 +141,11 @@ class ControlLoop:
             raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
         self.controller = controller
+        self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
-        self.guards = tuple(default_guards(manifest) if guards is None else guards)
+        made = default_guards if guards is None else guards
+        self._made = made if callable(made) else None  # what makes the guards; None: they are the host's own
+        self.guards: tuple[Guard, ...] = tuple(made(manifest) if callable(made) else made)
         self.recover_after = recover_after
         self.clock: Clock = clock or MonotonicClock()
         self.warm_lead_s = min(warm_lead_s, manifest.period_s / 4)
@@ -168,7 +173,7 @@ class ControlLoop:
         self._transfer.begin()
         self.successor: Successor | None = None  # tried beside the controller, see ``swap``
         self.replaced: Controller | None = None  # the one that was in charge before the present one
-        self._past: deque[Sample] = deque(maxlen=max((g.memory for g in self.guards), default=0))
+        self._past: deque[Sample] = deque(maxlen=_memory(self.guards))
 
     # ------------------------------------------------------------------ operator
     @property
@@ -224,12 +229,13 @@ class ControlLoop:
     def swap(self, controller: Controller, trial: int) -> None:
         """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.
 
-        Until then its MV stands in ``Command.successor_mv``. LoopError where its period or signals are others.
+        Until then its MV stands in ``Command.successor_mv``. It may read fewer PVs and measured disturbances than the
+        loop does. LoopError where its period, set points or MVs are others, or it has a signal that the loop has not.
         """
         if trial < 1:
             raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
-        require_same_signals(self.controller.manifest, controller.manifest)
-        self.successor = Successor(controller, trial)
+        new = fitted(controller, self.manifest)
+        self.successor = Successor(new, trial, () if self._made is None else tuple(self._made(new.manifest)))
 
     def keep(self) -> None:
         """End the trial of a successor; the controller in charge stays."""
@@ -244,6 +250,7 @@ class ControlLoop:
         if reason:
             return self._missed(reason)
         applied = self._mv
+        past = tuple(self._past) if self.successor is not None else ()
         try:
             applied = self._read_back(sample)
             step = self.controller.step(sp=self._sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
@@ -262,7 +269,7 @@ class ControlLoop:
             self._mv = np.array(self._transfer.limited(step.mv, applied))  # the host gets step.mv, may write into it
         elif self._mode is Mode.SHADOW:
             self._mv = applied.copy()
-        beside = self._beside(sample, applied)
+        beside = self._beside(sample, applied, past)
         self._lasting()
         return self._command(step.mv, step.info, self._fault, beside)
 
@@ -319,15 +326,18 @@ class ControlLoop:
         since = (self._held - 1) * self.controller.manifest.period_s
         return bool(self._fault) and self.fallback is not None and since >= self.fallback.after_s
 
-    def _beside(self, sample: Sample, applied: Array) -> Array | None:
+    def _beside(self, sample: Sample, applied: Array, past: Collection[Sample]) -> Array | None:
         """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
         if self.successor is None:
             return None
         new = self.successor
-        new.step(sample, self._sp, applied)
+        new.step(sample, self._sp, applied, past)
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state = new.controller, new.state
+            if self._made is not None:
+                self.guards = tuple(new.guards)
+                self._past = deque(self._past, maxlen=_memory(self.guards))
             self._transfer.begin()
         return new.mv
 
@@ -336,14 +346,7 @@ class ControlLoop:
             return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
         if sample.fault:
             return str(sample.fault)
-        for guard in self.guards:
-            try:
-                reason = guard.check(sample, self._past)
-                if reason:
-                    return str(reason)
-            except Exception as error:  # a guard that fails refuses the sample
-                return f"{type(guard).__name__} failed: {first_line(error)}"
-        return None
+        return refused(self.guards, sample, self._past)
 
     def _read_back(self, sample: Sample) -> Array:
         """The applied MV (n_mv,) within its range; the last command if there is no read-back.
@@ -431,6 +434,10 @@ class ControlLoop:
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")
         return run_on_grid(self, self.endpoint, n, until=until, before=before, observe=observe)
+
+
+def _memory(guards: Sequence[Guard]) -> int:
+    return max((g.memory for g in guards), default=0)
 
 
 def within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:

@@ -49,6 +49,7 @@ class Values:
     quality: tuple[int, ...]
     asked_sp: Mapping[str, float] = field(default_factory=dict)
     asked_mode: str = ""
+    starts: int = 0  # how often the server has started anew since the endpoint did
 
 
 _HAND_BACK = "hand back"
@@ -103,7 +104,8 @@ class OpcUaEndpoint:
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
         self.unwritten = ""  # why the last MV did not reach the plant
-        self.connections = 0
+        self.connections = self.starts = 0
+        self._started_s: float | None = None  # when the server started, by its own clock
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
         self._beats, self._scans, self._next_s, self._wrote = 0, 0, 0.0, 0
         self._written: tuple[Array, float] | None = None  # the last MV that was passed on, and when
@@ -228,13 +230,14 @@ class OpcUaEndpoint:
             try:
                 plan = await Plan.made(link, self.manifest, self.nodes, max(self.answer_s, self.server.connect_s))
                 self.connections += 1
+                anew = await self._anew(link)
                 if self._outbox:
                     self._outbox.clear()  # what was to be written then is too old now
                     self.unwritten = self.unwritten or "the connection was lost before the MV was sent"
                 self._written, self._shown = None, 0
                 self._link = link
                 pause = FIRST_RETRY_S
-                self.tell(f"connected to {self.server.endpoint}")
+                self.tell(f"connected to {self.server.endpoint}{anew}")
                 await self._exchange(link, plan)
             except Exception as error:
                 self._lost(first_line(error) if isinstance(error, LoopError) else named(error))
@@ -249,6 +252,16 @@ class OpcUaEndpoint:
                     link.abort()
             await self._rest(pause)
             pause = min(pause * GROWTH, LAST_RETRY_S)
+
+    async def _anew(self, link: Link) -> str:
+        """Whether the server has started anew, or may have, since it was last spoken to: counted, and in words."""
+        before, self._started_s = self._started_s, await link.started_s(self.server.connect_s)
+        if self.connections == 1 or (before is not None and before == self._started_s):
+            return ""
+        self.starts += 1
+        if before is None or self._started_s is None:
+            return ": it does not say whether it has started anew since"
+        return ": it has started anew"
 
     def _lost(self, why: str) -> None:
         if why != self.trouble:
@@ -379,6 +392,7 @@ class OpcUaEndpoint:
             tuple(a.status for a in answers[:n]),
             asked_sp,
             mode,
+            self.starts,
         )
 
     def _dead(self, watchdog: float) -> str:

@@ -246,6 +246,82 @@ def test_the_plants_own_operator_sets_mode_and_set_point(plant: Plant, wire: Wir
     running.end()
 
 
+def told(running: Running, words: str) -> list[str]:
+    return [line for line in running.told if words in line]
+
+
+def test_what_a_plant_shows_that_started_anew_is_no_wish_until_it_changes(tmp_path: Path) -> None:
+    """Its set point and its mode are defaults then; after a mere outage of the network a new value is a wish."""
+    plant = Plant(tmp_path, CASE, SPEED)
+    plant.start()
+    wire = Wire(plant.port)
+    mode = ModeNode(f"{SPACE}Control.Mode", {"MANUAL": 0, "AUTO": 1, "SHADOW": 2})
+    try:
+        write(plant, "Control.Mode", 1, ua.VariantType.Int32)
+        write(plant, "SP.C_A", 0.9)
+        running = Running(tmp_path, wire.port, nodes={"mode": mode, "sp": {"C_A": f"{SPACE}SP.C_A"}})
+        running.becomes(Mode.AUTO, scans=8)
+        assert running.commands[-1].sp.tolist() == [0.9]
+
+        cut(plant, wire)  # the network alone
+        running.becomes(Mode.HOLD, scans=6)
+        write(plant, "SP.C_A", 0.85)
+        wire.cut = False
+        running.becomes(Mode.AUTO, scans=5)
+        assert within(20, lambda: running.commands[-1].sp.tolist() == [0.85])
+        assert told(running, "started anew") == []
+
+        plant.end()
+        running.becomes(Mode.HOLD, scans=6)
+        plant.start()
+        assert read(plant, "Control.Mode") == 2  # SHADOW, and a set point that nobody asked for
+        assert read(plant, "SP.C_A") != 0.85
+        running.becomes(Mode.AUTO, scans=8)
+        assert running.commands[-1].sp.tolist() == [0.85]
+        assert len(told(running, "no wish of its operator until they change")) == 1
+        assert len(told(running, ": it has started anew")) == 1
+
+        write(plant, "SP.C_A", 0.8)
+        assert within(20, lambda: running.commands[-1].sp.tolist() == [0.8])
+        write(plant, "Control.Mode", 0, ua.VariantType.Int32)
+        running.becomes(Mode.MANUAL)
+        running.end()
+    finally:
+        wire.close()
+        plant.end()
+
+
+@pytest.mark.parametrize("spoilt", ["", "bad"])
+def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
+    spoilt: str, plant: Plant, wire: Wire, tmp_path: Path
+) -> None:
+    """HOLD goes on from where the MV stands, also while a PV is bad; MANUAL too."""
+    running = Running(tmp_path, wire.port, hold=Hold(recover_after=60))  # it holds for all that is looked at below
+    running.becomes(Mode.AUTO, 120, scans=8)
+    for begin, moved in ((Mode.HOLD, 311.0), (Mode.MANUAL, 287.0)):
+        if begin is Mode.MANUAL:
+            assert running.ask(lambda loop: loop.set_mode(Mode.MANUAL), "mode MANUAL") == ""
+            running.becomes(Mode.MANUAL, scans=3)
+        cut(plant, wire)
+        assert within(20, lambda: "does not answer" in running.commands[-1].reason)
+        running.becomes(begin, scans=6)
+        assert running.commands[-1].mv[0] != moved
+        write(plant, "MV.T_j", moved)
+        write(plant, "Faults.PV.T", spoilt)
+        n = len(running.commands)
+        since = len(plant.actuator())
+        mend(plant, wire)
+        assert within(30, lambda: running.commands[-1].mv.tolist() == [moved])  # noqa: B023
+        assert within(20, lambda: len(running.commands) > n + 20)  # noqa: B023
+        write(plant, "Faults.PV.T", "")
+        running.becomes(begin, scans=5)
+        rows = plant.actuator()[since + 1 :]
+        assert len(rows) > 10
+        assert {row["asked"][0] for row in rows} == {moved}
+        assert told(running, f"the MV stands at T_j {moved:g} K, not at T_j ")
+    running.end()
+
+
 def test_a_plant_is_handed_back_and_asked_for_again(plant: Plant, wire: Wire, tmp_path: Path) -> None:
     running = Running(
         tmp_path,

@@ -354,7 +354,13 @@ def test_others_that_do_not_fit_are_named(
         r"MVs are valve \[%\] 0..90; the loop's are valve \[%\] 0..100": replace(
             SIGNALS, mv=(Signal("valve", "%", 0.0, 90.0),)
         ),
-        "measured disturbances are none; the loop's are inflow": replace(SIGNALS, dv=()),
+        r"measured disturbances are heat \[kW\] 0..3; the loop's are inflow": replace(
+            SIGNALS, dv=(Signal("heat", "kW", 0.0, 3.0),)
+        ),
+        r"PVs are T .* have no others, and must begin with those that are controlled": replace(
+            SIGNALS, pv=SIGNALS.pv[1:]
+        ),
+        r"PVs are level .*, T \[degC\]": replace(SIGNALS, pv=(SIGNALS.pv[0], replace(SIGNALS.pv[1], unit="degC"))),
     }
     for words, signals in others.items():
         export(make_formula(fast, signals=signals), tmp_path / "other.onnx", case="tank", provenance={})
