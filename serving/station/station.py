@@ -28,6 +28,7 @@ from serving.station.lease import Lease
 from serving.station.recorder import Recorder
 from serving.station.requests import Change, Request, change
 from serving.station.settings import Settings
+from serving.station.tending import Tending
 from serving.station.views import about, picture, state
 from serving.station.watching import Watching
 from serving.station.wishes import Wishes
@@ -118,6 +119,7 @@ class Station:
                 stack.callback(held)
             control = Control(s.journal.file, self.answer)
             stack.callback(control.close)
+            stack.callback(Tending(lambda: self._tend(control), self._untended).close)
             self._serve(stack, control)
             stack.callback(self.watching.keep)
             stack.callback(self.endpoint.close)
@@ -144,6 +146,15 @@ class Station:
             report = self.loop.run(n, before=self._before, observe=self._observe, until=lambda _: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
+
+    def _tend(self, control: Control) -> None:
+        """Keep the files that lie in a folder for temporary ones."""
+        self.lease.tend()
+        control.tend()
+
+    def _untended(self, trouble: str) -> None:
+        what = trouble or "over: the locks of this loop are kept again"
+        self.recorder.note("fault", "loop", what, alarm="lease", raised=bool(trouble))
 
     def _serve(self, stack: ExitStack, control: Control) -> None:
         """The page, where one is asked for."""

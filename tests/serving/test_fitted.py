@@ -142,8 +142,8 @@ def test_guards_are_made_anew_for_the_ranges_of_whoever_takes_over(made: Made) -
     old = made(deaf, SIGNALS)
     wide = made(deaf, replace(SIGNALS, pv=(replace(LEVEL, high=4.0), T), sp=(replace(LEVEL, high=4.0),)))
     loop = ControlLoop(old, sp=1.0, mv=40.0, mode=Mode.AUTO, recover_after=1)
-    reading = {"mv_applied": np.array([40.0]), "dv": np.zeros(1)}
-    high, low = (Sample(np.array([level, 300.0]), **reading) for level in (3.0, 0.8))
+    rest = np.array([40.0]), np.zeros(1)
+    high, low = (Sample(np.array([level, 300.0]), *rest) for level in (3.0, 0.8))
     assert "PV level is 3 m, outside its range [0, 2] m" in loop.scan(high).reason
     loop.swap(wide, trial=1)
     loop.scan(low)
