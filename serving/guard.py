@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from serving.errors import LoopError
 from serving.manifest import Manifest, Signal
+from serving.words import first_line
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -23,8 +24,9 @@ class Sample:
     """Values of the plant's side at one scan, in engineering units.
 
     ``mv_applied`` is the MV that the plant really received over the last period, read back; None
-    where it cannot be read. ``age_s`` is the time since the PVs were measured. ``fault`` says why
-    the endpoint does not trust its own sample; empty: it does.
+    where it cannot be read now: a loop that lost its plant goes on from the next one. ``age_s`` is
+    the time since the PVs were measured. ``fault`` says why the endpoint does not trust its own
+    sample; empty: it does.
     """
 
     pv: Array  # shape: (n_pv,)
@@ -181,6 +183,18 @@ class Rate:
 def default_guards(manifest: Manifest) -> tuple[Guard, ...]:
     """The guards that suit every plant: values there and allowed, PVs in range, no sample older than a period."""
     return (Complete(manifest), Allowed(manifest.mv), InRange(manifest.pv), Fresh(manifest.period_s))
+
+
+def refused(guards: Sequence[Guard], sample: Sample, past: Collection[Sample]) -> str | None:
+    """Why the first guard that refuses a sample does so; None where none does. A guard that fails refuses."""
+    for guard in guards:
+        try:
+            reason = guard.check(sample, past)
+            if reason:
+                return str(reason)
+        except Exception as error:
+            return f"{type(guard).__name__} failed: {first_line(error)}"
+    return None
 
 
 def implausible(signals: Sequence[Signal], applied: Sequence[float]) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, isnan, nan
@@ -17,10 +17,12 @@ from serving.controller import Controller
 from serving.endpoint import Endpoint, HandsBack
 from serving.errors import ContractError, LoopError, SampleError
 from serving.fallback import Fallback
+from serving.fitted import fitted
 from serving.grid import RunReport, run_on_grid
-from serving.guard import Guard, Sample, default_guards, implausible
-from serving.manifest import Signal
-from serving.successor import Successor, require_same_signals
+from serving.guard import Guard, Sample, default_guards, implausible, refused
+from serving.manifest import Manifest, Signal
+from serving.standing import Standing
+from serving.successor import Successor
 from serving.transfer import Transfer
 from serving.words import first_line
 
@@ -75,6 +77,10 @@ class ControlLoop:
     HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
     lasts is for ``fallback``. After a gap the law starts cold (state = 0).
 
+    A command that did not reach the plant (``unwritten``) leaves it unknown where the MV stands: others may move it
+    meanwhile. The next read-back tells, also that of a sample which is refused for another reason. HOLD, MANUAL and
+    the fallback go on from there, and nothing writes an old MV over it.
+
     Every written MV lies in its range, in every mode and with any guards; a discrete MV has one
     of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
     it is clipped to the range, for the law and for HOLD. A larger excess is a fault.
@@ -93,7 +99,8 @@ class ControlLoop:
     mode
         Mode at the start.
     guards
-        Checks that can refuse a sample; ``default_guards`` unless given.
+        Checks that can refuse a sample, or what makes them for a controller's manifest: they are then made anew for
+        each controller that takes over. ``default_guards`` unless given.
     recover_after
         Good samples after which HOLD returns to AUTO after a fault; None: only the operator returns it.
     clock
@@ -122,7 +129,7 @@ class ControlLoop:
         sp: ArrayLike,
         mv: ArrayLike | None = None,
         mode: Mode = Mode.MANUAL,
-        guards: Sequence[Guard] | None = None,
+        guards: Sequence[Guard] | Callable[[Manifest], Sequence[Guard]] | None = None,
         recover_after: int | None = None,
         clock: Clock | None = None,
         warm_lead_s: float = WARM_LEAD_S,
@@ -136,8 +143,11 @@ class ControlLoop:
             raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
         self.controller = controller
+        self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
-        self.guards = tuple(default_guards(manifest) if guards is None else guards)
+        made = default_guards if guards is None else guards
+        self._made = made if callable(made) else None  # what makes the guards; None: they are the host's own
+        self.guards: tuple[Guard, ...] = tuple(made(manifest) if callable(made) else made)
         self.recover_after = recover_after
         self.clock: Clock = clock or MonotonicClock()
         self.warm_lead_s = min(warm_lead_s, manifest.period_s / 4)
@@ -159,11 +169,13 @@ class ControlLoop:
         self._held = 0  # scans since that fault began
         self._scan = 0
         self._state = controller.cold_state()
+        self._standing, self._given = Standing(manifest.mv, self._mv), self._mv
+        self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
         self.successor: Successor | None = None  # tried beside the controller, see ``swap``
         self.replaced: Controller | None = None  # the one that was in charge before the present one
-        self._past: deque[Sample] = deque(maxlen=max((g.memory for g in self.guards), default=0))
+        self._past: deque[Sample] = deque(maxlen=_memory(self.guards))
 
     # ------------------------------------------------------------------ operator
     @property
@@ -202,9 +214,14 @@ class ControlLoop:
         self._sp = within(sp, self.controller.manifest.sp, "set point")
 
     def set_mv(self, mv: ArrayLike) -> None:
-        """Set the MV (n_mv,) in MANUAL; LoopError outside its range or in another mode."""
+        """Set the MV (n_mv,) in MANUAL; LoopError outside its range or in another mode.
+
+        LoopError too after a command that did not reach the plant, until it is known where the MV stands.
+        """
         if self._mode is not Mode.MANUAL:
             raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self._mode}")
+        if self._standing.lost:
+            raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
         self._mv = within(mv, self.controller.manifest.mv, "MV")
 
     def hand_back(self) -> None:
@@ -214,12 +231,13 @@ class ControlLoop:
     def swap(self, controller: Controller, trial: int) -> None:
         """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.
 
-        Until then its MV stands in ``Command.successor_mv``. LoopError where its period or signals are others.
+        Until then its MV stands in ``Command.successor_mv``. It may read fewer PVs and measured disturbances than the
+        loop does. LoopError where its period, set points or MVs are others, or it has a signal that the loop has not.
         """
         if trial < 1:
             raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
-        require_same_signals(self.controller.manifest, controller.manifest)
-        self.successor = Successor(controller, trial)
+        new = fitted(controller, self.manifest)
+        self.successor = Successor(new, trial, () if self._made is None else tuple(self._made(new.manifest)))
 
     def keep(self) -> None:
         """End the trial of a successor; the controller in charge stays."""
@@ -230,9 +248,11 @@ class ControlLoop:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         reason = self._refusal(sample)
         self._blind = ""
+        self._stands(sample, refused=bool(reason))
         if reason:
-            return self.miss(reason)
+            return self._missed(reason)
         applied = self._mv
+        past = tuple(self._past) if self.successor is not None else ()
         try:
             applied = self._read_back(sample)
             if isnan(self._mv[0]):
@@ -243,7 +263,7 @@ class ControlLoop:
         except Exception as error:  # the plant needs an MV after any error
             if self._mode in {Mode.AUTO, Mode.SHADOW}:
                 self._mv = applied
-            return self.miss(first_line(error))
+            return self._missed(first_line(error))
         self._state = step.state
         if self._fault:
             self._good += 1
@@ -253,21 +273,30 @@ class ControlLoop:
             self._mv = np.array(self._transfer.limited(step.mv, applied))  # the host gets step.mv, may write into it
         elif self._mode is Mode.SHADOW:
             self._mv = applied.copy()
-        beside = self._beside(sample, applied)
+        beside = self._beside(sample, applied, past)
         self._lasting()
         return self._command(step.mv, step.info, self._fault, beside)
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
+        self._standing.commanded(self._given)
+        self.found = None
+        return self._missed(reason)
+
+    def _missed(self, reason: str) -> Command:
         self._blind = reason = reason or "a fault without a reason"
         self._lose(reason)
         self._lasting()
         return self._command(None, None, reason)
 
     def unwritten(self, before: Array, reason: str) -> Command:
-        """The command in place of the last one, which never reached the plant: the MV ``before`` it (n_mv,) stays."""
+        """The command in place of the last one, which never reached the plant: the MV ``before`` it (n_mv,) stays.
+
+        Where the scan has found that the MV stands elsewhere, it stays there.
+        """
         if self._mode is not Mode.MANUAL:
-            self._mv = before
+            self._mv = np.array(before if self.found is None else self.found, dtype=np.float64)
+        self._standing.lost = True
         self._lose(reason)
         self._scan -= 1
         return self._command(None, None, reason)
@@ -301,15 +330,18 @@ class ControlLoop:
         since = (self._held - 1) * self.controller.manifest.period_s
         return bool(self._fault) and self.fallback is not None and since >= self.fallback.after_s
 
-    def _beside(self, sample: Sample, applied: Array) -> Array | None:
+    def _beside(self, sample: Sample, applied: Array, past: Collection[Sample]) -> Array | None:
         """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
         if self.successor is None:
             return None
         new = self.successor
-        new.step(sample, self._sp, applied)
+        new.step(sample, self._sp, applied, past)
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state = new.controller, new.state
+            if self._made is not None:
+                self.guards = tuple(new.guards)
+                self._past = deque(self._past, maxlen=_memory(self.guards))
             self._transfer.begin()
         return new.mv
 
@@ -318,14 +350,7 @@ class ControlLoop:
             return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
         if sample.fault:
             return str(sample.fault)
-        for guard in self.guards:
-            try:
-                reason = guard.check(sample, self._past)
-                if reason:
-                    return str(reason)
-            except Exception as error:  # a guard that fails refuses the sample
-                return f"{type(guard).__name__} failed: {first_line(error)}"
-        return None
+        return refused(self.guards, sample, self._past)
 
     def _read_back(self, sample: Sample) -> Array:
         """The applied MV (n_mv,) within its range; the last command if there is no read-back.
@@ -350,8 +375,30 @@ class ControlLoop:
                 return np.clip(applied, lows, highs)
         return applied
 
+    def _stands(self, sample: Sample, *, refused: bool) -> None:
+        """Where the MV stands, as far as the sample tells: ``found`` where that was not known.
+
+        A refused sample without a read-back tells nothing; a good one says that nothing is read back at all.
+        """
+        self._standing.commanded(self._given)
+        self.found = None
+        try:
+            given = sample.mv_applied
+            if given is not None and np.asarray(given).dtype.kind not in "fiu":
+                return
+            applied = None if given is None else self._read_back(sample)
+        except Exception:  # no sample, or no MV that any actuator can have
+            return
+        if applied is not None:
+            self.found = self._standing.seen(applied)
+        elif not refused:
+            self._standing.lost = False
+        if self.found is not None:
+            self._mv = self.found.copy()
+
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
+        self._given = self._mv.copy()
         hand_back = self._overdue() and self.fallback is not None and self.fallback.hand_back
         return Command(
             self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, hand_back
@@ -393,6 +440,10 @@ class ControlLoop:
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")
         return run_on_grid(self, self.endpoint, n, until=until, before=before, observe=observe)
+
+
+def _memory(guards: Sequence[Guard]) -> int:
+    return max((g.memory for g in guards), default=0)
 
 
 def within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from serving import controller
 from serving.errors import ArtifactError
+from serving.fitted import Fitted
 
 if TYPE_CHECKING:
     from serving.signing.verify import Signed, Trusted
@@ -59,6 +60,8 @@ class Controller(controller.Controller):
 
 def signer(loaded: controller.Controller) -> Signed | None:
     """Who signed a controller's file; None where nobody was asked."""
+    if isinstance(loaded, Fitted):
+        loaded = loaded.inner
     return loaded.signed if isinstance(loaded, Controller) else None
 
 

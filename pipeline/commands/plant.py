@@ -33,7 +33,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--log", metavar="FILE", type=Path, help="write there what the actuator gets, a line of JSON each period")
     add("--periods", metavar="N", type=whole(1), help="stop after so many")
     fault = commands.add_parser("fault", help="spoil a signal of a served plant, or mend it")
-    fault.add_argument("tag", metavar="TAG", help="PV.C_A, MV.T_j, RB.T_j, DV.F, ...")
+    fault.add_argument("tag", metavar="TAG", help="PV.C_A, MV.T_j, RB.T_j, DV.F, ...; Control.Watchdog (frozen)")
     fault.add_argument("kind", metavar="KIND", choices=["ok", *FAULTS[1:]], help=", ".join(["ok", *FAULTS[1:]]))
     fault.add_argument("--endpoint", default="opc.tcp://127.0.0.1:4840", help="the served plant (%(default)s)")
 

@@ -29,6 +29,7 @@ NAMESPACE = "urn:loopwright:plant"
 APPLICATION = "urn:loopwright:plant:server"
 LOCAL, REMOTE = 0, 1  # who has the plant: its own controller, or whoever writes the MVs
 ALIVE_PERIODS = 3
+WATCHDOG = "Control.Watchdog"
 PARTS, LEAST_PART_S = 10, 0.025  # a period has so many parts at most, each at least as long by the clock
 KINDS = {"LREAL": ua.VariantType.Double, "REAL": ua.VariantType.Float}
 
@@ -44,7 +45,8 @@ class PlantServer:
     each with its unit and range; ``Control.Owner`` (0 its own controller, which holds the MVs; 1 the loop),
     ``Control.Mode`` (for an operator: 0 MANUAL, 1 AUTO, 2 SHADOW), ``Control.Watchdog`` (counts periods),
     ``Control.Heartbeat`` (for the loop to count), ``Control.LoopAlive``, ``Control.Lease``; and ``Faults.x`` for every
-    PV, MV and DV, which takes one of FAULTS, and ``Faults.Clock``, by how many seconds the source times are off.
+    PV, MV and DV, which takes one of FAULTS, ``Faults.Control.Watchdog``, which takes "frozen", and ``Faults.Clock``,
+    by how many seconds the source times are off.
     """
 
     plant: Simulator
@@ -58,7 +60,9 @@ class PlantServer:
     folder: Path = Path("plant-server")  # of its certificate, and of trusted ones
     trust_all: bool = True
     tell: Callable[[str], object] = lambda _: None
-    log: Path | None = None  # a line of JSON each period: what the MV nodes hold, what the actuator has
+    log: Path | None = (
+        None  # a line of JSON each period: what the MV nodes hold, the actuator has; the loop's heartbeat
+    )
 
     def __post_init__(self) -> None:
         self.server = Server()
@@ -116,7 +120,7 @@ class PlantServer:
         for name, start in (("LoopAlive", False), ("Lease", "")):
             node = await self.root.add_variable(self._id(f"Control.{name}"), f"{self.index}:{name}", start)
             await node.set_writable(name == "Lease")
-        for tag in self.start:
+        for tag in (*self.start, WATCHDOG):
             node = await self.root.add_variable(self._id(f"Faults.{tag}"), f"{self.index}:Faults.{tag}", "")
             await node.set_writable()
         node = await self.root.add_variable(self._id("Faults.Clock"), f"{self.index}:Faults.Clock", 0.0)
@@ -175,15 +179,15 @@ class PlantServer:
         if await self._value("Control.Owner") == REMOTE:
             low, high = (np.array([getattr(s, end) for s in self.plant.mv_signals]) for end in ("low", "high"))
             self.mv = np.clip(asked, low, high)
-        if self._out is not None and first:
-            row = {"k": self.k, "time": time.time(), "asked": asked.tolist(), "mv": self.mv.tolist()}
-            self._out.write(json.dumps(row) + "\n")
         self.x = self._advance(self.x, self.mv, dv, p.parameters())
         if not np.isfinite(self.x).all():
             raise PlantError(f"{self.plant.name} has left what it can compute, with MVs {self.mv.tolist()}")
         await self._publish()
         if first:
-            await self._count()
+            beat, alive = await self._count()
+            if self._out is not None:
+                row = {"k": self.k, "time": time.time(), "asked": asked.tolist(), "mv": self.mv.tolist()}
+                self._out.write(json.dumps({**row, "beat": beat, "alive": alive}) + "\n")
 
     async def _publish(self) -> None:
         now = datetime.now(UTC) + timedelta(seconds=float(await self._value("Faults.Clock")))
@@ -196,13 +200,16 @@ class PlantServer:
                 if f"{group}.{s.name}" in self.start:
                     await self._spoil_alone(f"{group}.{s.name}")
 
-    async def _count(self) -> None:
-        """Show that the server lives, and see whether the loop does."""
-        await self._set("Control.Watchdog", ua.Variant(self.k % 30_000, ua.VariantType.Int32))
+    async def _count(self) -> tuple[Any, bool]:
+        """Show that the server lives, and see whether the loop does: its heartbeat, and whether it counts as alive."""
+        if await self._value(f"Faults.{WATCHDOG}") != "frozen":
+            await self._set(WATCHDOG, ua.Variant(self.k % 30_000, ua.VariantType.Int32))
         beat = await self._value("Control.Heartbeat")
         last, age = self._beat
         self._beat = (beat, 0 if beat != last else age + 1)
-        await self._set("Control.LoopAlive", ua.Variant(self._beat[1] < ALIVE_PERIODS, ua.VariantType.Boolean))
+        alive = self._beat[1] < ALIVE_PERIODS
+        await self._set("Control.LoopAlive", ua.Variant(alive, ua.VariantType.Boolean))
+        return beat, alive
 
     async def _show(self, tag: str, value: float, now: datetime) -> None:
         """Publish a value, as its fault has it."""

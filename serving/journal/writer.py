@@ -17,6 +17,7 @@ import numpy as np
 from serving.journal.entries import Event, Scan, columns
 from serving.journal.file import opened
 from serving.journal.packing import packed
+from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
 from serving.manifest import Manifest
 from serving.words import named
 
@@ -31,7 +32,8 @@ class Journal:
 
     The file is in WAL mode: a process that dies, whatever it was doing, leaves a whole file without its last
     ``FLUSH_S`` at most. With ``fsync`` "power loss" each write waits for the disk. Older scans are packed, and beyond
-    ``max_mb`` the oldest go. While the disk takes nothing, scans wait in memory, and ``trouble`` says why.
+    ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
+    takes nothing, scans wait in memory, and ``trouble`` says why.
 
     Raises LoopError for a file that is no journal.
     """
@@ -47,6 +49,7 @@ class Journal:
         self.path, self.max_bytes, self.tell = path, max_mb * 1e6, tell
         self.trouble, self.lost = "", 0
         self._fsync = fsync
+        self._most_events = self._events = most_events(self.max_bytes)  # written since the last look at how many
         self._queue = queue.SimpleQueue[Any]()
         self._base = opened(path, write=True, fsync=fsync)
         self._closing = threading.Event()
@@ -100,6 +103,7 @@ class Journal:
                 self.trouble = ""
                 self._waiting.clear()
                 self._pack()
+                self._rotate()
             except Exception as error:
                 with suppress(sqlite3.Error):
                     self._base.rollback()
@@ -145,6 +149,7 @@ class Journal:
                 elif kind == "learnt":
                     self._base.execute("insert or replace into learnt (name, value) values (?, ?)", item)
                 else:
+                    self._events += 1
                     self._base.execute(
                         "insert into event (time, kind, who, what, reason, alarm, raised, about) "
                         "values (?, ?, ?, ?, ?, ?, ?, ?)",
@@ -166,13 +171,12 @@ class Journal:
                     (rows[0][0], rows[-1][0], rows[0][1], rows[0][2], rows[-1][2], packed(rows)),
                 )
                 self._base.execute("delete from scan where id <= ?", (rows[-1][0],))
-                self._shorten()
+                shorten_scans(self._base, self.max_bytes)
             count -= len(rows)
 
-    def _shorten(self) -> None:
-        (size,) = self._base.execute("select coalesce(sum(length(data)), 0) from block").fetchone()
-        for first, length in self._base.execute("select first, length(data) from block order by first").fetchall():
-            if size <= self.max_bytes:
-                return
-            self._base.execute("delete from block where first = ?", (first,))
-            size -= length
+    def _rotate(self) -> None:
+        """Drop the oldest events once there are too many; seldom looked at, since each look goes through all."""
+        if self._events >= SLACK * self._most_events:
+            self._events = 0
+            with self._base:
+                shorten_events(self._base, self._most_events)

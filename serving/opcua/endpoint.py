@@ -49,6 +49,7 @@ class Values:
     quality: tuple[int, ...]
     asked_sp: Mapping[str, float] = field(default_factory=dict)
     asked_mode: str = ""
+    starts: int = 0  # how often the server has started anew since the endpoint did
 
 
 _HAND_BACK = "hand back"
@@ -103,11 +104,14 @@ class OpcUaEndpoint:
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
         self.unwritten = ""  # why the last MV did not reach the plant
-        self.connections = 0
+        self.connections = self.starts = 0
+        self._started_s: float | None = None  # when the server started, by its own clock
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
         self._beats, self._scans, self._next_s, self._wrote = 0, 0, 0.0, 0
         self._written: tuple[Array, float] | None = None  # the last MV that was passed on, and when
         self._called = 0  # the scan of the last call to write
+        # Which connection has shown where the plant is (0: the present one has not), and which one `read` told of.
+        self._shown, self._told = 0, 0
         self.lease = NodeLease(self.period_s)
         self._handed_back, self._watched = False, (float("nan"), 0)
         self._wake: asyncio.Event | None = None
@@ -135,6 +139,7 @@ class OpcUaEndpoint:
 
     def read(self) -> Sample:
         """The last values; EndpointError where there are none that are young enough."""
+        self._told = self._shown
         values = self.values  # before the time is taken: newer ones may arrive meanwhile, from the future as it were
         now = self.clock()
         self._scans += 1
@@ -145,14 +150,19 @@ class OpcUaEndpoint:
         age = now - values.arrived_s + values.age_s
         if self.trouble and age > self.max_age_s:
             raise EndpointError(self.trouble)
-        return Sample(values.pv, values.mv, values.dv, age * self.speed, values.fault)
+        # An MV of long ago is none that the plant has now; an old PV may come with a young MV.
+        mv = values.mv if now - values.arrived_s <= self.max_age_s else None
+        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault)
 
     def write(self, mv: Array) -> None:
-        """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection."""
+        """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection.
+
+        A connection that was made anew takes none before ``read`` has told where the MV stands.
+        """
         refused = self.unwritten
-        if self._link is None:
-            self._written = None
-            raise EndpointError(self.trouble or "not connected")
+        if self._link is None or self._shown == 0 or self._told != self._shown:
+            self.unwritten, self._written = "", None
+            raise EndpointError(self.trouble or refused or "not connected")
         if not refused and self._stands(mv):
             return
         if self._outbox:
@@ -220,11 +230,14 @@ class OpcUaEndpoint:
             try:
                 plan = await Plan.made(link, self.manifest, self.nodes, max(self.answer_s, self.server.connect_s))
                 self.connections += 1
-                self._outbox.clear()  # what was to be written then is too old now
-                self.unwritten, self._written = "", None
+                anew = await self._anew(link)
+                if self._outbox:
+                    self._outbox.clear()  # what was to be written then is too old now
+                    self.unwritten = self.unwritten or "the connection was lost before the MV was sent"
+                self._written, self._shown = None, 0
                 self._link = link
                 pause = FIRST_RETRY_S
-                self.tell(f"connected to {self.server.endpoint}")
+                self.tell(f"connected to {self.server.endpoint}{anew}")
                 await self._exchange(link, plan)
             except Exception as error:
                 self._lost(first_line(error) if isinstance(error, LoopError) else named(error))
@@ -239,6 +252,16 @@ class OpcUaEndpoint:
                     link.abort()
             await self._rest(pause)
             pause = min(pause * GROWTH, LAST_RETRY_S)
+
+    async def _anew(self, link: Link) -> str:
+        """Whether the server has started anew, or may have, since it was last spoken to: counted, and in words."""
+        before, self._started_s = self._started_s, await link.started_s(self.server.connect_s)
+        if self.connections == 1 or (before is not None and before == self._started_s):
+            return ""
+        self.starts += 1
+        if before is None or self._started_s is None:
+            return ": it does not say whether it has started anew since"
+        return ": it has started anew"
 
     def _lost(self, why: str) -> None:
         if why != self.trouble:
@@ -280,7 +303,7 @@ class OpcUaEndpoint:
                 silent = 0
                 self._slowest_s = max(self.clock() - now, FADES * self._slowest_s)
                 self.values = self._valued(plan, answers, ages)
-                self.trouble = ""
+                self.trouble, self._shown = "", self.connections
             else:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(due - now):
@@ -305,7 +328,11 @@ class OpcUaEndpoint:
                 self.unwritten = first_line(error)
                 return
         self._wrote = self._scans
-        statuses = await link.write(rows, self.answer_s)
+        try:
+            statuses = await link.write(rows, self.answer_s)
+        except EndpointError as error:
+            self.unwritten = first_line(error)
+            raise
         names = ["hand_back"] if handing else plan.mv_names
         wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != GOOD]
         self.unwritten = f"the server refuses {', '.join(wrong)}" if wrong else ""
@@ -334,8 +361,10 @@ class OpcUaEndpoint:
         arrived, fault, found = self.clock(), "", dict[str, float]()
         for (name, point, judged), answer in zip(plan.points, answers, strict=False):
             usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
-            # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good.
-            found[name] = point.scale * answer.number + point.offset if judged or usable else np.nan
+            # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
+            # is a read-back, which says where the MV stands also while a PV is bad.
+            told = usable or (judged and not name.startswith("MV "))
+            found[name] = point.scale * answer.number + point.offset if told else np.nan
             if fault or not judged:
                 continue
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
@@ -363,6 +392,7 @@ class OpcUaEndpoint:
             tuple(a.status for a in answers[:n]),
             asked_sp,
             mode,
+            self.starts,
         )
 
     def _dead(self, watchdog: float) -> str:

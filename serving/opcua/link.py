@@ -158,6 +158,19 @@ class Link:
         request.NodesToRead = [ua.ReadValueId(NodeId=n, AttributeId=attribute) for n in nodes]
         return list(await self._within(self.client.uaclient.session.read(request), timeout_s))
 
+    async def started_s(self, timeout_s: float) -> float | None:
+        """When the server started [s since 1970, by its clock]; None where it does not say."""
+        node = ua.NodeId(ua.Int32(ua.ObjectIds.Server_ServerStatus_StartTime))
+        try:
+            (answer,) = await self.values([node], timeout_s)
+        except EndpointError:
+            return None
+        when = None if answer.Value is None else answer.Value.Value
+        if not isinstance(when, datetime):
+            return None
+        started = (when.replace(tzinfo=None) - EPOCH).total_seconds()
+        return started if started > 0 else None
+
     async def write(self, values: Sequence[tuple[ua.NodeId, ua.Variant]], timeout_s: float) -> list[int]:
         """Write values, in one request; the status of each."""
         request = ua.WriteParameters()

@@ -74,15 +74,17 @@ class PageApp:
         found = await self._asked({"do": "about"})
         card = found["card"]
         folder, trusted = Path(found.pop("folder")), found.pop("trusted", None)
-        found["candidates"] = await asyncio.to_thread(self._candidates, folder, card["file"], trusted)
+        at = folder / card["file"]
+        first = Path(found.pop("first", at))
+        found["candidates"] = await asyncio.to_thread(self._candidates, at, first, trusted)
         card["picture"] = f"/api/picture/{card['sha256'][:16]}" if card["picture"] else None
         return JSONResponse(found)
 
-    def _candidates(self, folder: Path, in_charge: str, trusted: list[str] | None) -> list[dict[str, Any]]:
+    def _candidates(self, in_charge: Path, first: Path, trusted: list[str] | None) -> list[dict[str, Any]]:
         try:
-            return candidates(folder, in_charge, trusted)
+            return candidates(in_charge, trusted, first)
         except (LoopwrightError, OSError, KeyError):
-            return []  # the file in charge is gone from its folder
+            return []  # the file that the loop began with is gone
 
     async def state(self, _: Request) -> Response:
         """How it stands."""

@@ -8,27 +8,31 @@ from typing import Any
 
 from serving.digest import file_digest, unseal
 from serving.errors import ArtifactError, LoopwrightError
+from serving.fitted import require_fits
 from serving.graph_audit import MAX_BYTES, audit
 from serving.manifest import MANIFEST_KEY, Manifest
-from serving.successor import require_same_signals
 
 MOST = 50  # files that are looked at
 
 
-def candidates(folder: Path, in_charge: str, trusted: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Law, case, file, sha256 and signer of each controller with the period and the signals of the file ``in_charge``.
+def candidates(
+    in_charge: Path, trusted: Sequence[str] | None = None, first: Path | None = None
+) -> list[dict[str, Any]]:
+    """Law, case, file, sha256 and signer of each controller beside the file ``in_charge`` that fits the loop.
+
+    The loop has the signals of the file ``first`` that it began with; without one, of the file in charge.
 
     Where public keys are ``trusted``, only of files that one of them signed: the loop would refuse any other.
     """
     found: list[dict[str, Any]] = []
-    now, _, _ = _described(folder / in_charge, trusted)
-    for path in sorted(folder.glob("*.onnx"))[:MOST]:
+    now, _, _ = _described(first or in_charge, trusted)
+    for path in sorted(in_charge.parent.glob("*.onnx"))[:MOST]:
         try:
             manifest, sha256, signed = _described(path, trusted)
-            require_same_signals(now, manifest)
+            require_fits(manifest, now)
         except (LoopwrightError, OSError, KeyError):
             continue
-        if path.name != in_charge:
+        if path.name != in_charge.name:
             row = {"law": manifest.law, "case": manifest.case, "file": path.name, "sha256": sha256, "signed": signed}
             found.append(row)
     return found

@@ -75,7 +75,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _state(options: argparse.Namespace) -> int:
     journal = Settings.read(options.loop).journal.file
-    state, about = (ask(journal, {"do": do}) for do in ("state", "about"))
+    about, state = (ask(journal, {"do": do}) for do in ("about", "state"))
+    while about["card"]["sha256"] != state["sha256"]:  # another controller has taken over between the two
+        about, state = (ask(journal, {"do": do}) for do in ("about", "state"))
     signals = {group: [s["name"] for s in about["signals"][group]] for group in ("sp", "pv", "mv", "dv")}
     names = {**signals, **dict.fromkeys(("applied", "law", "beside"), signals["mv"]), "info": about["info"]}
     for group, of in names.items():

@@ -30,19 +30,32 @@ class Control:
     """
 
     def __init__(self, journal: Path, answer: Callable[[Any], Answer]) -> None:
+        self._journal, self._answer = journal, answer
         self.path = door(journal)
         with suppress(FileNotFoundError):
             self.path.unlink()  # of a loop that was killed; the lease says that none lives
-        self._server = _Server(str(self.path), _Handler)
-        self._server.answer = answer
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="control", daemon=True)
-        self._thread.start()
+        self._server = self._opened()
+
+    def tend(self) -> None:
+        """Keep the socket from those who clean temporary folders: young, and made anew where it is gone."""
+        try:
+            os.utime(door(self._journal))
+        except FileNotFoundError:
+            gone, self._server = self._server, self._opened()
+            gone.shutdown()
+            gone.server_close()
 
     def close(self) -> None:
         """Answer no more."""
         self._server.shutdown()
         self._server.server_close()
         self.path.unlink(missing_ok=True)
+
+    def _opened(self) -> _Server:
+        server = _Server(str(self.path), _Handler)
+        server.answer = self._answer
+        threading.Thread(target=server.serve_forever, args=(0.2,), name="control", daemon=True).start()
+        return server
 
 
 def door(journal: Path) -> Path:

@@ -10,11 +10,11 @@ from typing import Any, TypeAlias
 from serving.controller import Controller
 from serving.errors import LoopError
 from serving.fields import nearest
+from serving.fitted import require_fits
 from serving.journal.entries import Kind
 from serving.loop import ControlLoop, Mode, within
 from serving.manifest import Signal
 from serving.station.recorder import named
-from serving.successor import require_same_signals
 from serving.trust import signer
 
 Opened: TypeAlias = Callable[[str, str | None], Controller]  # file, its pinned SHA-256 or None
@@ -119,7 +119,7 @@ def _back(request: Request, loop: ControlLoop, _: Opened) -> Change:
 def _tried(request: Request, loop: ControlLoop, controller: Controller, trial: Any) -> Change:
     if not isinstance(trial, int) or isinstance(trial, bool) or not 1 <= trial <= LONGEST_TRIAL:
         raise LoopError(f"trial is {trial!r}; it must be a whole number of scans, 1 .. {LONGEST_TRIAL}")
-    require_same_signals(loop.controller.manifest, controller.manifest)
+    require_fits(controller.manifest, loop.manifest)
     if controller.sha256 == loop.controller.sha256:
         raise LoopError(f"{named(controller)} is in charge already")
     signed = signer(controller)

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from serving.clock import MonotonicClock
+from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
 from serving.grid import RunReport
-from serving.guard import Sample
+from serving.guard import Guard, Sample
 from serving.journal import Journal, JournalReader
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
@@ -27,9 +28,12 @@ from serving.station.lease import Lease
 from serving.station.recorder import Recorder
 from serving.station.requests import Change, Request, change
 from serving.station.settings import Settings
+from serving.station.tending import Tending
 from serving.station.views import about, picture, state
 from serving.station.watching import Watching
-from serving.trust import Controller, signer
+from serving.station.wishes import Wishes
+from serving.trust import Controller as TrustedController
+from serving.trust import signer
 from serving.words import first_line
 
 if TYPE_CHECKING:
@@ -54,10 +58,11 @@ class Station:
     def __init__(self, settings: Settings, *, tell: Callable[[str], None] = lambda _: None) -> None:
         self.settings, self.tell = settings, tell
         self.trusted = self._public_keys()
-        self.controller = Controller(settings.controller, settings.sha256 or None, self.trusted)
+        self.controller = TrustedController(settings.controller, settings.sha256 or None, self.trusted)
         m = self.manifest
         age = settings.max_age_s(m.period_s)
-        self.guards, self.fallback = settings.guards.of(m, age), settings.hold.fallback(m.mv)
+        self.fallback = settings.hold.fallback(m.mv)
+        self.guards(m)  # refuses what is none
         self.clock = MonotonicClock(settings.speed)
         self.endpoint = OpcUaEndpoint(
             m, settings.server, settings.nodes, max_age_s=age, speed=settings.speed, tell=self._connection
@@ -77,18 +82,22 @@ class Station:
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
         self.last: tuple[Sample | None, Command, float] | None = None  # with when that was, since 1970
+        self.stepped: Controller | None = None  # the controller of that scan
         self.scans = self.faults = self.missed = 0
         self.warnings: list[str] = []
         self.ended = False
         self.page: PageProcess | None = None
         self._watchers: list[Callable[[Sample | None, Command], None]] = []
-        self._asked_sp: dict[str, float] = {}
-        self._asked_mode: str | None = None  # None: not read yet; what stands there at the start is no wish
+        self.wishes = Wishes()
 
     @property
     def manifest(self) -> Manifest:
-        """Of the controller that the loop began with; a successor has the same signals."""
+        """Of the controller that the loop began with: the signals that are read, whichever controller takes over."""
         return self.controller.manifest
+
+    def guards(self, manifest: Manifest) -> tuple[Guard, ...]:
+        """The guards for a controller."""
+        return self.settings.guards.of(manifest, self.settings.max_age_s(manifest.period_s))
 
     def ask(self, change: Change) -> None:
         """Have a change carried out before the next scan; from any thread."""
@@ -110,6 +119,7 @@ class Station:
                 stack.callback(held)
             control = Control(s.journal.file, self.answer)
             stack.callback(control.close)
+            stack.callback(Tending(lambda: self._tend(control), self._untended).close)
             self._serve(stack, control)
             stack.callback(self.watching.keep)
             stack.callback(self.endpoint.close)
@@ -136,6 +146,15 @@ class Station:
             report = self.loop.run(n, before=self._before, observe=self._observe, until=lambda _: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
+
+    def _tend(self, control: Control) -> None:
+        """Keep the files that lie in a folder for temporary ones."""
+        self.lease.tend()
+        control.tend()
+
+    def _untended(self, trouble: str) -> None:
+        what = trouble or "over: the locks of this loop are kept again"
+        self.recorder.note("fault", "loop", what, alarm="lease", raised=bool(trouble))
 
     def _serve(self, stack: ExitStack, control: Control) -> None:
         """The page, where one is asked for."""
@@ -182,17 +201,18 @@ class Station:
 
     def _plant_side(self, loop: ControlLoop, values: Values) -> None:
         """Set points and mode, where the plant's own operator changed them."""
-        changed = {name: v for name, v in values.asked_sp.items() if self._asked_sp.get(name) != v}
+        starts = self.wishes.starts
+        changed, mode = self.wishes.of(values)
+        if self.wishes.starts != starts and (self.settings.nodes.sp or self.settings.nodes.mode is not None):
+            what = "the plant's server has, or may have, started anew: the set points and the mode that stand there"
+            self.recorder.note("connection", "opcua", f"{what} are no wish of its operator until they change")
         if changed:
-            self._asked_sp.update(changed)
             wanted = loop.sp
             for i, s in enumerate(self.manifest.sp):
                 wanted[i] = changed.get(s.name, wanted[i])
             self._from_plant(lambda: loop.set_sp(wanted), f"set point {_shown(wanted, self.manifest.sp)}")
-        if values.asked_mode and values.asked_mode != self._asked_mode:
-            wish, self._asked_mode = self._asked_mode is not None, values.asked_mode
-            if wish:
-                self._from_plant(lambda: loop.set_mode(Mode(values.asked_mode)), f"mode {values.asked_mode}")
+        if mode:
+            self._from_plant(lambda: loop.set_mode(Mode(mode)), f"mode {mode}")
 
     def _from_plant(self, act: Callable[[], None], what: str) -> None:
         try:
@@ -206,12 +226,20 @@ class Station:
         """Write the scan down, and show it."""
         assert self.loop is not None
         values = self.endpoint.values
+        self._moved(self.loop)
         self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
-        self.last = sample, command, time.time()
-        self.watching.seen(self.recorder.controller, self.last)
+        self.last, self.stepped = (sample, command, time.time()), self.recorder.controller
+        self.watching.seen(self.stepped, self.last)
         self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
         for seen in self._watchers:
             seen(sample, command)
+
+    def _moved(self, loop: ControlLoop) -> None:
+        """Say where an MV stands that somebody else moved while the loop could not write."""
+        if loop.found is None or self.last is None or np.array_equal(loop.found, self.last[1].mv):
+            return
+        found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self.last[1].mv))
+        self.recorder.note("change", "plant", f"the MV stands at {found}, not at {left}: the loop goes on from there")
 
     # ------------------------------------------------------------------ requests
     def _public_keys(self) -> list[PublicKey] | None:
@@ -224,7 +252,7 @@ class Station:
 
     def _opened(self, file: str, sha256: str | None) -> Controller:
         """A controller that is to be tried; a relative path lies beside the one in charge."""
-        return Controller(self.settings.controller.parent / file, sha256, self.trusted)
+        return TrustedController(self.settings.controller.parent / file, sha256, self.trusted)
 
     def answer(self, tree: Any) -> Answer:
         """What a request gets, from any thread: a view, or the change once a scan has carried it out."""

@@ -36,6 +36,7 @@ def about(station: Station) -> View:
         "columns": columns(m),
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
+        "first": str(station.controller.path.absolute()),
         "trusted": None if (keys := station.settings.trusted) is None else [str(key.absolute()) for key in keys],
         "warnings": [*station.warnings, *ending(controller)],
     }
@@ -73,7 +74,7 @@ def state(station: Station) -> View:
         "law": _plain(command.law_mv),
         "beside": _plain(command.successor_mv),
         "dv": _plain(None if sample is None else sample.dv),
-        "info": _plain(command.info),
+        "info": _plain(command.info if station.stepped is loop.controller else None),  # of the names in ``about``
         "quality": station.quality(),
         "sha256": loop.controller.sha256,
         "successor": _successor(station),

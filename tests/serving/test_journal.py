@@ -8,13 +8,16 @@ import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from serving import Controller, LoopError
 from serving.journal import Event, Journal, JournalReader, Scan, columns
+from serving.journal.entries import Kind
 from serving.journal.packing import packed, unpacked
+from serving.journal.rotation import LEAST_EVENTS, SLACK
 from serving.journal.writer import BLOCK, FRESH
 
 pytest_plugins = ["small_laws"]
@@ -97,6 +100,73 @@ def test_the_oldest_go_where_it_would_grow_too_large(tmp_path: Path, controller:
     assert ids == list(range(ids[0], 4 * n + 1))  # no gap within
     assert ids[0] > 3 * n - BLOCK
     assert sizes[3] < 1.05 * sizes[1] < 1_500_000
+
+
+def test_events_are_bounded_and_no_alarm_is_lost_that_somebody_has_yet_to_see(
+    tmp_path: Path, controller: Controller
+) -> None:
+    path = tmp_path / "loop.journal"
+
+    def event(k: int, kind: Kind, what: str, **more: Any) -> Event:
+        return Event(1e9 + k, kind, "loop", what, "", **more)
+
+    def written(events: list[Event]) -> None:
+        journal = Journal(path, max_mb=1.0)
+        for e in events:
+            journal.event(e)
+        journal.keep("monitor", "learnt")
+        journal.close()
+
+    written([
+        event(0, "fault", "standing and seen", alarm="monitor gain", raised=True),
+        event(1, "acknowledged", "standing and seen", about=1),
+        event(2, "fault", "over and not seen", alarm="fault", raised=True),
+        event(3, "fault", "over", alarm="fault"),
+        event(4, "fault", "over and seen", alarm="fault", raised=True),
+        event(5, "fault", "over again", alarm="fault"),
+        event(6, "acknowledged", "over and seen", about=5),
+        event(7, "connection", "standing", alarm="connection", raised=True),
+        *[event(8 + k, "change", f"set point {k}") for k in range(5 * LEAST_EVENTS)],
+    ])  # fmt: skip
+    reader = JournalReader(path)
+    found = reader.events()
+    assert LEAST_EVENTS <= len(found) <= (1 + SLACK) * LEAST_EVENTS
+    assert [i for i, _ in found[:6]] == [1, 2, 3, 4, 8, found[5][0]]
+    assert [e.what for _, e in found[5:]] == [f"set point {k}" for k in range(5 * LEAST_EVENTS)][5 - len(found) :]
+    assert [e.event.what for e in reader.active()] == ["standing", "standing and seen"]
+    shown = {e.event.what: e for e in reader.entries()}
+    assert shown["standing and seen"].acknowledged is not None
+    assert (shown["over and not seen"].over_s, shown["over and not seen"].acknowledged) == (1e9 + 3, None)
+    assert "over and seen" not in shown
+    assert reader.learnt("monitor") == "learnt"
+    size, last = path.stat().st_size, found[-1][0]
+    reader.close()
+    # Faults that come and go, and that nobody ever acknowledges, are bounded too.
+    for _ in range(3):
+        written([event(9, "fault", "flaps" * raised, alarm="flap", raised=raised) for _ in range(5 * LEAST_EVENTS)
+                 for raised in (True, False)])  # fmt: skip
+    reader = JournalReader(path)
+    assert len(reader.events()) <= (1 + SLACK) * LEAST_EVENTS
+    assert reader.events()[-1][0] == last + 30 * LEAST_EVENTS
+    assert [e.event.what for e in reader.active()] == ["standing", "standing and seen"]
+    reader.close()
+    assert path.stat().st_size < 4 * size
+
+
+def test_runs_go_with_their_last_scan(tmp_path: Path, controller: Controller) -> None:
+    path = tmp_path / "loop.journal"
+    for _ in range(6):
+        journal = Journal(path, max_mb=0.2)
+        journal.begin(controller.manifest, controller.sha256, 1e9)
+        for scan in scans(4 * BLOCK):
+            journal.scan(scan)
+        journal.close()
+    reader = JournalReader(path)
+    runs = {run["id"] for run in reader.runs()}
+    assert runs == {run for _, run, _ in reader.scans()}
+    assert 1 not in runs
+    assert 6 in runs
+    reader.close()
 
 
 WRITER = """

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ from serving import Mode, Sample
 from serving.journal import JournalReader, Scan
 from serving.loop import Command
 from serving.opcua.settings import HandBack, ModeNode, Nodes, Point, Server
+from serving.standing import SAME
 from serving.station.requests import Change
 from serving.station.settings import Hold, JournalSettings, Settings
 from serving.station.station import Station
@@ -157,6 +161,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "a value that stands still": (faulty("PV.C_A", "frozen"), "the sample is"),
     "a node that is deleted": (faulty("PV.T", "deleted"), "PV T: BadNodeIdUnknown"),
     "an MV node that is deleted": (faulty("MV.T_j", "deleted"), "the server refuses T_j: Bad"),
+    "a watchdog that stands": (faulty("Control.Watchdog", "frozen"), "the plant's watchdog has stood at"),
     "slow answers": ((slow, fast), "does not answer within"),
     "half-open connection": ((cut, mend), "does not answer within"),
     "server frozen": (
@@ -173,17 +178,26 @@ def wire(plant: Plant) -> Iterator[Wire]:
     made.close()
 
 
-def legal(found: list[Scan], plant: Plant, since: int) -> None:
-    """All that the MV node held since then was commanded by the loop, or was there before it, and lies in the range."""
+def legal(found: list[Scan], plant: Plant, since: int, restarts: bool) -> None:
+    """What the MV node held since then, period by period: in range, and changed by nothing but fresh commands.
+
+    A value that is new there was commanded within the last periods. While the loop holds, the node stands still. Only a
+    node that the server has made anew (``restarts``) shows START without a command.
+    """
     mv = 1 + 2  # behind sp and pv
-    rows = plant.actuator()
-    known = {round(scan.numbers[mv], 9) for scan in found} | {
-        round(row["asked"][0], 9) for row in rows[since - 1 : since + 1]
-    }
-    for row in rows[since:]:
+    commands = [(s.time_s, s.numbers[mv]) for s in found]
+    anew = {START} if restarts else set()
+    rows = plant.actuator()[since - 1 :]
+    for before, row in pairwise(rows):
         (asked,) = row["asked"]
         assert 0 <= asked <= 500
-        assert round(asked, 9) in known or asked == START  # which a server that was started anew has
+        fresh = {v for t, v in commands if row["time"] - 6 * PERIOD_S <= t <= row["time"] + PERIOD_S}
+        assert asked in {before["asked"][0], *fresh, *anew}, (row, fresh)
+    for mode, group in groupby(found, key=lambda s: s.mode):
+        times = [s.time_s for s in group][6:]  # what was on its way has arrived, or never will
+        if mode == "HOLD" and times:
+            stood = {row["asked"][0] for row in rows if times[0] <= row["time"] <= times[-1]} - anew
+            assert not stood or max(stood) - min(stood) <= SAME * 500, stood
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -208,11 +222,76 @@ def test_a_fault_holds_and_is_recovered_from(
     found = running.end()
     assert any(words in r for r in reasons), reasons
     assert len(held) == 1
-    legal(found, plant, since)
+    legal(found, plant, since, restarts=name in {"server killed", "an MV node that is deleted"})
     assert n <= len(found) <= n + 3  # every scan is in the journal
     with capsys.disabled():
         print(f"\n{name:28} HOLD after {until_hold:2} periods, AUTO {until_auto:3} after its end: {reason}")
     assert until_hold <= 5
+
+
+def test_a_plant_whose_watchdog_stands_is_held_within_three_periods(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    """Its values go on, with new source times: nothing else would tell."""
+    running = Running(tmp_path, wire.port)
+    try:
+        running.becomes(Mode.AUTO, 120, scans=8)
+        write(plant, "Faults.Control.Watchdog", "frozen")
+        stood = read(plant, "Control.Watchdog")
+        reason = f"the plant's watchdog has stood at {stood} for 3 scans"  # the first that is said: not for 4
+        assert within(30, lambda: any(c.reason == reason and c.mode is Mode.HOLD for c in running.commands))
+        running.becomes(Mode.HOLD, scans=10)
+        write(plant, "Faults.Control.Watchdog", "")
+        running.becomes(Mode.AUTO, 60)
+    finally:
+        write(plant, "Faults.Control.Watchdog", "")
+        running.end()
+
+
+LOOP = """
+controller = "{file}"
+start = "AUTO"
+speed = {speed}
+[server]
+endpoint = "{endpoint}"
+security = "None"
+insecure = true
+[nodes]
+heartbeat = "nsu=urn:loopwright:plant;s=Control.Heartbeat"
+[nodes.pv]
+C_A = "nsu=urn:loopwright:plant;s=PV.C_A"
+T = "nsu=urn:loopwright:plant;s=PV.T"
+[nodes.mv]
+T_j = {{ node = "nsu=urn:loopwright:plant;s=MV.T_j", read_back = "nsu=urn:loopwright:plant;s=RB.T_j" }}
+"""
+
+
+def test_a_plant_learns_within_three_periods_that_its_loop_was_killed(plant: Plant, tmp_path: Path) -> None:
+    """By the server's own count of periods: a busy machine changes nothing about that."""
+    file = ROOT / "artifacts" / CASE / f"{LAW}.onnx"
+    (tmp_path / "loop.toml").write_text(LOOP.format(file=file, speed=SPEED, endpoint=plant.endpoint))
+    since = len(plant.actuator())
+    command = [sys.executable, "-m", "pipeline", "loop", "run", str(tmp_path / "loop.toml")]
+    with (tmp_path / "said").open("w") as said:
+        loop = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said)
+    try:
+
+        def beats() -> int:
+            rows = plant.actuator()[since:]
+            return sum(a["beat"] != b["beat"] and b["alive"] for a, b in pairwise(rows))
+
+        assert within(120, lambda: beats() > 10), (tmp_path / "said").read_text()
+    finally:
+        loop.kill()
+        loop.wait()
+    killed = len(plant.actuator())
+    assert within(60, lambda: len(plant.actuator()) > killed + 10)
+    rows = plant.actuator()
+    last = max(i for i in range(since + 1, len(rows)) if rows[i]["beat"] != rows[i - 1]["beat"])
+    assert last <= killed + 1
+    learnt = next(i for i in range(last, len(rows)) if not rows[i]["alive"])
+    assert rows[learnt]["k"] - rows[last]["k"] == 3
+    assert not any(row["alive"] for row in rows[learnt:])
+    assert read(plant, "Control.LoopAlive") is False
+    assert len({row["asked"][0] for row in rows[learnt:]}) == 1  # the actuator keeps what it has
 
 
 def test_an_mv_node_of_another_type_is_written_in_that_type(plant: Plant, wire: Wire, tmp_path: Path) -> None:
@@ -243,6 +322,82 @@ def test_the_plants_own_operator_sets_mode_and_set_point(plant: Plant, wire: Wir
     write(plant, "SP.C_A", 1.7)
     assert within(20, lambda: any("refused: set point C_A 1.7" in line for line in running.told))
     assert running.commands[-1].sp.tolist() == [0.9]
+    running.end()
+
+
+def told(running: Running, words: str) -> list[str]:
+    return [line for line in running.told if words in line]
+
+
+def test_what_a_plant_shows_that_started_anew_is_no_wish_until_it_changes(tmp_path: Path) -> None:
+    """Its set point and its mode are defaults then; after a mere outage of the network a new value is a wish."""
+    plant = Plant(tmp_path, CASE, SPEED)
+    plant.start()
+    wire = Wire(plant.port)
+    mode = ModeNode(f"{SPACE}Control.Mode", {"MANUAL": 0, "AUTO": 1, "SHADOW": 2})
+    try:
+        write(plant, "Control.Mode", 1, ua.VariantType.Int32)
+        write(plant, "SP.C_A", 0.9)
+        running = Running(tmp_path, wire.port, nodes={"mode": mode, "sp": {"C_A": f"{SPACE}SP.C_A"}})
+        running.becomes(Mode.AUTO, scans=8)
+        assert running.commands[-1].sp.tolist() == [0.9]
+
+        cut(plant, wire)  # the network alone
+        running.becomes(Mode.HOLD, scans=6)
+        write(plant, "SP.C_A", 0.85)
+        wire.cut = False
+        running.becomes(Mode.AUTO, scans=5)
+        assert within(20, lambda: running.commands[-1].sp.tolist() == [0.85])
+        assert told(running, "started anew") == []
+
+        plant.end()
+        running.becomes(Mode.HOLD, scans=6)
+        plant.start()
+        assert read(plant, "Control.Mode") == 2  # SHADOW, and a set point that nobody asked for
+        assert read(plant, "SP.C_A") != 0.85
+        running.becomes(Mode.AUTO, scans=8)
+        assert running.commands[-1].sp.tolist() == [0.85]
+        assert len(told(running, "no wish of its operator until they change")) == 1
+        assert len(told(running, ": it has started anew")) == 1
+
+        write(plant, "SP.C_A", 0.8)
+        assert within(20, lambda: running.commands[-1].sp.tolist() == [0.8])
+        write(plant, "Control.Mode", 0, ua.VariantType.Int32)
+        running.becomes(Mode.MANUAL)
+        running.end()
+    finally:
+        wire.close()
+        plant.end()
+
+
+@pytest.mark.parametrize("spoilt", ["", "bad"])
+def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
+    spoilt: str, plant: Plant, wire: Wire, tmp_path: Path
+) -> None:
+    """HOLD goes on from where the MV stands, also while a PV is bad; MANUAL too."""
+    running = Running(tmp_path, wire.port, hold=Hold(recover_after=60))  # it holds for all that is looked at below
+    running.becomes(Mode.AUTO, 120, scans=8)
+    for begin, moved in ((Mode.HOLD, 311.0), (Mode.MANUAL, 287.0)):
+        if begin is Mode.MANUAL:
+            assert running.ask(lambda loop: loop.set_mode(Mode.MANUAL), "mode MANUAL") == ""
+            running.becomes(Mode.MANUAL, scans=3)
+        cut(plant, wire)
+        assert within(20, lambda: "does not answer" in running.commands[-1].reason)
+        running.becomes(begin, scans=6)
+        assert running.commands[-1].mv[0] != moved
+        write(plant, "MV.T_j", moved)
+        write(plant, "Faults.PV.T", spoilt)
+        n = len(running.commands)
+        since = len(plant.actuator())
+        mend(plant, wire)
+        assert within(30, lambda: running.commands[-1].mv.tolist() == [moved])  # noqa: B023
+        assert within(20, lambda: len(running.commands) > n + 20)  # noqa: B023
+        write(plant, "Faults.PV.T", "")
+        running.becomes(begin, scans=5)
+        rows = plant.actuator()[since + 1 :]
+        assert len(rows) > 10
+        assert {row["asked"][0] for row in rows} == {moved}
+        assert told(running, f"the MV stands at T_j {moved:g} K, not at T_j ")
     running.end()
 
 

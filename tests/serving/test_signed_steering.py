@@ -140,6 +140,6 @@ def test_a_mistake_in_trusted_is_one_clear_error(trusting: Path, trusted: str, w
 
 
 def test_without_trusted_keys_every_controller_is_offered(trusting: Path) -> None:
-    rows = candidates(trusting.parent, "pid.onnx")
+    rows = candidates(trusting.parent / "pid.onnx")
     assert [row["file"] for row in rows] == ["incad.onnx", "incadec.onnx", "inverse_dob.onnx"]
     assert [row["signed"] for row in rows] == [None] * 3

@@ -125,6 +125,29 @@ def test_a_shipped_law_takes_over_without_a_bump(path: Path, before: Mode) -> No
         assert np.all(move <= 1 / periods * (1 + 1e-12))
 
 
+OTHERS = [(a, b) for a in Mode for b in Mode if a is not b and b is not Mode.AUTO]
+
+
+@by_name
+def test_no_other_change_of_mode_moves_the_mv_of_a_shipped_law(path: Path) -> None:
+    """MANUAL and HOLD begin with the MV that the plant has, and a shadow writes none."""
+    controller = Controller(path)
+    m, case = controller.manifest, CASES[path.parent.name]
+    test = next(iter(case.scenarios().values()))[0]
+    pv = case.plant.measure(test.x0)
+    for before, after in OTHERS:
+        loop = ControlLoop(controller, sp=pv[: len(m.sp)], mv=test.mv0, mode=before, guards=(), transfer_s=m.period_s)
+        mv = test.mv0
+        for _ in range(5):
+            mv = loop.scan(Sample(pv, mv, case.plant.dv_nominal)).mv
+        loop.set_mode(after)
+        for _ in range(3):
+            command = loop.scan(Sample(pv, mv, case.plant.dv_nominal))
+            assert command.mode is after
+            assert command.writes is (after is not Mode.SHADOW)
+            assert command.mv.tolist() == mv.tolist(), (before, after)
+
+
 def test_a_transfer_ends_where_the_law_wants_the_mv(make_loop: Callable[..., ControlLoop]) -> None:
     transfer = Transfer((Signal("valve", "%", 0.0, 100.0), Signal("drain", "-", 0.0, 1.0, (0.0, 1.0))), 0.5, 5.0)
     transfer.begin()
@@ -354,7 +377,13 @@ def test_others_that_do_not_fit_are_named(
         r"MVs are valve \[%\] 0..90; the loop's are valve \[%\] 0..100": replace(
             SIGNALS, mv=(Signal("valve", "%", 0.0, 90.0),)
         ),
-        "measured disturbances are none; the loop's are inflow": replace(SIGNALS, dv=()),
+        r"measured disturbances are heat \[kW\] 0..3; the loop's are inflow": replace(
+            SIGNALS, dv=(Signal("heat", "kW", 0.0, 3.0),)
+        ),
+        r"PVs are T .* have no others, and must begin with those that are controlled": replace(
+            SIGNALS, pv=SIGNALS.pv[1:]
+        ),
+        r"PVs are level .*, T \[degC\]": replace(SIGNALS, pv=(SIGNALS.pv[0], replace(SIGNALS.pv[1], unit="degC"))),
     }
     for words, signals in others.items():
         export(make_formula(fast, signals=signals), tmp_path / "other.onnx", case="tank", provenance={})

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import shutil
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,8 +20,9 @@ from serving import Mode
 from serving.errors import LoopError
 from serving.opcua.lease import SCANS, NodeLease
 from serving.station import station
-from serving.station.control import ask
+from serving.station.control import Control, ask, door
 from serving.station.lease import Lease, address_of
+from serving.station.tending import Tending
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
 LOOP = """
@@ -154,6 +158,74 @@ def test_a_system_without_unix_users_is_told_so(monkeypatch: pytest.MonkeyPatch,
     with pytest.raises(LoopError, match="runs on Linux and macOS; on Windows run it in WSL"):
         Lease("opc.tcp://plant", ["ns=2;s=MV.u"], tmp_path / "locks")
     assert not (tmp_path / "locks").exists()
+
+
+def test_locks_are_kept_from_those_who_clean_temporary_folders(tmp_path: Path) -> None:
+    nodes, folder = ["ns=2;s=MV.u", "ns=2;s=MV.v"], tmp_path / "locks"
+    lease = Lease("opc.tcp://127.0.0.1:4841", nodes, folder)
+    for path in folder.iterdir():
+        os.utime(path, (0, 0))
+    lease.tend()
+    assert all(time.time() - path.stat().st_mtime < 600 for path in folder.iterdir())
+    shutil.rmtree(folder)
+    lease.tend()
+    with pytest.raises(LoopError, match=rf"is written by another loop \(process {os.getpid()}\)"):
+        Lease("opc.tcp://127.0.0.1:4841", nodes[1:], folder)
+    # A second loop that came while the file was gone has the node: the first one says so, and keeps what it has.
+    next(path for path in folder.iterdir() if path == lease._path(nodes[0])).unlink()
+    other = Lease("opc.tcp://127.0.0.1:4841", nodes[:1], folder)
+    with pytest.raises(LoopError, match=r"MV.u at .* is written by another loop"):
+        lease.tend()
+    other.release()
+    lease.tend()
+    lease.release()
+    Lease("opc.tcp://127.0.0.1:4841", nodes, folder).release()
+
+
+def test_a_loops_door_is_opened_anew_where_its_socket_was_removed(tmp_path: Path) -> None:
+    journal = tmp_path / "loop.journal"
+    control = Control(journal, lambda request: {"done": request["do"]})
+    try:
+        os.utime(control.path, (0, 0))
+        control.tend()
+        assert time.time() - control.path.stat().st_mtime < 600
+        control.path.unlink()
+        with pytest.raises(LoopError, match="no loop runs with this journal"):
+            ask(journal, {"do": "state"})
+        control.tend()
+        assert ask(journal, {"do": "state"}) == {"done": "state"}
+    finally:
+        control.close()
+    assert not control.path.exists()
+
+
+def test_tending_goes_on_whatever_it_meets() -> None:
+    said, calls = list[str](), list[int]()
+
+    def act() -> None:
+        calls.append(1)
+        if len(calls) in {2, 3}:
+            raise LoopError("another loop has it")
+
+    tending = Tending(act, said.append, every_s=0.001)
+    assert within(20, lambda: len(calls) > 5)
+    tending.close()
+    assert said == ["LoopError: another loop has it", ""]
+
+
+def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(station, "Tending", lambda act, trouble: Tending(act, trouble, every_s=0.05))
+    loop = machine(tmp_path / "a", plant, "SHADOW", monkeypatch)
+    folder, journal = tmp_path / "a", loop.settings.journal.file
+    try:
+        locks = [path for path in folder.iterdir() if len(path.name) == 32]
+        assert len(locks) == 1
+        locks[0].unlink()
+        door(journal).unlink()
+        assert within(20, lambda: locks[0].exists() and door(journal).exists())
+        assert ask(journal, {"do": "state"})["mode"] == "SHADOW"
+    finally:
+        loop.end()
 
 
 def test_another_spelling_of_the_host_is_the_same_plant(tmp_path: Path) -> None:

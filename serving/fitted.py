@@ -1,0 +1,119 @@
+"""A controller in a loop that reads more signals than the controller does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from serving.controller import Controller, Step
+from serving.errors import ContractError, LoopError
+from serving.manifest import INPUTS, Manifest, Signal
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Fitted(Controller):
+    """A controller that gets its own PVs and measured disturbances out of a loop's, by name.
+
+    Its ``manifest`` has all signals of the loop, so that whoever reads, judges, shows or writes down a scan does so as
+    before; those that the controller reads have the ranges for which it was proven. ``inner`` is the controller itself.
+    """
+
+    def __init__(self, inner: Controller, loop: Manifest) -> None:
+        own = inner.manifest
+        self.inner, self.manifest = inner, _seen_as(own, loop)
+        self.path, self.sha256 = inner.path, inner.sha256
+        self.size_bytes, self.summary = inner.size_bytes, inner.summary
+        self._pv, self._dv = _places(own.pv, loop.pv), _places(own.dv, loop.dv)
+
+    def step(
+        self, *, sp: ArrayLike, pv: ArrayLike, mv_applied: ArrayLike, state: ArrayLike, dv: ArrayLike | None = None
+    ) -> Step:
+        """One step, on all PVs and measured disturbances of the loop."""
+        return self.inner.step(
+            sp=sp,
+            pv=_picked(pv, self._pv, self.manifest.pv, "pv"),
+            mv_applied=mv_applied,
+            state=state,
+            dv=_picked(dv, self._dv, self.manifest.dv, "dv") if "dv" in self.inner.manifest.inputs else None,
+        )
+
+    def warm(self) -> None:
+        """As the controller itself."""
+        self.inner.warm()
+
+
+def fitted(controller: Controller, loop: Manifest) -> Controller:
+    """``controller`` for a loop that reads the signals of ``loop``: itself where it reads all of them.
+
+    LoopError where it cannot take over there: another period, a signal that the loop does not read, another order of
+    what it controls, other set points or MVs. Of the MVs ranges and values count too: they belong to the actuator. The
+    ranges of set points and PVs say where a controller was proven, and may be others.
+    """
+    require_fits(controller.manifest, loop)
+    return controller if _seen_as(controller.manifest, loop) == controller.manifest else Fitted(controller, loop)
+
+
+def require_fits(own: Manifest, loop: Manifest) -> None:
+    """LoopError where a controller of ``own`` cannot take over in a loop that reads ``loop``; see ``fitted``."""
+    if own.period_s != loop.period_s:
+        raise LoopError(f"the new controller has a period of {own.period_s:g} s; the loop runs at {loop.period_s:g} s")
+    if "dv" in own.inputs and "dv" not in loop.inputs:
+        raise LoopError(
+            "the new controller uses measured disturbances, which this loop does not judge; restart with it"
+        )
+    for name, words, ranged in (("sp", "set points", False), ("mv", "MVs", True)):
+        ours, its = loop.signals(name), own.signals(name)
+        if [_what(s, ranged) for s in ours] != [_what(s, ranged) for s in its]:
+            same = "name, unit, range and order" if ranged else "name, unit and order"
+            raise LoopError(
+                f"the new controller's {words} are {_shown(its)}; the loop's are {_shown(ours)}, and both must be the "
+                f"same in {same}"
+            )
+    controlled = len(loop.sp)
+    for name, words, first in (("pv", "PVs", controlled), ("dv", "measured disturbances", 0)):
+        ours, its = loop.signals(name), own.signals(name)
+        known = [_what(s) for s in ours]
+        if [_what(s) for s in its[:first]] != known[:first] or not {_what(s) for s in its} <= set(known):
+            order = ", and must begin with those that are controlled, in the same order" if first else ""
+            raise LoopError(
+                f"the new controller's {words} are {_shown(its)}; the loop's are {_shown(ours)}: it may leave some of "
+                f"them out, but have no others{order}"
+            )
+
+
+def _seen_as(own: Manifest, loop: Manifest) -> Manifest:
+    """``own`` with all PVs and measured disturbances of the loop, which goes on judging them as it did."""
+    inputs = tuple(n for n in INPUTS if n in own.inputs or (n == "dv" and n in loop.inputs))
+    if set(inputs) == set(own.inputs):
+        inputs = own.inputs
+    return replace(own, pv=_ranged(loop.pv, own.pv), dv=_ranged(loop.dv, own.dv), inputs=inputs)
+
+
+def _ranged(loop: Sequence[Signal], own: Sequence[Signal]) -> tuple[Signal, ...]:
+    known = {s.name: s for s in own}
+    return tuple(known.get(s.name, s) for s in loop)
+
+
+def _places(own: Sequence[Signal], loop: Sequence[Signal]) -> list[int]:
+    names = [s.name for s in loop]
+    return [names.index(s.name) for s in own]
+
+
+def _picked(values: ArrayLike | None, places: Sequence[int], loop: Sequence[Signal], name: str) -> Array:
+    vector = np.asarray(values)
+    if vector.shape != (len(loop),):
+        raise ContractError(f"{name} has the shape {vector.shape}; the loop has ({len(loop)},)")
+    return np.asarray(vector[places])
+
+
+def _what(s: Signal, ranged: bool = False) -> tuple[object, ...]:
+    return (s.name, s.unit, s.low, s.high, s.values) if ranged else (s.name, s.unit)
+
+
+def _shown(signals: Sequence[Signal]) -> str:
+    return ", ".join(f"{s.name} [{s.unit}] {s.low:g}..{s.high:g}" for s in signals) or "none"

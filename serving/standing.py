@@ -1,0 +1,56 @@
+"""Where the MVs stand after commands that did not reach the plant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.guard import READ_BACK_MARGIN
+from serving.manifest import Signal
+
+Array: TypeAlias = NDArray[np.float64]
+
+SAME = 1e-3  # of an MV's range: a read-back no farther than that from where it was expected has not moved
+SETTLED = 5  # equal commands in a row: a read-back that lags has followed
+
+
+class Standing:
+    """The MVs that the plant has, as far as the loop knows.
+
+    While commands arrive, they are the last command. Once one did not arrive, others may have moved an MV, and the next
+    read-back decides. A sound read-back may differ from its command all the time, by an actuator's offset: without it,
+    each outage would carry the MV away by that much. The offset is learnt while the command rests.
+    """
+
+    def __init__(self, signals: Sequence[Signal], mv: Array) -> None:
+        span = np.array([s.high - s.low for s in signals])
+        self._low, self._high = np.array([s.low for s in signals]), np.array([s.high for s in signals])
+        self._same = SAME * span
+        self._most = np.array([0.0 if s.values is not None else READ_BACK_MARGIN for s in signals]) * span
+        self.mv = mv.copy()  # shape: (n_mv,)
+        self._rested = 0
+        # What is seen just before a loss may be somebody's move already: an offset counts once a command has followed.
+        self._offset = self._seen = np.zeros(len(signals))
+        self.lost = False  # whether the last command did not arrive, and no read-back has come since
+
+    def commanded(self, mv: Array) -> None:
+        """A command (n_mv,) went out, and nothing was heard of its loss."""
+        if self.lost:
+            return
+        self._rested = self._rested + 1 if np.array_equal(mv, self.mv) else 0
+        self.mv, self._offset = mv.copy(), self._seen
+
+    def seen(self, applied: Array) -> Array | None:
+        """A read-back (n_mv,). Where the MVs stand after a loss, else None: HOLD then keeps what it has."""
+        if not self.lost:
+            off = applied - self.mv
+            if self._rested >= SETTLED:
+                self._seen = np.where(np.abs(off) <= self._most, off, 0.0)
+            return None
+        found = np.clip(applied - self._offset, self._low, self._high)
+        self.mv, self.lost = np.where(np.abs(found - self.mv) <= self._same, self.mv, found), False
+        self._rested, self._seen = 0, self._offset
+        return self.mv

@@ -1,0 +1,34 @@
+"""What the plant's own operator asks for by the nodes of its set points and its mode."""
+
+from __future__ import annotations
+
+from serving.opcua.endpoint import Values
+
+MODE = "mode"
+
+
+class Wishes:
+    """A value that has changed is a wish.
+
+    The set points that stand there when the loop begins are wishes, too; the mode is none. What a server shows that has
+    started anew are its defaults: nobody asked for them, and they are no wish until they change.
+    """
+
+    def __init__(self) -> None:
+        self._stands: dict[str, float | str] = {}  # since the loop began, or the server did
+        self.starts = 0  # of the server, as far as its values were looked at
+
+    def of(self, values: Values) -> tuple[dict[str, float], str]:
+        """Set points by name, and the mode, that are asked for with these values; empty where there is no wish."""
+        if values.starts != self.starts:
+            self.starts = values.starts
+            self._stands.clear()
+        points = {n: v for n, v in values.asked_sp.items() if self._changed(f"SP {n}", v, first=self.starts == 0)}
+        mode = values.asked_mode
+        return points, mode if mode and self._changed(MODE, mode, first=False) else ""
+
+    def _changed(self, name: str, value: float | str, *, first: bool) -> bool:
+        """Whether a value is a wish; ``first``: also one that is seen for the first time."""
+        before = self._stands.get(name)
+        self._stands[name] = value
+        return first if before is None else before != value

@@ -1,0 +1,207 @@
+"""After commands that did not reach the plant the loop goes on from where the MV stands, and writes nothing over it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from serving import Controller, ControlLoop, EndpointError, Fallback, LoopError, Mode, Sample, VirtualClock
+from serving.standing import SAME, SETTLED
+
+pytest_plugins = ["small_laws"]
+RANGE = 100.0
+TOLERANCE = SAME * RANGE
+
+
+class Line:
+    """A plant with an MV that others may move; a read-back that lags, or differs by an offset; a way that is cut."""
+
+    def __init__(self, mv: float = 40.0, lag: int = 0, offset: float = 0.0) -> None:
+        self.mv, self.lag, self.offset = mv, lag, offset
+        self.away = self.deaf = self.pv_bad = self.rb_bad = False
+        self.written: list[float] = []
+        self._past = [mv]
+        self.owner = 0
+
+    def read(self) -> Sample:
+        self._past.append(self.mv)
+        if self.away:
+            raise EndpointError("no answer")
+        read_back = self._past[-1 - min(self.lag, len(self._past) - 1)] + self.offset
+        applied = np.array([np.nan if self.rb_bad else read_back])
+        return Sample(np.array([0.9, 300.0]), applied, np.zeros(1), fault="PV level: Bad" if self.pv_bad else "")
+
+    def write(self, mv: np.ndarray) -> None:
+        if self.away or self.deaf:
+            raise EndpointError("not written")
+        self.mv = float(mv[0])
+        self.written.append(self.mv)
+
+    def hand_back(self) -> None:
+        if self.away or self.deaf:
+            raise EndpointError("not written")
+        self.owner += 1
+
+
+@pytest.fixture(scope="module")
+def law(pi_file: Path) -> Controller:
+    return Controller(pi_file)
+
+
+@pytest.fixture
+def make_loop(law: Controller) -> Callable[..., ControlLoop]:
+    def make(line: Line, **options: Any) -> ControlLoop:
+        values = {"sp": 1.0, "mv": 40.0, "mode": Mode.AUTO, "clock": VirtualClock(), "warm_lead_s": 0, **options}
+        return ControlLoop(law, line, **values)
+
+    return make
+
+
+def outage(loop: ControlLoop, line: Line, scans: int, moved_to: float | None = None) -> None:
+    line.away = True
+    loop.run(scans)
+    if moved_to is not None:
+        line.mv = moved_to
+    line.away = False
+    line.written.clear()
+
+
+@pytest.mark.parametrize("mode", [Mode.AUTO, Mode.MANUAL, Mode.HOLD])
+@pytest.mark.parametrize("pv_bad", [False, True])
+def test_what_others_set_meanwhile_is_held(make_loop: Callable[..., ControlLoop], mode: Mode, pv_bad: bool) -> None:
+    """Also while a PV is bad: a read-back that is good says where the MV stands."""
+    line = Line()
+    loop = make_loop(line, mode=mode)
+    loop.run(3)
+    outage(loop, line, 50, 71.0)
+    line.pv_bad = pv_bad
+    loop.run(5)
+    assert line.written == [71.0] * 5
+    assert loop.mode is (Mode.MANUAL if mode is Mode.MANUAL else Mode.HOLD)
+
+
+def test_a_read_back_that_is_bad_waits_for_a_good_one(make_loop: Callable[..., ControlLoop]) -> None:
+    """Refused writes, as by a plant that somebody else controls: each good read-back counts, and a bad one does not."""
+    line = Line()
+    loop = make_loop(line, mode=Mode.MANUAL)
+    loop.run(3)
+    line.deaf = True
+    loop.run(4)
+    line.mv = 71.0
+    loop.run(1)
+    line.rb_bad = True
+    loop.run(3)
+    line.deaf = False
+    loop.run(1)
+    assert line.written[-1] == 71.0  # found while nothing could be written, and not forgotten by the next refusal
+    line.rb_bad = False
+    loop.run(2)
+    assert line.written[-2:] == [71.0, 71.0]
+
+
+def test_an_mv_is_not_set_by_hand_while_nobody_knows_where_it_stands(make_loop: Callable[..., ControlLoop]) -> None:
+    line = Line()
+    loop = make_loop(line, mode=Mode.MANUAL)
+    loop.run(1)
+    line.away = True
+    loop.run(2)
+    with pytest.raises(LoopError, match="the last MV did not reach the plant, so where the MV stands is not known"):
+        loop.set_mv(63.0)
+    line.away = False
+    loop.run(1)
+    loop.set_mv(63.0)
+    loop.run(1)
+    assert line.written[-1] == 63.0
+
+
+def test_a_loop_without_read_back_keeps_what_it_has(law: Controller) -> None:
+    loop = ControlLoop(law, sp=1.0, mv=40.0, mode=Mode.MANUAL)
+    sample = Sample(np.array([0.9, 300.0]), None, np.zeros(1))
+    loop.scan(sample)
+    loop.unwritten(loop.mv, "not written")
+    assert loop.scan(sample).mv.tolist() == [40.0]
+    loop.set_mv(63.0)
+    assert loop.scan(sample).mv.tolist() == [63.0]
+
+
+def test_a_safe_mv_is_reached_from_where_the_mv_stands(make_loop: Callable[..., ControlLoop]) -> None:
+    line = Line()
+    loop = make_loop(line, fallback=Fallback(1.0, (20.0,), (6.0,)))
+    loop.run(3)
+    outage(loop, line, 50, 71.0)
+    line.pv_bad = True
+    loop.run(20)
+    assert line.written == [*np.arange(68.0, 20.0, -3.0), 20.0, 20.0, 20.0, 20.0]
+
+
+def test_a_plant_that_is_handed_back_is_not_moved(make_loop: Callable[..., ControlLoop]) -> None:
+    line = Line()
+    loop = make_loop(line, fallback=Fallback(1.0, hand_back=True))
+    loop.run(3)
+    outage(loop, line, 50, 71.0)
+    loop.run(5)
+    assert (line.written, line.owner, loop.mode) == ([], 1, Mode.SHADOW)
+    loop.set_mode(Mode.HOLD)
+    loop.run(2)
+    assert line.written == [71.0, 71.0]
+
+
+def test_auto_takes_over_from_where_the_mv_stands(make_loop: Callable[..., ControlLoop]) -> None:
+    line = Line()
+    loop = make_loop(line, sp=0.9, recover_after=3, transfer_s=50.0)
+    loop.run(3)
+    outage(loop, line, 50, 71.0)
+    loop.run(20)
+    assert loop.mode is Mode.AUTO
+    assert np.abs(np.diff([71.0, *line.written])).max() <= 1.0 + 1e-9  # 1 % of the range a scan
+
+
+@pytest.mark.parametrize(("lag", "offset"), [(1, 0.0), (2, 0.0), (0, 0.7), (1, -1.3)])
+@pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD])
+def test_a_read_back_that_lags_or_differs_does_not_make_the_mv_creep(
+    make_loop: Callable[..., ControlLoop], mode: Mode, lag: int, offset: float
+) -> None:
+    """A thousand outages in which nobody moves anything."""
+    line = Line(lag=lag, offset=offset)
+    loop = make_loop(line, mode=mode)
+    loop.run(SETTLED + lag + 2)
+    for k in range(1_000):
+        outage(loop, line, 1 + k % 4)
+        loop.run(1 + k % 3)
+    assert line.mv == 40.0
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.data(), st.sampled_from([0, 1, 2]), st.sampled_from([0.0, 0.5]), st.sampled_from([Mode.MANUAL, Mode.HOLD]))
+def test_no_outage_moves_an_mv_that_nobody_moved_and_none_writes_over_one_that_was_moved(
+    law: Controller, data: st.DataObject, lag: int, offset: float, mode: Mode
+) -> None:
+    line = Line(lag=lag, offset=offset)
+    loop = ControlLoop(law, line, sp=1.0, mv=40.0, mode=mode, clock=VirtualClock(), warm_lead_s=0)
+    loop.run(SETTLED + lag + 2)
+    for _ in range(data.draw(st.integers(1, 6))):
+        stood = line.mv
+        moved = data.draw(st.none() | st.floats(0.0, RANGE - 1.0))  # beyond, a read-back is clipped
+        scans = data.draw(st.integers(lag + 1, lag + 20))
+        line.away = data.draw(st.booleans())
+        line.deaf = not line.away
+        first = data.draw(st.integers(0, scans - lag - 1))
+        loop.run(first)
+        if moved is not None:
+            line.mv = moved
+        loop.run(scans - first)
+        line.pv_bad = data.draw(st.booleans())
+        line.away = line.deaf = False
+        line.written.clear()
+        loop.run(data.draw(st.integers(lag + 1, 5)))
+        if moved is None:
+            assert line.written == [stood] * len(line.written)
+        else:
+            assert np.abs(np.array(line.written) - moved).max() <= TOLERANCE + 1e-9
+        line.pv_bad = False
