@@ -22,7 +22,7 @@ def candidates(folder: Path, in_charge: str, trusted: Sequence[str] | None = Non
     """
     found: list[dict[str, Any]] = []
     now, _, _ = _described(folder / in_charge, trusted)
-    for path in sorted(folder.glob("*.onnx"))[:MOST]:
+    for path in sorted(p for p in folder.glob("*.onnx") if p.is_file())[:MOST]:  # no pipe, which would never end
         try:
             manifest, sha256, signed = _described(path, trusted)
             require_same_signals(now, manifest)

@@ -13,7 +13,7 @@ from serving.journal import JournalReader
 Array: TypeAlias = NDArray[np.float64]
 
 GAP = 5  # periods without a scan: a gap in the line
-MOST_POINTS = 5_000
+MOST_POINTS = 2_000
 
 
 class Thinned:
