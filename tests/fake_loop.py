@@ -16,6 +16,7 @@ from serving.page.settings import Page
 from serving.station.control import Control
 
 BEGIN = 1_790_000_000.0
+THIRDS = [0.0, 1 / 3, 1.0]  # of an MV that is not continuous
 
 
 class FakeLoop:
@@ -35,6 +36,7 @@ class FakeLoop:
         groups = {"sp": m.sp, "pv": m.pv, "mv": m.mv, "dv": m.dv}
         self.about = {
             "title": m.law,
+            "period_s": 1.0,
             "signals": {name: [s.to_dict() for s in group] for name, group in groups.items()},
             "info": list(m.info),
             "folder": str(controller.path.parent),

@@ -25,7 +25,7 @@ class Access:
     """Answers only who asks for one of ``hosts``, and lets nothing but this page's own scripts change anything.
 
     A name that an attacker's own DNS points here is no name of this page (Host); a form or a script of another site
-    says where it comes from (Origin, Sec-Fetch-Site).
+    says where it comes from (Origin, Sec-Fetch-Site). Of other sites only a link to the page itself is followed.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], scheme: str) -> None:
@@ -55,13 +55,21 @@ class Access:
         if len(hosts) != 1 or hosts[0].lower() not in self.hosts:
             return 421, f"this page is served as {', '.join(sorted(self.hosts))}; page.names in loop.toml adds names"
         if scope["method"] in {"GET", "HEAD"}:
+            foreign = headers.get("sec-fetch-site", "none") not in {"same-origin", "none"}
+            followed = headers.get("sec-fetch-dest") == "document" and not scope["path"].startswith("/api/")
+            if foreign and not followed:
+                return 403, "only this page's own scripts may read from it"
             return None
+        if scope["method"] != "POST":
+            return 405, "this page is read by GET and changed by POST"
         if headers.getlist("origin") not in ([o] for o in self.origins):
             return 403, "a change must come from this page itself"
         if headers.get("sec-fetch-site", "same-origin") != "same-origin":
             return 403, "a change must come from this page itself"
         if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
             return 415, "a change is sent as application/json"
+        if headers.getlist("transfer-encoding") or headers.getlist("content-encoding"):
+            return 413, "a change is sent as it is, and says how long it is"
         length = headers.get("content-length", "")
         if not (length.isascii() and length.isdigit()) or int(length) > LONGEST_BODY:
             return 413, f"a change has at most {LONGEST_BODY} bytes, and says how many"

@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from starlette.applications import Starlette
@@ -25,7 +25,8 @@ from serving.journal import JournalReader
 from serving.page import metrics
 from serving.page.access import LONGEST_BODY, Access
 from serving.page.candidates import candidates
-from serving.page.live import ENTRIES, Ask, Live, shown
+from serving.page.live import ENTRIES, LATER_MS, Ask, Live, shown
+from serving.page.shared import Shared
 from serving.page.trend import MOST_POINTS, trend
 
 STATIC = Path(__file__).parent / "static"
@@ -41,6 +42,8 @@ class PageApp:
     def __init__(self, journal: Path, ask: Ask, token: str, tell: Callable[[str], None] = lambda _: None) -> None:
         self.journal, self.ask, self.token, self.tell = journal, ask, token, tell
         self.live = Live(journal, ask)
+        self._about = Shared(lambda: self._asked({"do": "about"}))
+        self._described = Shared(self._describe)
         self._told = -math.inf
         self._trends = asyncio.Semaphore(TRENDS)
 
@@ -71,14 +74,17 @@ class PageApp:
 
     async def about(self, _: Request) -> Response:
         """What the loop is."""
-        found = await self._asked({"do": "about"})
-        card = found["card"]
-        folder, trusted = Path(found.pop("folder")), found.pop("trusted", None)
-        at = folder / card["file"]
-        first = Path(found.pop("first", at))
-        found["candidates"] = await asyncio.to_thread(self._candidates, at, first, trusted)
-        card["picture"] = f"/api/picture/{card['sha256'][:16]}" if card["picture"] else None
-        return JSONResponse(found)
+        return Response(await self._described(), media_type="application/json")
+
+    async def _describe(self) -> str:
+        about = await self._about()
+        card = about["card"]
+        picture = f"/api/picture/{card['sha256'][:16]}" if card["picture"] else None
+        at = Path(about["folder"]) / card["file"]
+        others = await asyncio.to_thread(self._candidates, at, Path(about.get("first", at)), about.get("trusted"))
+        private = {"folder", "first", "trusted"}  # paths of this machine
+        shown = {k: v for k, v in about.items() if k not in private}
+        return json.dumps({**shown, "card": {**card, "picture": picture}, "candidates": others}, allow_nan=False)
 
     def _candidates(self, in_charge: Path, first: Path, trusted: list[str] | None) -> list[dict[str, Any]]:
         try:
@@ -128,6 +134,11 @@ class PageApp:
 
     async def stream(self, request: Request) -> Response:
         """What is new, as server-sent events."""
+        if request.method == "HEAD":
+            return Response(media_type="text/event-stream")
+        if self.live.full:
+            after = {"Retry-After": str(LATER_MS // 1000)}
+            raise HTTPException(503, "as many pages are open as are sent news; close one", after)
         last = request.headers.get("last-event-id", "")
         seen = int(last) if last.isascii() and last.isdigit() and len(last) < 16 else None
         return StreamingResponse(self.live.messages(seen), media_type="text/event-stream")
@@ -142,20 +153,21 @@ class PageApp:
             return JSONResponse({"error": "the token is not the loop's; it prints its token at its start"}, 401)
         try:
             async with asyncio.timeout(BODY_S):
-                body = await request.body()
-            wanted = json.loads(body) if len(body) <= LONGEST_BODY else None
+                wanted = json.loads(await _body(request))
         except TimeoutError:
             raise HTTPException(408, "the change did not arrive in time") from None
         except (ValueError, RecursionError):
             raise HTTPException(400, "the change is no JSON") from None
         if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "picture"}:
             raise HTTPException(400, 'a change is an object with "do"')
+        if wanted.get("do") == "swap" and not _is_name(wanted.get("value")):
+            raise HTTPException(400, "the page tries only files that lie beside the controller in charge, by name")
         answer = await asyncio.to_thread(self.ask, wanted)
         return JSONResponse(answer, 409 if "error" in answer else 200)
 
     async def metrics(self, _: Request) -> Response:
         """For Prometheus."""
-        about, state = await self._asked({"do": "about"}), await self.live.state()
+        about, state = await self._about(), await self.live.state()
         return PlainTextResponse(metrics.text(about, state), media_type="text/plain; version=0.0.4")
 
     async def healthz(self, _: Request) -> Response:
@@ -181,6 +193,22 @@ def _number(request: Request, name: str, otherwise: float | None = None) -> floa
     if number is None or not math.isfinite(number):
         raise HTTPException(400, f"{name} must be a number")
     return number
+
+
+async def _body(request: Request) -> bytes:
+    """The body of a change; its length was said, but a proxy may have said another one."""
+    body = bytearray()
+    async for piece in request.stream():
+        body += piece
+        if len(body) > LONGEST_BODY:
+            raise HTTPException(413, f"a change has at most {LONGEST_BODY} bytes")
+    return bytes(body)
+
+
+def _is_name(value: Any) -> bool:
+    """Whether a swap names a file without a way to it."""
+    file = value.get("file") if isinstance(value, dict) else None
+    return isinstance(file, str) and file not in {"", ".", ".."} and PurePath(file).name == file and "\\" not in file
 
 
 async def _http_error(_: Request, error: Exception) -> Response:

@@ -26,7 +26,8 @@ def candidates(
     """
     found: list[dict[str, Any]] = []
     now, _, _ = _described(first or in_charge, trusted)
-    for path in sorted(in_charge.parent.glob("*.onnx"))[:MOST]:
+    beside = (p for p in in_charge.parent.glob("*.onnx") if p.is_file())  # no pipe, which would never end
+    for path in sorted(beside)[:MOST]:
         try:
             manifest, sha256, signed = _described(path, trusted)
             require_fits(manifest, now)

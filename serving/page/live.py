@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import json
+import sqlite3
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from serving.errors import LoopwrightError
 from serving.journal import JournalReader
 from serving.journal.reader import Entry
+from serving.page.shared import Shared
 from serving.page.trend import plain
 
 Ask: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 
 QUIET = ": still here\n\n"
 POLL_S, STATE_S, QUIET_S = 0.3, 1.0, 15.0
+MOST_PAGES = 60  # that are sent news at a time
+LATER_MS = 30_000  # after which a page beyond them may come again
 WAITING = 100  # messages that a page that takes none may leave
 MOST_SCANS = 2_000  # that fill a gap; beyond it the page asks for the trend anew
 ENTRIES = 200
@@ -31,6 +35,8 @@ class Live:
         self.journal, self._ask = journal, ask
         self._pages: set[asyncio.Queue[str | None]] = set()
         self._task: asyncio.Task[None] | None = None
+        self._beginning = asyncio.Lock()
+        self._newest_state = Shared(self._asked_state)
         self._last_id, self._state_at = 0, 0.0
         self._log: dict[int, str] = {}
         self._state: dict[str, Any] = {}
@@ -38,23 +44,33 @@ class Live:
     async def state(self, longest_s: float = 0.5) -> dict[str, Any]:
         """The loop's state, at most so old; where the loop does not answer, one that says so."""
         if not self._state or time.monotonic() - self._state_at > longest_s:
-            try:
-                found = await asyncio.to_thread(self._ask, {"do": "state"})
-            except LoopwrightError as error:
-                found = {**self._state, "alive": False, "connection": str(error)}
-                found.setdefault("time", time.time())
-                found.setdefault("mode", "HOLD")
-            self._state, self._state_at = found, time.monotonic()
+            return await self._newest_state()
         return self._state
+
+    async def _asked_state(self) -> dict[str, Any]:
+        try:
+            found = await asyncio.to_thread(self._ask, {"do": "state"})
+        except LoopwrightError as error:
+            found = {**self._state, "alive": False, "connection": str(error)}
+            found.setdefault("time", time.time())
+            found.setdefault("mode", "HOLD")
+        self._state, self._state_at = found, time.monotonic()
+        return found
+
+    @property
+    def full(self) -> bool:
+        """Whether no further page is sent news."""
+        return len(self._pages) >= MOST_PAGES
 
     async def messages(self, last_id: int | None) -> AsyncIterator[str]:
         """Server-sent events for one page; ``last_id`` is the last scan that it has seen."""
+        if self.full:  # others came in at the same moment
+            yield f"retry: {LATER_MS}\n\n"
+            return
         queue = asyncio.Queue[str | None](WAITING)
-        if self._task is None or self._task.done():
-            self._last_id = (await asyncio.to_thread(self._read, None))[1]
-            self._task = asyncio.create_task(self._run())
         self._pages.add(queue)
         try:
+            await self._begin()
             yield "retry: 1000\n\n"
             yield _message("state", await self.state())
             if last_id is not None:
@@ -73,12 +89,22 @@ class Live:
         finally:
             self._pages.discard(queue)
 
+    async def _begin(self) -> None:
+        """Look for news from here on, unless that is done already."""
+        async with self._beginning:
+            if self._task is None or self._task.done():
+                self._last_id = (await asyncio.to_thread(self._read, None))[1]
+                self._task = asyncio.create_task(self._run())
+
     async def _run(self) -> None:
         began = 0.0
         while self._pages:
             await asyncio.sleep(POLL_S)
-            texts, self._last_id = await asyncio.to_thread(self._read, self._last_id)
-            texts += await asyncio.to_thread(self._entries)
+            texts: list[str] = []
+            # A journal that cannot be read now may be read the next time; the state is told meanwhile.
+            with suppress(LoopwrightError, sqlite3.Error, OSError):
+                texts, self._last_id = await asyncio.to_thread(self._read, self._last_id)
+                texts += await asyncio.to_thread(self._entries)
             if time.monotonic() - began > STATE_S or any("event: log" in text for text in texts):
                 began = time.monotonic()
                 texts.append(_message("state", await self.state(0.0)))

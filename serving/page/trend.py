@@ -13,7 +13,7 @@ from serving.journal import JournalReader
 Array: TypeAlias = NDArray[np.float64]
 
 GAP = 5  # periods without a scan: a gap in the line
-MOST_POINTS = 5_000
+MOST_POINTS = 2_000
 
 
 class Thinned:
@@ -65,11 +65,36 @@ class Thinned:
         return times, columns
 
 
+class Modes:
+    """The changes of mode, ``(time, mode)``, as scans come in; the mode is empty where none did."""
+
+    def __init__(self) -> None:
+        self.changes: list[tuple[float, str]] = []
+        self._last: float | None = None
+
+    def add(self, times: Array, modes: list[str], longest_s: float) -> None:
+        """Scans at ``times`` (n,), in order; a pause longer than ``longest_s`` is a gap."""
+        last = times[0] if self._last is None else self._last
+        before = np.concatenate([[last], times[:-1]])
+        gaps = times - before > longest_s
+        present = self.changes[-1][1] if self.changes else ""
+        for t, since, gap, mode in zip(times.tolist(), before.tolist(), gaps.tolist(), modes, strict=True):
+            if gap:
+                self.changes.append((since, ""))
+            if gap or mode != present:
+                self.changes.append((t, mode))
+                present = mode
+        self._last = float(times[-1])
+
+
 def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> dict[str, Any]:
-    """What is drawn from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode."""
+    """What is drawn from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode.
+
+    The mode is empty from the last scan before a gap to the first one after it.
+    """
     runs = {run["id"]: run for run in reader.runs()}
-    thinned, whole, modes, count = Thinned(begin_s, end_s, points), list[tuple[Array, dict[str, Array]]](), [], 0
-    period = max((run["period_s"] for run in runs.values()), default=1.0)
+    thinned, whole, modes, count = Thinned(begin_s, end_s, points), list[tuple[Array, dict[str, Array]]](), Modes(), 0
+    longest = GAP * max((run["period_s"] / run["speed"] for run in runs.values()), default=1.0)
     for run, numbers, mode in reader.tables(begin_s, end_s):
         times = numbers[:, 0]
         columns = {name: numbers[:, i + 1] for i, name in enumerate(runs[run]["columns"])}
@@ -77,15 +102,13 @@ def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> d
         count += len(times)
         if count <= 2 * points:
             whole.append((times, columns))
-        modes += [
-            [t, m] for i, (t, m) in enumerate(zip(times.tolist(), mode, strict=True)) if i == 0 or m != mode[i - 1]
-        ]
+        modes.add(times, mode, longest)
     times, columns = _joined(whole) if count <= 2 * points else thinned.rows()
-    times, columns = _with_gaps(times, columns, max(GAP * period, 2.5 * thinned.bin_s if count > 2 * points else 0.0))
+    times, columns = _with_gaps(times, columns, max(longest, 2.5 * thinned.bin_s if count > 2 * points else 0.0))
     return {
         "time": times.tolist(),
         "columns": {name: plain(values) for name, values in columns.items()},
-        "modes": [m for i, m in enumerate(modes) if i == 0 or m[1] != modes[i - 1][1]],
+        "modes": modes.changes,
     }
 
 

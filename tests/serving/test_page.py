@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 import http.client
 import json
 import os
-import random
 import signal
-import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import uvicorn
 from fake_loop import BEGIN, Browser, FakeLoop, opened
 from processes import lives, within
 
 from serving import Controller, LoopError
 from serving.journal import JournalReader
-from serving.page import patience
-from serving.page.app import PageApp
 from serving.page.process import PageProcess
 from serving.page.settings import Page
 from serving.page.trend import Thinned, trend
@@ -190,88 +183,6 @@ def _next(stream: http.client.HTTPResponse, event: str) -> Any:
             fields[name] = value
         if fields.get("event") == event:
             return json.loads(fields["data"])
-
-
-def test_malformed_requests_change_nothing(browser: Browser, loop: FakeLoop) -> None:
-    before = len(loop.changes)
-    rng = random.Random(1)
-    for _ in range(3_000):
-        with suppress(OSError), socket.create_connection(("127.0.0.1", browser.port), timeout=5) as wire:
-            wire.sendall(malformed(rng, browser.port))
-            wire.shutdown(socket.SHUT_WR)
-            while wire.recv(65_536):
-                pass
-    assert loop.changes[before:] == []
-    assert browser.json("/api/state")["mode"] == "AUTO"
-
-
-def malformed(rng: random.Random, port: int) -> bytes:
-    """A request for a change without the token, damaged."""
-    body = b'{"do": "mode", "value": "AUTO", "who": "x"}'
-    lines = [
-        b"POST /api/change HTTP/1.1", b"Host: 127.0.0.1:%d" % port, b"Origin: http://127.0.0.1:%d" % port,
-        b"Content-Type: application/json", b"Content-Length: %d" % len(body), b"Authorization: Bearer x",
-    ]  # fmt: skip
-    for _ in range(rng.randint(1, 3)):
-        place = rng.randrange(len(lines))
-        how = rng.randrange(8)
-        if how == 0:
-            del lines[place]
-        elif how == 1:
-            lines.insert(place, lines[rng.randrange(len(lines))])
-        elif how == 2:
-            line = bytearray(lines[place])
-            line[rng.randrange(len(line))] = rng.randrange(256)
-            lines[place] = bytes(line)
-        elif how == 3:
-            lines[place] += b"A" * rng.choice([100, 20_000])
-        elif how == 4:
-            lines.append(
-                rng.choice([b"Transfer-Encoding: chunked", b"Content-Length: -1", b"Content-Length: 99999999"])
-            )
-        elif how == 5:
-            lines[0] = rng.choice(
-                [b"GET /%00 HTTP/1.1", b"PUT /api/change HTTP/1.1", b"GET //x HTTP/9.9", b"\x16\x03\x01"]
-            )
-        elif how == 6:
-            body = bytes(rng.randrange(256) for _ in range(rng.randrange(200)))
-        else:
-            lines[0] = b"GET /api/trend?from=%s&to=%s HTTP/1.1" % (rng.randbytes(4).hex().encode(), rng.randbytes(4))
-        if not lines:
-            break
-    return b"\r\n".join(lines) + b"\r\n\r\n" + body
-
-
-def test_who_takes_his_time_is_cut_off(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Slow-loris: connections that never finish a request, or begin a second one and never finish that."""
-    monkeypatch.setattr(patience, "REQUEST_S", 0.4)
-    monkeypatch.setattr(patience, "MOST_CONNECTIONS", 30)
-    app = PageApp(loop.journal, loop.answer, "token")
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        port = int(listening.getsockname()[1])
-        config = uvicorn.Config(
-            app.asgi([f"127.0.0.1:{port}"], "http"),
-            http=patience.Impatient,
-            ws="none",
-            log_config=None,
-            access_log=False,
-        )
-        server = uvicorn.Server(config)
-        thread = threading.Thread(target=asyncio.run, args=(server.serve([listening]),), daemon=True)
-        thread.start()
-        assert within(10, lambda: server.started)
-        open_ones = [socket.create_connection(("127.0.0.1", port), timeout=10) for _ in range(60)]
-        for i, wire in enumerate(open_ones):
-            with suppress(OSError):
-                first = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n\r\n" % port if i % 2 else b""
-                wire.sendall(first + b"GET / HTTP/1.1\r\nHost: ")
-        for wire in open_ones:
-            with suppress(OSError), wire:
-                while wire.recv(65_536):
-                    pass  # an answer, then the end
-        assert Browser(port, "token").get("/healthz")[0] == 200
-        server.should_exit = True
-        thread.join(10)
 
 
 def test_a_page_that_died_is_started_again_and_ends_with_its_loop(loop: FakeLoop) -> None:

@@ -3,75 +3,22 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from fake_loop import BEGIN, FakeLoop, opened
+from chromium import CHROMIUM
+from fake_loop import BEGIN, THIRDS, FakeLoop
 
-from serving import Controller
 from serving.journal import Event
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
 
-from playwright.sync_api import Browser, Page, Route, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Page, Route, expect
 
-pytest_plugins = ["small_laws"]
+pytest_plugins = ["small_laws", "page_in_chromium"]
 
 TOKEN_FIELD = "#token"
 SUCCESSOR = {"law": "other", "file": "other.onnx", "sha256": "b" * 64, "good": 3, "trial": 60, "reason": ""}
-THIRDS = [0.0, 1 / 3, 1.0]
-
-
-@pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory, pi_file: Path) -> Iterator[tuple[FakeLoop, str, str]]:
-    made = FakeLoop(tmp_path_factory.mktemp("loop"), Controller(pi_file))
-    page, _ = opened(made, [])
-    yield made, page.url, page.token
-    page.close()
-    made.close()
-
-
-@pytest.fixture
-def loop(served: tuple[FakeLoop, str, str]) -> Iterator[FakeLoop]:
-    """Two set points with more digits than are shown, and an MV of three values."""
-    made = served[0]
-    about, state = json.dumps(made.about), dict(made.state)
-    sp = [{"name": name, "unit": "K", "low": 0.0, "high": 1.0} for name in ("a", "b")]
-    made.about["signals"] = {"sp": sp, "pv": sp, "dv": [], "mv": [{**sp[0], "name": "u", "values": THIRDS}]}
-    made.state.update(sp=[0.6123456, 0.3456789], pv=[0.5, 0.4], mv=[1 / 3], applied=[1 / 3], time=BEGIN + 100)
-    made.changes.clear()
-    yield made
-    made.about = json.loads(about)
-    made.state.clear()
-    made.state.update(state)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as p:
-        # Containers have no user namespaces; the page is our own.
-        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield made
-        made.close()
-
-
-@pytest.fixture
-def page(browser: Browser, loop: FakeLoop, served: tuple[FakeLoop, str, str]) -> Iterator[Page]:
-    made = browser.new_page(locale="en-GB", timezone_id="UTC")
-    made.set_default_timeout(20_000)
-    raised: list[str] = []
-    made.on("pageerror", lambda error: raised.append(str(error)))
-    made.goto(served[1])
-    expect(made.locator("#alarm-list .alarm").first).to_be_visible()
-    made.evaluate("token => sessionStorage.setItem('token', token)", served[2])
-    made.evaluate("sessionStorage.setItem('who', 'anna')")
-    yield made
-    made.close()
-    assert raised == []
 
 
 def ask_mode(page: Page, mode: str) -> None:
@@ -173,18 +120,6 @@ def test_each_alarm_that_is_over_is_shown_as_over(page: Page, loop: FakeLoop) ->
         expect(at).to_have_attribute("data-level", "past-unseen")
     assert [what for what in stand("past-unseen") if "valve" in what] == ["valve third", "valve second", "valve first"]
     expect(page.locator("#events")).to_contain_text("the alarm is over")
-
-
-def test_the_mode_is_written_once_so_that_a_screen_reader_says_it_once(page: Page, loop: FakeLoop) -> None:
-    page.evaluate("""() => {
-        window.written = 0;
-        new MutationObserver((found) => { window.written += found.length; }).observe(
-            document.getElementById('mode'), {childList: true, characterData: true, subtree: true});
-    }""")
-    for value in (0.51, 0.52, 0.53):
-        loop.state["pv"] = [value, 0.4]
-        expect(page.locator('[data-signal="PV a"] .number')).to_have_text(f"{value:.3f}")
-    assert page.evaluate("window.written") == 0
 
 
 def test_the_trend_is_asked_for_in_the_loops_time(page: Page, loop: FakeLoop) -> None:

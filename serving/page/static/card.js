@@ -6,6 +6,8 @@ const $ = (id) => document.getElementById(id);
 const TRIAL = 60;
 const COLUMNS = 4;
 const SIGNS = { "as validated": "●", watch: "◆", retrain: "▲", "not known yet": "○" };
+const URGENT = ["retrain", "watch"];
+let judged = "";
 
 export function describe(about) {
   const c = about.card;
@@ -18,16 +20,20 @@ export function describe(about) {
     ["sha256", digest],
     ["signed by", c.signed ? signer(c.signed) : "not checked: trusted is not set"],
     ["period", `${c.period_s} s`],
-    ["size", `${Math.round(c.size_bytes / 1024)} KiB`],
+    ["lock-ups", c.lock_ups === 0 ? "none in its validation" : String(c.lock_ups ?? "not known")],
+  ];
+  const making = [
     ["commit", c.commit ? c.commit.slice(0, 12) : "–"],
     ["versions", Object.entries(c.versions || {}).map(([k, v]) => `${k} ${v}`).join(", ") || "–"],
-    ["lock-ups in its validation", c.lock_ups === 0 ? "none" : String(c.lock_ups ?? "not known")],
+    ["size", `${Math.round(c.size_bytes / 1024)} KiB`],
   ];
-  const list = element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+  const made = element("details", {}, element("summary", {}, "How it was made"), list(making));
   const picture = c.picture && element("img", { src: c.picture, alt: "closed loop of its validation", loading: "lazy" });
   const notes = (about.warnings || []).map((words) => element("p", { class: "note" }, `◆ ${words}`));
-  $("card-body").replaceChildren(list, ...notes, scenarios(c), picture || "", candidates(about));
+  $("card-body").replaceChildren(list(facts), ...notes, scenarios(c), made, picture || "", candidates(about));
 }
+
+const list = (facts) => element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
 
 function signer(signed) {
   const until = signed.expires ? `, until ${signed.expires.slice(0, 10)}` : "";
@@ -55,7 +61,7 @@ function scenarios(c) {
     element("summary", {}, `Evidence: ${rows.length} closed loops of its validation`),
     element(
       "div",
-      { class: "scroll" },
+      { class: "scroll", tabindex: 0, role: "region", "aria-label": "Evidence" },
       element(
         "table",
         {},
@@ -74,8 +80,14 @@ function candidates(about) {
   const box = element("div", { id: "candidates" }, element("h3", {}, "Swap the controller"), element("div", { id: "back", hidden: true }));
   if (!about.candidates.length) box.append(element("p", { class: "calm" }, "No other controller with these signals lies beside this one's file."));
   for (const other of about.candidates) {
+    const of = `${other.file}, ${other.sha256.slice(0, 8)}${other.signed ? `, signed by ${other.signed}` : ""}`;
     box.append(
-      element("div", { class: "candidate" }, `${other.law} for ${other.case} (${other.file}, ${other.sha256.slice(0, 8)}${other.signed ? `, signed by ${other.signed}` : ""}) `, element("button", { type: "button", "data-file": other.file, onclick: () => swap(about, other) }, "Try…")),
+      element(
+        "div",
+        { class: "candidate" },
+        element("span", {}, `${other.law} for ${other.case} `, element("small", {}, `(${of})`)),
+        element("button", { type: "button", "data-file": other.file, "aria-label": `Try ${other.file}…`, onclick: () => swap(about, other) }, "Try…"),
+      ),
     );
   }
   return box;
@@ -108,10 +120,25 @@ export function show(state) {
       back.replaceChildren(element("button", { id: "put-back", type: "button", onclick: act }, `Put ${state.replaced.law} (${state.replaced.sha256.slice(0, 8)}) back…`));
     }
   }
-  const verdicts = state.verdicts || [];
-  $("verdicts").replaceChildren(
-    ...(verdicts.length ? verdicts.map(verdict) : [element("li", { class: "calm" }, "nothing to say yet")]),
-  );
+  verdicts(state.verdicts || []);
+}
+
+// What needs somebody comes first; the rest is counted, and listed on demand. Written only where something is new.
+function verdicts(found) {
+  const text = JSON.stringify(found);
+  if (text === judged) return;
+  judged = text;
+  const urgent = found.filter((v) => URGENT.includes(v.level)).sort((a, b) => URGENT.indexOf(a.level) - URGENT.indexOf(b.level));
+  const calm = found.filter((v) => !URGENT.includes(v.level));
+  const counts = Object.keys(SIGNS).flatMap((level) => {
+    const n = calm.filter((v) => v.level === level).length;
+    return n ? [`${SIGNS[level]} ${n} ${level}`] : [];
+  });
+  $("verdicts").replaceChildren(...urgent.map(verdict));
+  $("calm-verdicts").hidden = !calm.length;
+  $("calm-counts").textContent = counts.join("   ");
+  $("calm-list").replaceChildren(...calm.map(verdict));
+  $("no-verdicts").hidden = found.length > 0;
 }
 
 function verdict(v) {

@@ -1,9 +1,11 @@
 // Trends, one chart a signal, with one cursor and one time axis for all.
+import { bands } from "./bands.js";
 import { clock, element, number, unit } from "./format.js";
 
-const HEIGHT = 170;
-const SMALL = 120;
-const LABELS = { time: 76, value: 22 }; // pixels that a label of an axis needs
+const HEIGHT = 180;
+const SMALL = 130;
+const LABELS = { time: 76, value: 20 }; // pixels that a label of an axis needs
+const AXIS = { line: 28, lines: 44 }; // pixels below a chart: for times, and for times with days below them
 const SYNC = window.uPlot.sync("loop");
 
 // What is drawn of a loop: charts with their lines. `kind` says how a line looks.
@@ -38,12 +40,14 @@ const DASHES = { sp: "dashed", law: "dotted", beside: "dashed" };
 const line = (column, label, kind) => ({ column, label, kind });
 
 export class Charts {
+  // zoomed(from, to): a time was marked; back(): a double-click.
   constructor(box, { zoomed, back }) {
     this.box = box;
     this.zoomed = zoomed;
     this.back = back;
     this.made = [];
     this.whole = false;
+    this.read = null; // the row that the keyboard reads
     new ResizeObserver(() => this.resize()).observe(box);
   }
 
@@ -60,17 +64,36 @@ export class Charts {
   }
 
   draw(from, to) {
-    this.from = from;
-    this.to = to;
+    this.read = null;
     for (const { chart, plot } of this.made) {
-      plot.setData(this.data.of(chart.lines.map((l) => l.column)), false);
+      const numbers = this.data.of(chart.lines.map((l) => l.column));
+      plot.setData(numbers, false);
       plot.setScale("x", { min: from, max: to });
       plot.root.parentElement.dataset.rows = this.data.time.length; // for tests, which cannot read a canvas
+      const rows = plot.root.querySelectorAll(".u-series");
+      numbers.forEach((values, i) => i && rows[i].classList.toggle("empty", values.every((v) => v === null)));
+      newest(plot);
     }
   }
 
+  // The values one scan further, by the cursor of every chart and in words.
+  step(by) {
+    const { time } = this.data;
+    if (!time.length || !this.made.length) return "";
+    const { min, max } = this.made[0].plot.scales.x;
+    const [first, last] = [time.findIndex((t) => t >= min), time.findLastIndex((t) => t <= max)];
+    if (first < 0 || last < first) return "";
+    this.read = this.read === null ? last : Math.min(last, Math.max(first, this.read + by));
+    const said = this.made.map(({ chart, plot }) => {
+      plot.setCursor({ left: plot.valToPos(time[this.read], "x"), top: 1 }, false);
+      const values = chart.lines.map((l) => [l.label, this.data.columns[l.column]?.[this.read]]).filter(([, v]) => v !== null && v !== undefined);
+      return `${chart.name} ${values.map(([label, v]) => `${label} ${number(v, scaled(chart.signal, v))}`).join(", ") || "–"} ${unit(chart.signal)}`.trim();
+    });
+    return `${clock(time[this.read])}: ${said.join("; ")}`;
+  }
+
   width() {
-    return Math.max(260, this.box.clientWidth);
+    return Math.max(240, this.box.clientWidth);
   }
 
   resize() {
@@ -87,7 +110,7 @@ export class Charts {
       law: { stroke: color("law"), width: 1, dash: [2, 3] },
       beside: { stroke: color("beside"), width: 1.5, dash: [8, 3, 2, 3] },
     };
-    const value = (_, v) => (v === null || v === undefined ? "–" : number(v, chart.signal.high === undefined ? { low: 0, high: Math.abs(v) || 1 } : chart.signal));
+    const value = (_, v) => (v === null || v === undefined ? "–" : number(v, scaled(chart.signal, v)));
     return {
       width: this.width(),
       height: chart.tall ? HEIGHT : SMALL,
@@ -95,7 +118,7 @@ export class Charts {
       legend: { live: true, markers: { dash: (_, i) => DASHES[chart.lines[i - 1]?.kind] || "solid" } },
       scales: { x: { time: true }, y: { range: (_, low, high) => this.range(chart.signal, low, high) } },
       axes: [
-        { ...axis, values: times, space: LABELS.time },
+        { ...axis, values: times, space: LABELS.time, size: (_, words) => (words?.some((w) => w.includes("\n")) ? AXIS.lines : AXIS.line) },
         { ...axis, size: 62, space: LABELS.value },
       ],
       series: [
@@ -103,8 +126,9 @@ export class Charts {
         ...chart.lines.map((l) => ({ label: l.label, spanGaps: false, points: { show: false }, value, ...looks[l.kind] })),
       ],
       hooks: {
-        drawClear: [(u) => this.bands(u, color)],
+        drawClear: [(u) => bands(u, this.data, color)],
         setSelect: [(u) => this.selected(u)],
+        setCursor: [(u) => (u.cursor.left < 0 ? newest(u) : u.root.classList.add("reading"))],
         ready: [(u) => u.over.addEventListener("dblclick", () => this.back())],
       },
     };
@@ -125,40 +149,22 @@ export class Charts {
     u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
     if (to - from > 0.5) this.zoomed(from, to);
   }
-
-  // The time in each mode: HOLD hatched, SHADOW and MANUAL shaded, AUTO plain; each change with its word.
-  bands(u, color) {
-    const { ctx, bbox } = u;
-    const modes = this.data.modes;
-    ctx.save();
-    ctx.beginPath();
-    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-    ctx.clip();
-    ctx.font = `${10 * devicePixelRatio}px system-ui, sans-serif`;
-    ctx.textAlign = "left"; // uPlot leaves what its axes needed
-    ctx.textBaseline = "alphabetic";
-    modes.forEach(([time, mode], i) => {
-      const left = Math.max(bbox.left, u.valToPos(time, "x", true));
-      const end = i + 1 < modes.length ? u.valToPos(modes[i + 1][0], "x", true) : bbox.left + bbox.width;
-      const right = Math.min(bbox.left + bbox.width, end);
-      if (right <= left) return;
-      if (mode !== "AUTO") {
-        ctx.fillStyle = color(mode === "HOLD" ? "band-hold" : "band-other");
-        ctx.fillRect(left, bbox.top, right - left, bbox.height);
-      }
-      if (mode === "HOLD") hatch(ctx, left, right, bbox, color("hatch"));
-      if (right - left > 44 * devicePixelRatio) {
-        ctx.fillStyle = color("ink-2");
-        ctx.fillText(mode, left + 4 * devicePixelRatio, bbox.top + 11 * devicePixelRatio);
-      }
-    });
-    ctx.restore();
-  }
 }
 
-// Times of the axis, in 24 hours; the day where it changes.
+// The legend tells the newest values that are shown, unless the cursor reads others.
+function newest(u) {
+  if (u.cursor.left >= 0) return;
+  u.root.classList.remove("reading");
+  const last = u.data[0].findLastIndex((t) => t <= u.scales.x.max);
+  if (last >= 0) u.setLegend({ idx: last }, false);
+}
+
+// A signal with its range, or a number of the law, which has none.
+const scaled = (signal, v) => (signal.high === undefined ? { low: 0, high: Math.abs(v) || 1 } : signal);
+
+// Times of the axis, in 24 hours; the day where it is not today, or another than before.
 function times(_, splits, axis, space, step) {
-  let day = null;
+  let day = new Date().toLocaleDateString([], { day: "2-digit", month: "short" });
   return splits.map((t) => {
     const date = new Date(t * 1000);
     const clock = date.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: step < 60 ? "2-digit" : undefined, hourCycle: "h23" });
@@ -167,20 +173,4 @@ function times(_, splits, axis, space, step) {
     day = today;
     return step >= 86400 ? today : first ? `${clock}\n${today}` : clock;
   });
-}
-
-function hatch(ctx, left, right, bbox, stroke) {
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(left, bbox.top, right - left, bbox.height);
-  ctx.clip();
-  ctx.strokeStyle = stroke;
-  ctx.lineWidth = devicePixelRatio;
-  ctx.beginPath();
-  for (let x = left - bbox.height; x < right; x += 9 * devicePixelRatio) {
-    ctx.moveTo(x, bbox.top + bbox.height);
-    ctx.lineTo(x + bbox.height, bbox.top);
-  }
-  ctx.stroke();
-  ctx.restore();
 }

@@ -11,6 +11,8 @@ export class Data {
     this.modes = [];
     this.live = 0;
     this.asked = 0;
+    this.longest = Infinity; // seconds without a scan that are no gap yet
+    [this.from, this.to] = [0, 0]; // the time that is known here
   }
 
   // Replace everything by the trend of a time, and keep the scans that came in while it was made; an answer that a
@@ -24,6 +26,7 @@ export class Data {
     this.time = found.time;
     this.columns = found.columns;
     this.modes = found.modes;
+    [this.from, this.to] = [from, to];
     this.live = 0;
     this.append(late, -Infinity);
     return true;
@@ -42,6 +45,7 @@ export class Data {
     const last = this.time.length ? this.time[this.time.length - 1] : -Infinity;
     const first = time.findIndex((t) => t > last);
     if (first < 0) return false;
+    if (time[first] - last > this.longest) this.gap(last, time[first]);
     for (const name of new Set([...Object.keys(this.columns), ...Object.keys(columns)])) {
       const old = this.columns[name] || (this.columns[name] = new Array(this.time.length).fill(null));
       const added = columns[name] ? columns[name].slice(first) : new Array(time.length - first).fill(null);
@@ -49,6 +53,7 @@ export class Data {
     }
     this.time.push(...time.slice(first));
     this.live += time.length - first;
+    this.to = Math.max(this.to, this.time[this.time.length - 1]);
     let gone = 0;
     while (gone < this.time.length && this.time[gone] < oldest) gone++;
     if (gone > 200) {
@@ -56,6 +61,15 @@ export class Data {
       for (const values of Object.values(this.columns)) values.splice(0, gone);
     }
     return this.live > MOST_LIVE;
+  }
+
+  // Nothing came in for a while: no line is drawn over it, and the mode before it ends.
+  gap(last, next) {
+    if (last === -Infinity) return;
+    this.time.push((last + next) / 2);
+    for (const values of Object.values(this.columns)) values.push(null);
+    const mode = this.modes[this.modes.length - 1]?.[1];
+    if (mode && this.modes[this.modes.length - 1][0] <= last) this.modes.push([last, ""], [next, mode]);
   }
 
   mode(time, mode) {

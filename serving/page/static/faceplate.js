@@ -4,16 +4,19 @@ import { element, number, say, unit } from "./format.js";
 
 const $ = (id) => document.getElementById(id);
 const MODES = {
-  SHADOW: "The law is computed and shown; nothing is written.",
+  SHADOW: "The plant's own side moves the MV. The law is computed and shown; nothing is written.",
   MANUAL: "The operator sets the MV.",
   AUTO: "The law sets the MV.",
   HOLD: "The last MV stays.",
 };
 let about = null;
 let state = null;
+let laid = ""; // what the values that stand on the page were laid out for
 
 export function describe(found) {
   about = found;
+  laid = "";
+  if ($("modes").children.length) return;
   $("modes").replaceChildren(
     ...Object.keys(MODES).map((mode) => element("button", { type: "button", "data-mode": mode, onclick: () => askMode(mode) }, mode)),
   );
@@ -21,9 +24,12 @@ export function describe(found) {
 
 export function show(found) {
   state = found;
-  const mode = $("mode");
-  say(mode, state.mode);
-  mode.dataset.mode = state.mode;
+  // Said when the mode changes, and not at each scan that words its reason anew.
+  if ($("mode").textContent !== state.mode) say($("spoken"), `${state.mode}${state.reason ? `: ${state.reason}` : ""}`);
+  for (const mode of [$("mode"), $("standing")]) {
+    say(mode, state.mode);
+    mode.dataset.mode = state.mode;
+  }
   $("mode-words").textContent = MODES[state.mode] || "";
   $("reason").hidden = !state.reason;
   say($("reason"), state.reason ? `▲ ${state.reason}` : "");
@@ -31,52 +37,71 @@ export function show(found) {
   $("change-sp").disabled = !about; // without the signals a click would do nothing
   $("change-mv").disabled = !about || state.mode !== "MANUAL";
   $("change-mv").title = state.mode === "MANUAL" ? "" : "in MANUAL only";
-  if (about && state.pv !== undefined) $("values").replaceChildren(...rows());
+  if (about && state.pv !== undefined) values();
   trial();
 }
 
-function rows() {
+// A block a signal: its values side by side, and a bar of its range. It is laid out once, and then filled.
+function values() {
   const { sp, pv, mv, dv } = about.signals;
   const quality = state.quality || [];
-  const made = [];
-  pv.forEach((s, i) => {
-    if (i < sp.length) made.push(row("SP", sp[i], at(state.sp, i)));
-    made.push(row("PV", s, at(state.pv, i), quality[i], i < sp.length ? at(state.sp, i) : null));
-  });
-  mv.forEach((s, i) => {
-    const writes = state.mv !== null && state.mv !== undefined;
-    if (writes) made.push(row("MV asked", s, at(state.mv, i)));
-    else made.push(row("Law's MV", s, at(state.law, i), null, null, "not written"));
-    made.push(row("MV applied", s, at(state.applied, i), quality[pv.length + i]));
-    if (state.beside) made.push(row("Successor's MV", s, at(state.beside, i), null, null, "not written"));
-  });
-  dv.forEach((s, i) => made.push(row("DV", s, at(state.dv, i), quality[pv.length + mv.length + i])));
-  return made;
+  const writes = Boolean(state.mv);
+  const blocks = [
+    ...pv.map((s, i) => [
+      s,
+      [...(i < sp.length ? [["SP", at(state.sp, i), "", ""]] : []), ["PV", at(state.pv, i), quality[i], ""]],
+      [at(state.pv, i), i < sp.length ? at(state.sp, i) : null],
+    ]),
+    ...mv.map((s, i) => {
+      const [wanted, applied] = [at(writes ? state.mv : state.law, i), at(state.applied, i)];
+      const cells = [
+        writes ? ["MV asked", wanted, "", end(wanted, s)] : ["Law's MV", wanted, "", "not written"],
+        ["MV applied", applied, quality[pv.length + i], ""],
+      ];
+      if (state.beside) cells.push(["Successor's MV", at(state.beside, i), "", "not written"]);
+      return [s, cells, [applied, wanted]];
+    }),
+    ...dv.map((s, i) => [s, [["DV", at(state.dv, i), quality[pv.length + mv.length + i], ""]], [at(state.dv, i), null]]),
+  ];
+  const layout = JSON.stringify(blocks.map(([s, cells]) => [s.name, cells.map(([kind]) => kind)]));
+  if (layout !== laid) $("values").replaceChildren(...blocks.map(([s, cells]) => block(s, cells)));
+  laid = layout;
+  blocks.forEach(([s, cells, marks], i) => fill($("values").children[i], s, cells, marks));
 }
 
 const at = (values, i) => (values ? values[i] : null);
 
-function row(kind, signal, value, quality, mark = null, words = "") {
-  const bad = quality && quality !== "Good";
-  const share = (v) => (v === null ? 0 : Math.min(100, Math.max(0, (100 * (v - signal.low)) / (signal.high - signal.low))));
-  const fill = element("div", { class: "fill" });
-  fill.style.width = `${share(value)}%`;
-  const bar = element("div", { class: "bar", title: `${signal.low} … ${signal.high} ${unit(signal)}` }, fill);
-  if (mark !== null) {
-    const line = element("div", { class: "mark" });
-    line.style.left = `${share(mark)}%`;
-    bar.append(line);
-  }
-  return element(
-    "div",
-    { class: bad ? "value bad" : "value", "data-signal": `${kind} ${signal.name}` },
-    element("span", { class: "kind" }, kind),
-    element("span", { class: "name" }, signal.name),
-    element("span", { class: "number" }, number(value, signal)),
-    element("span", { class: "unit" }, unit(signal)),
-    bar,
-    element("span", { class: "quality" }, bad ? `▲ ${quality}` : words),
+// Where an MV can go no further.
+const end = (value, { low, high, values }) => (value === null || values ? "" : value >= high ? "at its upper end" : value <= low ? "at its lower end" : "");
+
+function block(signal, cells) {
+  const range = `${number(signal.low, signal)} … ${number(signal.high, signal)} ${unit(signal)}`.trim();
+  const bar = element("div", { class: "bar", title: range, "aria-hidden": "true" }, element("div", { class: "fill" }), element("div", { class: "mark" }));
+  const made = cells.map(([kind]) =>
+    element(
+      "div",
+      { class: "value", "data-signal": `${kind} ${signal.name}` },
+      element("span", { class: "kind" }, kind),
+      element("span", { class: "amount" }, element("span", { class: "number" }), " ", element("span", { class: "unit" }, unit(signal))),
+      element("span", { class: "quality" }),
+    ),
   );
+  return element("div", { class: "signal", role: "group", "aria-label": signal.name }, element("h3", {}, signal.name), element("div", { class: "cells" }, ...made), bar);
+}
+
+function fill(block, signal, cells, [value, mark]) {
+  cells.forEach(([, number_, quality, words], i) => {
+    const cell = block.querySelectorAll(".value")[i];
+    const bad = Boolean(quality) && quality !== "Good";
+    cell.classList.toggle("bad", bad);
+    say(cell.querySelector(".number"), number(number_, signal));
+    say(cell.querySelector(".quality"), bad ? `▲ ${quality}` : words);
+  });
+  const share = (v) => Math.min(100, Math.max(0, (100 * (v - signal.low)) / (signal.high - signal.low)));
+  block.querySelector(".fill").style.width = `${value === null ? 0 : share(value)}%`;
+  const line = block.querySelector(".mark");
+  line.hidden = mark === null;
+  if (mark !== null) line.style.left = `${share(mark)}%`;
 }
 
 function askMode(mode) {
@@ -133,7 +158,7 @@ function trial() {
     delete box.dataset.of; // the same one may be tried again
     return box.replaceChildren();
   }
-  const progress = element("progress", { max: next.trial, value: Math.min(next.good, next.trial) });
+  const progress = element("progress", { "aria-label": "Good scans of the trial", max: next.trial, value: Math.min(next.good, next.trial) });
   const keep = () => ask({ title: "End the trial", words: `${next.law} goes; the controller in charge stays.`, request: () => ({ do: "keep" }) });
   const words = `${next.law} (${next.file}) is on trial: ${next.good} of ${next.trial} good scans.`;
   if (box.dataset.of !== next.sha256) {

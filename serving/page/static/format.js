@@ -2,6 +2,7 @@
 
 export function number(value, signal) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";
+  if (signal?.values) return String(+value.toPrecision(4));
   const span = signal && signal.high > signal.low ? signal.high - signal.low : Math.abs(value) || 1;
   const digits = Math.min(8, Math.max(0, 3 - Math.floor(Math.log10(span))));
   return value.toFixed(digits);
@@ -24,6 +25,14 @@ export function clock(seconds) {
   const date = new Date(seconds * 1000);
   const today = new Date().toDateString() === date.toDateString();
   return (today ? "" : DAY.format(date) + " ") + CLOCK.format(date);
+}
+
+const UNITS = [["d", 86400], ["h", 3600], ["min", 60], ["s", 1]];
+
+// A span in its largest whole unit, or with three digits.
+export function duration(seconds) {
+  const [name, size] = UNITS.find(([, s]) => seconds >= s) || UNITS[UNITS.length - 1];
+  return `${+(seconds / size).toPrecision(3)} ${name}`;
 }
 
 export function zone() {

@@ -35,8 +35,9 @@ function draw() {
   const alarms = all.filter((e) => e.alarm).sort((a, b) => urgent(b) - urgent(a) || b.id - a.id).slice(0, 50);
   list(alarms);
   $("events").replaceChildren(...all.filter((e) => !e.alarm).slice(0, 100).map(happened));
-  const count = unacknowledged();
-  say($("alarm-count"), count ? `▲ ${count} not acknowledged` : "");
+  const [count, active] = [unacknowledged(), alarms.filter((e) => !e.over).length];
+  const counts = [active ? `${active} active` : "", count ? `${count} not acknowledged` : ""].filter(Boolean);
+  say($("alarm-count"), counts.length ? `▲ ${counts.join(", ")}` : "");
   document.title = (count ? `(${count}) ` : "") + ($("title").textContent || "Loopwright");
 }
 
@@ -64,7 +65,7 @@ function alarm(e) {
     element("span", { class: "stands" }, stands),
     e.acknowledged
       ? element("span", { class: "seen" }, seen)
-      : element("button", { type: "button", class: "acknowledge", onclick: () => acknowledge(e) }, "Acknowledge…"),
+      : element("button", { type: "button", class: "acknowledge", "aria-label": `Acknowledge… ${clock(e.time)} ${e.what}`, onclick: () => acknowledge(e) }, "Acknowledge…"),
   );
 }
 

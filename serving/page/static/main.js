@@ -4,42 +4,55 @@ import * as card from "./card.js";
 import { Charts, plan } from "./charts.js";
 import { Data } from "./data.js";
 import * as faceplate from "./faceplate.js";
-import { clock, element, say, zone } from "./format.js";
+import { clock, duration, element, say, zone } from "./format.js";
 import * as log from "./log.js";
+import { steer } from "./steering.js";
+import { View } from "./view.js";
 
 const $ = (id) => document.getElementById(id);
 const SPANS = [["5 min", 300], ["1 h", 3600], ["8 h", 28800], ["1 d", 86400], ["7 d", 604800]];
 const AGAIN_MS = 2000; // before what failed is tried again
+const SETTLE_MS = 150; // after the last of several steps through time the journal is asked
+const GAP = 5; // periods without a scan, as the server has it
 const PATIENCE = 5; // seconds without news, beside three periods, after which what is seen is old
 
 const data = new Data();
 let about = null;
 let state = null;
-let span = Number(localStorage.getItem("span")) || 300;
-let zoom = null; // [from, to] while the operator looks closer, or back
 let heard = 0; // when a state was shown last
 let describing = null; // the description that is on its way
 let described = ""; // the controller whose description is complete
 let again = 0; // the timer of a trend that failed and is asked for again
 let broken = false;
 let hidden = new Set(JSON.parse(localStorage.getItem("hidden") || "null") || []);
-const charts = new Charts($("charts"), { zoomed: (from, to) => look([from, to]), back: () => look(null) });
 
 const now = () => (state && state.time && !broken && state.alive ? Math.max(state.time, data.time.at(-1) || 0) : Date.now() / 1000);
-const shown = () => zoom || [now() - span, now()];
+const view = new View(Number(localStorage.getItem("span")) || SPANS[0][1], now);
+const zoomed = (from, to) => look(() => view.look(from, to));
+const live = () => look(() => view.follow());
+const charts = new Charts($("charts"), { zoomed, back: live });
 
-async function look(wanted) {
-  zoom = wanted;
-  $("follow").setAttribute("aria-pressed", String(!zoom));
-  $("follow").textContent = zoom ? "Paused" : "Live";
-  await reload();
+// Another time is shown: what is here of it at once, the rest when the journal has answered.
+function look(act) {
+  act();
+  if (view.live) localStorage.setItem("span", String(view.span));
+  $("follow").setAttribute("aria-pressed", String(view.live));
+  $("follow").textContent = view.live ? "Live" : "Paused";
+  $("to-live").hidden = view.live;
+  for (const button of $("spans").children) button.setAttribute("aria-pressed", String(view.live && Number(button.dataset.span) === view.span));
+  const [from, to] = view.bounds();
+  const times = view.live ? `the last ${duration(view.span)}` : `${clock(from)} to ${clock(to)}`;
+  say($("time-shown"), times);
+  charts.draw(from, to);
+  clearTimeout(again);
+  again = setTimeout(reload, SETTLE_MS);
 }
 
 async function reload() {
   clearTimeout(again);
-  const [from, to] = shown();
+  const [from, to] = view.bounds();
   try {
-    if (await data.load(from, to)) charts.draw(...shown());
+    if (await data.load(from, to)) charts.draw(...view.bounds());
   } catch (error) {
     old(error.message);
     clearTimeout(again);
@@ -57,6 +70,7 @@ async function describeAll() {
   const found = await get("/api/about");
   const stands = state || (await get("/api/state")); // the trend is asked for in the loop's time, not in this machine's
   about = found;
+  data.longest = (GAP * about.period_s) / (about.speed || 1);
   $("title").textContent = about.title;
   faceplate.describe(about);
   card.describe(about);
@@ -82,7 +96,7 @@ function choice() {
         hidden[hidden.has(key) ? "delete" : "add"](key);
         localStorage.setItem("hidden", JSON.stringify([...hidden]));
         build();
-        charts.draw(...shown());
+        charts.draw(...view.bounds());
       });
       return element("label", {}, box, ` ${chart.name}${chart.optional ? " (law)" : ""}`);
     }),
@@ -103,9 +117,9 @@ function onState(found) {
 }
 
 function onScans(rows) {
-  if (zoom) return;
-  const thin = data.append(rows, now() - 1.1 * span);
-  charts.draw(...shown());
+  if (!view.live) return;
+  const thin = data.append(rows, now() - 1.1 * view.span);
+  charts.draw(...view.bounds());
   if (thin) reload();
 }
 
@@ -138,15 +152,29 @@ function watch() {
 function buttons() {
   $("spans").replaceChildren(
     ...SPANS.map(([words, seconds]) =>
-      element("button", { type: "button", "data-span": seconds, "aria-pressed": String(seconds === span), onclick: () => choose(seconds) }, words),
+      element("button", { type: "button", "data-span": seconds, onclick: () => look(() => view.follow(seconds)) }, words),
     ),
   );
-  $("follow").addEventListener("click", () => look(zoom ? null : shown()));
+  const steps = { earlier: () => view.pan(-1), later: () => view.pan(1), wider: () => view.zoom(2), closer: () => view.zoom(0.5) };
+  for (const [id, act] of Object.entries(steps)) $(id).addEventListener("click", () => look(act));
+  $("follow").addEventListener("click", () => look(() => (view.live ? view.stop() : view.follow())));
+  $("to-live").addEventListener("click", () => {
+    live();
+    $("charts").focus({ preventScroll: true }); // the button is gone
+  });
+  steer($("charts"), view, { changed: () => look(() => {}), read: (by) => say($("time-shown"), charts.step(by)) });
   $("scale").addEventListener("click", () => {
     charts.whole = !charts.whole;
     $("scale").setAttribute("aria-pressed", String(charts.whole));
-    charts.draw(...shown());
+    charts.draw(...view.bounds());
   });
+  for (const menu of [$("choice"), $("help")]) {
+    menu.addEventListener("keydown", (event) => {
+      if (event.key !== "Escape" || !menu.open) return;
+      menu.open = false;
+      menu.querySelector("summary").focus();
+    });
+  }
   $("theme").addEventListener("click", () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
   const system = matchMedia("(prefers-color-scheme: dark)");
   const given = () => theme(localStorage.getItem("theme") || (system.matches ? "dark" : "light"), false);
@@ -154,24 +182,19 @@ function buttons() {
   given();
 }
 
-function choose(seconds) {
-  span = seconds;
-  localStorage.setItem("span", String(span));
-  for (const button of $("spans").children) button.setAttribute("aria-pressed", String(Number(button.dataset.span) === span));
-  look(null);
-}
-
 function theme(name, keep = true) {
   document.documentElement.dataset.theme = name;
   $("theme").textContent = name === "dark" ? "Light" : "Dark";
+  $("theme").setAttribute("aria-label", `${$("theme").textContent} colours`);
   if (keep) localStorage.setItem("theme", name);
   if (about) {
     build();
-    charts.draw(...shown());
+    charts.draw(...view.bounds());
   }
 }
 
 buttons();
+look(() => {});
 watch();
 setInterval(watch, 1000);
 const lost = () => {

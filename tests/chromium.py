@@ -1,0 +1,26 @@
+"""The browser that the tests drive."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+from fake_loop import FakeLoop
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def come_in(browser: Browser, served: tuple[FakeLoop, str, str], **how: object) -> Page:
+    """A new page that shows all there is, with the token at hand."""
+    from playwright.sync_api import expect
+
+    made = browser.new_page(locale="en-GB", timezone_id="UTC", **how)  # type: ignore[arg-type]
+    made.set_default_timeout(20_000)
+    made.goto(served[1])
+    expect(made.locator("#alarm-list .alarm").first).to_be_visible()
+    made.evaluate("token => sessionStorage.setItem('token', token)", served[2])
+    made.evaluate("sessionStorage.setItem('who', 'anna')")
+    return made
