@@ -1,4 +1,4 @@
-"""Whether the plant answers as at first: the errors of a model that was learnt beside the law."""
+"""Whether the plant answers as at first: what the errors of predictions go with."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from serving.manifest import Manifest
-from serving.monitor.beside import BesideModel
+from serving.monitor.beside import SQUARES, BesideModel
 from serving.monitor.chart import Chart
 from serving.monitor.memory import Remembers
 
@@ -19,9 +19,9 @@ LEAST_SCORE = 1.0  # of a score: what white errors give
 
 
 class Answers(Remembers):
-    """Errors e of the one-step model that was learnt beside the law, over blocks of N scans.
+    """Errors e of a one-step model that is learnt beside the law, and of the law's own prediction, in blocks of N scans.
 
-    The model learns ``model`` blocks and is then frozen. Each further block gives, for each PV,
+    The model learns ``model`` blocks and is then frozen. Each further block gives, for each error,
 
         log(mean e^2),    and    s = sum W' phi e / (sigma sqrt(N)),
 
@@ -32,12 +32,16 @@ class Answers(Remembers):
     validation", IEEE Trans. Automatic Control 32 (1987) 583.
     """
 
-    KEPT = ("model", "blocks", "count", "squares", "scores", "sizes", "shapes")
+    KEPT = ("model", "blocks", "count", "told_square", "squares", "scores", "sizes", "shapes")
 
-    def __init__(self, manifest: Manifest, *, block: int, model: int, learn: int, weekly: float, rate: float) -> None:
+    def __init__(
+        self, manifest: Manifest, *, block: int, model: int, learn: int, weekly: float, rate: float, told: bool = False
+    ) -> None:
         self.block, self.model_blocks = block, model
         self.model = BesideModel(manifest)
-        n_y, n_phi = self.model.n_y, self.model.n_phi
+        self.n_told = len(manifest.sp) if told else 0
+        n_y, n_phi = self.model.n_y + self.n_told, self.model.n_phi
+        self.told_square = np.zeros(self.n_told)  # mean square of the law's errors while the model learnt
         self.blocks, self.count = 0, 0
         self.squares, self.scores = np.zeros(n_y), np.zeros((n_phi, n_y))
         self.sizes = Chart(n_y, learn, weekly=weekly, rate=rate / 2 / n_y, least=LEAST_SIGMA, both=False)
@@ -58,16 +62,21 @@ class Answers(Remembers):
         """The samples before a gap say nothing of the next."""
         self.model.forget()
 
-    def add(self, pv: Array, mv: Array, time_s: float) -> None:
-        """One scan: PVs (n_pv,), and the MV that goes to the plant now (n_mv,)."""
-        told = self.model.add(pv, mv)
-        if told is None:
+    def add(self, pv: Array, mv: Array, error: Array | None, time_s: float) -> None:
+        """One scan: PVs (n_pv,), the MV that goes to the plant now (n_mv,), the error of the law's own prediction."""
+        found = self.model.add(pv, mv)
+        if found is None or (self.n_told and error is None):
             return
         self.count += 1
+        phi, errors = found
+        if self.n_told:
+            assert error is not None
+            errors = np.concatenate([errors, error])
         if self.model.frozen:
-            phi, error = told
-            self.squares = self.squares + error**2
-            self.scores = self.scores + phi[:, None] * error
+            self.squares = self.squares + errors**2
+            self.scores = self.scores + phi[:, None] * errors
+        elif self.n_told:
+            self.told_square = self.told_square + (error**2 - self.told_square) / min(self.model.scans, SQUARES)
         if self.count >= self.block:
             self.end(time_s, 1)
 
@@ -79,7 +88,8 @@ class Answers(Remembers):
                 if self.blocks >= self.model_blocks:
                     self.model.freeze()
             else:
-                sigma = np.sqrt(np.maximum(self.model.square, 1e-18))
+                squares = np.concatenate([self.model.square, self.told_square])
+                sigma = np.sqrt(np.maximum(squares, 1e-18))
                 scores = self.model.basis.T @ self.scores / (sigma * np.sqrt(self.count))
                 self.sizes.add(np.log(self.squares / self.count + 1e-18), time_s)
                 self.shapes.add(scores.T.ravel(), time_s)
@@ -96,5 +106,6 @@ class Answers(Remembers):
     def changed(self, i: int) -> float | None:
         """Since when PV ``i`` answers otherwise [s since 1970]; None where it does not."""
         n = self.model.n_phi
-        found = self.shapes.found[i * n : (i + 1) * n] > 0
-        return float(self.shapes.since_s[i * n : (i + 1) * n][found].min()) if found.any() else None
+        found, since = self.shapes.found.reshape(-1, n) > 0, self.shapes.since_s.reshape(-1, n)
+        rows = [i, self.model.n_y + i] if i < self.n_told else [i]
+        return float(since[rows][found[rows]].min()) if found[rows].any() else None

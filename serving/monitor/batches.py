@@ -74,7 +74,7 @@ class Batches(Remembers):
         )
         self.sums[part] += np.concatenate(shares)
         self.counts[part] += 1
-        self.answers.add(pv, mv, time_s)
+        self.answers.add(pv, mv, None, time_s)
 
     def end(self, time_s: float) -> None:
         """The end of a stretch in AUTO."""
@@ -122,7 +122,7 @@ class Batches(Remembers):
         place = slice(i * PARTS, (i + 1) * PARTS)
         if not self.chart.found[place].any():
             return None
-        off = (self.chart.recent - self.chart.mean)[place] / self.chart.scatter[place]
+        off = (self.chart.off / self.chart.offs / self.chart.scatter)[place]
         part = int(np.argmax(np.abs(off) * (self.chart.found[place] > 0)))
         at = i * PARTS + part
         return part, self.chart.shift(at) * float(self.spans[i]), float(self.chart.since_s[at])

@@ -14,6 +14,7 @@ from serving.monitor.memory import Remembers
 Array: TypeAlias = NDArray[np.float64]
 
 PAST_PV, PAST_MV = 2, 5  # samples that it looks back
+SQUARES = 1000  # scans over which squares of errors are averaged
 DOUBT = 100.0  # variance of its numbers before it has learnt
 
 
@@ -79,7 +80,7 @@ class BesideModel(Remembers):
         self.p = self.p - np.outer(gain, p_phi)
         self.scans += 1
         # Errors of a model that is still wild say nothing of its noise.
-        self.square = self.square + (error**2 - self.square) / max(min(self.scans, 1000), 20)
+        self.square = self.square + (error**2 - self.square) / max(min(self.scans, SQUARES), 20)
 
 
 def ranges(signals: Sequence[Signal]) -> tuple[Array, Array]:

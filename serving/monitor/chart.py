@@ -17,7 +17,7 @@ ONE_SIDED = 1.645  # normal quantile of .95: the unfavourable ends of what was l
 OVERSHOOT = 1.166  # of a sum of normal figures over its limit, in scatters [Siegmund]
 LEAST_LIMIT = 4.0
 FEWEST = 3.0  # degrees of freedom that a scatter is believed to have at least
-WORTH, DOUBLINGS = 5.0, 2  # independent figures that learning needs; how often it may last twice as long for them
+WORTH, DOUBLINGS = 12.0, 2  # independent figures that learning needs; how often it may last twice as long for them
 
 
 class Chart(Remembers):
@@ -74,6 +74,8 @@ class Chart(Remembers):
         "down",
         "last",
         "recent",
+        "off",
+        "offs",
         "found",
         "rises",
         "began_s",
@@ -91,6 +93,7 @@ class Chart(Remembers):
         self.figures, self.count = np.zeros((learn, n)), 0
         self.mean, self.scatter, self.slack, self.limit = np.zeros(n), np.ones(n), np.ones(n), np.full(n, LEAST_LIMIT)
         self.up, self.down, self.last, self.recent = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        self.off, self.offs = np.zeros(n), np.ones(n)  # sum and number of the figures since the present sum began
         self.found, self.rises = np.zeros(n), np.zeros(n)  # found: 1 or 0
         self.began_s, self.since_s = np.zeros(n), np.zeros(n)  # the present sum, the shift that was found
 
@@ -105,7 +108,9 @@ class Chart(Remembers):
         return min((self.count + self.pooled / self.pool) / self.learn, 1.0)
 
     def shift(self, i: int) -> float:
-        """By how much a figure lies off of late (mean of the last ten or so)."""
+        """By how much a figure lies off: since the shift began where one was found, else over the last ten or so."""
+        if self.found[i]:
+            return float(self.off[i] / self.offs[i])
         return float(self.recent[i] - self.mean[i])
 
     def add(self, x: Array, time_s: float) -> None:
@@ -129,7 +134,7 @@ class Chart(Remembers):
         self.mean, s = self.figures.mean(axis=0), self.figures.std(axis=0, ddof=1)
         f = correlation(self.figures)
         worth = self.learn / f
-        if self.n and worth.min() < WORTH and self.doublings < DOUBLINGS:
+        if self.n and self.learn / f.mean() < WORTH and self.doublings < DOUBLINGS:
             half = self.learn // 2
             self.figures[:half] = self.figures[: 2 * half].reshape(half, 2, self.n).mean(axis=1)
             self.count, self.pool, self.doublings = half, 2 * self.pool, self.doublings + 1
@@ -145,7 +150,10 @@ class Chart(Remembers):
         self.recent = self.recent + (x - self.recent) / min(self.count - self.learn, 10)
         most = self.MOST * self.limit
         z = np.clip((x - self.mean) / self.scatter, -most, most)
-        self.began_s = np.where((self.up == 0) & (self.down == 0), time_s, self.began_s)
+        begins = (self.up == 0) & (self.down == 0)
+        self.began_s = np.where(begins, time_s, self.began_s)
+        self.off = np.where(begins, 0.0, self.off) + x - self.mean
+        self.offs = np.where(begins, 0.0, self.offs) + 1
         self.up = np.clip(self.up + z - self.slack, 0.0, 2 * self.limit)
         if self.both:
             self.down = np.clip(self.down - z - self.slack, 0.0, 2 * self.limit)
@@ -183,10 +191,8 @@ def correlation(x: Array) -> Array:
     off = x - x.mean(axis=0)
     variance = np.maximum((off**2).mean(axis=0), 1e-300)
     found = np.ones(x.shape[1])
-    b = 2
-    while b <= n // 8:
+    for b in sorted({int(1.5**i) for i in range(2, 30) if 1.5**i < n // 8} | {n // 8}):
         means = off[: n // b * b].reshape(n // b, b, -1).mean(axis=1)
         found = np.maximum(found, b * (means**2).mean(axis=0) / variance * (n // b) / (n // b - 1))
-        b *= 2
     # The mean of n figures is theirs: what lies off it scatters less than the figures, by f / n.
     return np.minimum(found / np.maximum(1 - found / n, 0.5), n / (FEWEST + 1))

@@ -72,7 +72,9 @@ class Monitor:
         block = max(BLOCK * self.settle, ceil(LEARN_S / (LEARN_MODEL + LEARN_BLOCKS) / period))
         weekly = WEEK_S / (block * period)
         self.foresight = Foresight(m, block=block, learn=LEARN_BLOCKS, weekly=weekly, rate=rate)
-        self.answers = Answers(m, block=block, model=LEARN_MODEL, learn=LEARN_BLOCKS, weekly=weekly, rate=rate)
+        self.answers = Answers(
+            m, block=block, model=LEARN_MODEL, learn=LEARN_BLOCKS, weekly=weekly, rate=rate, told=self.foresight.told
+        )
         self.estimates = Estimates(m.info, block=block, learn=LEARN_BLOCKS, weekly=weekly, rate=rate)
         self.batches = Batches(m, rate)
         self.swings = [Swing(BAND * (s.high - s.low)) for s in m.sp]
@@ -127,8 +129,8 @@ class Monitor:
             mean.add(share)
             swing.add(value)
         self.plight.add(mv, max(off), time_s)
-        self.foresight.add(pv, command.info, time_s)
-        self.answers.add(pv, mv, time_s)
+        missed = self.foresight.add(pv, command.info, time_s)
+        self.answers.add(pv, mv, missed, time_s)
         self.estimates.add(command.info, time_s)
         self.batches.add((command.sp, pv, mv, command.info), time_s)
         sp = command.sp.tolist()

@@ -41,17 +41,20 @@ class Foresight(Remembers):
         """The samples before a gap say nothing of the next."""
         self._expected = None
 
-    def add(self, pv: Array, info: Array | None, time_s: float) -> None:
-        """One scan: PVs (n_pv,) and the law's info."""
+    def add(self, pv: Array, info: Array | None, time_s: float) -> Array | None:
+        """One scan: PVs (n_pv,) and the law's info. The errors (n_cv,) of what it expected, of their ranges."""
         if not self.told:
-            return
+            return None
+        error = None
         if self._expected is not None:
-            self.sums = self.sums + ((pv[: self.n_cv] - self._expected) / self._span) ** 2
+            error = (pv[: self.n_cv] - self._expected) / self._span
+            self.sums = self.sums + error**2
             self.count += 1
             if self.count >= self.block:
                 self.chart.add(np.log(self.sums / self.count + 1e-18), time_s)
                 self.sums, self.count = np.zeros(self.n_cv), 0
         self._expected = None if info is None else info[self._places]
+        return error
 
     def ratio(self, i: int) -> float:
         """The root mean square error of late over that of the time in which it learnt."""

@@ -1,4 +1,4 @@
-"""On every case a drift of a parameter by 20 % is found within a stated time, and nothing asked to retrain before it."""
+"""On every case a drift of a parameter by 20 % is found within a stated time; nothing asked to retrain before."""
 
 from __future__ import annotations
 

@@ -232,7 +232,7 @@ def test_a_plant_that_answers_otherwise_is_found_though_it_is_foreseen_as_well(p
     answers = Answers(manifest(), block=100, model=30, learn=40, weekly=1_000.0, rate=0.1)
 
     def watch(pv: np.ndarray, mv: np.ndarray, k: float) -> None:
-        answers.add(pv, mv, k)
+        answers.add(pv, mv, None, k)
         if k == 9_999:
             assert answers.learnt
             assert answers.changed(0) is None
