@@ -19,7 +19,7 @@ LEAST_SCORE = 1.0  # of a score: what white errors give
 
 
 class Answers(Remembers):
-    """Errors e of a one-step model that is learnt beside the law, and of the law's own prediction, in blocks of N scans.
+    """Errors e of a one-step model that is learnt beside the law, and of the law's own, over blocks of N scans.
 
     The model learns ``model`` blocks and is then frozen. Each further block gives, for each error,
 
@@ -69,14 +69,13 @@ class Answers(Remembers):
             return
         self.count += 1
         phi, errors = found
-        if self.n_told:
-            assert error is not None
-            errors = np.concatenate([errors, error])
+        told = np.zeros(0) if error is None else error[: self.n_told]
+        errors = np.concatenate([errors, told])
         if self.model.frozen:
             self.squares = self.squares + errors**2
             self.scores = self.scores + phi[:, None] * errors
         elif self.n_told:
-            self.told_square = self.told_square + (error**2 - self.told_square) / min(self.model.scans, SQUARES)
+            self.told_square = self.told_square + (told**2 - self.told_square) / min(self.model.scans, SQUARES)
         if self.count >= self.block:
             self.end(time_s, 1)
 

@@ -122,7 +122,6 @@ class Batches(Remembers):
         place = slice(i * PARTS, (i + 1) * PARTS)
         if not self.chart.found[place].any():
             return None
-        off = (self.chart.off / self.chart.offs / self.chart.scatter)[place]
-        part = int(np.argmax(np.abs(off) * (self.chart.found[place] > 0)))
+        part = int(np.argmax(np.abs(self.chart.shares()[place])))
         at = i * PARTS + part
         return part, self.chart.shift(at) * float(self.spans[i]), float(self.chart.since_s[at])

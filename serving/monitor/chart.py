@@ -93,9 +93,10 @@ class Chart(Remembers):
         self.figures, self.count = np.zeros((learn, n)), 0
         self.mean, self.scatter, self.slack, self.limit = np.zeros(n), np.ones(n), np.ones(n), np.full(n, LEAST_LIMIT)
         self.up, self.down, self.last, self.recent = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-        self.off, self.offs = np.zeros(n), np.ones(n)  # sum and number of the figures since the present sum began
+        # Sum and number of the figures since the present sums began, upwards and downwards.
+        self.off, self.offs = np.zeros((2, n)), np.zeros((2, n))
         self.found, self.rises = np.zeros(n), np.zeros(n)  # found: 1 or 0
-        self.began_s, self.since_s = np.zeros(n), np.zeros(n)  # the present sum, the shift that was found
+        self.began_s, self.since_s = np.zeros((2, n)), np.zeros(n)  # the present sums, the shift that was found
 
     @property
     def learnt(self) -> bool:
@@ -110,8 +111,17 @@ class Chart(Remembers):
     def shift(self, i: int) -> float:
         """By how much a figure lies off: since the shift began where one was found, else over the last ten or so."""
         if self.found[i]:
-            return float(self.off[i] / self.offs[i])
+            return float(self._since()[i])
         return float(self.recent[i] - self.mean[i])
+
+    def shares(self) -> Array:
+        """The shifts of those that were found, in scatters (n,); 0 of the others."""
+        return np.asarray(self.found * self._since() / self.scatter)
+
+    def _since(self) -> Array:
+        """Means of what figures lie off by since the larger sum began, (n,)."""
+        means = self.off / np.maximum(self.offs, 1)
+        return np.asarray(np.where(self.up >= self.down, means[0], means[1]))
 
     def add(self, x: Array, time_s: float) -> None:
         """One of each figure (n,)."""
@@ -150,17 +160,18 @@ class Chart(Remembers):
         self.recent = self.recent + (x - self.recent) / min(self.count - self.learn, 10)
         most = self.MOST * self.limit
         z = np.clip((x - self.mean) / self.scatter, -most, most)
-        begins = (self.up == 0) & (self.down == 0)
-        self.began_s = np.where(begins, time_s, self.began_s)
-        self.off = np.where(begins, 0.0, self.off) + x - self.mean
-        self.offs = np.where(begins, 0.0, self.offs) + 1
+        goes_on = np.array([self.up, self.down]) > 0
+        self.began_s = np.where(goes_on, self.began_s, time_s)
+        self.off = goes_on * self.off + x - self.mean
+        self.offs = goes_on * self.offs + 1
         self.up = np.clip(self.up + z - self.slack, 0.0, 2 * self.limit)
         if self.both:
             self.down = np.clip(self.down - z - self.slack, 0.0, 2 * self.limit)
         largest = np.maximum(self.up, self.down)
         begins = (largest > self.limit) & (self.found == 0)
         over = (largest < self.limit / 2) & (self.found > 0)
-        self.since_s = np.where(begins, self.began_s, self.since_s)
+        began_s = np.where(self.up >= self.down, self.began_s[0], self.began_s[1])
+        self.since_s = np.where(begins, began_s, self.since_s)
         self.found = np.where(begins, 1.0, np.where(over, 0.0, self.found))
         rise = over & (self.rises < self.RISES)
         self.limit = np.where(rise, self.RISE * self.limit, self.limit)
