@@ -17,6 +17,7 @@ from serving.monitor.batches import Batches
 from serving.monitor.chart import Chart
 from serving.monitor.error import Swing, harris_index
 from serving.monitor.estimates import Estimates
+from serving.monitor.numbers import numbers
 from serving.monitor.pace import LEARN_S, dead_times, pooled, settle_scans
 from serving.monitor.plight import Plight
 from serving.monitor.residual import Foresight
@@ -82,12 +83,12 @@ class Monitor:
         self.harris = [Share(1, 20) for _ in m.sp]
         self.dead_time = dead_times(m)
         self._window = [deque[float](maxlen=HARRIS_SCANS) for _ in m.sp]
-        self._domain = m.info.index("in_domain") if "in_domain" in m.info else None
+        self.domain = m.info.index("in_domain") if "in_domain" in m.info else None
         self._mv_low = np.array([s.low for s in m.mv])
         self._mv_span = np.array([s.high - s.low for s in m.mv])
         self._sp_span = np.array([s.high - s.low for s in m.sp])
         self._span: list[float] = self._sp_span.tolist()
-        self._max_move = [inf if s.max_move is None else 0.999 * s.max_move / (s.high - s.low) for s in m.mv]
+        self.max_move = [inf if s.max_move is None else 0.999 * s.max_move / (s.high - s.low) for s in m.mv]
         self._sp: list[float] | None = None
         self._last: list[float] | None = None  # the MVs of the scan before, as shares of their ranges
         self._still = 0  # scans since the set points moved or the loop left AUTO
@@ -144,10 +145,10 @@ class Monitor:
         saturated = any(s <= AT_END or s >= 1 - AT_END for s in shares)
         self.saturated.add(float(saturated))
         if self._last is not None:
-            moves = zip(shares, self._last, self._max_move, strict=True)
+            moves = zip(shares, self._last, self.max_move, strict=True)
             self.limited.add(float(any(abs(s - before) >= most for s, before, most in moves)))
-        if self._domain is not None and command.info is not None:
-            self.outside.add(float(command.info[self._domain] < 0.5))
+        if self.domain is not None and command.info is not None:
+            self.outside.add(float(command.info[self.domain] < 0.5))
         self._last = shares
         return saturated
 
@@ -208,27 +209,7 @@ class Monitor:
 
     def numbers(self) -> dict[str, float]:
         """What was measured, for those who draw it over months."""
-        m = self.manifest
-        found = {"saturated_share": self.saturated.value, "hold_share": self.hold.value}
-        if min(self._max_move) < inf:
-            found["rate_limited_share"] = self.limited.value
-        if self._domain is not None:
-            found["outside_domain_share"] = self.outside.value
-        for i, s in enumerate(m.sp):
-            found[f"mean_error_{s.name}"] = self.errors[i].value * float(self._sp_span[i])
-            found[f"regularity_{s.name}"] = self.swings[i].regularity()
-            if self.harris[i].count:
-                found[f"harris_index_{s.name}"] = self.harris[i].value
-            seen = self.residual
-            if seen.chart.learnt if isinstance(seen, Foresight) else seen.sizes.learnt:
-                found[f"residual_ratio_{s.name}"] = seen.ratio(i)
-        if self.rest.learnt:
-            for i, s in enumerate(m.mv):
-                found[f"shift_at_rest_{s.name}"] = self.rest.chart.shift(i) * float(self._mv_span[i])
-                gain = self.rest.gain(i)
-                if gain is not None:
-                    found[f"gain_ratio_{s.name}"] = gain[0]
-        return {name: value for name, value in found.items() if isfinite(value)}
+        return numbers(self)
 
     # ------------------------------------------------------------------ over a restart
     PARTS = (

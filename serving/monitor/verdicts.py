@@ -20,16 +20,12 @@ A chart is a CUSUM whose limit follows from the false alarms a week that are all
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from math import exp
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from serving.manifest import Signal
 from serving.monitor.batches import PARTS
 from serving.monitor.residual import Foresight
-from serving.monitor.verdict import Level, Verdict, unknown
+from serving.monitor.verdict import Level, Verdict, unit_of, unknown, when
 
 if TYPE_CHECKING:
     from serving.monitor.monitor import Monitor
@@ -59,11 +55,11 @@ def _plight(m: Monitor) -> list[Verdict]:
         name, plight = f"{s.name} moves", m.plight
         if plight.jammed(i):
             end = "upper" if plight.end[i] > 0 else "lower"
-            since = _when(float(plight.since_s[i]))
+            since = when(float(plight.since_s[i]))
             text = f"{s.name} is at the {end} end of its range since {since}, and the error stays"
             found.append(Verdict(name, "watch", text, float(plight.stuck[i]), float(plight.patience)))
         elif plight.flutters(i):
-            size = f"{plight.move[i] * (s.high - s.low):.3g} {_unit(s)}".strip()
+            size = f"{plight.move[i] * (s.high - s.low):.3g} {unit_of(s)}".strip()
             text = f"{s.name} turns round at nearly every scan, by {size} each time"
             found.append(Verdict(name, "watch", text, float(plight.turns[i])))
         else:
@@ -87,7 +83,7 @@ def _residual(m: Monitor) -> list[Verdict]:
         ratio = seen.ratio(i)
         if chart.found[i]:
             level: Level = "retrain" if ratio >= limit else "watch"
-            text = f"{source} errs {ratio:.2g} times as much as at first, since {_when(chart.since_s[i])}"
+            text = f"{source} errs {ratio:.2g} times as much as at first, since {when(chart.since_s[i])}"
         else:
             level, text = "as validated", f"{source} errs as much as at first"
         found.append(Verdict(name, level, text, ratio, limit))
@@ -106,7 +102,7 @@ def _answers(m: Monitor) -> list[Verdict]:
             found.append(unknown(name, text))
         elif since is not None:
             text = (
-                f"{s.name} answers otherwise than at first, since {_when(since)}: the plant has changed, or a load has"
+                f"{s.name} answers otherwise than at first, since {when(since)}: the plant has changed, or a load has"
             )
             found.append(Verdict(name, "watch", text))
         else:
@@ -125,7 +121,7 @@ def _estimates(m: Monitor) -> list[Verdict]:
         ratio = exp(chart.shift(i) / 2)
         if chart.found[i]:
             text = f"what the law corrects of its model is {ratio:.2g} times that of the first days"
-            found.append(Verdict(name, "watch", f"{text}, since {_when(chart.since_s[i])}", ratio))
+            found.append(Verdict(name, "watch", f"{text}, since {when(chart.since_s[i])}", ratio))
         else:
             found.append(Verdict(name, "as validated", "the law corrects its model as much as at first", ratio))
     return found
@@ -144,7 +140,7 @@ def _batches(m: Monitor) -> list[Verdict]:
             part, shift, since = change
             by = f"{abs(shift):.3g} {unit if unit != '-' else ''}".strip()
             text = f"{variable} is {by} {'higher' if shift > 0 else 'lower'} than in the first batches, "
-            text += f"most in part {part + 1} of {PARTS} of a batch, since {_when(since)}"
+            text += f"most in part {part + 1} of {PARTS} of a batch, since {when(since)}"
             found.append(Verdict(name, "watch", text, shift))
         else:
             found.append(Verdict(name, "as validated", "as in the first batches"))
@@ -165,10 +161,10 @@ def _rest(m: Monitor) -> list[Verdict]:
         gain = m.rest.gain(i)
         if gain is not None and abs(gain[0] - 1) > max(GAIN, ERRORS * gain[1]):
             change = f"{abs(gain[0] - 1):.0%} {'higher' if gain[0] > 1 else 'lower'}"
-            since = f" since {_when(chart.since_s[i])}" if chart.found[i] else ""
+            since = f" since {when(chart.since_s[i])}" if chart.found[i] else ""
             found.append(Verdict(name, "retrain", f"the plant's gain seems {change}{since}", gain[0], 1 + GAIN))
         elif chart.found[i]:
-            text = f"the plant needs {shift:+.3g} {_unit(s)}for the same set points since {_when(chart.since_s[i])}"
+            text = f"the plant needs {shift:+.3g} {unit_of(s)}for the same set points since {when(chart.since_s[i])}"
             found.append(Verdict(name, "watch", text, shift, float(chart.scatter[i]) * (s.high - s.low)))
         else:
             found.append(Verdict(name, "as validated", "the plant needs what it needed at first", shift))
@@ -182,14 +178,14 @@ def _variability(m: Monitor) -> list[Verdict]:
         worst = _worst_validated(m)
         mean = m.errors[i].value * span
         if worst is not None and len(m.manifest.sp) == 1 and m.errors[i].learnt and mean > WORSE * worst:
-            text = f"the mean error is {mean:.3g} {_unit(s)}; in the validation it was at most {worst:.3g}"
+            text = f"the mean error is {mean:.3g} {unit_of(s)}; in the validation it was at most {worst:.3g}"
             found.append(Verdict(name, "watch", text, mean, worst))
         elif not drift.learnt:
             if not m.batches.known:
                 found.append(unknown(name, f"the error at rest is still measured: {drift.done:.0%} done"))
         elif drift.found[i]:
             ratio = exp(drift.shift(i) / 2)
-            text = f"the error at rest is {ratio:.2g} times that of the first days, since {_when(drift.since_s[i])}"
+            text = f"the error at rest is {ratio:.2g} times that of the first days, since {when(drift.since_s[i])}"
             found.append(Verdict(name, "watch", text, ratio))
         else:
             left = m.harris[i]
@@ -210,7 +206,7 @@ def _swing(m: Monitor) -> list[Verdict]:
             found.append(unknown(f"swing of {s.name}", "the error at rest is still measured"))
         elif r > SWINGS and swing.amplitude() > loud:
             seconds = swing.period() * m.manifest.period_s
-            text = f"{s.name} swings by {swing.amplitude():.3g} {_unit(s)}every {seconds:.3g} s"
+            text = f"{s.name} swings by {swing.amplitude():.3g} {unit_of(s)}every {seconds:.3g} s"
             found.append(Verdict(f"swing of {s.name}", "watch", text, r, SWINGS))
         else:
             found.append(Verdict(f"swing of {s.name}", "as validated", "no regular swing", r, SWINGS))
@@ -244,11 +240,3 @@ def _worst_validated(m: Monitor) -> float | None:
     found = [row.get("mae") for name, row in rows.items() if isinstance(row, dict) and name.endswith("_noise")]
     known = [float(v) for v in found if isinstance(v, int | float)]
     return max(known) if known else None
-
-
-def _when(time_s: float | np.floating[Any]) -> str:
-    return datetime.fromtimestamp(float(time_s), UTC).strftime("%d %b %H:%M UTC")
-
-
-def _unit(s: Signal) -> str:
-    return "" if s.unit == "-" else f"{s.unit} "

@@ -55,10 +55,10 @@ def test_the_unfavourable_end_of_a_scatter_is_that_of_its_distribution() -> None
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.5, 0.9])
-def test_the_correlation_of_an_ar_1_figure(pole: float) -> None:
-    """1 + 2 sum rho = (1 + a) / (1 - a)."""
-    x = ar1(np.random.default_rng(2), pole, 20_000, 4)
-    assert np.median(correlation(x)) == pytest.approx((1 + pole) / (1 - pole), rel=0.25, abs=0.15)
+def test_the_correlation_of_an_ar_1_figure_is_not_thought_smaller_than_it_is(pole: float) -> None:
+    """1 + 2 sum rho = (1 + a) / (1 - a); the largest of many estimates lies above it, but below twice that."""
+    found = np.median(correlation(ar1(np.random.default_rng(2), pole, 2_000, 40)))
+    assert 0.9 < found / ((1 + pole) / (1 - pole)) < 2.0
 
 
 def ar1(rng: np.random.Generator, pole: float, length: int, n: int) -> np.ndarray:
