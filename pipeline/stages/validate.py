@@ -17,6 +17,7 @@ from pipeline.config.params import CaseParams, ControllerParams, choose, parse, 
 from pipeline.engine.command import run_stage
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.dead_time import dead_times
 from pipeline.evaluation.evidence import WITHHELD
 from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
@@ -97,6 +98,7 @@ def validate(name: str) -> None:
     evidence = _evidence(case, base, shipped, grounds_of(case, models, [metrics.reached]))
     if (analysis := metrics.forms[BASE].analysis) is not None:
         evidence["analysis"] = analysis.figures
+    evidence["dead_time_periods"] = dead_times(case.plant)
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     target = ARTIFACTS / params.case / f"{params.name}.onnx"

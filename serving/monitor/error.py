@@ -30,6 +30,10 @@ class Swing(Remembers):
 
     def __init__(self, band: float) -> None:
         self.band = band
+        self.forget()
+
+    def forget(self) -> None:
+        """What follows has nothing to do with what was."""
         self.side, self.since, self.largest = 0, 0, 0.0
         self.intervals: list[int] = []
         self.amplitudes: list[float] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from math import isfinite, log
+from math import ceil, inf, isfinite
 from typing import Any, Self, TypeAlias
 
 import numpy as np
@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 from serving.guard import Sample
 from serving.loop import Command, Mode
 from serving.manifest import Manifest
-from serving.monitor.cusum import Drift
+from serving.monitor.answers import Answers
+from serving.monitor.batches import Batches
+from serving.monitor.chart import Chart
 from serving.monitor.error import Swing, harris_index
 from serving.monitor.estimates import Estimates
+from serving.monitor.numbers import numbers
+from serving.monitor.pace import LEARN_S, dead_times, pooled, settle_scans
 from serving.monitor.plight import Plight
 from serving.monitor.residual import Foresight
 from serving.monitor.rest import RestMap
@@ -24,10 +28,10 @@ from serving.monitor.verdicts import verdicts
 
 Array: TypeAlias = NDArray[np.float64]
 
-SETTLE, LEAST_SETTLE, MOST_SETTLE = 100, 20, 2000  # scans
-LEARN_RESTS = 300  # periods of rest
-LEARN_BLOCKS = 60
-DAY_S = 86_400.0
+LEARN_RESTS, LEARN_MODEL, LEARN_BLOCKS = 300, 20, 40  # periods of rest, blocks of the model, blocks of a chart
+BLOCK = 10  # settling times: a block holds some moves of the set point
+FALSE_ALARMS = 0.25  # a week that are allowed to all charts together
+DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
 LEAST_DAY, MOST_DAY = 2_000, 200_000  # scans over which a share is taken
 BAND = 0.005  # of a set point's range: smaller errors are no swing
 HARRIS_SCANS = 500
@@ -58,26 +62,44 @@ class Monitor:
         learn = 20 * self.settle
         self.saturated, self.hold, self.limited, self.outside = (Share(learn, day) for _ in range(4))
         self.errors = [Share(learn, day) for _ in m.sp]  # mean |error|, of the range
-        self.rest = RestMap(m.sp, m.mv, LEARN_RESTS)
-        self.spread = [Drift(LEARN_RESTS, 0.3) for _ in m.sp]  # log of the error's mean square at rest
-        self.foresight = Foresight(m, self.settle, LEARN_BLOCKS)
-        self.estimates = Estimates(m.info, 10 * self.settle, LEARN_BLOCKS)
+        period, rate = m.period_s, FALSE_ALARMS / 6
+        rests, pool = pooled(LEARN_RESTS, self.settle * period)
+        weekly = WEEK_S / (self.settle * period)
+        self.rest = RestMap(m.sp, m.mv, learn=rests, pool=pool, weekly=weekly, rate=rate)
+        # The logarithm of the error's mean square at rest.
+        self.spread = Chart(
+            len(m.sp), LEARN_RESTS, pool=pool, weekly=weekly, rate=rate / len(m.sp), least=0.3, both=False
+        )
+        block = max(BLOCK * self.settle, ceil(LEARN_S / (LEARN_MODEL + LEARN_BLOCKS) / period))
+        weekly = WEEK_S / (block * period)
+        self.foresight = Foresight(m, block=block, learn=LEARN_BLOCKS, weekly=weekly, rate=rate)
+        self.answers = Answers(
+            m, block=block, model=LEARN_MODEL, learn=LEARN_BLOCKS, weekly=weekly, rate=rate, told=self.foresight.told
+        )
+        self.estimates = Estimates(m.info, block=block, learn=LEARN_BLOCKS, weekly=weekly, rate=rate)
+        self.batches = Batches(m, rate)
         self.swings = [Swing(BAND * (s.high - s.low)) for s in m.sp]
         self.plight = Plight(m.mv, 2 * self.settle)
         self.harris = [Share(1, 20) for _ in m.sp]
-        self.moves = np.zeros(len(m.mv))
+        self.dead_time = dead_times(m)
         self._window = [deque[float](maxlen=HARRIS_SCANS) for _ in m.sp]
-        self._domain = m.info.index("in_domain") if "in_domain" in m.info else None
+        self.domain = m.info.index("in_domain") if "in_domain" in m.info else None
         self._mv_low = np.array([s.low for s in m.mv])
         self._mv_span = np.array([s.high - s.low for s in m.mv])
         self._sp_span = np.array([s.high - s.low for s in m.sp])
-        self._max_move = np.array([np.inf if s.max_move is None else s.max_move for s in m.mv])
-        self._sp: Array | None = None
-        self._last_mv: Array | None = None
+        self._span: list[float] = self._sp_span.tolist()
+        self.max_move = [inf if s.max_move is None else 0.999 * s.max_move / (s.high - s.low) for s in m.mv]
+        self._sp: list[float] | None = None
+        self._last: list[float] | None = None  # the MVs of the scan before, as shares of their ranges
         self._still = 0  # scans since the set points moved or the loop left AUTO
         self._mv_sum, self._e_sum, self._e2_sum = np.zeros(0), np.zeros(0), np.zeros(0)
         self._clear()
         self.trouble = ""  # what the monitor itself failed at
+
+    @property
+    def residual(self) -> Foresight | Answers:
+        """What tells the one-step error: the law where it tells what it expects, else a model beside it."""
+        return self.foresight if self.foresight.told else self.answers
 
     # ------------------------------------------------------------------ a scan
     def observe(self, time_s: float, sample: Sample | None, command: Command) -> None:
@@ -93,39 +115,50 @@ class Monitor:
             self.hold.add(float(command.mode is Mode.HOLD))
         if sample is None or command.mode is not Mode.AUTO or command.law_mv is None:
             if command.mode in {Mode.SHADOW, Mode.MANUAL}:  # a batch's end; a fault is none
-                self.estimates.end(time_s)
+                self.batches.end(time_s)
             self._gap()
             return
         pv, mv = np.asarray(sample.pv, dtype=np.float64), command.mv
-        n_cv = len(self.manifest.sp)
-        error = pv[:n_cv] - command.sp
-        if not isfinite(float(error.sum() + mv.sum())):
+        error = pv[: len(self._span)] - command.sp
+        errors, shares = error.tolist(), ((mv - self._mv_low) / self._mv_span).tolist()
+        if not isfinite(sum(errors) + sum(shares)):
             self._gap()
             return
-        saturated = self._shares(mv, command)
-        for i, value in enumerate(error.tolist()):
-            self.errors[i].add(abs(value) / self._sp_span[i])
-            self.swings[i].add(value)
-        self.plight.add(mv, float(np.max(np.abs(error) / self._sp_span)), time_s)
-        self.foresight.add(pv, mv, command.info, time_s)
+        saturated = self._shares(shares, command)
+        off = [abs(e) / span for e, span in zip(errors, self._span, strict=True)]
+        for value, share, mean, swing in zip(errors, off, self.errors, self.swings, strict=True):
+            mean.add(share)
+            swing.add(value)
+        self.plight.add(mv, max(off), time_s)
+        missed = self.foresight.add(pv, command.info, time_s)
+        self.answers.add(pv, mv, missed, time_s)
         self.estimates.add(command.info, time_s)
-        if self._sp is None or not np.array_equal(self._sp, command.sp):
-            self._sp, self._still = command.sp.copy(), 0
-            self._clear()
+        self.batches.add((command.sp, pv, mv, command.info), time_s)
+        sp = command.sp.tolist()
+        if sp != self._sp:
+            self._moved(sp)
         self._still += 1
         if self._still > 2 * self.settle:
             self._rest(time_s, error, mv, saturated)
-        self._last_mv = mv
 
-    def _shares(self, mv: Array, command: Command) -> bool:
-        share = (mv - self._mv_low) / self._mv_span
-        saturated = bool((share <= AT_END).any() or (share >= 1 - AT_END).any())
+    def _shares(self, shares: list[float], command: Command) -> bool:
+        saturated = any(s <= AT_END or s >= 1 - AT_END for s in shares)
         self.saturated.add(float(saturated))
-        if self._last_mv is not None:
-            self.limited.add(float((np.abs(mv - self._last_mv) >= 0.999 * self._max_move).any()))
-        if self._domain is not None and command.info is not None:
-            self.outside.add(float(command.info[self._domain] < 0.5))
+        if self._last is not None:
+            moves = zip(shares, self._last, self.max_move, strict=True)
+            self.limited.add(float(any(abs(s - before) >= most for s, before, most in moves)))
+        if self.domain is not None and command.info is not None:
+            self.outside.add(float(command.info[self.domain] < 0.5))
+        self._last = shares
         return saturated
+
+    def _moved(self, sp: list[float]) -> None:
+        """The set points are others than at the scan before."""
+        before = self._sp
+        if before is None or any(abs(a - b) > BAND * span for a, b, span in zip(sp, before, self._span, strict=True)):
+            self._steady()
+        self._sp, self._still = sp, 0
+        self._clear()
 
     def _rest(self, time_s: float, error: Array, mv: Array, saturated: bool) -> None:
         """A scan at set points that stand still; a period of rest is whole after ``settle`` of them."""
@@ -140,20 +173,27 @@ class Monitor:
             return
         mean = self._e_sum / self._n
         if not self._ends and (np.abs(mean) <= NEAR_REST * self._sp_span).all():
-            assert self._sp is not None
-            self.rest.add(self._sp, self._mv_sum / self._n, time_s)
-        for i, drift in enumerate(self.spread):
-            drift.add(log(float(self._e2_sum[i]) / self._n / self._sp_span[i] ** 2 + 1e-18), time_s)
-            if len(self._window[i]) == HARRIS_SCANS:
-                self.harris[i].add(harris_index(np.array(self._window[i]), 2))
-                self._window[i].clear()
+            self.rest.add(np.array(self._sp), self._mv_sum / self._n, time_s)
+        self.spread.add(np.log(self._e2_sum / self._n / self._sp_span**2 + 1e-18), time_s)
+        for i, window in enumerate(self._window):
+            if len(window) == HARRIS_SCANS:
+                self.harris[i].add(harris_index(np.array(window), self.dead_time[i]))
+                window.clear()
         self._clear()
+
+    def _steady(self) -> None:
+        """Swings count from here: a set point that moves swings the error by itself."""
+        for swing in self.swings:
+            swing.forget()
 
     def _gap(self) -> None:
         """No sample, or another mode: what follows has nothing to do with what was."""
         self.foresight.forget()
+        self.answers.forget()
+        self.batches.forget()
         self.plight.forget()
-        self._sp = self._last_mv = None
+        self._steady()
+        self._sp = self._last = None
         self._still = 0
         self._clear()
 
@@ -169,26 +209,7 @@ class Monitor:
 
     def numbers(self) -> dict[str, float]:
         """What was measured, for those who draw it over months."""
-        m = self.manifest
-        found = {"saturated_share": self.saturated.value, "hold_share": self.hold.value}
-        if np.isfinite(self._max_move).any():
-            found["rate_limited_share"] = self.limited.value
-        if self._domain is not None:
-            found["outside_domain_share"] = self.outside.value
-        for i, s in enumerate(m.sp):
-            found[f"mean_error_{s.name}"] = self.errors[i].value * float(self._sp_span[i])
-            found[f"regularity_{s.name}"] = self.swings[i].regularity()
-            if self.harris[i].count:
-                found[f"harris_index_{s.name}"] = self.harris[i].value
-            if self.foresight.learnt:
-                found[f"residual_ratio_{s.name}"] = self.foresight.ratio(i)
-        if self.rest.learnt:
-            for i, s in enumerate(m.mv):
-                found[f"shift_at_rest_{s.name}"] = float(self.rest.shift[i] * self._mv_span[i])
-                gain = self.rest.gain(i)
-                if gain is not None:
-                    found[f"gain_ratio_{s.name}"] = gain[0]
-        return {name: value for name, value in found.items() if isfinite(value)}
+        return numbers(self)
 
     # ------------------------------------------------------------------ over a restart
     PARTS = (
@@ -200,7 +221,9 @@ class Monitor:
         "rest",
         "spread",
         "foresight",
+        "answers",
         "estimates",
+        "batches",
         "swings",
         "harris",
     )
@@ -229,12 +252,3 @@ class Monitor:
             else:
                 part.recall(kept)
         return made
-
-
-def settle_scans(m: Manifest) -> int:
-    """Scans of a settling time: the median over the evidence's tests."""
-    rows = m.evidence.get("scenarios")
-    found = [row.get("settling") for row in rows.values() if isinstance(row, dict)] if isinstance(rows, dict) else []
-    times = sorted(float(v) for v in found if isinstance(v, int | float) and v > 0)
-    scans = round(times[len(times) // 2] / m.period_s) if times else SETTLE
-    return min(max(scans, LEAST_SETTLE), MOST_SETTLE)

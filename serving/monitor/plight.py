@@ -34,41 +34,43 @@ class Plight:
         self._low = np.array([s.low for s in mv])
         self._span = np.array([s.high - s.low for s in mv])
         # An MV of few values turns round as a matter of course.
-        self._steps = np.array([s.values is not None for s in mv])
-        self.since_s = np.full(len(mv), np.nan)
+        self._steps = [s.values is not None for s in mv]
+        self.since_s = [float("nan")] * len(mv)
         self.forget()
 
     def forget(self) -> None:
         """What follows has nothing to do with what was."""
         n = len(self._span)
-        self.stuck, self.end = np.zeros(n, dtype=np.int64), np.zeros(n)  # scans; 1 upper end, -1 lower end
-        self.turns, self.move, self._count = np.zeros(n), np.zeros(n), 0
-        self._last: Array | None = None
-        self._last_move = np.zeros(n)
+        self.stuck, self.end = [0] * n, [0.0] * n  # scans; 1 upper end, -1 lower end
+        self.turns, self.move, self._count = [0.0] * n, [0.0] * n, 0
+        self._last: list[float] | None = None
+        self._last_move = [0.0] * n
 
     def add(self, mv: Array, error: float, time_s: float) -> None:
         """The MVs (n_mv,) of a scan, the largest error as a share of its range, and when that was [s since 1970]."""
-        share = (mv - self._low) / self._span
-        end = (share >= 1 - AT_END).astype(np.float64) - (share <= AT_END)
-        stays = (end != 0) & (end == self.end) & (error > FAR)
-        self.stuck = np.where(stays, self.stuck + 1, 0)
-        self.since_s = np.where(stays, self.since_s, time_s)
-        self.end = end
-        if self._last is not None:
-            move = (mv - self._last) / self._span
-            turned = move * self._last_move < 0
-            self._count += 1
-            weight = 1 / min(self._count, MEMORY)
-            self.turns += (turned - self.turns) * weight
-            self.move += (np.abs(move) - self.move) * weight
-            self._last_move = move
-        self._last = mv.copy()
+        first, far = self._last is None, error > FAR
+        self._count += not first
+        weight = 1 / min(max(self._count, 1), MEMORY)
+        shares = ((mv - self._low) / self._span).tolist()
+        for i, share in enumerate(shares):  # a loop over one or two is faster than a dozen calls of numpy
+            end = 1.0 if share >= 1 - AT_END else -1.0 if share <= AT_END else 0.0
+            if far and end and end == self.end[i]:
+                self.stuck[i] += 1
+            else:
+                self.stuck[i], self.since_s[i] = 0, time_s
+            self.end[i] = end
+            if self._last is not None:
+                move = share - self._last[i]
+                self.turns[i] += (float(move * self._last_move[i] < 0) - self.turns[i]) * weight
+                self.move[i] += (abs(move) - self.move[i]) * weight
+                self._last_move[i] = move
+        self._last = shares
 
     def jammed(self, i: int) -> bool:
         """Whether an MV has stayed at its end for too long."""
-        return bool(self.stuck[i] > self.patience)
+        return self.stuck[i] > self.patience
 
     def flutters(self, i: int) -> bool:
         """Whether an MV turns round at nearly every scan, by moves that matter."""
         known = self._count >= MEMORY and not self._steps[i]
-        return bool(known and self.turns[i] > TURNING and self.move[i] > MOVING)
+        return known and self.turns[i] > TURNING and self.move[i] > MOVING

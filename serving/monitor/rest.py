@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from serving.manifest import Signal
-from serving.monitor.cusum import Cusum
+from serving.monitor.chart import Chart
 from serving.monitor.memory import Remembers
 
 Array: TypeAlias = NDArray[np.float64]
@@ -20,66 +20,51 @@ LEAST_SIGMA = 0.01  # of the MV's range: less is no drift worth a word
 SMALLEST_MOVE = 0.03  # of the MV's range: a smaller one says nothing of a gain
 MOVES = 6  # that a gain needs
 FORGET = 0.95  # a move
-SLACK = 2.0  # standard deviations: loads come and go, and stay for a while
+WILD = 0.25  # of the learning time in which the map is still too wild for its scatter to be known
 
 
 class RestMap(Remembers):
     """mv_rest = theta' phi(sp), phi piecewise linear over each set point's range, by recursive least squares.
 
     It learns ``learn`` periods of rest and is frozen then, but where it has no data (leverage phi' P phi >= NEAR) it
-    goes on learning. What lies between the map and the MV, over its scatter, goes into a CUSUM; the moves of the MV
-    from one set point to another beside those of the map tell the plant's gain, whatever the load is.
+    goes on learning. What lies between the map and the MV goes into a chart, averaged over ``pool`` periods; the moves
+    of the MV from one set point to another beside those of the map tell the plant's gain, whatever the load is.
     """
 
-    KEPT = (
-        "theta",
-        "p",
-        "square",
-        "count",
-        "judged",
-        "shift",
-        "sxy",
-        "sxx",
-        "syy",
-        "moves",
-        "last",
-        "last_phi",
-        "cusums",
-    )
+    KEPT = ("theta", "p", "judged", "sxy", "sxx", "syy", "moves", "last", "last_phi", "chart")
 
-    def __init__(self, sp: Sequence[Signal], mv: Sequence[Signal], learn: int) -> None:
-        self.sp, self.mv, self.learn = sp, mv, learn
+    def __init__(
+        self, sp: Sequence[Signal], mv: Sequence[Signal], *, learn: int, weekly: float, rate: float, pool: int = 1
+    ) -> None:
+        self.sp, self.mv = sp, mv
+        figures = round((1 - WILD) * learn / pool)
+        self.learn, self._wild = learn, learn - figures * pool
         n = KNOTS * len(sp)
         self._low = np.array([s.low for s in mv])
         self._span = np.array([s.high - s.low for s in mv])
         self.theta, self.p = np.zeros((n, len(mv))), 100.0 * np.eye(n)
-        self.square = np.zeros(len(mv))  # mean square between map and MV while it learnt, of the range
-        self.count = self.judged = 0
-        self.shift = np.zeros(len(mv))  # between map and MV, averaged over the last periods of rest, of the range
+        self.judged = 0
         self.sxy = self.sxx = self.syy = np.zeros(len(mv))  # of the moves: asked for by the map, made
         self.moves = 0.0
         self.last, self.last_phi = np.zeros(len(mv)), np.zeros(n)
-        self.cusums = [Cusum(SLACK, most=2.0) for _ in mv]  # a figure is a mean over a settling time
+        self.chart = Chart(len(mv), figures, weekly=weekly, rate=rate / len(mv), least=LEAST_SIGMA, pool=pool)
 
     @property
     def learnt(self) -> bool:
         """Whether it has seen enough."""
         return self.judged >= self.learn
 
-    @property
-    def sigma(self) -> Array:
-        """Scatter of the MV around the map while it learnt, as share of the range, (n_mv,)."""
-        return np.maximum(np.sqrt(self.square), LEAST_SIGMA)
-
     def add(self, sp: Array, mv: Array, time_s: float) -> None:
         """One period of rest: the set points (n_sp,) and the mean MV (n_mv,)."""
         phi, share = self._phi(sp), (mv - self._low) / self._span
         leverage = float(phi @ self.p @ phi)
         off = share - phi @ self.theta
+        learnt = self.learnt
         if leverage < NEAR:
             self.judged += 1
-            self._judge(off, time_s)
-        if leverage >= NEAR or not self.learnt:
+            if self.judged > self._wild:
+                self.chart.add(off, time_s)
+        if leverage >= NEAR or not learnt:
             gain = self.p @ phi / (1.0 + leverage)
             self.theta = self.theta + np.outer(gain, off)
             self.p = self.p - np.outer(gain, phi @ self.p)
@@ -87,7 +72,6 @@ class RestMap(Remembers):
             self._move(phi, share)
         else:
             self.last_phi = np.zeros_like(phi)
-        self.count += 1
 
     def gain(self, i: int) -> tuple[float, float] | None:
         """(gain over the learnt one, its standard error) for MV ``i``; None as long as too few moves were made."""
@@ -97,21 +81,6 @@ class RestMap(Remembers):
         left = max(self.syy[i] - slope * self.sxy[i], 0.0)
         error = float(np.sqrt(left / max(self.moves - 1, 1) / self.sxx[i]))
         return (1 / slope, error / slope**2) if slope > 0.05 else None
-
-    def _judge(self, off: Array, time_s: float) -> None:
-        if not self.learnt:
-            share = 1 / min(self.judged, self.learn)
-            self.square = self.square + share * (off**2 - self.square)
-            if self.judged > self.learn // 4:  # the scatter is known roughly
-                for cusum, z in zip(self.cusums, (off / self.sigma).tolist(), strict=True):
-                    cusum.add(z, time_s, learning=True)
-            return
-        if self.judged == self.learn:
-            for cusum in self.cusums:
-                cusum.begin()
-        self.shift = self.shift + 0.2 * (off - self.shift)
-        for cusum, z in zip(self.cusums, (off / self.sigma).tolist(), strict=True):
-            cusum.add(z, time_s)
 
     def _move(self, phi: Array, share: Array) -> None:
         """From the period of rest before to this one, where the set points differ and the map is done."""

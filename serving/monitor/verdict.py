@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from datetime import UTC, datetime
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from serving.manifest import Signal
 
 Level: TypeAlias = Literal["as validated", "watch", "retrain", "not known yet"]
 
@@ -22,3 +27,13 @@ class Verdict:
 def unknown(name: str, text: str) -> Verdict:
     """Nothing can be said yet."""
     return Verdict(name, "not known yet", text)
+
+
+def when(time_s: float | np.floating[Any]) -> str:
+    """A time [s since 1970] as an operator reads it."""
+    return datetime.fromtimestamp(float(time_s), UTC).strftime("%d %b %H:%M UTC")
+
+
+def unit_of(s: Signal) -> str:
+    """The unit and a blank; nothing of a signal without one."""
+    return "" if s.unit == "-" else f"{s.unit} "

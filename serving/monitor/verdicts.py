@@ -7,21 +7,25 @@
 | MV at its end beside an error above a tenth of the range | two settling times |
 | MV that turns round | four of five moves, of a twentieth of its range |
 | swing | regularity 1, with errors beyond LOUD times the learning time's at rest (before that: a tenth of the range) |
-| variability | the learning time's scatter at rest (CUSUM); the mean error also against the validation's largest |
-| load, offset, disturbance of the law's info | the learning time's (CUSUM) |
-| MV at rest | the learnt map and its scatter (CUSUM) |
+| variability | the learning time's scatter at rest (chart); the mean error also against the validation's largest |
+| load, offset, disturbance of the law's info | the learning time's (chart) |
+| MV at rest | the learnt map and its scatter (chart) |
 | gain | 15 % and four standard errors |
-| one-step error | the learning time's (CUSUM); retrain: RETRAIN_RATIO times it |
+| one-step error | the learning time's (chart); retrain: RETRAIN_RATIO times it |
+| answer of a PV | what the errors of a linear model went with while it learnt (chart) |
+| a variable over a batch | its means over the eighths of the first batches (chart) |
+
+A chart is a CUSUM whose limit follows from the false alarms a week that are allowed: see ``serving.monitor.chart``.
 """
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from math import exp
 from typing import TYPE_CHECKING
 
-from serving.manifest import Signal
-from serving.monitor.verdict import Level, Verdict, unknown
+from serving.monitor.batches import PARTS
+from serving.monitor.residual import Foresight
+from serving.monitor.verdict import Level, Verdict, unit_of, unknown, when
 
 if TYPE_CHECKING:
     from serving.monitor.monitor import Monitor
@@ -38,7 +42,8 @@ RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a line
 
 def verdicts(m: Monitor) -> list[Verdict]:
     """All of them."""
-    found = [*_plight(m), *_residual(m), *_estimates(m), *_rest(m), *_variability(m), *_swing(m), *_shares(m)]
+    parts = (_plight, _residual, _answers, _estimates, _batches, _rest, _variability, _swing, _shares)
+    found = [verdict for part in parts for verdict in part(m)]
     if m.trouble:
         found.append(Verdict("monitor", "watch", f"the monitor itself failed: {m.trouble}"))
     return found
@@ -50,11 +55,11 @@ def _plight(m: Monitor) -> list[Verdict]:
         name, plight = f"{s.name} moves", m.plight
         if plight.jammed(i):
             end = "upper" if plight.end[i] > 0 else "lower"
-            since = _when(float(plight.since_s[i]))
+            since = when(float(plight.since_s[i]))
             text = f"{s.name} is at the {end} end of its range since {since}, and the error stays"
             found.append(Verdict(name, "watch", text, float(plight.stuck[i]), float(plight.patience)))
         elif plight.flutters(i):
-            size = f"{plight.move[i] * (s.high - s.low):.3g} {_unit(s)}".strip()
+            size = f"{plight.move[i] * (s.high - s.low):.3g} {unit_of(s)}".strip()
             text = f"{s.name} turns round at nearly every scan, by {size} each time"
             found.append(Verdict(name, "watch", text, float(plight.turns[i])))
         else:
@@ -64,56 +69,103 @@ def _plight(m: Monitor) -> list[Verdict]:
 
 def _residual(m: Monitor) -> list[Verdict]:
     found = []
-    limit = RETRAIN_RATIO if m.foresight.told else RETRAIN_LEARNT
-    source = "the law's own prediction" if m.foresight.told else "a model that was learnt beside the law"
+    seen = m.residual
+    chart = seen.chart if isinstance(seen, Foresight) else seen.sizes
+    limit = RETRAIN_RATIO if isinstance(seen, Foresight) else RETRAIN_LEARNT
+    source = "the law's own prediction" if isinstance(seen, Foresight) else "a model that was learnt beside the law"
     for i, s in enumerate(m.manifest.sp):
-        name, drift = f"one-step error of {s.name}", m.foresight.drifts[i]
-        if not drift.learnt:
-            have = m.foresight.blocks / ((1 if m.foresight.told else 2) * m.foresight.learn)
-            found.append(unknown(name, f"{source} is still measured: {min(have, 1):.0%} done"))
+        name = f"one-step error of {s.name}"
+        if not chart.learnt:
+            if not m.batches.known:
+                done = chart.done if isinstance(seen, Foresight) else seen.done
+                found.append(unknown(name, f"{source} is still measured: {done:.0%} done"))
             continue
-        ratio = m.foresight.ratio(i)
-        if drift.found:
+        ratio = seen.ratio(i)
+        if chart.found[i]:
             level: Level = "retrain" if ratio >= limit else "watch"
-            text = f"{source} errs {ratio:.2g} times as much as at first, since {_when(drift.cusum.since_s)}"
+            text = f"{source} errs {ratio:.2g} times as much as at first, since {when(chart.since_s[i])}"
         else:
             level, text = "as validated", f"{source} errs as much as at first"
         found.append(Verdict(name, level, text, ratio, limit))
     return found
 
 
+def _answers(m: Monitor) -> list[Verdict]:
+    """Whether each PV answers as at first."""
+    found = []
+    batches = m.batches.known
+    seen = m.batches.answers if batches else m.answers
+    for i, s in enumerate(m.manifest.pv):
+        name, since = f"answer of {s.name}", seen.changed(i)
+        if not seen.learnt:
+            text = f"how {s.name} answers is still learnt: {seen.done:.0%} done"
+            found.append(unknown(name, text))
+        elif since is not None:
+            text = (
+                f"{s.name} answers otherwise than at first, since {when(since)}: the plant has changed, or a load has"
+            )
+            found.append(Verdict(name, "watch", text))
+        else:
+            found.append(Verdict(name, "as validated", f"{s.name} answers moves as at first"))
+    return found
+
+
 def _estimates(m: Monitor) -> list[Verdict]:
     found = []
-    for name, drift in zip(m.estimates.names, m.estimates.drifts, strict=True):
-        if not drift.learnt:
-            found.append(unknown(name, f"what the law corrects is still measured: {drift.count} of {drift.learn}"))
+    chart = m.estimates.chart
+    for i, name in enumerate(m.estimates.names):
+        if not chart.learnt:
+            if not m.batches.known:
+                found.append(unknown(name, f"what the law corrects is still measured: {chart.done:.0%} done"))
             continue
-        ratio = exp((drift.last - drift.mean) / 2)
-        if drift.found:
+        ratio = exp(chart.shift(i) / 2)
+        if chart.found[i]:
             text = f"what the law corrects of its model is {ratio:.2g} times that of the first days"
-            found.append(Verdict(name, "watch", f"{text}, since {_when(drift.cusum.since_s)}", ratio))
+            found.append(Verdict(name, "watch", f"{text}, since {when(chart.since_s[i])}", ratio))
         else:
             found.append(Verdict(name, "as validated", "the law corrects its model as much as at first", ratio))
     return found
 
 
+def _batches(m: Monitor) -> list[Verdict]:
+    """Each variable beside earlier batches."""
+    if not m.batches.known:
+        return []
+    found, chart = [], m.batches.chart
+    for i, (variable, unit) in enumerate(zip(m.batches.names, m.batches.units, strict=True)):
+        name, change = f"{variable} over a batch", m.batches.changed(i)
+        if not chart.learnt:
+            found.append(unknown(name, f"batches of one recipe are still learnt: {chart.count} of {chart.learn}"))
+        elif change is not None:
+            part, shift, since = change
+            by = f"{abs(shift):.3g} {unit if unit != '-' else ''}".strip()
+            text = f"{variable} is {by} {'higher' if shift > 0 else 'lower'} than in the first batches, "
+            text += f"most in part {part + 1} of {PARTS} of a batch, since {when(since)}"
+            found.append(Verdict(name, "watch", text, shift))
+        else:
+            found.append(Verdict(name, "as validated", "as in the first batches"))
+    return found
+
+
 def _rest(m: Monitor) -> list[Verdict]:
     found = []
+    chart = m.rest.chart
     for i, s in enumerate(m.manifest.mv):
         name = f"{s.name} at rest"
-        if not m.rest.learnt:
-            text = f"what the plant needs at rest is still learnt: {m.rest.judged} of {m.rest.learn} periods of rest"
-            found.append(unknown(name, text))
+        if not chart.learnt:
+            if not m.batches.known:
+                done = min(m.rest.judged / m.rest.learn, 1) if chart.doublings == 0 else chart.done
+                found.append(unknown(name, f"what the plant needs at rest is still learnt: {done:.0%} done"))
             continue
-        cusum, shift = m.rest.cusums[i], float(m.rest.shift[i]) * (s.high - s.low)
+        shift = chart.shift(i) * (s.high - s.low)
         gain = m.rest.gain(i)
         if gain is not None and abs(gain[0] - 1) > max(GAIN, ERRORS * gain[1]):
             change = f"{abs(gain[0] - 1):.0%} {'higher' if gain[0] > 1 else 'lower'}"
-            since = f" since {_when(cusum.since_s)}" if cusum.found else ""
+            since = f" since {when(chart.since_s[i])}" if chart.found[i] else ""
             found.append(Verdict(name, "retrain", f"the plant's gain seems {change}{since}", gain[0], 1 + GAIN))
-        elif cusum.found:
-            text = f"the plant needs {shift:+.3g} {_unit(s)}for the same set points since {_when(cusum.since_s)}"
-            found.append(Verdict(name, "watch", text, shift, float(m.rest.sigma[i]) * (s.high - s.low)))
+        elif chart.found[i]:
+            text = f"the plant needs {shift:+.3g} {unit_of(s)}for the same set points since {when(chart.since_s[i])}"
+            found.append(Verdict(name, "watch", text, shift, float(chart.scatter[i]) * (s.high - s.low)))
         else:
             found.append(Verdict(name, "as validated", "the plant needs what it needed at first", shift))
     return found
@@ -122,17 +174,18 @@ def _rest(m: Monitor) -> list[Verdict]:
 def _variability(m: Monitor) -> list[Verdict]:
     found = []
     for i, s in enumerate(m.manifest.sp):
-        name, drift, span = f"error of {s.name}", m.spread[i], s.high - s.low
+        name, drift, span = f"error of {s.name}", m.spread, s.high - s.low
         worst = _worst_validated(m)
         mean = m.errors[i].value * span
         if worst is not None and len(m.manifest.sp) == 1 and m.errors[i].learnt and mean > WORSE * worst:
-            text = f"the mean error is {mean:.3g} {_unit(s)}; in the validation it was at most {worst:.3g}"
+            text = f"the mean error is {mean:.3g} {unit_of(s)}; in the validation it was at most {worst:.3g}"
             found.append(Verdict(name, "watch", text, mean, worst))
         elif not drift.learnt:
-            found.append(unknown(name, f"the error at rest is still measured: {drift.count} of {drift.learn} periods"))
-        elif drift.found:
-            ratio = exp((drift.last - drift.mean) / 2)
-            text = f"the error at rest is {ratio:.2g} times that of the first days, since {_when(drift.cusum.since_s)}"
+            if not m.batches.known:
+                found.append(unknown(name, f"the error at rest is still measured: {drift.done:.0%} done"))
+        elif drift.found[i]:
+            ratio = exp(drift.shift(i) / 2)
+            text = f"the error at rest is {ratio:.2g} times that of the first days, since {when(drift.since_s[i])}"
             found.append(Verdict(name, "watch", text, ratio))
         else:
             left = m.harris[i]
@@ -145,14 +198,15 @@ def _variability(m: Monitor) -> list[Verdict]:
 
 def _swing(m: Monitor) -> list[Verdict]:
     found = []
-    for s, swing, drift in zip(m.manifest.sp, m.swings, m.spread, strict=True):
-        r, quiet = swing.regularity(), exp(drift.mean / 2) * (s.high - s.low)
+    drift = m.spread
+    for i, (s, swing) in enumerate(zip(m.manifest.sp, m.swings, strict=True)):
+        r, quiet = swing.regularity(), exp(drift.mean[i] / 2) * (s.high - s.low)
         loud = LOUD * quiet if drift.learnt else PLAIN * (s.high - s.low)
-        if not drift.learnt and not (r > SWINGS and swing.amplitude() > loud):
+        if not drift.learnt and not m.batches.known and not (r > SWINGS and swing.amplitude() > loud):
             found.append(unknown(f"swing of {s.name}", "the error at rest is still measured"))
         elif r > SWINGS and swing.amplitude() > loud:
             seconds = swing.period() * m.manifest.period_s
-            text = f"{s.name} swings by {swing.amplitude():.3g} {_unit(s)}every {seconds:.3g} s"
+            text = f"{s.name} swings by {swing.amplitude():.3g} {unit_of(s)}every {seconds:.3g} s"
             found.append(Verdict(f"swing of {s.name}", "watch", text, r, SWINGS))
         else:
             found.append(Verdict(f"swing of {s.name}", "as validated", "no regular swing", r, SWINGS))
@@ -186,11 +240,3 @@ def _worst_validated(m: Monitor) -> float | None:
     found = [row.get("mae") for name, row in rows.items() if isinstance(row, dict) and name.endswith("_noise")]
     known = [float(v) for v in found if isinstance(v, int | float)]
     return max(known) if known else None
-
-
-def _when(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).strftime("%d %b %H:%M UTC")
-
-
-def _unit(s: Signal) -> str:
-    return "" if s.unit == "-" else f"{s.unit} "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from contextlib import closing, suppress
+from math import ceil
 
 from serving.controller import Controller
 from serving.errors import LoopError
@@ -25,7 +26,7 @@ class Watching:
         self._recorder = recorder
         self._of = controller
         self._levels = self._active()
-        self._looked = self._kept = time.time()
+        self._scans = 0  # the clock may be set; scans go on
         self.monitor = self._begun(controller)
 
     def seen(self, controller: Controller, scan: tuple[Sample | None, Command, float]) -> None:
@@ -37,11 +38,11 @@ class Watching:
             self.monitor = self._begun(controller)
         sample, command, time_s = scan
         self.monitor.observe(time_s, sample, command)
-        if time_s - self._looked >= LOOK_S:
-            self._looked = time_s
+        self._scans += 1
+        period_s = controller.manifest.period_s
+        if self._scans % ceil(LOOK_S / period_s) == 0:
             self._look()
-        if time_s - self._kept >= KEEP_S:
-            self._kept = time_s
+        if self._scans % ceil(KEEP_S / period_s) == 0:
             self.keep()
 
     def keep(self) -> None:

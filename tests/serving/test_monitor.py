@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +12,10 @@ import pytest
 
 from serving import Command, Controller, Manifest, Mode, Sample, Signal
 from serving.monitor import Monitor
-from serving.monitor.cusum import Cusum, Drift
+from serving.monitor.answers import Answers
+from serving.monitor.chart import Chart, correlation, run_limit, upper_scatter
 from serving.monitor.error import Swing, harris_index
+from serving.monitor.pace import dead_times, settle_scans
 from serving.monitor.plight import Plight
 from serving.monitor.residual import Foresight
 from serving.monitor.rest import RestMap
@@ -22,47 +26,98 @@ SP = (Signal("T", "K", 0.0, 100.0),)
 MV = (Signal("u", "%", 0.0, 100.0),)
 
 
-def test_a_cusum_finds_a_shift_as_fast_as_theory_says_and_is_quiet_without() -> None:
-    """After a shift of d standard deviations a sum grows by d - slack a figure: limit / (d - slack), and whole ones."""
-    rng = np.random.default_rng(0)
-    quiet = Cusum(slack=1.0, limit=8.0)
-    for k in range(20_000):
-        quiet.add(float(rng.normal()), float(k))
-        assert not quiet.found
-    delays = []
-    for _ in range(200):
-        cusum, k = Cusum(slack=1.0, limit=8.0), 0
-        while not cusum.found:
-            cusum.add(3.0 + float(rng.normal()), float(k))
-            k += 1
-        delays.append(k)
-        assert cusum.since_s <= k
-    assert np.mean(delays) == pytest.approx(8.0 / 2.0 + 0.5, abs=0.6)
+def charted(figures: np.ndarray, learn: int, **changed: Any) -> tuple[Chart, np.ndarray]:
+    """A chart after these figures (N, n), and for each the first one at which it was found (N: never)."""
+    chart = Chart(figures.shape[1], learn, **{"weekly": 1_000.0, "rate": 1.0, **changed})
+    first = np.full(figures.shape[1], len(figures))
+    for k, row in enumerate(figures):
+        chart.add(row, float(k))
+        first = np.where((chart.found > 0) & (first == len(figures)), k, first)
+    return chart, first
 
 
-def test_a_shift_that_is_over_is_forgotten_and_a_downward_one_is_found_where_it_matters() -> None:
-    both, up = Cusum(limit=5.0), Cusum(limit=5.0, both=False)
-    for k in range(20):
-        both.add(-4.0, k)
-        up.add(-4.0, k)
-    assert both.found
-    assert not up.found
-    for k in range(20, 60):
-        both.add(0.0, k)
-    assert not both.found
+def test_the_limit_of_a_sum_gives_the_run_length_that_theory_says() -> None:
+    """One-sided sums of white figures with known mean and scatter, and limits for 1,000 figures."""
+    rng, limit, n, length = np.random.default_rng(0), run_limit(0.5, 1_000.0), 400, 4_000
+    alarms, sums = 0, np.zeros(n)
+    for _ in range(length):
+        sums = np.maximum(sums + rng.normal(size=n) - 0.5, 0.0)
+        alarms += int(np.sum(sums > limit))
+        sums[sums > limit] = 0.0
+    assert n * length / alarms == pytest.approx(1_000, rel=0.15)
 
 
-def test_what_hangs_together_in_time_raises_the_limit_that_it_learns() -> None:
-    """An AR(1) figure of .9 stays beyond a standard deviation for long: theory's limit would cry wolf."""
-    rng = np.random.default_rng(3)
-    drift = Drift(learn=500, least=0.1, both=True)
-    x, alarms = 0.0, 0
-    for k in range(20_000):
-        x = 0.9 * x + 0.436 * rng.normal()
-        drift.add(x, k)
-        alarms += drift.found
-    assert drift.cusum.limit > 12.0
-    assert alarms < 0.02 * 20_000
+def test_the_unfavourable_end_of_a_scatter_is_that_of_its_distribution() -> None:
+    rng = np.random.default_rng(1)
+    for freedom in (4, 10, 50):
+        s = rng.normal(size=(20_000, freedom + 1)).std(axis=1, ddof=1)
+        assert np.mean(s * upper_scatter(freedom) >= 1) == pytest.approx(0.95, abs=0.01)
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.5, 0.9])
+def test_the_correlation_of_an_ar_1_figure_is_not_thought_smaller_than_it_is(pole: float) -> None:
+    """1 + 2 sum rho = (1 + a) / (1 - a); the largest of many estimates lies above it, but below twice that."""
+    found = np.median(correlation(ar1(np.random.default_rng(2), pole, 2_000, 40)))
+    assert 0.9 < found / ((1 + pole) / (1 - pole)) < 2.0
+
+
+def ar1(rng: np.random.Generator, pole: float, length: int, n: int) -> np.ndarray:
+    x = np.zeros((length, n))
+    x[0] = rng.normal(size=n)
+    for k in range(1, length):
+        x[k] = pole * x[k - 1] + np.sqrt(1 - pole**2) * rng.normal(size=n)
+    return x
+
+
+@pytest.mark.parametrize(("pole", "learn"), [(0.0, 20), (0.0, 300), (0.5, 60), (0.9, 300), (0.95, 300)])
+def test_false_alarms_are_as_rare_as_asked_for_whether_or_not_figures_hang_together(pole: float, learn: int) -> None:
+    """Asked for: one in 5 weeks of 1,000 figures. Watched: 100 charts for four weeks, so that 80 would be too many."""
+    figures = ar1(np.random.default_rng(3), pole, 2 * learn + 4_000, 100)
+    _, first = charted(figures, learn, rate=0.2)
+    assert np.sum(first < len(figures)) <= 20
+
+
+def test_a_shift_is_found_soon_and_its_time_is_told() -> None:
+    rng = np.random.default_rng(4)
+    figures = rng.normal(size=(300, 50))
+    figures[200:] += 4.0
+    chart, first = charted(figures, 100)
+    assert (first >= 200).all()
+    assert (first < 210).all()
+    assert (np.abs(chart.since_s - 200) <= 3).all()
+    assert chart.shift(0) == pytest.approx(4.0, abs=1.0)
+
+
+def test_one_strange_figure_is_no_shift_and_one_that_is_over_is_forgotten() -> None:
+    figures = np.random.default_rng(5).normal(size=(400, 1))
+    figures[200] = 1e6
+    assert charted(figures, 100)[1][0] == 400
+    figures[250:270] += 8.0
+    chart, first = charted(figures, 100)
+    assert 250 < first[0] < 270
+    assert not chart.found[0]
+    assert chart.rises[0] == 1
+
+
+def test_a_shift_downwards_counts_where_it_matters() -> None:
+    figures = np.random.default_rng(6).normal(size=(200, 1))
+    figures[100:] -= 5.0
+    assert charted(figures, 100)[1][0] < 110
+    assert charted(figures, 100, both=False)[1][0] == 200
+
+
+def test_learning_lasts_longer_where_figures_hang_together_longer() -> None:
+    slow, quick = Chart(1, 40, weekly=1e3, rate=1.0), Chart(1, 40, weekly=1e3, rate=1.0)
+    for k, (a, b) in enumerate(
+        zip(ar1(np.random.default_rng(7), 0.98, 300, 1), ar1(np.random.default_rng(8), 0.0, 300, 1), strict=True)
+    ):
+        slow.add(a, k)
+        quick.add(b, k)
+        if k == 40:
+            assert quick.learnt
+            assert not slow.learnt
+    assert slow.learnt
+    assert slow.pool in {2, 4}
 
 
 @pytest.mark.parametrize(("pole", "dead"), [(0.0, 1), (0.9, 1), (0.9, 2), (0.9, 5), (-0.5, 2)])
@@ -102,18 +157,22 @@ def rests(gain: float, load: float, n: int, rest: RestMap, seed: int, began: int
         rest.add(np.array([sp]), np.array([sp / gain + load + 0.3 * rng.normal()]), float(began + k))
 
 
+def rest_map(learn: int) -> RestMap:
+    return RestMap(SP, MV, learn=learn, weekly=1_000.0, rate=0.1)
+
+
 def test_a_lower_gain_is_told_from_a_load() -> None:
-    rest = RestMap(SP, MV, learn=150)
+    rest = rest_map(150)
     rests(1.0, 0.0, 250, rest, seed=0)
     assert rest.learnt
-    assert not rest.cusums[0].found
+    assert not rest.chart.found[0]
     gain = rest.gain(0)
     assert gain is not None
     assert gain[0] == pytest.approx(1.0, abs=0.05)
     memory = rest.memory()
     rests(1.0, 6.0, 90, rest, seed=1, began=250)
-    assert rest.cusums[0].found
-    assert rest.shift[0] == pytest.approx(0.06, abs=0.005)
+    assert rest.chart.found[0]
+    assert rest.chart.shift(0) == pytest.approx(0.06, abs=0.005)
     gain = rest.gain(0)
     assert gain is not None
     assert gain[0] == pytest.approx(1.0, abs=0.06)
@@ -125,38 +184,64 @@ def test_a_lower_gain_is_told_from_a_load() -> None:
 
 
 def test_set_points_that_it_never_saw_are_learnt_and_not_judged() -> None:
-    rest = RestMap(SP, MV, learn=60)
+    rest = rest_map(60)
     for k in range(100):
         rest.add(np.array([30.0]), np.array([30.0]), float(k))
     for k in range(3):
         rest.add(np.array([80.0]), np.array([20.0]), 100.0 + k)
-    assert not rest.cusums[0].found
+    assert not rest.chart.found[0]
     for k in range(20):
         rest.add(np.array([80.0]), np.array([35.0]), 200.0 + k)
-    assert rest.cusums[0].found
+    assert rest.chart.found[0]
 
 
 def manifest(info: tuple[str, ...] = ()) -> Manifest:
     return Manifest("tank", "pid", 1.0, SP, SP, (), MV, 0, info, ("sp", "pv", "state"), {}, {})
 
 
-@pytest.mark.parametrize("info", [(), ("next_T",)])
-def test_a_plant_that_became_faster_is_foreseen_worse(info: tuple[str, ...]) -> None:
+def first_order(pole_after: float, gain_after: float, watch: Callable[[np.ndarray, np.ndarray, float], None]) -> None:
+    """y(k+1) = a y + (1 - a) g u + noise with a = .9, g = 1 for 10,000 scans, and others for 4,000."""
     rng = np.random.default_rng(4)
-    foresight = Foresight(manifest(info), settle=20, learn=20)
     y, u = 50.0, 50.0
     for k in range(14_000):
-        pole = 0.9 if k < 10_000 else 0.8
+        pole, gain = (0.9, 1.0) if k < 10_000 else (pole_after, gain_after)
         if k % 20 == 0:
             u = rng.uniform(30, 70)
-        foresight.add(np.array([y]), np.array([u]), np.array([0.9 * y + 0.1 * u]) if info else None, float(k))
-        y = pole * y + (1 - pole) * u + 0.05 * rng.normal()
+        watch(np.array([y]), np.array([u]), float(k))
+        y = pole * y + (1 - pole) * gain * u + 0.05 * rng.normal()
+
+
+def test_a_plant_that_became_faster_is_foreseen_worse_by_its_law() -> None:
+    foresight = Foresight(manifest(("next_T",)), block=100, learn=40, weekly=1_000.0, rate=0.1)
+
+    def watch(pv: np.ndarray, mv: np.ndarray, k: float) -> None:
+        foresight.add(pv, 0.9 * pv + 0.1 * mv, k)
         if k == 9_999:
-            assert foresight.learnt
-            assert not foresight.drifts[0].found
-    assert foresight.drifts[0].found
+            assert foresight.chart.learnt
+            assert not foresight.chart.found[0]
+
+    first_order(0.8, 1.0, watch)
+    assert foresight.chart.found[0]
     assert foresight.ratio(0) > 1.5
-    assert foresight.drifts[0].cusum.since_s == pytest.approx(10_000, abs=500)
+    assert foresight.chart.since_s[0] == pytest.approx(10_000, abs=500)
+
+
+@pytest.mark.parametrize(("pole", "gain"), [(0.9, 1.0), (0.91, 1.0), (0.89, 1.0), (0.9, 1.02)])
+def test_a_plant_that_answers_otherwise_is_found_though_it_is_foreseen_as_well(pole: float, gain: float) -> None:
+    """A time constant that is 11 % off shifts what errors go with, long before their size tells."""
+    answers = Answers(manifest(), block=100, model=30, learn=40, weekly=1_000.0, rate=0.1)
+
+    def watch(pv: np.ndarray, mv: np.ndarray, k: float) -> None:
+        answers.add(pv, mv, None, k)
+        if k == 9_999:
+            assert answers.learnt
+            assert answers.changed(0) is None
+
+    first_order(pole, gain, watch)
+    if (pole, gain) == (0.9, 1.0):
+        assert answers.changed(0) is None
+    else:
+        assert answers.changed(0) == pytest.approx(10_000, abs=500)
 
 
 def command(k: int, mode: Mode = Mode.AUTO, sp: float = 50.0, mv: float = 40.0, **changed: Any) -> Command:
@@ -209,6 +294,36 @@ def test_a_monitor_that_starts_again_goes_on_where_it_was() -> None:
         loop(monitor, 9_000, seed=1, began=9_000)
     assert other.numbers() == pytest.approx(one.numbers(), rel=1e-3)
     assert [v.level for v in one.verdicts()] == [v.level for v in other.verdicts()]
+
+
+def test_a_clock_that_is_set_changes_no_verdict() -> None:
+    """What it counts, it counts by scans."""
+    right, wrong = Monitor(manifest(), started_s=0.0), Monitor(manifest(), started_s=0.0)
+    rng = np.random.default_rng(9)
+    for k in range(12_000):
+        sp = 40.0 + 20 * (k // 400 % 2)
+        sample = Sample(np.array([sp + 0.3 * rng.normal()]), np.array([sp]))
+        said = command(k, sp=sp, mv=sp + 0.1 * rng.normal() + 5 * (k > 11_000))
+        right.observe(float(k), sample, said)
+        wrong.observe(float(k) + (-3_600 if 5_000 < k < 8_000 else 86_400 if k >= 8_000 else 0), sample, said)
+    assert [v.level for v in right.verdicts()] == [v.level for v in wrong.verdicts()]
+    assert right.numbers() == wrong.numbers()
+
+
+def test_the_dead_time_is_the_evidence_s_and_two_where_nobody_knows() -> None:
+    m = manifest()
+    assert dead_times(m) == [2]
+    assert dead_times(replace(m, evidence={"dead_time_periods": [5]})) == [5]
+    for strange in ([None], [0], [1.5], [True], ["3"], [10_000], [1, 2], "x", None):
+        assert dead_times(replace(m, evidence={"dead_time_periods": strange})) == [2]
+
+
+def test_a_settling_time_is_that_of_the_tests_without_noise() -> None:
+    rows = {"up": {"settling": 30.0}, "down": {"settling": 40.0}, "up_noise": {"settling": 900.0}}
+    assert (
+        settle_scans(replace(manifest(), evidence={"scenarios": {**rows, "none": {"settling": 0.0}, "odd": 3}})) == 40
+    )
+    assert settle_scans(manifest()) == 100
 
 
 @pytest.mark.parametrize("spoil", ["law", "shape", "missing", "kind"])
