@@ -236,8 +236,9 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
         certain = cells.get("unit_certain", "").lower()
         if certain not in CERTAIN:
             wrong.append(f"{where}, unit_certain: {certain!r} is neither yes nor no; empty is no")
-        texts = {"tag": cells["tag"], "unit": cells.get("unit", ""), "name": cells.get("name", "")}
-        tag = widen(Tag(role=role, unit_certain=CERTAIN.get(certain, False), **texts, **numbers))
+        unit, name = cells.get("unit", ""), cells.get("name", "")
+        given = Tag(cells["tag"], role, unit, name=name, **numbers)  # type: ignore[arg-type]
+        tag = widen(replace(given, unit_certain=CERTAIN.get(certain, False)))
         wrong += [f"{where}: {words}" for words in _wrong(tag)]
         found.append(tag)
     if wrong:
