@@ -19,6 +19,7 @@ class ExportedTag:
     """A column of the files and its role; unit, range and name where a person gave them.
 
     Else the unit is the files', the range is what the readings show, and the name is the tag's own, made safe.
+    ``unit_certain``: no reading is in another unit, so that none is left out for looking like it.
     """
 
     tag: str
@@ -27,6 +28,7 @@ class ExportedTag:
     low: float | None = None
     high: float | None = None
     name: str = ""
+    unit_certain: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -15,16 +15,18 @@ class Grounds:
 
     ``set_points``, ``loops``: how far set points, and PVs and MVs in closed loops, go beyond the range of the record,
     in % of that range, by signal; signals that stay within are left out. A fit is None where the run exploded.
+    ``unproven``: why the record does not prove the models, each to go on a sentence: ``not proven: ...``.
     """
 
     fit: Mapping[str, float | None]
     set_points: Mapping[str, float]
     loops: Mapping[str, float]
+    unproven: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
         """Where tests ran and what that is worth, to go on a sentence."""
-        return f"{ON_MODELS} ({self.figures})"
+        return "; ".join((f"{ON_MODELS} ({self.figures})", *self.unproven))
 
     @property
     def figures(self) -> str:
@@ -37,15 +39,22 @@ class Grounds:
 
     @property
     def warning(self) -> str:
-        """One sentence where set points go beyond the record; empty where none does."""
+        """Sentences: what is not proven, and where set points go beyond the record; empty where there is neither."""
+        sentences = [f"{why[:1].upper()}{why[1:]}." for why in self.unproven]
+        return " ".join((*sentences, *self._beyond))
+
+    @property
+    def _beyond(self) -> tuple[str, ...]:
         if not self.set_points:
-            return ""
+            return ()
         far = ", ".join(f"{name} by {value:.3g} % of its recorded range" for name, value in self.set_points.items())
-        return f"Set points of the tests go beyond the record, {far}: figures there rest on no data."
+        return (f"Set points of the tests go beyond the record, {far}: figures there rest on no data.",)
 
     def to_dict(self) -> dict[str, Any]:
         """For the manifest: the figures, and the sentence."""
-        return {"words": self.words, **{key: dict(value) for key, value in asdict(self).items()}}
+        figures = asdict(self)
+        unproven = figures.pop("unproven")
+        return {"words": self.words, **figures, **({"unproven": list(unproven)} if unproven else {})}
 
 
 def _far(of: Mapping[str, float], verb: str = "") -> str:

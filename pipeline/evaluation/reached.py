@@ -9,6 +9,8 @@ import numpy as np
 
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.grounds import Grounds
+from pipeline.evaluation.model_evidence import IDENTIFIED
+from pipeline.evaluation.proof import fit_doubts, sign_doubts
 from pipeline.plants.simulator import Array
 from pipeline.simulation.simulate import Trajectory
 
@@ -39,7 +41,13 @@ def grounds_of(case: Case, models: Mapping[str, Any], reached: Iterable[Ranges])
     asked = np.concatenate([test.sp for tests in case.tests().values() for test in tests])
     names = [s.name for s in case.plant.sp_signals]
     wanted = dict(zip(names, zip(asked.min(axis=0).tolist(), asked.max(axis=0).tolist(), strict=True), strict=True))
-    return Grounds(fit, beyond(wanted, case.recorded), beyond(widest(reached), case.recorded))
+    unproven = (sign_doubts({"": models}), fit_doubts({"": models})) if case.stand_in == IDENTIFIED else ()
+    return Grounds(
+        fit,
+        beyond(wanted, case.recorded),
+        beyond(widest(reached), case.recorded),
+        tuple(why for why in unproven if why),
+    )
 
 
 def beyond(found: Ranges, recorded: Ranges) -> dict[str, float]:

@@ -78,7 +78,12 @@ def _dead(values: Array, tag: Tag) -> bool:
 
 
 def _possible(tag: Tag) -> tuple[float, float]:
-    """Where a value that comes again is no code: the range of a manipulated variable; (inf, -inf) for other tags."""
+    """Where a value that comes again is no code: the range of a manipulated variable; (inf, -inf) for other tags.
+
+    A set point is given and held, so that it comes again wherever it stands.
+    """
+    if tag.role == "sp":
+        return (-np.inf if tag.low is None else tag.low), (np.inf if tag.high is None else tag.high)
     if tag.role != "mv":
         return np.inf, -np.inf
     low, high = PERCENT if tag.unit == "%" else (np.inf, -np.inf)

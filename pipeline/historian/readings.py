@@ -54,7 +54,7 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
     found += _out_of_range(series, tag)
     if tag.role in {"pv", "dv"}:
         found += _unlike_the_rest(series, tag)
-    elif tag.role == "mv":
+    elif tag.role == "mv" and not tag.unit_certain:
         place = np.flatnonzero(series.good & (series.value != 0.0))  # zero is a closed valve in every unit
         found += _slipped(series, tag, place, *unit_slips(series.value[place], MV_CONVERSIONS))
     return found
@@ -94,7 +94,9 @@ def _unlike_the_rest(series: Series, tag: Tag) -> list[Finding]:
     calm = ~outliers(values)
     slipped = np.zeros(len(values), dtype=bool)
     unlike_zero = calm & (values != 0.0) if tag.role == "dv" else calm  # a flow that stopped is 0 in every unit
-    slipped[unlike_zero], kinds = unit_slips(values[unlike_zero])
+    kinds = Counter[str]()
+    if not tag.unit_certain:
+        slipped[unlike_zero], kinds = unit_slips(values[unlike_zero])
     found += _slipped(series, tag, place, slipped, kinds)
     place, values = place[~slipped], values[~slipped]
     alone = outliers(values) if slipped.any() else ~calm

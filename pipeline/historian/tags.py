@@ -19,8 +19,9 @@ from serving.manifest import MAX_NAME, Signal
 ROLES = ("pv", "mv", "dv", "sp", "mode")
 SIGNAL_ROLES = ("pv", "mv", "dv")
 COMMANDS = ("command_low", "command_high", "max_move_per_min")  # of an MV, for the controller
+CERTAIN = {"": False, "no": False, "yes": True}
 NUMBERS = ("low", "high", *COMMANDS)
-COLUMNS = ("tag", "role", "name", "unit", *NUMBERS, "step", "good_percent", "remark")
+COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, "step", "good_percent", "remark")
 OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
 UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
 RANGES = """low, high: the range in which a reading can be true; of an mv it holds all that the valve did
@@ -30,6 +31,7 @@ max_move_per_min of an mv: the largest change that the controller may make in a 
 EXPLAINED = f"""role: pv (to be controlled), mv (what the controller commands), dv (measured disturbance),
   sp (set point of a loop), mode (of a loop); empty leaves a tag out
 name: of the signal in reports and in the controller
+unit_certain: yes where no reading can be in another unit; empty lets the screening look for such readings
 {RANGES}
 step, good_percent, remark: the smallest difference of two readings, the share of good ones, what was seen; only to
   read. docs/tag_table.md says more"""
@@ -59,6 +61,7 @@ class Tag:
     command_low: float | None = None
     command_high: float | None = None
     max_move_per_min: float | None = None
+    unit_certain: bool = False  # no reading is in another unit
 
     @property
     def commands(self) -> dict[str, float]:
@@ -182,7 +185,17 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
         good = f"{100 * g.good:.2f}"
         numbers = ["" if v is None else f"{v:.6g}" for v in (getattr(t, name) for name in NUMBERS)]
         rows.writerow(
-            [t.tag, t.role, safe_name(t.tag), t.unit, *numbers, f"{g.step:.6g}" if g.step else "", good, g.remark]
+            [
+                t.tag,
+                t.role,
+                safe_name(t.tag),
+                t.unit,
+                "yes" if t.unit_certain else "",
+                *numbers,
+                f"{g.step:.6g}" if g.step else "",
+                good,
+                g.remark,
+            ]
         )
     write_text(path, out.getvalue())
 
@@ -220,7 +233,12 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
                 numbers |= {key: _number(cells[key], f"{where}, {key}")} if cells.get(key) else {}
             except RecordError as error:
                 wrong.append(str(error))
-        tag = widen(Tag(tag=cells["tag"], role=role, unit=cells.get("unit", ""), name=cells.get("name", ""), **numbers))
+        certain = cells.get("unit_certain", "").lower()
+        if certain not in CERTAIN:
+            wrong.append(f"{where}, unit_certain: {certain!r} is neither yes nor no; empty is no")
+        unit, name = cells.get("unit", ""), cells.get("name", "")
+        given = Tag(cells["tag"], role, unit, name=name, **numbers)  # type: ignore[arg-type]
+        tag = widen(replace(given, unit_certain=CERTAIN.get(certain, False)))
         wrong += [f"{where}: {words}" for words in _wrong(tag)]
         found.append(tag)
     if wrong:

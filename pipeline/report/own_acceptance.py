@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pipeline.evaluation.closed_loop import FAR
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import lock_up_text
+from pipeline.evaluation.model_evidence import IDENTIFIED
+from pipeline.evaluation.proof import statements
 from pipeline.evaluation.validation import Statement
 from pipeline.pictures.drawing import axis_label
 from pipeline.pictures.numbers import number, times
@@ -17,11 +19,12 @@ UNMEASURED = "not measured"
 
 
 def own_acceptance(evidence: Evidence) -> list[Statement]:
-    """No lock-up of any law; of the best one: it settles, stays in range, bears noise, and is no worse than the PID.
+    """The record proves the model; no law locks up; the best one settles, stays in range, bears noise, beats the PID.
 
     Every limit is a figure of the evidence, or the one by which a lock-up is told; its row says why.
     """
-    rows = [_lock_ups(name, evidence) for name in evidence.laws]
+    on_models = evidence.case.stand_in == IDENTIFIED  # a simulator tells a wrong model itself
+    rows = [*(statements(evidence.models) if on_models else ()), *(_lock_ups(n, evidence) for n in evidence.laws)]
     if evidence.best is None:
         return rows
     rows += [_settles(evidence, evidence.best), _in_range(evidence, evidence.best)]

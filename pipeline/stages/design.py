@@ -21,6 +21,8 @@ from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError, PipelineError, WithheldError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.law_evidence import BASE
+from pipeline.evaluation.model_evidence import IDENTIFIED
+from pipeline.evaluation.proof import sign_doubts
 from pipeline.export.gate import export
 from pipeline.files import digest, read_json, write_json
 from pipeline.laws import LAWS, ControlLaw
@@ -49,12 +51,14 @@ def design(name: str) -> None:
         raise LawError(f"{where}: {models} holds no models; run the fit stage of that model set first")
     folder = design_folder(params.case, params.name)
     shutil.rmtree(folder, ignore_errors=True)
-    data = read_json(models / "metrics.json").get("data", {})
+    fitted = read_json(models / "metrics.json")
+    data = fitted.get("data", {})
     provenance = {"params_sha256": digest(forms), "commit": commit(), "versions": _versions()}
     work = [(form, seed) for form in forms for seed in seeds]
     arguments = (params, read, models, case.plant, provenance, data)
     label = f"design {name}: controllers, tuned and written as ONNX files"
     try:
+        _require_proof(law, case, fitted)
         _require_fit(law, case)
         rows = parallel_map(partial(_export, *arguments, withhold=case.on_models), work, label, in_folder=True)
     except WithheldError as error:
@@ -62,6 +66,15 @@ def design(name: str) -> None:
         print(f"design {name}: {error}", file=sys.stderr)
         return
     write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "controllers": rows})
+
+
+def _require_proof(law: type[ControlLaw], case: Case, fitted: Mapping[str, Any]) -> None:
+    """Raise WithheldError where the record does not prove the sign of the model that the law rests on.
+
+    Its tests would run on models of the same record, wrong like this one, and find nothing.
+    """
+    if case.on_models and case.stand_in == IDENTIFIED and (why := sign_doubts({"": fitted})):
+        raise WithheldError(f"law {law.name!r} is withheld: it is {why}")
 
 
 def _require_fit(law: type[ControlLaw], case: Case) -> None:

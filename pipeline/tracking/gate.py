@@ -16,6 +16,7 @@ Aliases:
     the best version of a controller that passed the gate. It moves only to a version that did not
     lock up in any run, whose score is below that of the case's baseline in the same validation, and
     below that of the present best version. The baseline has only its own former version to beat.
+    On an own plant the record must prove the models that it was tested on, ``Gate.unproven``.
     An own plant whose baseline was not designed or locked up has none to beat; ``Gate.no_baseline``
     says why.
 ``champion``
@@ -49,6 +50,7 @@ class Gate:
     no_baseline: str = ""  # why an own plant has no baseline to beat
     reference: str = "the bound"  # what the score is a multiple of
     times: str = "× NMPC"  # the same, short
+    unproven: tuple[str, ...] = ()  # why the record of an own plant does not prove the models of the tests
 
     @classmethod
     def of(cls, validation: Validation | None, law: str) -> Self:
@@ -72,6 +74,7 @@ class Gate:
             gate.no_baseline,
             gate.reference,
             gate.times,
+            () if validation.grounds is None else validation.grounds.unproven,
         )
 
     def tags(self) -> dict[str, str]:
@@ -83,6 +86,7 @@ class Gate:
             "gate_baseline_score": self.baseline,
             "gate_no_baseline": self.no_baseline or None,
             "gate_relative_to": None if self.reference == "the bound" else self.times,
+            "unproven": "; ".join(self.unproven) or None,
             "lock_ups": self.lock_ups,
             "locked_up": self.locked_up or None,
             **{f"gate_{scenario}": ratio for scenario, ratio in self.ratios.items()},
@@ -95,6 +99,8 @@ class Gate:
             return "its validation has no gate score"
         if self.lock_ups:
             return f"it locked up in {self.lock_ups} of its closed loops"
+        if self.unproven:
+            return "; ".join(self.unproven)
         if self.law == self.baseline_law or self.no_baseline:
             return None
         if self.baseline is None:

@@ -5,19 +5,24 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from serving.errors import LoopError
 from serving.journal import JournalReader
 
-WRITTEN = ("pv", "dv", "applied", "sp")  # groups of columns; the MV as the actuator had it
+WRITTEN = ("pv", "dv", "applied", "sp")  # groups of columns; the MV as the actuator has it from then on
+LATE = 1.5  # periods to the next scan from which it does not say what the actuator had
 
 
 def export(journal: Path, out: Path) -> int:
     """Write the scans to a CSV file, whole or not at all; how many there were. LoopError where there is none.
 
+    The MV of a row is the one that the actuator has from this scan to the next, as the next one reads it back: a model
+    of rows whose MV acted before their PVs would take what the controller made of a PV for what moved it.
     Times are the plant's: where its time runs faster than the clock's, so do they, and runs follow each other.
     """
     reader = JournalReader(journal)
@@ -32,16 +37,19 @@ def export(journal: Path, out: Path) -> int:
             table = csv.writer(text)
             table.writerow(["time", *map(_tag, names), "MODE"])
             of, began, last = 0, 0.0, 0.0
+            waiting: _Row | None = None
             for _, run, scan in reader.scans():
                 speed, period = found[run]["speed"], found[run]["period_s"]
                 if run != of:
                     of, began = run, max(found[run]["began"], last + period)
                 last = began + (scan.time_s - found[run]["began"]) * speed
-                at = {name: i for i, name in enumerate(runs[run])}
-                cells = [_cell(scan.numbers[at[name]]) if name in at else "" for name in names]
-                when = datetime.fromtimestamp(last, UTC).isoformat(timespec="milliseconds")
-                table.writerow([when, *cells, scan.mode])
+                row = _Row(run, last, dict(zip(runs[run], scan.numbers, strict=True)), scan.mode)
+                if waiting is not None:
+                    table.writerow(waiting.cells(names, row if last - waiting.time_s < LATE * period else None))
+                waiting = row
                 count += 1
+            if waiting is not None:
+                table.writerow(waiting.cells(names, None))
         if not count:
             raise LoopError(f"{journal} holds no scan yet")
         os.replace(draft, out)
@@ -51,11 +59,34 @@ def export(journal: Path, out: Path) -> int:
     return count
 
 
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """A scan by column, on the plant's time."""
+
+    run: int
+    time_s: float
+    numbers: Mapping[str, float]
+    mode: str
+
+    def cells(self, names: Sequence[str], following: _Row | None) -> list[str]:
+        """The row of the table, with the MVs that the ``following`` scan reads back; None: the scan's own command."""
+        after = following.numbers if following is not None and following.run == self.run else {}
+        when = datetime.fromtimestamp(self.time_s, UTC).isoformat(timespec="milliseconds")
+        return [when, *(_cell(self._value(name, after)) for name in names), self.mode]
+
+    def _value(self, name: str, after: Mapping[str, float]) -> float:
+        if not name.startswith("applied "):
+            return self.numbers.get(name, math.nan)
+        asked = self.numbers.get(name.replace("applied", "mv", 1), math.nan)
+        found = (after.get(name, math.nan), asked, self.numbers.get(name, math.nan))
+        return next((value for value in found if math.isfinite(value)), math.nan)
+
+
 def tag_table(journal: Path, out: Path) -> None:
     """Write the tags of the exported file: roles, names, units and ranges, as the last controller had them."""
     with closing(JournalReader(journal)) as reader:
         last = reader.runs()[-1]
-    fields = ["tag", "role", "name", "unit", "low", "high", "max_move_per_min"]
+    fields = ["tag", "role", "name", "unit", "unit_certain", "low", "high", "max_move_per_min"]
     with out.open("w", encoding="utf-8", newline="") as text:
         table = csv.DictWriter(text, fields)
         table.writeheader()
@@ -63,6 +94,7 @@ def tag_table(journal: Path, out: Path) -> None:
             for s in last["signals"][group]:
                 row = {"tag": _tag(f"{'applied' if group == 'mv' else group} {s['name']}"), "role": role}
                 row |= {"name": s["name"], "unit": s["unit"], "low": s["low"], "high": s["high"]}
+                row["unit_certain"] = "yes"  # loop.toml states it, and no reading is in another one
                 if s.get("max_move") is not None:
                     row["max_move_per_min"] = s["max_move"] * 60 / last["period_s"]
                 table.writerow(row)

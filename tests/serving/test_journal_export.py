@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from pipeline.historian.tags import read_tags
 from serving import Controller
 from serving.journal import Journal, Scan, columns
 from serving.station.export import export, tag_table
@@ -36,3 +37,47 @@ def test_times_are_the_plants_and_runs_follow_each_other(tmp_path: Path, control
     within = np.delete(steps, [0, 40, 80])
     assert np.allclose(within, m.period_s, atol=2e-3)
     assert (steps[[40, 80]] >= m.period_s - 2e-3).all()
+
+
+def test_the_mv_of_a_row_is_the_one_that_acts_after_its_pv(tmp_path: Path, controller: Controller) -> None:
+    """The scan reads back what acted before it; a scan without a next one in its period has its own command."""
+    m = controller.manifest
+    names = columns(m)
+    mv, pv = (f"{group} {s.name}" for group, s in (("mv", m.mv[0]), ("pv", m.pv[0])))
+    back = f"applied {m.mv[0].name}"
+    journal = Journal(tmp_path / "loop.journal")
+    for began, read_back in ((1e9, True), (1e9 + 100 * m.period_s, False)):
+        journal.begin(m, controller.sha256, began, 1.0)
+        for k in (0, 1, 2, 5, 6):  # two scans were lost
+            own = {mv: 10.0 + k, back: 9.0 + k if read_back else np.nan, pv: float(k)}
+            journal.scan(Scan(began + k * m.period_s, "AUTO", tuple(own.get(n, 0.0) for n in names), reason=""))
+    journal.close()
+    export(tmp_path / "loop.journal", tmp_path / "loop.csv")
+    table = pd.read_csv(tmp_path / "loop.csv")
+    assert table[f"{m.pv[0].name}.PV"].tolist() == [0, 1, 2, 5, 6] * 2
+    # What the next scan read back, 9 + (k + 1), is what this one asked for; before the gap and at the end, the command.
+    assert table[f"{m.mv[0].name}.OP"].tolist() == [10, 11, 12, 15, 16] * 2
+
+
+def test_an_actuator_that_does_not_follow_is_believed(tmp_path: Path, controller: Controller) -> None:
+    m = controller.manifest
+    mv, back = (f"{group} {m.mv[0].name}" for group in ("mv", "applied"))
+    journal = Journal(tmp_path / "loop.journal")
+    journal.begin(m, controller.sha256, 1e9, 1.0)
+    for k in range(3):
+        own = {mv: 50.0, back: float(k)}
+        numbers = tuple(own.get(name, 0.0) for name in columns(m))
+        journal.scan(Scan(1e9 + k * m.period_s, "AUTO", numbers, reason=""))
+    journal.close()
+    export(tmp_path / "loop.journal", tmp_path / "loop.csv")
+    assert pd.read_csv(tmp_path / "loop.csv")[f"{m.mv[0].name}.OP"].tolist() == [1, 2, 50]
+
+
+def test_the_table_of_tags_says_that_units_are_certain(tmp_path: Path, controller: Controller) -> None:
+    m = controller.manifest
+    journal = Journal(tmp_path / "loop.journal")
+    journal.begin(m, controller.sha256, 1e9, 1.0)
+    journal.close()
+    tag_table(tmp_path / "loop.journal", tmp_path / "tags.csv")
+    tags = {tag.tag: tag for tag in read_tags(tmp_path / "tags.csv")}
+    assert all(tag.unit_certain for tag in tags.values() if tag.role != "mode")

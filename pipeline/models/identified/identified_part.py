@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -16,14 +16,16 @@ from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
+from pipeline.models.identified.proof import answers, proof_figures
 from pipeline.models.identified.residual_tests import residual_figures
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.selection import Selection
 from pipeline.models.identified.stability import stability_figures
 from pipeline.models.identified.structure import Problem, Structure
-from pipeline.models.identified.structure_search import StructureSearch
+from pipeline.models.identified.structure_search import Searched, StructureSearch
 from pipeline.models.identified.uncertainty import drawn
 from pipeline.models.identified.verdict import (
+    STEP,
     dead_times,
     free_run_figures,
     gain_figures,
@@ -35,7 +37,10 @@ from pipeline.models.identified.verdict import (
 from pipeline.models.part import Learnt, Part, Source
 from pipeline.plants.simulator import Array
 from pipeline.records.levels import levels_of, only_between
+from pipeline.records.record import Record
 from serving.manifest import Signal
+
+Figures = Mapping[str, Mapping[str, Any]]
 
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
@@ -112,8 +117,9 @@ class IdentifiedPart(Part):
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
         bands = [*_bands(selection), *_as_likely(problem, structure, fitted.model, source.seed)]
         # The gains belong to the middle of the whole record, also where only a part of its rows is fitted.
-        rows = ScaledRecord.of(source.data(self.model.kind), scales)
-        runs, predictions = free_run_figures(problem, selection.chosen, scales, [s.name for s in pvs])
+        record = source.data(self.model.kind)
+        rows, names = ScaledRecord.of(record, scales), [s.name for s in pvs]
+        runs, predictions = free_run_figures(problem, selection.chosen, scales, names)
         curves = response_curves(bands, rows)
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
@@ -139,6 +145,7 @@ class IdentifiedPart(Part):
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
             "gains": gain_figures(bands, rows, scales, pvs, inputs),
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
+            "proof": _proof(searched, record, rows, curves, runs, noise * scales.y_scale),
             "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model, problem.data)[2],
             "stability": stability_figures(fitted.model, visited, [s.v for s in whole]),
@@ -149,6 +156,17 @@ class IdentifiedPart(Part):
         }
         time_s: Array = source.signals.period_s * np.arange(len(predictions["measured"]), dtype=np.float64)
         return Learnt(model, metrics, predictions={"time_s": time_s, **predictions})
+
+
+def _proof(
+    searched: Searched, record: Record, rows: ScaledRecord, curves: Array, runs: Figures, noise: Array
+) -> dict[str, Any]:
+    """Whether the record proves the model; ``runs`` over the rows that the first fold held out, noise (n_y,)."""
+    problem, chosen, scales = searched.problem, searched.selection.chosen, searched.scales
+    found, surprise = answers(curves, chosen.structure, problem.data, STEP * rows.v.std(axis=0), problem.n_mv)
+    second = [free_run_figures(problem, chosen, scales, list(runs), fold=1)[0]] if 1 in chosen.folds else []
+    # What a wrong model misses at every row is no noise: the plant's own past foresees more of it.
+    return proof_figures(found, record, scales, [runs, *second], np.minimum(noise, surprise * scales.y_scale))
 
 
 def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:

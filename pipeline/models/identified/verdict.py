@@ -75,9 +75,9 @@ def free_run_figures(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 
-    ``rmse`` in the PV's unit, ``fit_percent``, ``rmse_by_third``: where the PV was low, in the middle and high, and
-    ``outside_training``: the share of these rows in which it left the range of the training rows, where the error
-    says nothing of the other rows.
+    ``free_run_rmse`` and the PV's own deviation ``held_sd`` in its unit, ``fit_percent``, ``rmse_by_third``: where the
+    PV was low, in the middle and high, and ``outside_training``: the share of these rows in which it left the range of
+    the training rows, where the error says nothing of the other rows.
     """
     best = trial.of_fold(fold)[0]
     held = problem.held(trial.structure, fold)
@@ -100,6 +100,7 @@ def free_run_figures(
         thirds = [error[np.searchsorted(edges, y) == j] for j in range(3)]
         figures[name] = {
             "free_run_rmse": float(np.sqrt(np.mean(error**2))),
+            "held_sd": float(y.std()),
             "fit_percent": fit_percent(y, predicted[:, i]) if np.all(np.isfinite(error)) else None,
             "outside_training": float(np.mean((y < low[i]) | (y > high[i]))),
             "rmse_by_third": [float(np.sqrt(np.mean(e**2))) if len(e) else None for e in thirds],

@@ -1,0 +1,97 @@
+"""Whether the record of an own plant proves the model that all tests ran on: the requirements of the model itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pipeline.evaluation.model_evidence import Metrics, identified_part
+from pipeline.evaluation.validation import Statement
+
+MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
+FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
+REMEDY = (
+    "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
+    "`loopwright new` lists them in step_test.csv, and give these rows too"
+)
+
+
+def statements(models: Mapping[str, Metrics]) -> list[Statement]:
+    """A row for each PV's free run, and for each answer of a PV to an MV that a controller uses.
+
+    ``models``: model set -> its metrics.json. Empty where the fit says nothing of it.
+    """
+    proof = identified_part(models).get("proof") or {}
+    return [*_free_runs(proof), *(row for row, _ in _signs(proof))]
+
+
+def sign_doubts(models: Mapping[str, Metrics]) -> str:
+    """Why no controller of these models may be shipped: what speaks against the gains that it uses; empty if nothing.
+
+    To go on a sentence: ``not proven: the model's gain is uncertain in sign ...``.
+    """
+    rows = [(row, pair) for row, pair in _signs(identified_part(models).get("proof") or {}) if not row.holds]
+    if not rows:
+        return ""
+    found = "; ".join(f"{pair}: {row.because}" for row, pair in rows)
+    return f"not proven: the model's gain is uncertain in sign ({found}); {REMEDY}"
+
+
+def fit_doubts(models: Mapping[str, Metrics]) -> str:
+    """What the free runs miss, to go on a sentence; empty if they miss little."""
+    proof = identified_part(models).get("proof") or {}
+    rows = zip(proof.get("free_run") or {}, _free_runs(proof), strict=True)
+    missed = [f"{name} ({row.measured})" for name, row in rows if not row.holds]
+    return f"not proven: the model misses most of what {', '.join(missed)} does" if missed else ""
+
+
+def _free_runs(proof: Mapping[str, Any]) -> Iterator[Statement]:
+    for name, found in (proof.get("free_run") or {}).items():
+        missed, limit = found["missed"], MISSED * found["motion"]
+        yield Statement(
+            f"model, free-run error of {name} beyond the noise, over rows that its fit never saw",
+            f"≤ {limit:.3g}, {100 * MISSED:g} % of its motion there",
+            "the run explodes" if missed is None else f"{missed:.3g}",
+            missed is not None and missed <= limit,
+            "where it misses more, loads that nobody measures or another law moved the variable more than the model",
+        )
+
+
+def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[Statement, str]]:
+    """The row of each answer, and PV and MV in words."""
+    for pv, mvs in (proof.get("answers") or {}).items():
+        for mv, found in mvs.items():
+            yield _sign(pv, mv, found), f"{pv} to {mv}"
+
+
+def _sign(pv: str, mv: str, found: Mapping[str, Any]) -> Statement:
+    direct = (
+        "too few rows for one-step predictions"
+        if found["direct"] is None
+        else f"one-step predictions {found['direct']:.3g} ± {found['sd']:.2g}"
+    )
+    span = f"{found['low']:.3g} … {found['high']:.3g}"
+    return Statement(
+        f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
+        "certain in sign, the same in both halves of the record, and of the size that one-step predictions find",
+        f"{found['model']:.3g} ({span}); {direct}",
+        found["verdict"] == "proven",
+        _why(pv, mv, found),
+    )
+
+
+def _why(pv: str, mv: str, found: Mapping[str, Any]) -> str:
+    """What speaks against an answer; empty where nothing does."""
+    verdict, share = found["verdict"], found["follows"]
+    if verdict == "proven":
+        return ""
+    back = "the model may be the controller, read backwards"
+    if verdict == "uncertain":
+        if share > FOLLOWS:
+            return f"{mv} follows {pv} ({100 * share:.0f} % of its moves) and hardly moves of its own: {back}"
+        return "the record shows too little of it"
+    if verdict == "opposite":
+        return f"one-step predictions of the same rows find the other sign: {back}"
+    if verdict == "halves":
+        return "a half of the record speaks for the other sign"
+    return f"one-step predictions of the same rows find {found['direct'] / found['model']:.2g} times as much"

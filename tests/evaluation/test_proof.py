@@ -1,0 +1,140 @@
+"""The requirements of an own plant's model: in rows, in sentences, at the gate, and in the reasons of withheld laws."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from own_cases import controllers_of_a_lag
+from rich.console import Console
+
+from pipeline.evaluation.grounds import Grounds
+from pipeline.evaluation.proof import fit_doubts, sign_doubts, statements
+from pipeline.evaluation.validation import Validation
+from pipeline.report.results import show_results
+from pipeline.stages.design import design
+from pipeline.stages.report import report
+from pipeline.stages.validate import validate
+from pipeline.tracking.gate import Gate
+from serving import Controller
+
+ANSWER: dict[str, Any] = {
+    "model": 2.0, "low": 1.8, "high": 2.2, "first": 5, "last": 9, "direct": 1.9, "sd": 0.2, "halves": [8.0, 7.0],
+    "verdict": "proven", "follows": 0.4,
+}  # fmt: skip
+
+
+def models(missed: float | None = 0.1, **answer: Any) -> dict[str, Any]:
+    """metrics.json of a model set with one identified part."""
+    proof = {
+        "answers": {"y0": {"u0": {**ANSWER, **answer}}},
+        "free_run": {"y0": {"missed": missed, "motion": 1.0}},
+    }
+    part = {"kind": "identified", "per_seed": {"0": {"proof": proof, "outputs": {"y0": {"fit_percent": 35.0}}}}}
+    return {"data": {"0": "x"}, "parts": {"identified": part}}
+
+
+def test_a_proven_model_meets_both_rows() -> None:
+    rows = statements({"": models()})
+    assert [row.holds for row in rows] == [True, True]
+    assert rows[0].what.startswith("model, free-run error of y0 beyond the noise")
+    assert (rows[0].limit, rows[0].measured) == ("≤ 0.5, 50 % of its motion there", "0.1")
+    assert rows[1].measured == "2 (1.8 … 2.2); one-step predictions 1.9 ± 0.2"
+    assert sign_doubts({"": models()}) == fit_doubts({"": models()}) == ""
+
+
+def test_models_of_which_the_fit_says_nothing_have_no_rows() -> None:
+    assert statements({}) == statements({"": {"data": {}, "parts": {}}}) == []
+    assert sign_doubts({}) == fit_doubts({}) == ""
+
+
+@pytest.mark.parametrize("missed", [0.51, None])
+def test_a_free_run_that_misses_most_is_a_failure(missed: float | None) -> None:
+    found = {"": models(missed)}
+    assert [row.holds for row in statements(found)] == [False, True]
+    assert fit_doubts(found).startswith("not proven: the model misses most of what y0 (")
+    assert sign_doubts(found) == ""
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        ({"verdict": "uncertain"}, "u0 follows y0 (40 % of its moves) and hardly moves of its own"),
+        ({"verdict": "uncertain", "follows": 0.0}, "the record shows too little of it"),
+        ({"verdict": "uncertain", "direct": None, "sd": None, "follows": 0.0}, "the record shows too little of it"),
+        ({"verdict": "opposite"}, "one-step predictions of the same rows find the other sign"),
+        ({"verdict": "halves"}, "a half of the record speaks for the other sign"),
+        ({"verdict": "size", "direct": 9.0}, "one-step predictions of the same rows find 4.5 times as much"),
+    ],
+)
+def test_a_gain_that_is_not_certain_says_why_and_what_to_do(answer: dict[str, Any], why: str) -> None:
+    found = {"": models(**answer)}
+    assert [row.holds for row in statements(found)] == [True, False]
+    said = sign_doubts(found)
+    assert said.startswith(f"not proven: the model's gain is uncertain in sign (y0 to u0: {why}")
+    assert "step_test.csv" in said
+
+
+def test_what_is_not_proven_stands_in_the_words_the_warning_and_the_manifest() -> None:
+    grounds = Grounds({"T": 35.0}, {}, {}, ("not proven: this and that",))
+    assert grounds.words.endswith("; not proven: this and that")
+    assert grounds.warning == "Not proven: this and that."
+    assert grounds.to_dict()["unproven"] == ["not proven: this and that"]
+    assert "unproven" not in Grounds({"T": 35.0}, {}, {}).to_dict()
+
+
+def lag(fitted: dict[str, Any]) -> None:
+    """A lag with a PID, in the present folder, whose fit says this."""
+    pid = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 4.0}
+    case = controllers_of_a_lag({"pid": pid})
+    (case.models.parent / "metrics.json").write_text(json.dumps(fitted))
+    for stage in (design, validate):
+        stage("it-pid")
+    report("it")
+
+
+def shown() -> str:
+    out = io.StringIO()
+    show_results(Path("artifacts"), Console(file=out, width=200))
+    return out.getvalue()
+
+
+def test_no_controller_is_shipped_of_a_model_whose_sign_is_uncertain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    lag(models(verdict="opposite"))
+    assert not Path("artifacts/it/pid.onnx").exists()
+    why = json.loads(Path("artifacts/it/pid.json").read_text())["withheld"]
+    assert why.startswith("law 'pid' is withheld: it is not proven: the model's gain is uncertain in sign")
+    said = shown()
+    assert "it: pid is not shipped, because it is not proven: the model's gain is uncertain in sign" in said
+    assert "1 of 2 requirements" in said
+    page = Path("artifacts/it/report.md").read_text()
+    assert "**`pid` was not designed**, because it is not proven: the model's gain is uncertain in sign" in page
+    assert "**Not proven: the model's gain is uncertain in sign" in page
+    validation = Validation.read(Path("artifacts/it/validation.json"))
+    assert validation.grounds is not None
+    assert validation.grounds.unproven[0].startswith("not proven: the model's gain is uncertain in sign")
+    assert [row.holds for row in validation.requirements] == [True, False]
+
+
+def test_a_controller_of_a_model_that_misses_most_says_so_everywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    lag(models(missed=0.8))
+    evidence = Controller("artifacts/it/pid.onnx").manifest.evidence
+    assert evidence["on"]["unproven"] == ["not proven: the model misses most of what y0 (0.8) does"]
+    assert "not proven: the model misses most" in evidence["on"]["words"]
+    validation = Validation.read(Path("artifacts/it/validation.json"))
+    assert Gate.of(validation, "pid").refusal() == "not proven: the model misses most of what y0 (0.8) does"
+    met, known = sum(bool(r.holds) for r in validation.requirements), len(validation.requirements)
+    assert met < known
+    said = shown()
+    assert f"{met} of {known} requirements" in said
+    assert "it: Not proven: the model misses most of what y0 (0.8) does." in said
+    assert "Not proven: the model misses most" in Path("artifacts/it/report.html").read_text()
