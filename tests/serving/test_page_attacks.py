@@ -46,7 +46,7 @@ def _nothing_is_changed(loop: FakeLoop) -> Iterator[None]:
     assert loop.changes[before:] == []
 
 
-def codes_of(came: bytes) -> list[int]:
+def codes_of(came: bytes | bytearray) -> list[int]:
     return [int(code) for code in re.findall(rb"HTTP/1.1 (\d{3}) ", came)]
 
 

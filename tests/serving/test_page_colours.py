@@ -54,7 +54,7 @@ def ground(theme: Mapping[str, str], name: str) -> Colour:
 
 WRITTEN = {
     "ink": ("ground", "panel", "button", "alarm-ground"),
-    "ink-2": ("ground", "panel", "button", "alarm-ground", "band-hold", "band-other", "band-none"),
+    "ink-2": ("ground", "panel", "button", "alarm-ground"),
     "alarm": ("panel", "alarm-ground"),
     "watch": ("panel", "watch-ground"),
 }

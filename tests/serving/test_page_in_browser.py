@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from plant_servers import Plant, RunningLoop, spoil
 from processes import within
 
@@ -95,8 +96,13 @@ def drawn(page: Page) -> int:
 
 def picture(page: Page, name: str, whole: bool = False) -> None:
     if PICTURES:
+        path = Path(PICTURES) / f"{name}.png"
         page.evaluate("scrollTo(0, 0)")
-        page.screenshot(path=Path(PICTURES) / f"{name}.png", full_page=whole)
+        page.screenshot(path=path, full_page=whole)
+        # The page has few colours; so a picture has a third of the bytes.
+        with Image.open(path) as taken:
+            small = taken.convert("RGB").quantize(96, dither=Image.Dither.NONE)
+        small.save(path, optimize=True)
 
 
 def test_an_operator_takes_a_loop_from_the_shadow_through_a_fault_to_another_controller(

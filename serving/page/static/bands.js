@@ -1,8 +1,9 @@
-// The time in each mode, behind the lines: HOLD hatched, SHADOW and MANUAL shaded, AUTO plain; each with its word. A
-// time without a scan is ruled and says so.
+// The time in each mode, behind the lines: HOLD hatched, SHADOW and MANUAL shaded, AUTO plain, a time without a scan
+// darker; each with its word above.
 
 const NO_RECORD = "no record";
-const LEAST_TEXT = 44; // pixels that a word needs
+const WIDTH = { word: 48, words: 64 }; // pixels that they need
+export const ABOVE = 16; // pixels above the lines, where the words stand
 
 // record: what data.js has.
 export function bands(u, record, color) {
@@ -10,7 +11,7 @@ export function bands(u, record, color) {
   const end = bbox.left + bbox.width;
   ctx.save();
   ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  ctx.rect(bbox.left, 0, bbox.width, bbox.top + bbox.height);
   ctx.clip();
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
   ctx.textAlign = "left"; // uPlot leaves what its axes needed
@@ -42,38 +43,12 @@ function band(ctx, left, right, bbox, mode, color) {
     ctx.fillRect(left, bbox.top, right - left, bbox.height);
   }
   if (mode === "HOLD") hatch(ctx, left, right, bbox, color("hatch"));
-  if (!mode) rule(ctx, left, right, bbox, color("line"));
-  const words = mode || NO_RECORD;
-  if (right - left > (mode ? 1 : 1.5) * LEAST_TEXT * devicePixelRatio) {
-    const [x, y] = [left + 4 * devicePixelRatio, bbox.top + 12 * devicePixelRatio];
-    if (!mode) {
-      ctx.fillStyle = color("band-none"); // no rule runs through the words
-      ctx.fillRect(left, bbox.top, ctx.measureText(words).width + 8 * devicePixelRatio, 16 * devicePixelRatio);
-    }
-    ctx.fillStyle = color("ink-2");
-    ctx.fillText(words, x, y);
-  }
+  if (right - left < (mode ? WIDTH.word : WIDTH.words) * devicePixelRatio) return;
+  ctx.fillStyle = color("ink-2");
+  ctx.fillText(mode || NO_RECORD, left, bbox.top - 5 * devicePixelRatio);
 }
 
 function hatch(ctx, left, right, bbox, stroke) {
-  strokes(ctx, left, right, bbox, stroke, () => {
-    for (let x = left - bbox.height; x < right; x += 9 * devicePixelRatio) {
-      ctx.moveTo(x, bbox.top + bbox.height);
-      ctx.lineTo(x + bbox.height, bbox.top);
-    }
-  });
-}
-
-function rule(ctx, left, right, bbox, stroke) {
-  strokes(ctx, left, right, bbox, stroke, () => {
-    for (let y = bbox.top + 4; y < bbox.top + bbox.height; y += 7 * devicePixelRatio) {
-      ctx.moveTo(left, y);
-      ctx.lineTo(right, y);
-    }
-  });
-}
-
-function strokes(ctx, left, right, bbox, stroke, draw) {
   ctx.save();
   ctx.beginPath();
   ctx.rect(left, bbox.top, right - left, bbox.height);
@@ -81,7 +56,10 @@ function strokes(ctx, left, right, bbox, stroke, draw) {
   ctx.strokeStyle = stroke;
   ctx.lineWidth = devicePixelRatio;
   ctx.beginPath();
-  draw();
+  for (let x = left - bbox.height; x < right; x += 9 * devicePixelRatio) {
+    ctx.moveTo(x, bbox.top + bbox.height);
+    ctx.lineTo(x + bbox.height, bbox.top);
+  }
   ctx.stroke();
   ctx.restore();
 }

@@ -1,10 +1,10 @@
 // Trends, one chart a signal, with one cursor and one time axis for all.
-import { bands } from "./bands.js";
+import { ABOVE, bands } from "./bands.js";
 import { clock, element, number, unit } from "./format.js";
 
-const HEIGHT = 180;
-const SMALL = 130;
-const LABELS = { time: 76, value: 20 }; // pixels that a label of an axis needs
+const HEIGHT = 184;
+const SMALL = 134;
+const LABELS = { time: 76, seconds: 66, minutes: 46, value: 20 }; // pixels that a label of an axis needs
 const AXIS = { line: 28, lines: 44 }; // pixels below a chart: for times, and for times with days below them
 const SYNC = window.uPlot.sync("loop");
 
@@ -114,11 +114,12 @@ export class Charts {
     return {
       width: this.width(),
       height: chart.tall ? HEIGHT : SMALL,
+      padding: [ABOVE, null, null, null],
       cursor: { sync: { key: SYNC.key, setSeries: false }, drag: { x: true, y: false, setScale: false } },
       legend: { live: true, markers: { dash: (_, i) => DASHES[chart.lines[i - 1]?.kind] || "solid" } },
       scales: { x: { time: true }, y: { range: (_, low, high) => this.range(chart.signal, low, high) } },
       axes: [
-        { ...axis, values: times, space: LABELS.time, size: (_, words) => (words?.some((w) => w.includes("\n")) ? AXIS.lines : AXIS.line) },
+        { ...axis, values: times, space: between, size: (_, words) => (words?.some((w) => w.includes("\n")) ? AXIS.lines : AXIS.line) },
         { ...axis, size: 62, space: LABELS.value },
       ],
       series: [
@@ -161,6 +162,12 @@ function newest(u) {
 
 // A signal with its range, or a number of the law, which has none.
 const scaled = (signal, v) => (signal.high === undefined ? { low: 0, high: Math.abs(v) || 1 } : signal);
+
+// Pixels between two times: on a phone as few as their words need, which are shorter where no seconds are told.
+function between(_, axis, from, to, width) {
+  if (width > 400) return LABELS.time;
+  return (LABELS.minutes * (to - from)) / width > 30 ? LABELS.minutes : LABELS.seconds;
+}
 
 // Times of the axis, in 24 hours; the day where it is not today, or another than before.
 function times(_, splits, axis, space, step) {
