@@ -102,8 +102,16 @@ LawFactory = Callable[..., ControlLaw]
 
 # By their time. Taken first, so that with several workers none is waited for alone at the end.
 LONG_FILES = (
-    *("test_pipeline.py", "test_export_to_controller.py", "test_screen_by_dvc.py", "test_laws_contract.py"),
-    *("test_identified_part.py", "test_tracking.py", "test_new.py", "test_rbf.py", "test_report.py"),
+    *("test_pipeline.py", "test_laws_contract.py", "test_real_servers.py", "test_identified_part.py", "test_new.py"),
+    *(
+        "test_export_to_controller.py",
+        "test_cluster_stages.py",
+        "test_screen_by_dvc.py",
+        "test_playground_in_browser.py",
+    ),
+    *("test_runtime_floor.py", "test_cluster.py", "test_tracking.py", "test_plant_faults.py", "test_embed.py"),
+    *("test_manual_builds.py", "test_report.py", "test_report_of_squared_errors.py", "test_pictures.py"),
+    *("test_rbf.py", "test_controller_fmu.py", "test_fusion.py", "test_c_host.py", "test_structure_search.py"),
 )
 
 

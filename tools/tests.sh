@@ -4,10 +4,15 @@
 set -uo pipefail
 cd "$(dirname "$0")/.."
 said=$(mktemp)
-(mypy > "$said" 2>&1 || { status=$?; cat "$said" >&2; exit "$status"; }) &
+(
+  mypy > "$said" 2>&1 &
+  trap "kill $! 2> /dev/null" TERM
+  wait $! || { status=$?; cat "$said" >&2; exit "$status"; }
+) &
 types=$!
 trap 'kill "$types" 2> /dev/null; rm -f "$said"' EXIT
 python -m pytest "$@"
 status=$?
+[ "$status" = 2 ] && exit 2 # Ctrl-C
 wait "$types" || { echo "tests.sh: mypy failed, see above" >&2; status=1; }
 exit "$status"

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -16,6 +16,7 @@ import onnx_ir as ir
 import torch
 from onnx_ir.passes import common as passes
 from onnxscript import optimizer
+from torch.onnx._internal.exporter._registration import ONNXRegistry
 
 from pipeline.errors import ExportError
 from pipeline.export.operators import check_operators
@@ -89,7 +90,7 @@ def _translated(traced: _Traced) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     Most of an export's time goes here, so laws of other seeds share it. The buffers are those of
     the law that came first.
     """
-    with _quiet():
+    with _quiet(), _operators_kept():
         program = torch.onnx.export(
             traced.program, dynamo=True, external_data=False, verbose=False, optimize=False, opset_version=OPSET
         )
@@ -207,6 +208,20 @@ def _cause(error: Exception) -> str:
     while inner.__cause__ is not None:
         inner = inner.__cause__
     return (str(inner).strip().splitlines() or [type(inner).__name__])[0]
+
+
+_operators = cache(ONNXRegistry.from_torchlib)
+
+
+@contextmanager
+def _operators_kept() -> Iterator[None]:
+    """Have torch make its table of operators once a process: it reads the table only, and makes it anew in 0.4 s."""
+    method = vars(ONNXRegistry)["from_torchlib"]
+    ONNXRegistry.from_torchlib = staticmethod(_operators)  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        ONNXRegistry.from_torchlib = method  # type: ignore[method-assign]
 
 
 @contextmanager

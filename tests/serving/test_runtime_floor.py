@@ -32,7 +32,7 @@ def command(*words: str | Path) -> str:
 
 @pytest.fixture(scope="module")
 def pythons() -> dict[str, Path]:
-    """The interpreters; those of the two environments are made here if ``make test`` has not made them."""
+    """The interpreters; those of the two environments are made here unless an earlier run made them."""
     done = subprocess.run(
         ["bash", "tools/runtime_venvs.sh", "build/runtime"],
         cwd=ROOT,
