@@ -18,7 +18,8 @@ from serving.transfer import Transfer
 
 pytest_plugins = ["small_laws"]
 PERIOD = 0.5
-SHIPPED = sorted((Path(__file__).parents[2] / "artifacts").glob("*/*.onnx"))
+# A clone also holds the controllers of plants of its own, which have no case.
+SHIPPED = sorted(p for p in (Path(__file__).parents[2] / "artifacts").glob("*/*.onnx") if p.parent.name in CASES)
 by_name = pytest.mark.parametrize("path", SHIPPED, ids=lambda p: f"{p.parent.name}-{p.stem}")
 
 
