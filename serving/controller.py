@@ -232,7 +232,10 @@ def _read(path: Path, pinned: str | None) -> bytes:
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
         raise ArtifactError(f"the file cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if pinned is not None and file_digest(data) != pinned.lower():
-        raise ArtifactError(f"the file's SHA-256 is {file_digest(data)}, not the pinned {pinned}")
+        raise ArtifactError(
+            f"the file's SHA-256 is {file_digest(data)}, not the pinned {pinned}; "
+            "pin this one only if you changed the file yourself"
+        )
     unseal(data)
     return data
 

@@ -123,7 +123,7 @@ def _exchange(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sampl
     try:
         sample = endpoint.read()
     except Exception as error:
-        command = loop.miss(reason or f"the endpoint cannot be read: {named(error)}")
+        command = loop.miss(reason or f"the plant cannot be read: {named(error)}")
     else:
         command = loop.miss(reason) if reason else loop.scan(sample)
     try:
@@ -133,8 +133,8 @@ def _exchange(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sampl
         elif command.writes:
             endpoint.write(command.mv)
     except Exception as error:
-        doing = "cannot hand the plant back" if command.hand_back else "cannot be written"
-        command = loop.unwritten(last, f"the endpoint {doing}: {named(error)}")
+        doing = "cannot be handed back" if command.hand_back else "cannot be written"
+        command = loop.unwritten(last, f"the plant {doing}: {named(error)}")
     return sample if isinstance(sample, Sample) else None, command
 
 

@@ -52,7 +52,10 @@ class Controller(controller.Controller):
 
             self.signed = verified(path, trusted)
             if sha256 is not None and sha256.lower() != self.signed.sha256:
-                raise ArtifactError(f"{path}: the file's SHA-256 is {self.signed.sha256}, not the pinned {sha256}")
+                raise ArtifactError(
+                    f"{path}: the file's SHA-256 is {self.signed.sha256}, not the pinned {sha256}; "
+                    "pin this one only if you changed the file yourself"
+                )
             # The signature gives the pin: bytes that somebody puts there meanwhile are not those that were verified.
             sha256 = self.signed.sha256
         super().__init__(path, sha256)

@@ -50,8 +50,8 @@ def require_valid(certificate: Path) -> None:
     found, now = _read(certificate), datetime.now(UTC)
     if now > found.not_valid_after_utc:
         raise LoopError(
-            f"{certificate} was valid until {valid_until(certificate)}; remove it and its key: `loopwright loop init` "
-            "makes a new one, which the server must trust again"
+            f"{certificate} was valid until {valid_until(certificate)}; remove it and its key: "
+            "`loopwright loop init CONTROLLER --out spare.toml` makes new ones, which the server must trust again"
         )
     if now < found.not_valid_before_utc:
         first = f"{found.not_valid_before_utc:%Y-%m-%d}"

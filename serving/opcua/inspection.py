@@ -90,7 +90,8 @@ async def _one(
     signal = _signal(manifest, name)
     wrong = ""
     if reading.quality == BAD or (reading.quality == UNCERTAIN and server.uncertain == "fault"):
-        wrong = f"its quality is {words(reading.status)}"
+        unknown = words(reading.status) == "BadNodeIdUnknown"
+        wrong = f"its quality is {words(reading.status)}" + (f"; the server has no node {node}" if unknown else "")
     elif reading.text:
         wrong = f"it holds {reading.text}"
     elif name.endswith(", written") and reading.kind not in {*FLOATS, *INTEGERS, ua.VariantType.Boolean}:
@@ -135,7 +136,7 @@ async def _properties(
         return unit, limits, ""
     if signal is not None and (scale, offset) == (1.0, 0.0):
         if unit not in {"-", signal.unit}:
-            notes.append(f"the server says {unit}, the controller {signal.unit}")
+            notes.append(f"another unit? the server says {unit}, the controller {signal.unit}")
         if limits != "-" and limits != f"{signal.low:g} .. {signal.high:g}":
             notes.append(f"the controller's range is {signal.low:g} .. {signal.high:g}")
     return unit, limits, "; ".join(notes)

@@ -299,6 +299,8 @@ def words(status: int) -> str:
 
 def _reason(error: BaseException) -> str:
     """What refused, by OPC UA's own name where it has one."""
+    if isinstance(error, ConnectionRefusedError):
+        return "nothing listens there; is the server running?"
     code = getattr(error, "code", None)
     if isinstance(error, ua.UaStatusCodeError) and code is not None:
         return words(code)

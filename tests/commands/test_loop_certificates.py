@@ -94,7 +94,7 @@ def test_a_certificate_that_has_ended_is_named(settings: Path, capsys: pytest.Ca
     assert status == 2
     assert words.count("\n") == 1
     assert "loop-certificate.der was valid until 2021-01-02" in words
-    assert "`loopwright loop init` makes a new one" in words
+    assert "`loopwright loop init CONTROLLER --out spare.toml` makes new ones" in words
 
 
 def expired(certificate: Path, key: Path) -> None:

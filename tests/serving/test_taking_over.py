@@ -18,7 +18,8 @@ from serving.transfer import Transfer
 
 pytest_plugins = ["small_laws"]
 PERIOD = 0.5
-SHIPPED = sorted((Path(__file__).parents[2] / "artifacts").glob("*/*.onnx"))
+# A clone also holds the controllers of plants of its own, which have no case.
+SHIPPED = sorted(p for p in (Path(__file__).parents[2] / "artifacts").glob("*/*.onnx") if p.parent.name in CASES)
 by_name = pytest.mark.parametrize("path", SHIPPED, ids=lambda p: f"{p.parent.name}-{p.stem}")
 
 
@@ -194,7 +195,7 @@ def test_a_safe_mv_is_reached_at_its_rate(make_loop: Callable[..., ControlLoop])
     line.away = False
     reasons: list[Any] = []
     loop.run(2, observe=lambda s, c: reasons.append((c.mode, c.reason)))
-    assert reasons == [(Mode.HOLD, "the endpoint cannot be read: EndpointError: no answer"), (Mode.AUTO, "")]
+    assert reasons == [(Mode.HOLD, "the plant cannot be read: no answer"), (Mode.AUTO, "")]
 
 
 def test_the_way_to_the_safe_mv_waits_where_nothing_arrives(make_loop: Callable[..., ControlLoop]) -> None:
@@ -213,7 +214,7 @@ def test_a_plant_is_handed_back_once(make_loop: Callable[..., ControlLoop]) -> N
     line.away = line.deaf = True
     modes: list[Any] = []
     loop.run(4, observe=lambda s, c: modes.append((c.mode, c.reason.partition(":")[0])))
-    assert modes[-1] == (Mode.HOLD, "the endpoint cannot hand the plant back")
+    assert modes[-1] == (Mode.HOLD, "the plant cannot be handed back")
     line.deaf = False
     loop.run(1)
     assert (loop.mode, line.handed_back) == (Mode.SHADOW, 1)
