@@ -127,7 +127,7 @@ def test_what_the_controller_may_command_is_written_and_every_row_is_kept(capsys
     assert main(["new", "kettle", "x.csv"]) == 0
     table = Path("kettle-tags.csv")
     lines = list(csv.DictReader(table.read_text().splitlines()))
-    assert list(lines[0])[4:9] == ["low", "high", "command_low", "command_high", "max_move_per_min"]
+    assert list(lines[0])[5:10] == ["low", "high", "command_low", "command_high", "max_move_per_min"]
     valve_line = {**lines[1], "command_low": "30", "command_high": "60", "max_move_per_min": "12"}
     with table.open("w") as file:
         rows = csv.DictWriter(file, lines[0], lineterminator="\n")
