@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
+import numpy as np
 import pytest
 
 from serving import Command, Controller, Mode
@@ -28,8 +29,8 @@ def test_an_alarm_is_written_down_within_one_look_whatever_the_clock_does(
     watching = Watching(controller, cast(Recorder, recorder))
 
     def scan(k: int, time_s: float) -> None:
-        mv = [s.middle for s in m.mv]
-        command: Any = Command(k, Mode.HOLD, [s.middle for s in m.sp], mv, None, None, reason="lost")
+        mv, sp = np.array([s.middle for s in m.mv]), np.array([s.middle for s in m.sp])
+        command = Command(k, Mode.HOLD, sp, mv, None, None, reason="lost")
         watching.seen(controller, (None, command, time_s))
 
     scan(0, 1e9)
