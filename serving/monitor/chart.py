@@ -142,7 +142,7 @@ class Chart(Remembers):
 
     def _reckon(self) -> None:
         self.mean, s = self.figures.mean(axis=0), self.figures.std(axis=0, ddof=1)
-        f = correlation(self.figures)
+        f = np.where(s > self.least, correlation(self.figures), 1.0)  # a smaller scatter is not the measure anyway
         worth = self.learn / f
         if self.n and self.learn / f.mean() < WORTH and self.doublings < DOUBLINGS:
             half = self.learn // 2
