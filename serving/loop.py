@@ -196,7 +196,8 @@ class ControlLoop:
     def set_mode(self, mode: Mode) -> None:
         """Set the mode, as a Mode or its name; it takes effect at the next scan.
 
-        LoopError for another word, and where a shadow that knows no good sample now is to move the plant: where the MV stands is not known.
+        LoopError for another word, and where a shadow that knows no good sample now is to move the plant: where the MV
+        stands is not known.
         """
         mode = _known(mode)
         if self._mode is Mode.SHADOW and mode is not Mode.SHADOW and self._blind:
