@@ -63,8 +63,9 @@ def first_sentence(cls: type[Any]) -> str:
 
 def type_of(field: dataclasses.Field[Any]) -> str:
     """The type of a parameter as its class writes it, whether its module puts off reading annotations or not."""
-    plain = isinstance(field.type, type) and not isinstance(field.type, types.GenericAlias)
-    return field.type.__name__ if plain else str(field.type)
+    if isinstance(field.type, type) and not isinstance(field.type, types.GenericAlias):
+        return field.type.__name__
+    return str(field.type)
 
 
 def default_of(field: dataclasses.Field[Any]) -> str:

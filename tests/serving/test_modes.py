@@ -59,9 +59,10 @@ def test_what_is_no_mode_is_refused_before_anything_is_written(pi_file: Path, mo
 def test_the_traceback_of_an_endpoint_can_be_had(pi_file: Path, caplog: pytest.LogCaptureFixture) -> None:
     class Mistaken(Tank):
         def read(self) -> Sample:
-            return Sample(pv=np.array([{}["level"]]))
+            return Sample(pv=np.array([readings["level"]]))
 
+    readings: dict[str, float] = {}
     with caplog.at_level(logging.DEBUG, logger="serving.loop"):
         loop_on(Mistaken(), pi_file, Mode.AUTO).run(1)
     assert [r.getMessage() for r in caplog.records] == ["the endpoint's read failed"]
-    assert 'in read\n    return Sample(pv=np.array([{}["level"]]))' in caplog.text
+    assert 'in read\n    return Sample(pv=np.array([readings["level"]]))' in caplog.text
