@@ -123,6 +123,7 @@ def _exchange(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sampl
     try:
         sample = endpoint.read()
     except Exception as error:
+        _trace("read")
         command = loop.miss(reason or f"the plant cannot be read: {named(error)}")
     else:
         command = loop.miss(reason) if reason else loop.scan(sample)
@@ -133,9 +134,16 @@ def _exchange(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sampl
         elif command.writes:
             endpoint.write(command.mv)
     except Exception as error:
+        _trace("write")
         doing = "cannot be handed back" if command.hand_back else "cannot be written"
         command = loop.unwritten(last, f"the plant {doing}: {named(error)}")
     return sample if isinstance(sample, Sample) else None, command
+
+
+def _trace(call: str) -> None:
+    """The traceback of an endpoint's exception, for who writes the endpoint: the command's reason is one line."""
+    with suppress(Exception):  # the host's log handler may fail too
+        _log.debug("the endpoint's %s failed", call, exc_info=True)
 
 
 def _true(until: Callable[[Command], bool], command: Command) -> bool:

@@ -43,6 +43,14 @@ class Mode(StrEnum):
     SHADOW = "SHADOW"
 
 
+def _known(mode: Mode) -> Mode:
+    """``mode``, also given as its name; LoopError for anything else, as a loop in no mode would write the old MV."""
+    try:
+        return Mode(mode)
+    except ValueError:
+        raise LoopError(f"the mode is {mode!r}; it must be one of {', '.join(Mode)}") from None
+
+
 @dataclass(frozen=True, slots=True)
 class Command:
     """The result of one scan. ``reason`` names a fault; it is empty without one.
@@ -137,6 +145,7 @@ class ControlLoop:
         transfer_s: float = 0.0,
         fallback: Fallback | None = None,
     ) -> None:
+        mode = _known(mode)
         if recover_after is not None and recover_after < 1:
             raise LoopError(f"recover_after is {recover_after}; it must be at least 1, or None")
         if not 0 <= transfer_s < inf:
@@ -199,10 +208,12 @@ class ControlLoop:
         return self._fault
 
     def set_mode(self, mode: Mode) -> None:
-        """Set the mode; it takes effect at the next scan.
+        """Set the mode, as a Mode or its name; it takes effect at the next scan.
 
-        LoopError where a shadow that knows no good sample now is to move the plant: where the MV stands is not known.
+        LoopError for another word, and where a shadow that knows no good sample now is to move the plant: where the MV
+        stands is not known.
         """
+        mode = _known(mode)
         if self._mode is Mode.SHADOW and mode is not Mode.SHADOW and self._blind:
             raise LoopError(f"the last sample was refused ({self._blind}), so where the MV stands is not known; wait")
         if mode is not self._mode:

@@ -20,7 +20,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Compute the bounds, a line for each figure."""
-    case = choose(CASES, options.case, "case", "bounds")
+    case = choose(CASES, options.case, "case")
     tests = case.tests()
     for name in options.scenario or ():
         choose(tests, name, "scenario", f"case {case.name!r}")

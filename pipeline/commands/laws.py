@@ -17,7 +17,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print the list, or one law with its parameters and the parts of a model set that it needs."""
-    list_or_show({name: (law.title, law.Params) for name, law in LAWS.items()}, options.name, "law", "laws")
+    list_or_show({name: (law.title, law.Params) for name, law in LAWS.items()}, options.name, "law")
     if options.name is not None:
         parts = LAWS[options.name].parts
         print("\nparts of the model set:" + " none needed" * (not parts))

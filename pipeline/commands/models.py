@@ -16,4 +16,4 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Print the list or one kind."""
     kinds = {kind: (first_sentence(part), part) for kind, part in MODELS.items()}
-    list_or_show(kinds, options.name, "kind of model", "models")
+    list_or_show(kinds, options.name, "kind of model")

@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import re
 import textwrap
+import types
 import typing
 from collections.abc import Mapping
 from typing import Any
@@ -15,20 +16,20 @@ from pipeline.config.params import choose
 WIDTH = 110
 
 
-def list_or_show(table: Mapping[str, tuple[str, type[Any]]], name: str | None, what: str, command: str) -> None:
+def list_or_show(table: Mapping[str, tuple[str, type[Any]]], name: str | None, what: str) -> None:
     """Print each entry of the table, name -> (title, parameters), in a line; or the one that is named, in full."""
     if name is None:
         for entry, (title, _) in table.items():
             print(f"{entry:28} {title}")
         return
-    title, params = choose(table, name, what, command)
+    title, params = choose(table, name, what)
     print(f"{name}: {title}\n")
     show(params)
 
 
 def show(params: type[Any]) -> None:
     """Print every parameter with its type and default, then the words of the docstrings."""
-    rows = [(f.name, str(f.type), default_of(f)) for f in dataclasses.fields(params) if f.init]
+    rows = [(f.name, type_of(f), default_of(f)) for f in dataclasses.fields(params) if f.init]
     if not rows:
         print("no parameters")
         return
@@ -58,6 +59,13 @@ def texts(params: type[Any]) -> list[str]:
 def first_sentence(cls: type[Any]) -> str:
     """First paragraph of the class's docstring."""
     return " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].replace("``", "").split())
+
+
+def type_of(field: dataclasses.Field[Any]) -> str:
+    """The type of a parameter as its class writes it, whether its module puts off reading annotations or not."""
+    if isinstance(field.type, type) and not isinstance(field.type, types.GenericAlias):
+        return field.type.__name__
+    return str(field.type)
 
 
 def default_of(field: dataclasses.Field[Any]) -> str:

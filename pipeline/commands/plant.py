@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
         asyncio.run(spoil(options.endpoint, options.tag, "" if options.kind == "ok" else options.kind))
         print(f"{options.tag}: {options.kind}")
         return
-    case = choose(CASES, options.case, "case", "plant serve")
+    case = choose(CASES, options.case, "case")
     test = next(iter(case.scenarios().values()))[0]
     server = PlantServer(
         plant=case.plant,

@@ -77,7 +77,7 @@ def _cases(names: list[str], artifacts: Path) -> list[Case]:
         if not found:
             raise ParamsError(f"{artifacts} has no controller; make some with `loopwright run`")
         return found
-    return [choose(cases, name, "case", "playground") for name in dict.fromkeys(names)]
+    return [choose(cases, name, "case") for name in dict.fromkeys(names)]
 
 
 def _serve(folder: Path, port: int, pages: list[Playground]) -> None:

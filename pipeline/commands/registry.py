@@ -33,7 +33,7 @@ def _list(args: argparse.Namespace) -> None:
                 row = f"{model.name:40} {version.version:>4}  gate {f'{score} {over}':10} {aliases}"
                 print(f"{row:70}  signed by {signer}" if signer else row)
         if not models:
-            print("the registry is empty; run `dvc repro`, or `loopwright registry publish`")
+            print("the registry is empty: `loopwright run` fills it; a clone holds no results to publish until then")
 
 
 def _promote(args: argparse.Namespace) -> None:

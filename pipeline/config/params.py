@@ -76,10 +76,11 @@ def _entry(tree: Mapping[str, Any], key: str, where: str) -> Any:
     return tree[key]
 
 
-def choose(table: Mapping[str, T], word: object, what: str, where: str) -> T:
-    """``table[word]``; raises ParamsError that names the nearest known word."""
+def choose(table: Mapping[str, T], word: object, what: str, where: str = "") -> T:
+    """``table[word]``; raises ParamsError that names the nearest known word, and ``where`` the wrong one stands."""
     if not isinstance(word, str) or word not in table:
-        raise ParamsError(f"{where}: unknown {what} {word!r}{nearest(word, table)}")
+        place = f"{where}: " if where else ""
+        raise ParamsError(f"{place}unknown {what} {word!r}{nearest(word, table)}")
     return table[word]
 
 

@@ -204,12 +204,13 @@ def _check_range(what: str, s: Signal, value: float) -> None:
 
 
 def _number(text: str, whole: str, form: str) -> float:
+    what = f"{text!r}" if text == whole else f"{whole!r}: {text!r}"
     try:
         value = float(text)
     except ValueError:
-        raise ParamsError(f"{whole!r}: {text!r} is no number; the form is {form}") from None
+        raise ParamsError(f"{what} is no number; the form is {form}") from None
     if not math.isfinite(value):
-        raise ParamsError(f"{whole!r}: {text!r} is not finite")
+        raise ParamsError(f"{what} is not finite")
     return value
 
 

@@ -34,13 +34,15 @@ def publish(root: Path) -> dict[str, Any]:
     """
     results, signer = read_lock(root), Signer.configured()
     by_case: dict[str, list[StageResult]] = {}
-    for result in results:
-        if result.case is None:
-            continue
-        if result.is_current(root):
-            by_case.setdefault(result.case, []).append(result)
-        else:
-            _say(f"left out {result.name}: its files are not those of dvc.lock; run `dvc repro`")
+    for result in (r for r in results if r.case is not None and r.is_current(root)):
+        by_case.setdefault(str(result.case), []).append(result)
+    if by_case:
+        for name in [r.name for r in results if r.case is not None and r not in by_case.get(r.case, [])]:
+            _say(f"left out {name}: its files are not those of dvc.lock; `loopwright run` makes them anew")
+    else:
+        _say(
+            "nothing to publish: the results of dvc.lock are not here, as in a fresh clone; `loopwright run` makes them"
+        )
     receipt: dict[str, Any] = {"stages": {r.name: r.key for own in by_case.values() for r in own}, "controllers": {}}
     with store() as client:
         for case, own in by_case.items():

@@ -224,7 +224,7 @@ def _find(client: MlflowClient, what: str, default_alias: str) -> ModelVersion:
             raise TrackingError(f"{bare} has no champion: no controller of the case passed the gate; `list` shows all")
     if bare not in names:
         near = get_close_matches(bare, names, n=1) or names[:1]
-        hint = f"did you mean {near[0]!r}? `list` shows all" if near else "the registry is empty: run `dvc repro`"
+        hint = f"did you mean {near[0]!r}? `list` shows all" if near else "it is empty: `loopwright run` fills it"
         raise TrackingError(f"no controller {bare!r} is registered; {hint}")
     number, alias = what.partition("/")[2], what.partition("@")[2] or default_alias
     rows = versions(client, bare)

@@ -132,9 +132,9 @@ def read_lock(root: Path) -> list[StageResult]:
         stages = (yaml.safe_load(path.read_text()) or {})["stages"]
         return [_stage(name, row) for name, row in stages.items()]
     except FileNotFoundError:
-        raise TrackingError(f"{path} does not exist, so there is nothing to publish; run `dvc repro` first") from None
+        raise TrackingError(f"{path} does not exist, so nothing can be published; run `loopwright run` first") from None
     except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
-        raise TrackingError(f"{path} is not a lock file of DVC ({error!r}); run `dvc repro` again") from error
+        raise TrackingError(f"{path} is not a lock file of DVC ({error!r}); restore it by git") from error
 
 
 def _stage(name: str, row: dict[str, Any]) -> StageResult:

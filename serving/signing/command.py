@@ -50,8 +50,9 @@ def run_sign(options: argparse.Namespace) -> None:
 
     key = PrivateKey.read(options.key, password_of(options.password_env, options.password_file))
     expires = options.expires if options.days is None else datetime.now(UTC).replace(microsecond=0) + options.days
+    until = "" if expires is None else f", until {expires:%Y-%m-%d}"
     for file in options.files:
-        print(f"{sign(file, key, expires=expires)}: signed by {key.public.words}")
+        print(f"{sign(file, key, expires=expires)}: signed by {key.public.words}{until}")
 
 
 def verify_options(parser: argparse.ArgumentParser) -> None:

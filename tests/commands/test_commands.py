@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.__main__ import main
 from pipeline.commands import COMMANDS
-from pipeline.commands.parameters import texts
+from pipeline.commands.parameters import texts, type_of
 from pipeline.laws import LAWS
 from pipeline.models import MODELS
 
@@ -51,9 +51,9 @@ def test_every_command_tells_what_it_takes(name: str, capsys: pytest.CaptureFixt
         (["bench", "none.onnx"], "none.onnx: the file cannot be read"),
         (["conformance", "none.onnx", "kit"], "none.onnx: the file cannot be read"),
         (["results", "--artifacts", "nowhere"], "nowhere holds no validation.json yet"),
-        (["laws", "pidd"], "unknown law 'pidd'; did you mean 'pid'?"),
-        (["models", "rbff"], "unknown kind of model 'rbff'; did you mean 'rbf'?"),
-        (["bounds", "nowhere"], "unknown case 'nowhere'"),
+        (["laws", "pidd"], "loopwright laws: unknown law 'pidd'; did you mean 'pid'?"),
+        (["models", "rbff"], "loopwright models: unknown kind of model 'rbff'; did you mean 'rbf'?"),
+        (["bounds", "nowhere"], "loopwright bounds: unknown case 'nowhere'"),
         (["check"], "params.yaml is not here"),
         (["run"], "params.yaml is not here"),
     ],
@@ -116,3 +116,10 @@ main([])
 sys.exit(len({'torch', 'casadi', 'mlflow'} & set(sys.modules)))
 """
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, timeout=60).returncode == 0
+
+
+def test_the_type_of_a_parameter_does_not_depend_on_how_its_module_reads_annotations() -> None:
+    at_once = dataclasses.make_dataclass("AtOnce", [("a", float), ("b", float | None), ("c", tuple[float, ...])])
+    put_off = dataclasses.make_dataclass("PutOff", [("a", "float"), ("b", "float | None"), ("c", "tuple[float, ...]")])
+    shown = [[type_of(f) for f in dataclasses.fields(cls)] for cls in (at_once, put_off)]
+    assert shown[0] == shown[1] == ["float", "float | None", "tuple[float, ...]"]

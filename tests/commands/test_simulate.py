@@ -167,7 +167,7 @@ def test_the_plant_goes_on_in_periods_that_a_slow_machine_missed(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--sp", "high"], "'high' is no number; the form is [NAME=]VALUE[@S]"),
+        (["--sp", "high"], "argument --sp: 'high' is no number; the form is [NAME=]VALUE[@S]"),
         (["--sp", "0.5@-1"], "must not be negative"),
         (["--sp", "1.5"], "set point C_A = 1.5 mol/l is outside [0, 1] mol/l"),
         (["--sp", "0.5@900", "--duration", "10"], "time 900 s lies beyond the run, which ends at 10 s"),

@@ -312,6 +312,14 @@ def test_files_that_are_not_the_locks_are_left_out(root, capsys):
     assert f"left out {stage.name}" in capsys.readouterr().err
 
 
+def test_a_clone_without_results_says_so_in_one_line(root, capsys):
+    shutil.rmtree(root / "work")
+    assert publish(root)["controllers"] == {}
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].endswith("`loopwright run` makes them")
+
+
 def test_outputs_are_hashed_as_dvc_does(tmp_path):
     write = "from pathlib import Path; p = Path('out/b'); p.mkdir(parents=True); (p / 'x').write_text('1'); "
     write += "Path('out/b.txt').write_text('2'); Path('out/B').write_text('3'); Path('single').write_text('4')"
@@ -335,7 +343,7 @@ def test_what_is_wrong_with_the_store_takes_one_line_and_seconds(root, monkeypat
     with pytest.raises(TrackingError, match="is its server running"):
         publish(root)
     (root / "dvc.lock").unlink()
-    with pytest.raises(TrackingError, match="run `dvc repro` first"):
+    with pytest.raises(TrackingError, match="run `loopwright run` first"):
         publish(root)
     (root / "dvc.lock").write_text("- not a lock")
     with pytest.raises(TrackingError, match="not a lock file"):
