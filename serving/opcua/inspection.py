@@ -13,7 +13,7 @@ from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
 from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, words
 from serving.opcua.plan import Plan
-from serving.opcua.settings import Nodes, Server
+from serving.opcua.settings import Nodes, Point, Server
 from serving.words import first_line
 
 WRITABLE = 2  # the second bit of an access level
@@ -50,13 +50,13 @@ async def _inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[F
         rows += [(f"MV {s.name}, written", p.node, p, True) for s, p in zip(manifest.mv, plan.mv_points, strict=True)]
         found = []
         for name, node, point, judged in rows:
-            found.append(await _one(link, manifest, server, name, node, point.scale, point.offset, judged))
+            found.append(await _one(link, manifest, server, name, node, point, judged))
         for name, node in (
             ("heartbeat", nodes.heartbeat),
             ("hand_back", nodes.hand_back.node if nodes.hand_back else ""),
         ):
             if node:
-                found.append(await _one(link, manifest, server, f"{name}, written", node, 1.0, 0.0, True))
+                found.append(await _one(link, manifest, server, f"{name}, written", node, Point(node), True))
         return [*found, *_certificates(link, server)]
     finally:
         await link.close()
@@ -74,7 +74,7 @@ def _certificates(link: Link, server: Server) -> list[Found]:
 
 
 async def _one(
-    link: Link, manifest: Manifest, server: Server, name: str, node: str, scale: float, offset: float, judged: bool
+    link: Link, manifest: Manifest, server: Server, name: str, node: str, point: Point, judged: bool
 ) -> Found:
     try:
         (at,) = await link.resolved([node], server.connect_s)
@@ -85,7 +85,7 @@ async def _one(
     kind = reading.kind.name if reading.kind is not None else "-"
     level = access.Value.Value if access.Value is not None else None
     writable = bool(level & WRITABLE) if isinstance(level, int) else None
-    number = scale * reading.number + offset
+    number = point.scale * reading.number + point.offset
     age = "-" if reading.source_s is None else f"{time.time() - reading.source_s:.3g} s"
     signal = _signal(manifest, name)
     wrong = ""
@@ -100,7 +100,10 @@ async def _one(
         wrong = "it may not be written by this user"
     elif signal is not None and not signal.low <= number <= signal.high:
         wrong = f"{number:.6g} lies outside {signal.low:g} .. {signal.high:g} {signal.unit}; another unit?"
-    unit, limits, note = await _properties(link, server, at, signal, scale, offset)
+    unit, limits = await _properties(link, server, at)
+    note = ""
+    if signal is not None:
+        wrong, note = wrong or other_unit(unit, point, signal), _other_range(limits, point, signal)
     quality = "Good" if reading.quality == GOOD else words(reading.status)
     may = {True: "yes", False: "no", None: "?"}[writable]
     if not judged:
@@ -116,12 +119,9 @@ def _signal(manifest: Manifest, name: str) -> Signal | None:
     return next((s for s in signals if s.name == rest), None)
 
 
-async def _properties(
-    link: Link, server: Server, at: ua.NodeId, signal: Signal | None, scale: float, offset: float
-) -> tuple[str, str, str]:
-    """(unit, range, note) as the server tells them; "-" where it does not."""
+async def _properties(link: Link, server: Server, at: ua.NodeId) -> tuple[str, str]:
+    """(unit, range) as the server tells them; "-" where it does not."""
     unit = limits = "-"
-    notes = []
     try:
         node = link.client.get_node(at)
         async with asyncio.timeout(server.connect_s):
@@ -133,10 +133,25 @@ async def _properties(
                     value = await child.read_value()
                     limits = f"{value.Low:g} .. {value.High:g}"
     except Exception:  # properties are a courtesy of the server
-        return unit, limits, ""
-    if signal is not None and (scale, offset) == (1.0, 0.0):
-        if unit not in {"-", signal.unit}:
-            notes.append(f"another unit? the server says {unit}, the controller {signal.unit}")
-        if limits != "-" and limits != f"{signal.low:g} .. {signal.high:g}":
-            notes.append(f"the controller's range is {signal.low:g} .. {signal.high:g}")
-    return unit, limits, "; ".join(notes)
+        return unit, limits
+    return unit, limits
+
+
+def other_unit(unit: str, point: Point, signal: Signal) -> str:
+    """What is wrong with the server's unit of a signal; empty where loop.toml explains it."""
+    converted = (point.scale, point.offset) != (1.0, 0.0)
+    if unit in {"-", point.unit} or (not point.unit and (converted or unit == signal.unit)):
+        return ""
+    if point.unit:
+        return f"the server says the unit is {unit}, loop.toml says {point.unit}"
+    return (
+        f"the server says the unit is {unit}, the controller's is {signal.unit}: give scale and offset, or "
+        f'unit = "{unit}" where it is only another name'
+    )
+
+
+def _other_range(limits: str, point: Point, signal: Signal) -> str:
+    own = f"{signal.low:g} .. {signal.high:g}"
+    if limits in {"-", own} or (point.scale, point.offset) != (1.0, 0.0):
+        return ""
+    return f"the controller's range is {own}"

@@ -22,13 +22,15 @@ class Point:
 
     ``node`` is a node id as OPC UA writes it (``ns=2;s=TIC101.PV``), or one with the namespace's own name
     (``nsu=urn:plant;s=TIC101.PV``), which stays right when the server numbers its namespaces anew. ``read_back``, of
-    an MV alone, is the node of what the actuator really has; empty: ``node`` itself.
+    an MV alone, is the node of what the actuator really has; empty: ``node`` itself. ``unit`` is the server's name of
+    the unit, where it is another name of the controller's unit, or ``scale`` and ``offset`` convert it.
     """
 
     node: str
     scale: float = 1.0
     offset: float = 0.0
     read_back: str = ""
+    unit: str = ""
 
     def __post_init__(self) -> None:
         if not self.node:

@@ -192,7 +192,7 @@ def _run(options: argparse.Namespace) -> int:
 
     station = Station(settings, tell=tell)
     station.warnings = _warnings(settings)
-    for line in station.warnings + ending(station.controller):
+    for line in station.warnings + station.ending():
         tell(f"note: {line}")
     station.watch(_Lines(station.manifest).show)
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -20,8 +21,10 @@ from serving.guard import Guard, Sample
 from serving.journal import Journal, JournalReader
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
+from serving.opcua import certificates
 from serving.opcua.endpoint import OpcUaEndpoint, Values
 from serving.opcua.link import words
+from serving.opcua.settings import Server
 from serving.page.process import PageProcess
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
@@ -33,7 +36,7 @@ from serving.station.views import about, picture, state
 from serving.station.watching import Watching
 from serving.station.wishes import Wishes
 from serving.trust import Controller as TrustedController
-from serving.trust import signer
+from serving.trust import ending, signer
 from serving.words import first_line
 
 if TYPE_CHECKING:
@@ -58,6 +61,7 @@ class Station:
     def __init__(self, settings: Settings, *, tell: Callable[[str], None] = lambda _: None) -> None:
         self.settings, self.tell = settings, tell
         self.trusted = self._public_keys()
+        self.certificate_ends = _certificate_ends(settings.server)
         self.controller = TrustedController(settings.controller, settings.sha256 or None, self.trusted)
         m = self.manifest
         age = settings.max_age_s(m.period_s)
@@ -98,6 +102,12 @@ class Station:
     def guards(self, manifest: Manifest) -> tuple[Guard, ...]:
         """The guards for a controller."""
         return self.settings.guards.of(manifest, self.settings.max_age_s(manifest.period_s))
+
+    def ending(self) -> list[str]:
+        """A line for what the loop runs by and that ends soon: its controller's signature, its certificate."""
+        lines = ending(self.controller if self.loop is None else self.loop.controller)
+        words = "" if self.certificate_ends is None else certificates.ending(self.certificate_ends)
+        return [*lines, words] if words else lines
 
     def ask(self, change: Change) -> None:
         """Have a change carried out before the next scan; from any thread."""
@@ -300,6 +310,15 @@ class Station:
     def _connection(self, what: str) -> None:
         up = what.startswith("connected")
         self.recorder.note("connection", "opcua", what, alarm="connection", raised=not up)
+
+
+def _certificate_ends(server: Server) -> datetime | None:
+    """When this loop's certificate ends; None where it has none. A file that is none is told when the loop connects."""
+    if server.security == "None" or server.certificate is None:
+        return None
+    with suppress(LoopError):
+        return certificates.until(server.certificate)
+    return None
 
 
 def _usable(values: Values | None) -> bool:

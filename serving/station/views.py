@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from serving.controller import Controller
 from serving.journal import columns
-from serving.trust import ending, signer
+from serving.trust import signer
 
 if TYPE_CHECKING:
     from serving.station.station import Station
@@ -38,7 +38,7 @@ def about(station: Station) -> View:
         "folder": str(controller.path.absolute().parent),
         "first": str(station.controller.path.absolute()),
         "trusted": None if (keys := station.settings.trusted) is None else [str(key.absolute()) for key in keys],
-        "warnings": [*station.warnings, *ending(controller)],
+        "warnings": [*station.warnings, *station.ending()],
     }
 
 
@@ -56,7 +56,7 @@ def state(station: Station) -> View:
             "connection": trouble,
             "sha256": station.controller.sha256,
             "verdicts": [],
-            "warnings": ending(station.controller),
+            "warnings": station.ending(),
         }
     sample, command, seen_s = last
     applied = None if sample is None else sample.mv_applied
@@ -86,7 +86,7 @@ def state(station: Station) -> View:
         "faults": station.faults,
         "verdicts": [asdict(v) for v in station.watching.monitor.verdicts()],
         "numbers": station.watching.monitor.numbers(),
-        "warnings": ending(loop.controller),
+        "warnings": station.ending(),
     }
 
 

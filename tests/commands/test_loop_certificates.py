@@ -15,7 +15,7 @@ from processes import within
 
 from pipeline.__main__ import main
 from serving import LoopError
-from serving.opcua.certificates import make, valid_until
+from serving.opcua.certificates import ending, make, valid_until
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
 
@@ -95,6 +95,13 @@ def test_a_certificate_that_has_ended_is_named(settings: Path, capsys: pytest.Ca
     assert words.count("\n") == 1
     assert "loop-certificate.der was valid until 2021-01-02" in words
     assert "`loopwright loop init CONTROLLER --out spare.toml` makes new ones" in words
+
+
+def test_a_certificate_that_ends_soon_is_told_while_the_loop_runs() -> None:
+    end = datetime(2027, 3, 1, tzinfo=UTC)
+    assert ending(end, end - timedelta(days=31)) == ""
+    assert ending(end, end - timedelta(days=29)).startswith("the loop's certificate ends on 2027-03-01; ")
+    assert ending(end, end + timedelta(days=1)).startswith("the loop's certificate ended on 2027-03-01; ")
 
 
 def expired(certificate: Path, key: Path) -> None:

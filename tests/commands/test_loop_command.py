@@ -15,7 +15,9 @@ from plant_servers import Plant
 from processes import within
 
 from pipeline.__main__ import main
-from serving import LoopError
+from serving import LoopError, Signal
+from serving.opcua.inspection import other_unit
+from serving.opcua.settings import Point
 from serving.station.lease import Lease
 from serving.station.settings import Settings
 
@@ -101,6 +103,40 @@ def test_check_names_what_would_stop_the_loop(settings: Path, plant: Plant, caps
     assert "would stop the loop: PV C_A: its quality is BadNodeIdUnknown; the server has no node nsu=" in said
     assert "outside 200 .. 600 K; another unit?" in said
     assert "would stop the loop: MV T_j, written: it may not be written by this user" in said
+
+
+def test_check_refuses_another_unit_unless_it_is_explained(
+    settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed(
+        settings,
+        'T = "nsu=urn:loopwright:plant;s=PV.T"',
+        'T = { node = "nsu=urn:loopwright:plant;s=PV.T", unit = "degC" }',
+    )
+    assert main(["loop", "check"]) == 2
+    assert "would stop the loop: PV T: the server says the unit is K, loop.toml says degC" in capsys.readouterr().err
+    changed(settings, 'unit = "degC"', 'unit = "K"')
+    assert main(["loop", "check"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("server", "point", "words"),
+    [
+        ("K", Point("n"), ""),
+        ("-", Point("n"), ""),
+        (
+            "°C",
+            Point("n"),
+            'the server says the unit is °C, the controller\'s is K: give scale and offset, or unit = "°C"',
+        ),
+        ("°C", Point("n", offset=273.15), ""),
+        ("kelvin", Point("n", unit="kelvin"), ""),
+        ("K", Point("n", unit="kelvin"), "the server says the unit is K, loop.toml says kelvin"),
+    ],
+)
+def test_a_unit_is_the_controllers_or_explained(server: str, point: Point, words: str) -> None:
+    assert other_unit(server, point, Signal("T", "K", 200.0, 600.0)).startswith(words)
+    assert bool(other_unit(server, point, Signal("T", "K", 200.0, 600.0))) == bool(words)
 
 
 @pytest.mark.parametrize(
