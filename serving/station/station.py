@@ -17,7 +17,7 @@ from serving.clock import MonotonicClock
 from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
 from serving.grid import RunReport
-from serving.guard import Guard, Sample
+from serving.guard import Guard, Sample, implausible
 from serving.journal import Journal, JournalReader
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
@@ -135,12 +135,15 @@ class Station:
             stack.callback(self.endpoint.close)
             self.endpoint.start()
             first = self._first_values()
+            if self.ended:
+                self.recorder.note("change", "loop", "ended before the first scan: nothing was written")
+                return RunReport(0, 0, 0, 0.0)
             pv = None if first is None else first.pv[: len(m.sp)]
             self.loop = ControlLoop(
                 self.controller,
                 self.endpoint,
                 sp=_near(pv, m.sp),
-                mv=_near(None if first is None else first.mv, m.mv),
+                mv=None if first is None else _begun_at(first.mv, m.mv),
                 mode=Mode(s.start),
                 guards=self.guards,
                 recover_after=s.hold.recover_after or None,
@@ -248,6 +251,8 @@ class Station:
         """Say where an MV stands that somebody else moved while the loop could not write."""
         if loop.found is None or self.last is None or np.array_equal(loop.found, self.last[1].mv):
             return
+        if np.isnan(self.last[1].mv).any():
+            return  # nobody knew where it was left
         found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self.last[1].mv))
         self.recorder.note("change", "plant", f"the MV stands at {found}, not at {left}: the loop goes on from there")
 
@@ -333,6 +338,13 @@ def _near(values: Array | None, signals: tuple[Signal, ...]) -> list[float]:
     if values is None or not np.isfinite(values).all():
         return [s.middle for s in signals]
     return [_allowed(v, s) for v, s in zip(values.tolist(), signals, strict=True)]
+
+
+def _begun_at(mv: Array, signals: tuple[Signal, ...]) -> list[float] | None:
+    """The MVs that a loop begins with; None where no actuator can stand there: the first good sample then tells."""
+    if implausible(signals, mv.tolist()):
+        return None
+    return [_allowed(v, s) for v, s in zip(mv.tolist(), signals, strict=True)]
 
 
 def _allowed(value: float, signal: Signal) -> float:

@@ -1,0 +1,154 @@
+"""How a loop begins on its plant: it writes no MV that neither the plant, an operator nor the law has named."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from processes import within
+
+from serving import Mode, Sample
+from serving.journal import JournalReader
+from serving.loop import Command
+from serving.opcua.endpoint import Values
+from serving.opcua.settings import Nodes, Server
+from serving.station import station
+from serving.station.lease import Lease
+from serving.station.settings import Hold, JournalSettings, Settings
+from serving.station.station import Station
+from serving.station.views import state
+
+PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+SPEED = 50.0  # 0.5 s periods in 0.01 s
+NODES: dict[str, Any] = {"pv": {"C_A": "ns=2;s=a", "T": "ns=2;s=b"}, "mv": {"T_j": "ns=2;s=c"}}
+
+
+class Plant:
+    """In the place of the endpoint: what it shows, and what was written there."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self.values: Values | None = None
+        self.trouble, self.connections = "", 1
+        self.written: list[float] = []
+        self.shows(250.0)
+
+    def shows(self, mv: float, fault: str = "") -> None:
+        pv = np.array([0.9, math.nan if fault else 330.0])
+        self.values = Values(0.0, pv, np.array([mv]), np.zeros(0), 0.0, fault, (0, 0, 0))
+
+    def start(self) -> None:
+        """Nothing: it is there."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+    def read(self) -> Sample:
+        assert self.values is not None
+        return Sample(self.values.pv, self.values.mv, self.values.dv, 0.0, self.values.fault)
+
+    def write(self, mv: np.ndarray) -> None:
+        self.written.append(float(mv[0]))
+
+
+@pytest.fixture
+def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Station, Any]]:
+    monkeypatch.setattr(station, "OpcUaEndpoint", Plant)
+    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
+
+    def make(start: str, **changed: Any) -> tuple[Station, Any]:
+        server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
+        made = Station(
+            Settings(
+                PID,
+                server,
+                Nodes(**NODES),
+                start=start,  # type: ignore[arg-type]
+                speed=SPEED,
+                hold=Hold(recover_after=2),
+                journal=JournalSettings(tmp_path / "loop.journal"),
+                **changed,
+            )
+        )
+        return made, made.endpoint
+
+    return make
+
+
+def events(made: Station) -> list[str]:
+    with closing(JournalReader(made.settings.journal.file)) as reader:
+        return [f"{e.who}: {e.what}" for _, e in reader.events()]
+
+
+@pytest.mark.parametrize("start", ["AUTO", "MANUAL"])
+def test_a_loop_that_is_ended_while_it_waits_for_a_pv_writes_nothing(
+    start: str, make_station: Callable[..., tuple[Station, Any]]
+) -> None:
+    made, plant = make_station(start)
+    plant.shows(250.0, "PV T: Bad")
+    thread = threading.Thread(target=made.run)
+    thread.start()
+    assert not within(0.2, lambda: made.scans > 0)
+    made.end()
+    thread.join(20)
+    assert not thread.is_alive()
+    assert (plant.written, made.scans) == ([], 0)
+    assert events(made) == ["loop: ended before the first scan: nothing was written"]
+
+
+@pytest.mark.parametrize("start", ["AUTO", "MANUAL"])
+def test_an_actuator_outside_the_controllers_range_is_left_there(
+    start: str, make_station: Callable[..., tuple[Station, Any]]
+) -> None:
+    """It stands at 550 K, and the controller's range ends at 500 K."""
+    made, plant = make_station(start)
+    plant.shows(550.0)
+    reasons: list[str] = []
+    journalled: list[Any] = []
+
+    def seen(_: Sample | None, command: Command) -> None:
+        reasons.append(command.reason)
+        journalled.append(json.loads(json.dumps(state(made), allow_nan=False))["mv"])
+        if made.scans == 8:
+            assert plant.written == []
+            plant.shows(498.0)
+
+    made.watch(seen)
+    made.run(12)
+    assert journalled[:8] == [None] * 8
+    assert "applied MV T_j is 550 K, outside its range" in reasons[7]
+    assert plant.written[0] == 498.0
+    assert not any("nan" in line for line in events(made))
+    with closing(JournalReader(made.settings.journal.file)) as reader:
+        rows = [scan.numbers[3] for _, _, scan in reader.scans()]  # behind a set point and two PVs
+    assert len(rows) == 12
+    assert all(math.isnan(mv) for mv in rows[:8])
+    assert rows[8] == 498.0
+
+
+def test_a_shadow_without_first_values_takes_no_middle_for_the_mv(
+    make_station: Callable[..., tuple[Station, Any]],
+) -> None:
+    made, plant = make_station("SHADOW")
+    plant.shows(250.0, "PV T: Bad")
+    shown: list[Any] = []
+
+    def seen(_: Sample | None, command: Command) -> None:
+        shown.append((command.mode, json.loads(json.dumps(state(made), allow_nan=False))["mv"]))
+        assert made.loop is not None
+        if made.scans == 3:
+            assert np.isnan(made.loop.mv).all()
+            plant.shows(310.0)
+        if made.scans == 5:
+            made.loop.set_mode(Mode.MANUAL)
+
+    made.watch(seen)
+    made.run(8)
+    assert shown[:5] == [(Mode.SHADOW, None)] * 5
+    assert plant.written == [310.0] * 3
