@@ -10,7 +10,8 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import astuple
-from itertools import takewhile
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -176,7 +177,7 @@ class Journal:
             # One run a block. Releases that let two loops write one journal left runs that alternate, and the ids of a
             # block have no gap.
             run = rows[0][1]
-            rows = list(takewhile(lambda row, run=run: row[1] == run, rows))
+            rows = next(list(same) for _, same in groupby(rows, key=itemgetter(1)))
             with self._base:
                 self._base.execute(
                     "insert into block values (?, ?, ?, ?, ?, ?)",

@@ -26,7 +26,8 @@ PATIENCE_S = 10.0
 class Control:
     """Answers whoever of this user knocks at the socket of a journal. Others cannot enter its folder.
 
-    Whoever opens it has the journal's lock. ``answer`` gets each request as it came and is called in threads of its own; what it raises on purpose is told.
+    Whoever opens it has the journal's lock. ``answer`` gets each request as it came and is called in threads of its
+    own; what it raises on purpose is told.
     """
 
     def __init__(self, journal: Path, answer: Callable[[Any], Answer]) -> None:

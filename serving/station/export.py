@@ -26,8 +26,9 @@ def export(journal: Path, out: Path) -> int:
 
     The MV of a row is the one that the actuator has from this scan to the next, as the next one reads it back: a model
     of rows whose MV acted before their PVs would take what the controller made of a PV for what moved it.
-    A value whose quality was not good is an empty cell: nobody measured it. One of uncertain quality counts where the loop
-    used it, as ``server.uncertain`` says. Times are the plant's: where its time runs faster than the clock's, so do they, and runs follow each other.
+    A value whose quality was not good is an empty cell: nobody measured it. One of uncertain quality counts where the
+    loop used it, as ``server.uncertain`` says.
+    Times are the plant's: where its time runs faster than the clock's, so do they, and runs follow each other.
     """
     reader = JournalReader(journal)
     draft = out.with_name(out.name + ".draft")
@@ -117,7 +118,10 @@ def tag_table(journal: Path, out: Path) -> None:
         table.writeheader()
         for group, role in (("pv", "pv"), ("mv", "mv"), ("dv", "dv"), ("sp", "sp")):
             for s in last["signals"][group]:
-                row = {"tag": _tag(f"{'applied' if group == 'mv' else group} {s['name']}"), "role": role}
+                row: dict[str, Any] = {
+                    "tag": _tag(f"{'applied' if group == 'mv' else group} {s['name']}"),
+                    "role": role,
+                }
                 low, high = _widest(runs, group, s)
                 row |= {"name": s["name"], "unit": s["unit"], "low": low, "high": high}
                 if group == "mv" and (low, high) != (s["low"], s["high"]):
