@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import sqlite3
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import astuple
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from serving.errors import LoopError
 from serving.journal.entries import Event, Scan, columns
-from serving.journal.file import opened
+from serving.journal.file import locked, opened
 from serving.journal.packing import packed
 from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
 from serving.manifest import Manifest
@@ -35,7 +39,7 @@ class Journal:
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
     takes nothing, scans wait in memory, and ``trouble`` says why.
 
-    Raises LoopError for a file that is no journal.
+    Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
 
     def __init__(
@@ -52,6 +56,11 @@ class Journal:
         self._most_events = self._events = most_events(self.max_bytes)  # written since the last look at how many
         self._queue = queue.SimpleQueue[Any]()
         self._base = opened(path, write=True, fsync=fsync)
+        try:
+            self._lock = locked(path)
+        except LoopError:
+            self._base.close()
+            raise
         self._closing = threading.Event()
         self._waiting: list[Any] = []
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
@@ -88,6 +97,7 @@ class Journal:
         self._queue.put(None)
         self._thread.join()
         self._base.close()
+        os.close(self._lock)
 
     # ------------------------------------------------------------------ the writer
     def _run(self) -> None:
@@ -164,13 +174,16 @@ class Journal:
             rows = self._base.execute(
                 "select id, run, time, mode, numbers, quality, reason from scan order by id limit ?", (BLOCK,)
             ).fetchall()
-            rows = [row for row in rows if row[1] == rows[0][1]]
+            # One run a block. Releases that let two loops write one journal left runs that alternate, and the ids of a
+            # block have no gap.
+            run = rows[0][1]
+            rows = next(list(same) for _, same in groupby(rows, key=itemgetter(1)))
             with self._base:
                 self._base.execute(
                     "insert into block values (?, ?, ?, ?, ?, ?)",
-                    (rows[0][0], rows[-1][0], rows[0][1], rows[0][2], rows[-1][2], packed(rows)),
+                    (rows[0][0], rows[-1][0], run, rows[0][2], rows[-1][2], packed(rows)),
                 )
-                self._base.execute("delete from scan where id <= ?", (rows[-1][0],))
+                self._base.execute("delete from scan where run = ? and id <= ?", (run, rows[-1][0]))
                 shorten_scans(self._base, self.max_bytes)
             count -= len(rows)
 

@@ -19,7 +19,7 @@ from serving.errors import EndpointError, LoopError
 from serving.guard import Sample
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
-from serving.opcua.lease import NodeLease
+from serving.opcua.lease import LeaseRefusedError, NodeLease
 from serving.opcua.link import BAD, GOOD, UNCERTAIN, Link, Reading, variant, words
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
@@ -104,6 +104,8 @@ class OpcUaEndpoint:
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
         self.unwritten = ""  # why the last MV did not reach the plant
+        self._unbeaten = ""  # why the last heartbeat did not
+        self._told_lost = ""  # what was said of the connection since it was lost
         self.connections = self.starts = 0
         self._started_s: float | None = None  # when the server started, by its own clock
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
@@ -244,6 +246,7 @@ class OpcUaEndpoint:
                 self._written, self._shown = None, 0
                 self._link = link
                 pause = FIRST_RETRY_S
+                self._told_lost = ""
                 self.tell(f"connected to {self.server.endpoint}{anew}")
                 await self._exchange(link, plan)
             except Exception as error:
@@ -271,9 +274,10 @@ class OpcUaEndpoint:
         return ": it has started anew"
 
     def _lost(self, why: str) -> None:
-        if why != self.trouble:
+        """Say it once. A silent server has been the trouble for some scans already, and was not told as lost."""
+        if why != self._told_lost:
             self.tell(why)
-        self.trouble = why
+        self.trouble = self._told_lost = why
 
     async def _rest(self, seconds: float) -> None:
         """Wait; not longer than until the endpoint is closed."""
@@ -289,6 +293,7 @@ class OpcUaEndpoint:
         """Read and write until the connection is lost, which raises EndpointError, or the endpoint closed."""
         assert self._wake is not None
         ages, silent, read_at = Ages(len(plan.timed)), 0, -float("inf")
+        self._unbeaten = ""
         while not self._closed.is_set():
             now = self.clock()
             due = self._next_s if self._next_s > read_at else read_at + self.period_s
@@ -365,14 +370,31 @@ class OpcUaEndpoint:
         if self.lease.held and self._scans - self._wrote > SILENT_SCANS:
             await self.lease.give_back(link, node, self.answer_s)
         elif self.lease.held:
-            await self.lease.renew(link, node, self.answer_s)
+            try:
+                await self.lease.renew(link, node, self.answer_s)
+            except LeaseRefusedError as error:
+                self.unwritten = self.unwritten or first_line(error)  # also while an MV stands and none is sent
 
     async def _beat(self, link: Link, plan: Plan) -> None:
-        """Count the scans on the server's side, while there are any."""
-        if plan.heartbeat is not None and self._scans != self._beats:
-            self._beats = self._scans
-            node, kind, most = plan.heartbeat
-            await link.write([(node, variant(float(self._scans % most), kind, 0.0, float(most)))], self.answer_s)
+        """Count the scans on the server's side, while there are any. A plant that gets no count must not be written.
+
+        A node that has another type now is counted in that one from the next scan on.
+        """
+        if plan.heartbeat is None or self._scans == self._beats:
+            return
+        self._beats = self._scans
+        node, kind, most = plan.heartbeat
+        try:
+            count = variant(float(self._scans % most), kind, 0.0, float(most))
+        except EndpointError as error:
+            self._unbeaten = f"heartbeat: {first_line(error)}"
+        else:
+            (status,) = await link.write([(node, count)], self.answer_s)
+            self._unbeaten = "" if status >> 30 == GOOD else f"the server refuses heartbeat: {words(status)}"
+        if self._unbeaten:
+            (now,) = await link.read([node], self.answer_s)
+            if now.kind is not None:
+                plan.beat_in(node, now.kind)
 
     def _valued(self, plan: Plan, answers: list[Reading], ages: Ages) -> Values:
         """The answers as values, with the first thing that is wrong with them."""
@@ -399,6 +421,7 @@ class OpcUaEndpoint:
             mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
         if self.nodes.watchdog and not fault:
             fault = self._dead(found["watchdog"])
+        fault = fault or self._unbeaten
         n = len(m.pv) + len(m.mv) + len(plan.dv_names)
         return Values(
             arrived,

@@ -210,6 +210,52 @@ def test_a_killed_process_loses_at_most_its_last_second(tmp_path: Path, controll
         assert times[-1] - (found[-1][2].time_s if found else times[0]) < 1.0
 
 
+def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path: Path, controller: Controller) -> None:
+    path, link = tmp_path / "loop.journal", tmp_path / "link.journal"
+    first = Journal(path)
+    link.symlink_to(path)
+    for name in (path, link):
+        with pytest.raises(LoopError, match=rf"{name.name} is written by another loop \(process {os.getpid()}\); end"):
+            Journal(name)
+    script = "import sys; from pathlib import Path; from serving.journal import Journal; Journal(Path(sys.argv[1]))"
+    other = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False)
+    assert other.returncode == 1
+    assert f"{path} is written by another loop (process {os.getpid()})" in other.stderr
+    first.begin(controller.manifest, controller.sha256, 1e9)
+    given = scans(FRESH + 2 * BLOCK)
+    for scan in given:
+        first.scan(scan)
+    first.close()
+    reader = JournalReader(path)
+    assert all(same(a, b) for a, (_, _, b) in zip(given, reader.scans(), strict=True))
+    reader.close()
+    Journal(link).close()
+
+
+def test_runs_that_alternate_lose_nothing_when_they_are_packed(tmp_path: Path, controller: Controller) -> None:
+    """Two loops that wrote one journal, before a second one was refused, left such files."""
+    path, given = tmp_path / "loop.journal", scans(FRESH + 2 * BLOCK)
+    journal = Journal(path)
+    for _ in range(2):
+        journal.begin(controller.manifest, controller.sha256, 1e9)
+    journal.close()
+    base, rng = sqlite3.connect(path), np.random.default_rng(0)
+    runs = [1 + int(rng.random() < 0.5) for _ in given]
+    rows = [(run, s.time_s, s.mode, np.array(s.numbers).tobytes()) for run, s in zip(runs, given, strict=True)]
+    base.executemany("insert into scan (run, time, mode, numbers) values (?, ?, ?, ?)", rows)
+    base.commit()
+    base.close()
+    journal = Journal(path)
+    journal.event(Event(1e9, "change", "anna", "mode AUTO"))
+    journal.close()
+    reader = JournalReader(path)
+    found = list(reader.scans())
+    assert [(i, run) for i, run, _ in found] == [(k + 1, run) for k, run in enumerate(runs)]
+    assert all(np.array_equal(a.numbers, b.numbers, equal_nan=True) for a, (_, _, b) in zip(given, found, strict=True))
+    assert len(list(reader.scans(after_id=100))) == len(given) - 100
+    reader.close()
+
+
 def test_what_is_no_journal_is_named(tmp_path: Path) -> None:
     foreign = tmp_path / "other.db"
     base = sqlite3.connect(foreign)
