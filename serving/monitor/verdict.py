@@ -29,6 +29,11 @@ def unknown(name: str, text: str) -> Verdict:
     return Verdict(name, "not known yet", text)
 
 
+def failed(trouble: str) -> Verdict:
+    """The monitor itself has an error."""
+    return Verdict("monitor", "watch", f"the monitor itself failed: {trouble}")
+
+
 def when(time_s: float | np.floating[Any]) -> str:
     """A time [s since 1970] as an operator reads it."""
     return datetime.fromtimestamp(float(time_s), UTC).strftime("%d %b %H:%M UTC")
