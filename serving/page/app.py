@@ -42,7 +42,7 @@ class PageApp:
 
     def __init__(self, journal: Path, ask: Ask, token: str, tell: Callable[[str], None] = lambda _: None) -> None:
         self.journal, self.ask, self.token, self.tell = journal, ask, token, tell
-        self.live = Live(journal, ask)
+        self.live = Live(journal, ask, tell)
         self._about = Shared(lambda: self._asked({"do": "about"}))
         self._described = Shared(self._describe)
         self._told = -math.inf

@@ -375,15 +375,19 @@ def test_the_loop_is_asked_once_for_all_who_ask_at_a_time(loop: FakeLoop) -> Non
         assert len(asked) < 10
 
 
-def test_news_go_on_after_a_journal_that_could_not_be_read(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [OSError("being exchanged"), KeyError(7), RuntimeError("odd")])
+def test_news_go_on_after_a_journal_that_could_not_be_read(
+    loop: FakeLoop, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     with serving_here(loop) as (app, browser, _):
-        failed = list[int]()
+        failed, told = list[int](), list[str]()
         read = app.live._read
+        monkeypatch.setattr(app.live, "_tell", told.append)
 
         def unreadable(after_id: int | None) -> tuple[list[str], int]:
             if after_id is not None and len(failed) < 2:
                 failed.append(after_id)
-                raise OSError("being exchanged")
+                raise error
             return read(after_id)
 
         monkeypatch.setattr(app.live, "_read", unreadable)
@@ -393,3 +397,6 @@ def test_news_go_on_after_a_journal_that_could_not_be_read(loop: FakeLoop, monke
             came = b""
             while b"event: scans" not in came:
                 came += wire.recv(65_536)
+        assert app.live.failed == 2
+        assert len(told) == 1
+        assert str(error) in told[0]
