@@ -35,8 +35,8 @@ def failed(trouble: str) -> Verdict:
 
 
 def when(time_s: float | np.floating[Any]) -> str:
-    """A time [s since 1970] as an operator reads it."""
-    return datetime.fromtimestamp(float(time_s), UTC).strftime("%d %b %H:%M UTC")
+    """A time [s since 1970] in UTC; the page writes what it finds in this form in the zone of its own clock."""
+    return datetime.fromtimestamp(float(time_s), UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def unit_of(s: Signal) -> str:
