@@ -17,7 +17,7 @@ def come_in(browser: Browser, served: tuple[FakeLoop, str, str], **how: object) 
     """A new page that shows all there is, with the token at hand."""
     from playwright.sync_api import expect
 
-    made = browser.new_page(locale="en-GB", timezone_id="UTC", **how)  # type: ignore[arg-type]
+    made = browser.new_page(**{"locale": "en-GB", "timezone_id": "UTC", **how})  # type: ignore[arg-type]
     made.set_default_timeout(20_000)
     made.goto(served[1])
     expect(made.locator("#alarm-list .alarm").first).to_be_visible()

@@ -242,8 +242,8 @@ class Station:
         self._moved(self.loop)
         self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
         self.last, self.stepped = (sample, command, time.time()), self.recorder.controller
-        self.watching.seen(self.stepped, self.last)
         self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
+        self.watching.seen(self.stepped, self.last)
         for seen in self._watchers:
             seen(sample, command)
 
