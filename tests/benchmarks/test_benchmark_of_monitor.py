@@ -13,15 +13,16 @@ from pipeline.cases import CASES
 from serving.monitor import monitor, pace
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "monitor.py"
-# Parameter, share, periods within which it is found.
+LEARNT_IN_FULL = {"ph_neutralization"}  # its loads wander for days: learnt for less, an upset of them is new
+# Parameter, share, the verdict that tells it, periods within which it does.
 DRIFTS = {
-    "thiosulfate_cstr": ("k0", -0.2, 2_000),
-    "ph_neutralization": ("q1", 0.2, 1_000),
-    "ph_neutralization_15s": ("q1", -0.2, 2_500),
-    "henson_seborg_cstr": ("K1", -0.2, 2_000),
-    "reversible_cstr": ("k1", -0.2, 4_000),
-    "batch_reactor": ("beta1", -0.2, 10 * 50),
-    "jacketed_batch_reactor": ("a_c", -0.2, 8 * 2_000),
+    "thiosulfate_cstr": ("k0", -0.2, "T_j at rest", 1_000),
+    "ph_neutralization": ("q1", 0.2, "q3 moves", 200),
+    "ph_neutralization_15s": ("q1", -0.2, "error of pH", 500),
+    "henson_seborg_cstr": ("K1", -0.2, "q_c at rest", 500),
+    "reversible_cstr": ("k1", -0.2, "F at rest", 1_000),
+    "batch_reactor": ("beta1", -0.2, "load_u over a batch", 7 * 50),
+    "jacketed_batch_reactor": ("a_c", -0.2, "mode over a batch", 4 * 2_000),
 }
 
 
@@ -41,15 +42,21 @@ def test_every_case_is_among_them(benchmark: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("name", DRIFTS)
-def test_a_drift_is_found(benchmark: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drift_is_found_and_the_same_run_without_it_is_quiet(
+    benchmark: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is normal is learnt in less time than on a plant, so that a run is short; batches are learnt in full."""
-    monkeypatch.setattr(monitor, "LEARN_RESTS", 60)
-    monkeypatch.setattr(monitor, "LEARN_MODEL", 6)
-    monkeypatch.setattr(monitor, "LEARN_BLOCKS", 10)
-    monkeypatch.setattr(monitor, "LEARN_S", 0.0)
-    monkeypatch.setattr(pace, "LEARN_S", 0.0)
-    parameter, share, within = DRIFTS[name]
+    if name not in LEARNT_IN_FULL:
+        monkeypatch.setattr(monitor, "LEARN_RESTS", 60)
+        monkeypatch.setattr(monitor, "LEARN_MODEL", 6)
+        monkeypatch.setattr(monitor, "LEARN_BLOCKS", 10)
+        monkeypatch.setattr(monitor, "LEARN_S", 0.0)
+        monkeypatch.setattr(pace, "LEARN_S", 0.0)
+    parameter, share, verdict, within = DRIFTS[name]
     watched = benchmark.learnt(name, seed=7)
     assert [alarm for alarm in watched.alarms if alarm[2] == "retrain"] == []
     assert "watch" not in watched.levels.values()
-    assert benchmark.drifted(watched, (parameter, share), within, seed=8) is not None
+    found = benchmark.drifted(watched, (parameter, share), within, seed=8)
+    assert found is not None
+    assert found[1] == verdict, found
+    assert benchmark.drifted(watched, (parameter, 0.0), within, seed=8) is None

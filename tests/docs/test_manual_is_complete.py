@@ -13,7 +13,7 @@ from manual.contents import GENERATED, OF_CASES, SECTIONS
 from manual.errors import known
 from manual.floors import imports, layers
 from manual.laws import info_of, shipped, told
-from manual.parameters import fields, is_described, parts_of, words
+from manual.parameters import fields, is_described, parameters, parts_of, words
 from pages import DOCS, ROOT
 
 import serving
@@ -38,6 +38,8 @@ ROOTS: dict[str, type] = {
     "validation.json": Validation,
     "loop.toml": Settings,
 }
+UNITS = {"_s": "s", "_ms": "ms", "_us": "us", "_h": "h", "_mb": "MB", "_per_min": "unit/min"}
+LEAST = 40  # characters of a section: a short sentence
 PARTS = ("Problem", "The law", "When to use it", "When not", "In closed loop", "References")
 
 
@@ -49,6 +51,12 @@ def every_dataclass() -> Iterator[type]:
             if cls not in seen:
                 seen.add(cls)
                 yield cls
+
+
+def content(text: str, part: str) -> str:
+    """What stands under a heading, to the next one of its level, without space; empty where there is none."""
+    found = re.search(rf"^## {re.escape(part)}\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    return re.sub(r"\s|<!--.*?-->", "", found[1], flags=re.DOTALL) if found else ""
 
 
 def asked() -> set[str]:
@@ -65,8 +73,8 @@ def test_a_law_has_its_theory_page(law: str) -> None:
     page = DOCS / "theory" / f"{law}.md"
     assert page.is_file(), f"write docs/theory/{law}.md, as the pages beside it"
     text = page.read_text(encoding="utf-8")
-    missing = [part for part in PARTS if f"\n## {part}\n" not in text]
-    assert not missing, f"{page.name} lacks the parts {missing}"
+    missing = [part for part in PARTS if len(content(text, part)) < LEAST]
+    assert not missing, f"{page.name} says next to nothing under {missing}"
     assert "\n$$\n" in text, "give the law's formula"
     assert "```{diagram}" in text, "draw the law"
     assert f"```{{generated}} law {law}\n" in text
@@ -99,6 +107,14 @@ def test_each_parameter_is_described(cls: type) -> None:
     assert not missing, (
         f"{cls.__module__}.{cls.__qualname__}: {missing}; name each in the docstring as ``name``, or in words.toml"
     )
+
+
+@pytest.mark.parametrize("cls", list(every_dataclass()), ids=lambda cls: cls.__qualname__)
+def test_a_parameter_whose_name_has_a_unit_shows_it(cls: type) -> None:
+    shown = dict(re.findall(r"^\| `(\w+)` \| (?:[^|\\]|\\.)+ \| ([^|]*?) *\|", parameters(cls), re.MULTILINE))
+    for name in (f.name for f in fields(cls)):
+        for end, unit in UNITS.items():
+            assert not name.endswith(end) or shown[name] == unit, f"{cls.__qualname__}.{name}: {shown[name]!r}"
 
 
 def test_no_words_are_of_a_parameter_that_is_gone() -> None:
