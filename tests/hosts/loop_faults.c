@@ -102,6 +102,12 @@ static int moved(Loop *l, Mode mode) {
   mv[0] = 505; /* beyond the range by less than the margin */
   loop_scan(l, &good_one);
   MUST(loop_writes(l) && l->mv[0] == 500);
+  loop_unwritten(l, "the plant cannot be written");
+  loop_scan(l, &unsound); /* the plant reads back, so the old MV is nothing to go back to */
+  loop_scan(l, &no_read_back);
+  MUST(!loop_writes(l) && strstr(l->reason, "there is no read-back"));
+  loop_scan(l, &good_one);
+  MUST(loop_writes(l) && l->mv[0] == 500);
   return 0;
 }
 

@@ -125,9 +125,16 @@ loop.setMode("MANUAL");
 loop.setMv([200]);
 loop.unwritten("no way");
 try { loop.setMv([210]); } catch (error) { refused.push(error.message); }
+// After a lost command: no read-back at all gives the old MV back, but not after an implausible one.
+loop.setMode("HOLD");
+const sample = { pv: [0.499, 300], dv: [], mv_applied: null, age_s: 0 };
+const nothingReadBack = await loop.scan(sample);
+loop.unwritten("no way");
+await loop.scan({ ...sample, mv_applied: [600] });
+const afterAnImplausibleOne = await loop.scan(sample);
 for (const bad of [[2], [NaN], [], [0.1, 0.2]])
   try { loop.setSp(bad); } catch (error) { refused.push(error.message); }
-console.log(JSON.stringify({ scans, refused, written, sp: [...loop.sp] }));
+console.log(JSON.stringify({ scans, lost: [nothingReadBack.mv, afterAnImplausibleOne.mv], refused, written, sp: [...loop.sp] }));
 """
 
 
@@ -188,6 +195,10 @@ def test_faults_hold_the_mv_in_node(told: dict[str, Any]) -> None:
         assert scans[fault + 1]["mv"] == scans[fault - 1]["mv"]
         assert scans[fault - 1]["mv"] != scans[fault - 2]["mv"]  # the law was moving it
         assert not any(scans[fault]["state"])
+
+
+def test_a_plant_that_reads_nothing_back_gets_its_old_mv_back_in_node(told: dict[str, Any]) -> None:
+    assert told["lost"] == [[200], None]  # none after an implausible read-back: the plant does read back
 
 
 def test_what_the_plant_s_operator_set_meanwhile_is_held_in_node() -> None:

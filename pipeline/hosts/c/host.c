@@ -620,11 +620,15 @@ static bool trusted(Controller *c, const Sample *sample) {
 }
 
 /* Where the MV stands after a command that did not arrive: at the next sound read-back, also that of a sample which is
-   refused for another reason. A good sample without one says that nothing is read back: the MV before it stays. */
+   refused for another reason. A good sample without one says that nothing is read back: the MV before it stays. After an
+   implausible one the old MV is nothing to go back to. */
 static void loop_found(Loop *l, const double *applied, bool good_one) {
-  if (!l->lost || (applied ? implausible(l->c, applied) < l->c->n_in[MV] : !good_one)) return;
-  if (applied) clip(l->c, applied, l->mv);
-  l->lost = false;
+  if (!l->lost || (!applied && !good_one)) return;
+  l->lost = applied && implausible(l->c, applied) < l->c->n_in[MV];
+  if (l->lost)
+    for (size_t k = 0; k < l->c->n_in[MV]; k++) l->mv[k] = NAN;
+  else if (applied)
+    clip(l->c, applied, l->mv);
 }
 
 /* One period: l->mv is what to write if loop_writes, l->mode and l->reason say why. sample NULL: the plant cannot be

@@ -167,12 +167,13 @@ export class Loop {
   }
 
   // Where the MV stands after a command that did not arrive: at the next sound read-back, also that of a sample which is
-  // refused for another reason. A good sample without one says that nothing is read back: the MV before it stays.
+  // refused for another reason. A good sample without one says that nothing is read back: the MV before it stays. After an
+  // implausible one the old MV is nothing to go back to.
   #found(given, reason) {
     const applied = given?.mv_applied;
-    if (!this.lost || (applied ? this.#implausible(applied) : reason)) return;
-    if (applied) this.mv = this.#clipped(applied);
-    this.lost = false;
+    if (!this.lost || (!applied && reason)) return;
+    this.lost = Boolean(applied && this.#implausible(applied));
+    if (applied) this.mv = this.lost ? null : this.#clipped(applied);
   }
 
   // No past any more. In AUTO a fault: the MV is held until recoverAfter good samples, or until the operator acts.
