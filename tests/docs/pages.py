@@ -18,7 +18,7 @@ PAGES = sorted(
     ]
 )
 FENCE = re.compile(r"^(```+)(\S*)[^\n]*\n(.*?)^\1[ ]*$", re.MULTILINE | re.DOTALL)
-REASON = re.compile(r"<!-- (not run|run by): (.+?) -->\s*$")
+REASON = re.compile(r"<!-- (not run|run by|run in part): (.+?) -->\s*$")
 
 
 @dataclass(frozen=True)

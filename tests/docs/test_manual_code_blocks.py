@@ -1,7 +1,8 @@
 """Code of the manual runs: Python as it stands, commands through the real parsers, settings through the real readers.
 
 A block that does not run here says why in a comment right above it: ``<!-- not run: REASON -->``, or
-``<!-- run by: FILE -->`` with the test that runs it.
+``<!-- run by: FILE -->`` with the test that runs it. ``test_manual_shell_blocks.py`` runs the shell blocks without a
+mark, and of those with ``<!-- run in part: PIECE, PIECE: REASON -->`` the commands that hold a PIECE.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from pathlib import Path
 import pytest
 import yaml
 from manual.commands import parser_of
-from pages import PAGES, ROOT, Block, blocks
+from pages import FENCE, PAGES, ROOT, Block, blocks
+from stated import assert_stated
 
 from pipeline.commands import COMMANDS
 from pipeline.config.exports import ExportParams
@@ -32,6 +34,7 @@ LANGUAGES = {"python", "sh", "bash", "yaml", "toml", "text", "", "{generated}", 
 ALL = [block for page in PAGES for block in blocks(page)]
 # Programs that a page may call, beside `loopwright` and Python: what they are given is for a person to see.
 OTHERS = {"cd", "git", "source", "export", "dask", "docker", "cp", "mlflow", "dvc", "curl", "openssl"}
+OTHERS |= {"npm", "node", "cmake", "build/host"}
 
 
 def of(*languages: str) -> list[Block]:
@@ -49,6 +52,23 @@ def test_who_does_not_run_says_why() -> None:
             assert len(words) > 10, block.where
             if kind == "run by":
                 assert block.page.name in (ROOT / words).read_text(encoding="utf-8"), block.where
+            for named in re.findall(r"\btests/[\w/.]*\w", words):
+                assert (ROOT / named).exists(), f"{block.where}: no {named}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_no_code_stands_without_a_fence(page: Path) -> None:
+    """A block that is only set in would be tested by nothing; a list's own lines may be set in."""
+    before, found = "", []
+    for line in FENCE.sub("", page.read_text(encoding="utf-8")).splitlines():
+        if line.startswith("    ") and not before.startswith(("    ", "- ", "  ", "* ")) and not _numbered(before):
+            found.append(line)
+        before = line or (before if before.startswith(("- ", "* ", "  ")) or _numbered(before) else "")
+    assert found == []
+
+
+def _numbered(line: str) -> bool:
+    return re.match(r"\d+\. ", line) is not None
 
 
 def pages_with_python() -> list[Path]:
@@ -62,11 +82,17 @@ def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pyte
         (tmp_path / name).symlink_to(ROOT / name)
     found = [block for block in blocks(page) if block.language == "python" and not block.mark]
     if page.parent.name == "tutorials":
-        lines = page.read_text(encoding="utf-8").splitlines()
+        text = page.read_text(encoding="utf-8")
+        lines = text.splitlines()
         for block in found:
-            name = re.findall(r"`(\w+\.py)`", " ".join(lines[block.line - 4 : block.line - 1]))[0]
+            above = " ".join(lines[block.line - 4 : block.line - 1])
+            name = re.findall(r"`(\w+\.py)`", above)[0]
             (tmp_path / name).write_text(block.text, encoding="utf-8")
-            _run(name, tmp_path)
+            printed = _run(name, tmp_path)
+            after = text[text.index(block.text) + len(block.text) :].split("\n## ")[0]
+            stated = re.findall(r"[Ii]t prints `([^`]+)`", above)
+            for shown in [*stated, *re.findall(r"It prints:?\s+```text\n(.*?)```", after, re.DOTALL)]:
+                assert_stated(shown, printed, block.where)
         return
     module = types.ModuleType("page")
     monkeypatch.setitem(sys.modules, "page", module)
@@ -74,10 +100,11 @@ def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pyte
     exec(compile("\n".join(block.text for block in found), str(page), "exec"), module.__dict__)
 
 
-def _run(file: str, folder: Path) -> None:
+def _run(file: str, folder: Path) -> str:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, file], cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{file}: {done.stderr[-2000:]}"
+    return done.stdout
 
 
 def commands_of(block: Block) -> list[list[str]]:
@@ -88,8 +115,6 @@ def commands_of(block: Block) -> list[list[str]]:
 
 @pytest.mark.parametrize("block", of("sh", "bash"), ids=lambda b: b.where)
 def test_commands_are_those_that_there_are(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
-    if block.mark:
-        return
     for found in commands_of(block):
         while found and re.fullmatch(r"[A-Z_]+=.*", found[0]):
             found = found[1:]

@@ -45,7 +45,7 @@ def test_the_plc_page_names_the_inputs_and_outputs() -> None:
 @pytest.mark.parametrize("host", ["python", "c", "node", "browser"])
 def test_each_host_has_a_short_page_that_says_the_same_four_things(host: str) -> None:
     text = (EMBED / host / "README.md").read_text()
-    assert len([line for line in text.splitlines() if line.strip()]) <= 11
+    assert len([line for line in text.splitlines() if line.strip() and not line.startswith(("```", "<!--"))]) <= 11
     for what in ("**State**", "**Loop**", "**Fault**", "loopwright conformance FILE.onnx KIT"):
         assert what in text
 
