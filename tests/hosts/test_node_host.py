@@ -134,7 +134,8 @@ await loop.scan({ ...sample, mv_applied: [600] });
 const afterAnImplausibleOne = await loop.scan(sample);
 for (const bad of [[2], [NaN], [], [0.1, 0.2]])
   try { loop.setSp(bad); } catch (error) { refused.push(error.message); }
-console.log(JSON.stringify({ scans, lost: [nothingReadBack.mv, afterAnImplausibleOne.mv], refused, written, sp: [...loop.sp] }));
+const lost = [nothingReadBack.mv, afterAnImplausibleOne.mv];
+console.log(JSON.stringify({ scans, lost, refused, written, sp: [...loop.sp] }));
 """
 
 
