@@ -150,8 +150,8 @@ def _scans(m: Manifest, good: Sample) -> Generator[Scan, Sample, None]:
     yield from some(recovery + 2, "after a fault while it recovers")
     good = yield Scan("a command did not arrive, and the MV was moved", _moved(m, good), unwritten=True)
     yield from some(recovery, "after an MV that was moved")
-    moved = _with(_moved(m, good), "pv", 0, nan)
-    good = yield Scan("a command did not arrive, the MV was moved, and a PV is not finite", moved, unwritten=True)
+    no_pv = _with(_moved(m, good), "pv", 0, nan)
+    good = yield Scan("a command did not arrive, the MV was moved, and a PV is not finite", no_pv, unwritten=True)
     yield from some(recovery, "after an MV that was moved")
     good = yield Scan(
         "a command did not arrive, and there is no read-back", replace(good, mv_applied=None), unwritten=True
