@@ -281,7 +281,7 @@ class ControlLoop:
                 self._mv = applied
             return self._missed(first_line(error))
         self._state = step.state
-        if self._fault:
+        if self._fault and not self._handing_back():  # once asked, the plant's own controller may have it already
             self._good += 1
             if self.recover_after is not None and self._good >= self.recover_after:
                 self.set_mode(Mode.AUTO)
@@ -345,6 +345,9 @@ class ControlLoop:
     def _overdue(self) -> bool:
         since = (self._held - 1) * self.controller.manifest.period_s
         return bool(self._fault) and self.fallback is not None and since >= self.fallback.after_s
+
+    def _handing_back(self) -> bool:
+        return self._overdue() and self.fallback is not None and self.fallback.hand_back
 
     def _beside(self, sample: Sample, applied: Array, past: Collection[Sample]) -> Array | None:
         """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
@@ -428,10 +431,8 @@ class ControlLoop:
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
         self._given = self._mv.copy()
-        hand_back = self._overdue() and self.fallback is not None and self.fallback.hand_back
-        return Command(
-            self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, hand_back
-        )
+        back = self._handing_back()
+        return Command(self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, back)
 
     # ------------------------------------------------------------------ running
     def run(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -149,7 +150,7 @@ class Station:
                 recover_after=s.hold.recover_after or None,
                 clock=self.clock,
                 warm_lead_s=WARM_LEAD_S * s.speed,
-                transfer_s=20 * m.period_s if s.transfer_s is None else s.transfer_s,
+                transfer_s=s.over_s(m.period_s),
                 fallback=self.fallback,
             )
             self.recorder.begin(self.controller)
@@ -162,8 +163,10 @@ class Station:
 
     def _tend(self, control: Control) -> None:
         """Keep the files that lie in a folder for temporary ones."""
-        self.lease.tend()
-        control.tend()
+        try:
+            self.lease.tend()
+        finally:
+            control.tend()
 
     def _untended(self, trouble: str) -> None:
         what = trouble or "over: the locks of this loop are kept again"
@@ -211,6 +214,17 @@ class Station:
         values = self.endpoint.values
         if values is not None and self.scans:
             self._plant_side(self.loop, values)
+        self._let_go(self.loop)
+
+    def _let_go(self, loop: ControlLoop) -> None:
+        """Write nothing while another loop has the lock of a node, whoever asks for it."""
+        if loop.mode is Mode.SHADOW or not self.lease.lost:
+            return
+        with suppress(LoopError, OSError):
+            self.lease.tend()  # the other loop may have ended since
+        if self.lease.lost:
+            self.recorder.note("change", "loop", f"mode {loop.mode} -> {Mode.SHADOW}", self.lease.lost)
+            loop.set_mode(Mode.SHADOW)
 
     def _plant_side(self, loop: ControlLoop, values: Values) -> None:
         """Set points and mode, where the plant's own operator changed them."""
@@ -220,12 +234,18 @@ class Station:
             what = "the plant's server has, or may have, started anew: the set points and the mode that stand there"
             self.recorder.note("connection", "opcua", f"{what} are no wish of its operator until they change")
         if changed:
-            wanted = loop.sp
-            for i, s in enumerate(self.manifest.sp):
-                wanted[i] = changed.get(s.name, wanted[i])
-            self._from_plant(lambda: loop.set_sp(wanted), f"set point {_shown(wanted, self.manifest.sp)}")
+            self._set_points(loop, changed)
         if mode:
             self._from_plant(lambda: loop.set_mode(Mode(mode)), f"mode {mode}")
+
+    def _set_points(self, loop: ControlLoop, changed: Mapping[str, float]) -> None:
+        """Each for itself: one outside its range takes no other one with it."""
+        for i, s in enumerate(self.manifest.sp):
+            if s.name in changed:
+                wanted = loop.sp
+                wanted[i] = changed[s.name]
+                what = f"set point {_shown(wanted[i : i + 1], (s,))}"
+                self._from_plant(partial(loop.set_sp, wanted), what)
 
     def _from_plant(self, act: Callable[[], None], what: str) -> None:
         try:
@@ -267,7 +287,8 @@ class Station:
 
     def _opened(self, file: str, sha256: str | None) -> Controller:
         """A controller that is to be tried; a relative path lies beside the one in charge."""
-        return TrustedController(self.settings.controller.parent / file, sha256, self.trusted)
+        charge = self.controller if self.loop is None else self.loop.controller
+        return TrustedController(charge.path.parent / file, sha256, self.trusted)
 
     def answer(self, tree: Any) -> Answer:
         """What a request gets, from any thread: a view, or the change once a scan has carried it out."""

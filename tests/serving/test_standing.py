@@ -152,6 +152,24 @@ def test_a_plant_that_is_handed_back_is_not_moved(make_loop: Callable[..., Contr
     assert line.written == [71.0, 71.0]
 
 
+def test_a_loop_that_has_asked_the_plants_own_controller_to_take_over_does_not_recover(
+    make_loop: Callable[..., ControlLoop],
+) -> None:
+    """The plant's controller may have taken over already, though it is not confirmed yet."""
+    line = Line()
+    asked: list[bool] = []
+    loop = make_loop(line, recover_after=1, fallback=Fallback(1.0, hand_back=True))
+    loop.run(3)
+    line.pv_bad = True
+    while not (asked and asked[-1]):
+        line.deaf = len(asked) > 1  # it is not confirmed
+        loop.run(1, observe=lambda _, command: asked.append(command.hand_back))
+    line.pv_bad = line.deaf = False
+    line.written.clear()
+    loop.run(5, observe=lambda _, command: asked.append(command.hand_back))
+    assert (line.written, line.owner, loop.mode) == ([], 1, Mode.SHADOW)
+
+
 def test_auto_takes_over_from_where_the_mv_stands(make_loop: Callable[..., ControlLoop]) -> None:
     line = Line()
     loop = make_loop(line, sp=0.9, recover_after=3, transfer_s=50.0)

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import threading
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from processes import within
+from processes import within as in_time
 
-from serving import Mode, Sample
+from serving import Controller, Mode, Sample, VirtualClock
 from serving.journal import JournalReader
-from serving.loop import Command
+from serving.loop import Command, within
 from serving.opcua.endpoint import Values
 from serving.opcua.settings import Nodes, Server
 from serving.station import station
@@ -26,7 +29,6 @@ from serving.station.station import Station
 from serving.station.views import state
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
-SPEED = 50.0  # 0.5 s periods in 0.01 s
 NODES: dict[str, Any] = {"pv": {"C_A": "ns=2;s=a", "T": "ns=2;s=b"}, "mv": {"T_j": "ns=2;s=c"}}
 
 
@@ -60,6 +62,7 @@ class Plant:
 @pytest.fixture
 def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Station, Any]]:
     monkeypatch.setattr(station, "OpcUaEndpoint", Plant)
+    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
     monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
 
     def make(start: str, **changed: Any) -> tuple[Station, Any]:
@@ -70,7 +73,6 @@ def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..
                 server,
                 Nodes(**NODES),
                 start=start,  # type: ignore[arg-type]
-                speed=SPEED,
                 hold=Hold(recover_after=2),
                 journal=JournalSettings(tmp_path / "loop.journal"),
                 **changed,
@@ -94,7 +96,7 @@ def test_a_loop_that_is_ended_while_it_waits_for_a_pv_writes_nothing(
     plant.shows(250.0, "PV T: Bad")
     thread = threading.Thread(target=made.run)
     thread.start()
-    assert not within(0.2, lambda: made.scans > 0)
+    assert not in_time(0.2, lambda: made.scans > 0)
     made.end()
     thread.join(20)
     assert not thread.is_alive()
@@ -152,3 +154,43 @@ def test_a_shadow_without_first_values_takes_no_middle_for_the_mv(
     made.run(8)
     assert shown[:5] == [(Mode.SHADOW, None)] * 5
     assert plant.written == [310.0] * 3
+
+
+def test_a_set_point_of_the_plants_side_outside_its_range_takes_no_other_one_with_it(
+    make_station: Callable[..., tuple[Station, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, _ = make_station("SHADOW")
+    a = made.manifest.sp[0]
+    signals = tuple(replace(a, name=name) for name in ("one", "two", "three"))
+    monkeypatch.setattr(Station, "manifest", property(lambda _: SimpleNamespace(sp=signals)))
+
+    class Loop:
+        points = np.array([0.1, 0.2, 0.3])
+
+        @property
+        def sp(self) -> np.ndarray:
+            return self.points.copy()
+
+        def set_sp(self, wanted: Any) -> None:
+            self.points = within(wanted, signals, "set point")
+
+    loop: Any = Loop()
+    made._set_points(loop, {"one": 0.5, "two": 99.0, "three": 0.7})
+    assert loop.sp.tolist() == [0.5, 0.2, 0.7]
+    made.journal.close()
+    said = events(made)
+    assert [line.split(" (")[0] for line in said] == [
+        f"plant: set point one 0.5 {a.unit}",
+        f"plant: refused: set point two 99 {a.unit}",
+        f"plant: set point three 0.7 {a.unit}",
+    ]
+
+
+def test_a_controller_that_is_tried_lies_beside_the_one_in_charge(
+    make_station: Callable[..., tuple[Station, Any]], tmp_path: Path
+) -> None:
+    made, _ = make_station("SHADOW")
+    shutil.copy(PID, tmp_path / "elsewhere.onnx")
+    assert made._opened("pid.onnx", None).path == PID
+    made.loop = SimpleNamespace(controller=Controller(tmp_path / "elsewhere.onnx"))  # type: ignore[assignment]
+    assert made._opened("elsewhere.onnx", None).path == tmp_path / "elsewhere.onnx"
