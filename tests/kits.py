@@ -11,13 +11,14 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
+from shipped_files import SHIPPED
+
 from serving import Controller
 from serving.conformance.check import Verdict, check
 from serving.conformance.kit import VECTORS, write_kit
 
 ROOT = Path(__file__).resolve().parents[1]
 EMBED = ROOT / "examples" / "embed"
-SHIPPED = sorted((ROOT / "artifacts").glob("*/*.onnx"))
 CASES = sorted({file.parent for file in SHIPPED})
 # Of each case its first and its last file: different laws.
 SOME = [file for case in CASES for file in sorted({min(case.glob("*.onnx")), max(case.glob("*.onnx"))})]

@@ -11,12 +11,13 @@ from asyncua import ua
 from serving.errors import EndpointError
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
-from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, words
+from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, Reading, words
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point, Server
 from serving.words import first_line
 
 WRITABLE = 2  # the second bit of an access level
+MAY = {True: "yes", False: "no", None: "?"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,8 @@ async def _inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[F
     link = await Link.opened(server)
     try:
         plan = Plan(nodes, manifest)
-        rows = [(name, p.read_back or p.node, p, judged) for name, p, judged in plan.points]
+        # A watchdog that cannot be read counts as dead, though no sample is judged by its quality.
+        rows = [(name, p.read_back or p.node, p, judged or name == "watchdog") for name, p, judged in plan.points]
         rows += [(f"MV {s.name}, written", p.node, p, True) for s, p in zip(manifest.mv, plan.mv_points, strict=True)]
         found = []
         for name, node, point, judged in rows:
@@ -57,6 +59,8 @@ async def _inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[F
         ):
             if node:
                 found.append(await _one(link, manifest, server, f"{name}, written", node, Point(node), True))
+        if nodes.lease:
+            found.append(await _lease(link, server, nodes.lease))
         return [*found, *_certificates(link, server)]
     finally:
         await link.close()
@@ -73,25 +77,56 @@ def _certificates(link: Link, server: Server) -> list[Found]:
     return rows
 
 
+async def _lease(link: Link, server: Server, node: str) -> Found:
+    """The text node by which loops on different machines find each other: without it no MV is written."""
+    name = "lease, written"
+    try:
+        reading, writable = await _read(link, server, node)
+    except EndpointError as error:
+        return Found(name, node, wrong=first_line(error))
+    kind = reading.kind.name if reading.kind is not None else "-"
+    wrong = ""
+    if reading.quality == BAD:
+        wrong = _bad(reading, node)
+    elif reading.kind is not ua.VariantType.String:
+        wrong = f"its type {kind} holds no text; it must be a String"
+    elif writable is False:
+        wrong = "it may not be written by this user"
+    owner = reading.words_held.partition(" ")[0]
+    note = f"{owner} has the plant, or had it last" if owner else ""
+    quality = "Good" if reading.quality == GOOD else words(reading.status)
+    return Found(name, node, kind, owner or "-", quality=quality, writable=MAY[writable], wrong=wrong, note=note)
+
+
+async def _read(link: Link, server: Server, node: str) -> tuple[Reading, bool | None]:
+    """What a node holds, and whether this user may write it; None: the server does not say."""
+    (at,) = await link.resolved([node], server.connect_s)
+    (reading,) = await link.read([at], server.connect_s)
+    (access,) = await link.values([at], server.connect_s, ua.AttributeIds.UserAccessLevel)
+    level = access.Value.Value if access.Value is not None else None
+    return reading, bool(level & WRITABLE) if isinstance(level, int) else None
+
+
+def _bad(reading: Reading, node: str) -> str:
+    unknown = words(reading.status) == "BadNodeIdUnknown"
+    return f"its quality is {words(reading.status)}" + (f"; the server has no node {node}" if unknown else "")
+
+
 async def _one(
     link: Link, manifest: Manifest, server: Server, name: str, node: str, point: Point, judged: bool
 ) -> Found:
     try:
         (at,) = await link.resolved([node], server.connect_s)
-        (reading,) = await link.read([at], server.connect_s)
-        (access,) = await link.values([at], server.connect_s, ua.AttributeIds.UserAccessLevel)
+        reading, writable = await _read(link, server, node)
     except EndpointError as error:
         return Found(name, node, wrong=first_line(error))
     kind = reading.kind.name if reading.kind is not None else "-"
-    level = access.Value.Value if access.Value is not None else None
-    writable = bool(level & WRITABLE) if isinstance(level, int) else None
     number = point.scale * reading.number + point.offset
     age = "-" if reading.source_s is None else f"{time.time() - reading.source_s:.3g} s"
     signal = _signal(manifest, name)
     wrong = ""
     if reading.quality == BAD or (reading.quality == UNCERTAIN and server.uncertain == "fault"):
-        unknown = words(reading.status) == "BadNodeIdUnknown"
-        wrong = f"its quality is {words(reading.status)}" + (f"; the server has no node {node}" if unknown else "")
+        wrong = _bad(reading, node)
     elif reading.text:
         wrong = f"it holds {reading.text}"
     elif name.endswith(", written") and reading.kind not in {*FLOATS, *INTEGERS, ua.VariantType.Boolean}:
@@ -105,11 +140,10 @@ async def _one(
     if signal is not None:
         wrong, note = wrong or other_unit(unit, point, signal), _other_range(limits, point, signal)
     quality = "Good" if reading.quality == GOOD else words(reading.status)
-    may = {True: "yes", False: "no", None: "?"}[writable]
     if not judged:
         wrong, note = "", "; ".join(filter(None, (wrong, note)))
     shown = "-" if reading.text else f"{number:.6g}"
-    return Found(name, node, kind, shown, unit, quality, age, limits, may, wrong, note)
+    return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note)
 
 
 def _signal(manifest: Manifest, name: str) -> Signal | None:

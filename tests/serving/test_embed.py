@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kits import DAMAGES, OLD, kit_of, spoilt, verdict_on
+from shipped_files import SHIPPED
 
 from pipeline.export.gate import export
 from pipeline.laws import ControlLaw
@@ -41,9 +42,6 @@ def test_both_examples_give_the_controllers_bits(make_law: object, name: str, tm
     first = controller.step(sp=0.5, pv=[0.0, 200.0], mv_applied=0.0, state=controller.cold_state())
     assert ast.literal_eval(ours.partition("] ")[0] + "]") == first.mv.tolist()
     assert np.isfinite(first.mv).all()
-
-
-SHIPPED = sorted((ROOT / "artifacts").glob("*/*.onnx"))
 
 
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")

@@ -15,13 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
+from shipped_files import SHIPPED
 
 from serving import ArtifactError
 from serving.graph_audit import audit, graph_values
 from serving.graph_work import MAX_WORK, RULES
 from serving.onnx_bytes import SCHEMA, read_model
 
-SHIPPED = sorted((Path(__file__).resolve().parents[2] / "artifacts").glob("*/*.onnx"))
 by_name = pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
 
 

@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from serving.journal.packing import packed, unpacked
 from serving.journal.reader import EVENT
 from serving.journal.rotation import LEAST_EVENTS, SLACK, shorten_events
 from serving.journal.writer import BLOCK, FRESH
+from serving.page import metrics
+from serving.station.recorder import Recorder
 
 pytest_plugins = ["small_laws"]
 
@@ -359,7 +362,7 @@ EVENTS = st.lists(
 
 
 @given(EVENTS, st.integers(1, 40))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_the_same_alarms_are_active_before_and_after_the_oldest_events_went(
     given: list[tuple[str, bool, int]], most: int
 ) -> None:
@@ -381,3 +384,22 @@ def rotated(given: list[tuple[str, bool, int]], most: int) -> tuple[list[int], l
     after = [e.id for e in reader.active()]
     base.close()
     return before, after
+
+
+def test_a_trial_that_begins_anew_at_each_scan_is_told_once(tmp_path: Path, controller: Controller) -> None:
+    """Its reason holds a number that changes."""
+    journal, said = Journal(tmp_path / "loop.journal"), list[str]()
+    recorder = Recorder(journal, said.append)
+    successor = SimpleNamespace(reason="", controller=controller)
+    for k in range(100):
+        successor.reason = f"PV T = {400 + k / 7:.4g} is outside its range"
+        recorder._tried(SimpleNamespace(successor=successor))  # type: ignore[arg-type]
+    journal.close()
+    assert len(said) == 1
+
+
+def test_the_metrics_tell_what_the_journal_lost() -> None:
+    about = {"card": {"law": "pi", "case": "tank", "sha256": "0", "file": "pi.onnx"}, "info": [],
+             "signals": {name: [] for name in ("sp", "pv", "mv", "dv")}}  # fmt: skip
+    state = {"alive": True, "mode": "AUTO", "time": 1.0, "journal": "", "journal_lost": 32}
+    assert "loopwright_journal_lost_total 32.0" in metrics.text(about, state).splitlines()

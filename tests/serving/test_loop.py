@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shipped_files import SHIPPED
 
 import serving.grid
 import serving.loop
@@ -273,7 +274,6 @@ def test_simulated_endpoint_steps_the_plant_at_each_write() -> None:
 
 
 # ---------------------------------------------------------------------- the range, whatever comes
-SHIPPED = sorted((Path(__file__).parents[2] / "artifacts").glob("*/*.onnx"))
 
 
 @functools.cache

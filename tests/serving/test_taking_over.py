@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shipped_files import SHIPPED
 
 from pipeline.cases import CASES
 from pipeline.export.gate import export
@@ -18,8 +19,6 @@ from serving.transfer import Transfer
 
 pytest_plugins = ["small_laws"]
 PERIOD = 0.5
-# A clone also holds the controllers of plants of its own, which have no case.
-SHIPPED = sorted(p for p in (Path(__file__).parents[2] / "artifacts").glob("*/*.onnx") if p.parent.name in CASES)
 by_name = pytest.mark.parametrize("path", SHIPPED, ids=lambda p: f"{p.parent.name}-{p.stem}")
 
 

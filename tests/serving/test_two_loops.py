@@ -17,6 +17,7 @@ from asyncua import Client
 from plant_servers import Plant, RunningLoop
 from processes import within
 
+from pipeline.__main__ import main
 from serving import Mode
 from serving.errors import LoopError
 from serving.opcua.lease import SCANS, NodeLease
@@ -105,6 +106,32 @@ def test_the_second_loop_holds_until_the_first_is_gone(
     finally:
         first.station.end()
         second.end()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wrong"),
+    [
+        ("Lease", "Lease", ""),
+        ("Control.Lease", "Control.NoLease", "its quality is BadNodeIdUnknown; the server has no node"),
+        ("Control.Lease", "PV.T", "its type Double holds no text; it must be a String"),
+        (
+            "[nodes]",
+            '[nodes]\nwatchdog = "nsu=urn:loopwright:plant;s=NoDog"',
+            "watchdog: its quality is BadNodeIdUnknown",
+        ),
+    ],
+)
+def test_a_check_tells_of_a_lease_or_a_watchdog_that_would_stop_the_loop(
+    plant: Plant, tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, wrong: str
+) -> None:
+    path = tmp_path / "loop.toml"
+    path.write_text(LOOP.format(pid=PID, start="AUTO", endpoint=plant.endpoint).replace(old, new))
+    lease(plant, "")
+    assert main(["loop", "check", str(path)]) == (2 if wrong else 0)
+    said = capsys.readouterr()
+    assert "lease, written" in said.out
+    assert wrong in said.err
+    assert ("nothing would stop the loop" in said.out) is (not wrong)
 
 
 def test_a_lease_of_a_loop_that_was_killed_is_taken_over(
