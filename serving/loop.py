@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf, isnan, nan
@@ -87,7 +88,8 @@ class ControlLoop:
 
     A command that did not reach the plant (``unwritten``) leaves it unknown where the MV stands: others may move it
     meanwhile. The next read-back tells, also that of a sample which is refused for another reason. HOLD, MANUAL and
-    the fallback go on from there, and nothing writes an old MV over it.
+    the fallback go on from there, and nothing writes an old MV over it. Where the MV then stands outside its range,
+    nothing is written until it is back.
 
     Every written MV lies in its range, in every mode and with any guards; a discrete MV has one
     of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
@@ -259,7 +261,10 @@ class ControlLoop:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         reason = self._refusal(sample)
         self._blind = ""
-        self._stands(sample, refused=bool(reason))
+        left = self._stands(sample, refused=bool(reason))
+        if left:
+            words = left if reason in {None, left} else f"{reason}; {left}"
+            return self._missed(f"{words}: nothing is written before it is back")
         if reason:
             return self._missed(reason)
         applied = self._mv
@@ -276,7 +281,7 @@ class ControlLoop:
                 self._mv = applied
             return self._missed(first_line(error))
         self._state = step.state
-        if self._fault:
+        if self._fault and not self._handing_back():  # once asked, the plant's own controller may have it already
             self._good += 1
             if self.recover_after is not None and self._good >= self.recover_after:
                 self.set_mode(Mode.AUTO)
@@ -341,6 +346,9 @@ class ControlLoop:
         since = (self._held - 1) * self.controller.manifest.period_s
         return bool(self._fault) and self.fallback is not None and since >= self.fallback.after_s
 
+    def _handing_back(self) -> bool:
+        return self._overdue() and self.fallback is not None and self.fallback.hand_back
+
     def _beside(self, sample: Sample, applied: Array, past: Collection[Sample]) -> Array | None:
         """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
         if self.successor is None:
@@ -386,34 +394,45 @@ class ControlLoop:
                 return np.clip(applied, lows, highs)
         return applied
 
-    def _stands(self, sample: Sample, *, refused: bool) -> None:
+    def _stands(self, sample: Sample, *, refused: bool) -> str:
         """Where the MV stands, as far as the sample tells: ``found`` where that was not known.
 
-        A refused sample without a read-back tells nothing; a good one says that nothing is read back at all.
+        A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where that
+        was not known and the MV stands outside its range, somebody has moved it there: why it is left there.
         """
         self._standing.commanded(self._given)
         self.found = None
         try:
             given = sample.mv_applied
             if given is not None and np.asarray(given).dtype.kind not in "fiu":
-                return
+                return ""
             applied = None if given is None else self._read_back(sample)
         except Exception:  # no sample, or no MV that any actuator can have
-            return
+            return self._left(sample) if self._standing.lost else ""
         if applied is not None:
             self.found = self._standing.seen(applied)
         elif not refused:
             self._standing.lost = False
         if self.found is not None:
             self._mv = self.found.copy()
+        return ""
+
+    def _left(self, sample: Sample) -> str:
+        """Why the MV is left where it stands: the plant has one that the loop may not command."""
+        with suppress(Exception):  # no sample, or no MV at all
+            applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
+            if applied.shape == self._mv.shape and np.isfinite(applied).all():
+                reason = implausible(self.controller.manifest.mv, applied.tolist()) or ""
+                if reason:
+                    self._mv = np.full(len(applied), nan)
+                return reason
+        return ""
 
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
         self._given = self._mv.copy()
-        hand_back = self._overdue() and self.fallback is not None and self.fallback.hand_back
-        return Command(
-            self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, hand_back
-        )
+        back = self._handing_back()
+        return Command(self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, back)
 
     # ------------------------------------------------------------------ running
     def run(

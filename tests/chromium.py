@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from fake_loop import FakeLoop
-
 if TYPE_CHECKING:
+    from fake_loop import FakeLoop
     from playwright.sync_api import Browser, Page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@contextmanager
+def launched() -> Iterator[Browser]:
+    """The browser until the block ends."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as p:
+        # Containers have no user namespaces; the pages are our own.
+        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield made
+        made.close()
 
 
 def come_in(browser: Browser, served: tuple[FakeLoop, str, str], **how: object) -> Page:
     """A new page that shows all there is, with the token at hand."""
     from playwright.sync_api import expect
 
-    made = browser.new_page(locale="en-GB", timezone_id="UTC", **how)  # type: ignore[arg-type]
+    made = browser.new_page(**{"locale": "en-GB", "timezone_id": "UTC", **how})  # type: ignore[arg-type]
     made.set_default_timeout(20_000)
     made.goto(served[1])
     expect(made.locator("#alarm-list .alarm").first).to_be_visible()

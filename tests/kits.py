@@ -84,18 +84,36 @@ def a_start_without_information(vectors: dict[str, Any]) -> None:
     row["mv"] = vectors["scans"][4]["mv"]
 
 
+def an_old_mv_written_over_a_new_one(vectors: dict[str, Any]) -> None:
+    """The loop seems to hold its old MV after a command that did not arrive, though somebody has moved it."""
+    k, row = next((k, row) for k, row in enumerate(vectors["scans"]) if row["unwritten"])
+    assert row["mv"] == row["sample"]["mv_applied"] != vectors["scans"][k - 1]["mv"]
+    row["mv"] = vectors["scans"][k - 1]["mv"]
+
+
+def as_version_2(vectors: dict[str, Any]) -> None:
+    """The kit as it was: every command arrives."""
+    scans = vectors["scans"]
+    vectors["kit"], vectors["scans"] = 2, scans[: next(k for k, row in enumerate(scans) if row["unwritten"])]
+    for row in vectors["scans"]:
+        del row["unwritten"]
+
+
 def as_version_1(vectors: dict[str, Any]) -> None:
-    """The kit as it was: its loop is told where the MV stands, and holds it from the first scan on."""
+    """The kit before that: its loop is told where the MV stands, and holds it from the first scan on."""
+    as_version_2(vectors)
     vectors["kit"], stands = 1, vectors["scans"][4]["mv"]
     vectors["loop"]["mv"] = stands
     for row in vectors["scans"][:4]:
         row["mv"] = stands
 
 
+OLD = {1: as_version_1, 2: as_version_2}
 DAMAGES = {
     "mv": another_mv,
     "state": another_state,
     "refusal": no_refusal,
     "mode": another_mode,
     "start": a_start_without_information,
+    "moved": an_old_mv_written_over_a_new_one,
 }

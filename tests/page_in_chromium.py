@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from chromium import CHROMIUM, come_in
+from chromium import come_in
 from fake_loop import BEGIN, THIRDS, FakeLoop, opened
 
 from serving import Controller
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
+
+
+pytest_plugins = ["browser_of_tests"]
 
 
 @pytest.fixture(scope="module")
@@ -39,17 +42,6 @@ def loop(served: tuple[FakeLoop, str, str]) -> Iterator[FakeLoop]:
     made.about = json.loads(about)
     made.state.clear()
     made.state.update(state)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as p:
-        # Containers have no user namespaces; the page is our own.
-        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield made
-        made.close()
 
 
 @pytest.fixture

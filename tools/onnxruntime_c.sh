@@ -1,14 +1,24 @@
 #!/usr/bin/env bash
-# Makes FOLDER/include and FOLDER/lib for examples/embed/c, without a network: the header that the package ships, and the
-# library of the Python package onnxruntime, which is installed already. Any release of the library serves a header that
-# is no newer. A person may unpack a release archive of onnxruntime instead.
+# onnxruntime_c.sh FOLDER: makes FOLDER/include and FOLDER/lib for examples/embed/c, without a network: the header that
+# the package ships, and the library of the Python package onnxruntime, which is installed already. Any release of the
+# library serves a header that is no newer. A person may unpack a release archive of onnxruntime instead.
 set -euo pipefail
-cd "$(dirname "$0")/.."
-mkdir -p "$1/lib" "$1/include"
+folder=${1:?"name the folder to make: onnxruntime_c.sh FOLDER"}
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 python=${PYTHON:-python3}
 
-library=$("$python" -c 'import onnxruntime, pathlib; print(*sorted(pathlib.Path(onnxruntime.__file__).parent.glob("capi/libonnxruntime.so.*")))')
-test -f "$library" || { echo "the Python package onnxruntime has no libonnxruntime.so: $library" >&2; exit 1; }
-ln -sf "$library" "$1/lib/libonnxruntime.so.1"
-ln -sf libonnxruntime.so.1 "$1/lib/libonnxruntime.so"
-cp pipeline/hosts/c/onnxruntime/onnxruntime_c_api.h "$1/include/"
+library=$("$python" -c '
+import importlib.util, pathlib
+found = importlib.util.find_spec("onnxruntime")
+print(*sorted(pathlib.Path(found.origin).parent.glob("capi/libonnxruntime.so.*")) if found and found.origin else [])
+')
+test -n "$library" || {
+  echo "onnxruntime_c.sh: $python has no package onnxruntime with a libonnxruntime.so; \`$python -m pip install onnxruntime\`" \
+    "brings it, and PYTHON=... names another Python" >&2
+  exit 1
+}
+test -f "$library" || { echo "onnxruntime_c.sh: the package onnxruntime has several libraries: $library" >&2; exit 1; }
+mkdir -p "$folder/lib" "$folder/include"
+ln -sf "$library" "$folder/lib/libonnxruntime.so.1"
+ln -sf libonnxruntime.so.1 "$folder/lib/libonnxruntime.so"
+cp "$root/pipeline/hosts/c/onnxruntime/onnxruntime_c_api.h" "$folder/include/"

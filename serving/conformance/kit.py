@@ -17,7 +17,9 @@ from serving.controller import Controller, runtime_version
 from serving.errors import LoopwrightError
 from serving.guard import READ_BACK_MARGIN, InRange, Sample
 
-KIT = 2  # version of the format; 1 began its scans at an MV that was told, so it shows nothing of a start without one
+# Version of the format. 1 began its scans at an MV that was told, so it shows nothing of a start without one; up to 2
+# every command arrived, so it shows nothing of what follows one that did not.
+KIT = 3
 VECTORS = "vectors.json"
 TOLERANCE = 1e-6  # share of an entry's scale
 PASS = (
@@ -31,6 +33,9 @@ PASS = (
     "A scan is one period of the loop around the controller. Mode and fault must be equal, mv as above. "
     "sample = null: the plant could not be read. mv_applied = null: there is no read-back. "
     "missed: so many periods passed before the scan without one.",
+    "unwritten = true: the command of the scan before did not reach the plant; your loop learns it before this scan. "
+    "Somebody may have moved the MV: the next sound read-back is where it stands, also by hand and in a sample that is "
+    "refused for another reason. Without any read-back the MV before that command stays.",
     "The loop is not told where the MV stands (loop: mv = null). Until a good sample has a read-back, nothing may be "
     "written (mv = null); that read-back is where the loop begins. Only then a fault holds the last MV.",
     "Every number is a hexadecimal float as C's printf writes it with %a and strtod reads it, or nan, inf, -inf.",
@@ -113,6 +118,7 @@ def _scan_row(row: Scanned) -> dict[str, Any]:
     return {
         "what": scan.what,
         "set_mode": None if scan.set_mode is None else str(scan.set_mode),
+        "unwritten": scan.unwritten,
         "missed": scan.missed,
         "sample": None if scan.sample is None else _sample_row(scan.sample),
         "mode": str(command.mode),

@@ -28,12 +28,14 @@ class Scan:
     """What happens before and at one scan. ``sample`` None: the plant cannot be read.
 
     ``set_mode`` is what the operator sets before it, ``missed`` the periods that passed without a scan before it.
+    ``unwritten``: the command of the scan before did not reach the plant.
     """
 
     what: str
     sample: Sample | None
     set_mode: Mode | None = None
     missed: int = 0
+    unwritten: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +94,15 @@ def scanned(controller: Controller) -> list[Scanned]:
     )
     course, stands, done = _Course(controller.manifest), actuators(controller.manifest), []
     scans = _scans(controller.manifest, course.sample(stands))
-    scan = next(scans)
+    scan, before = next(scans), loop.mv
     while True:
         if scan.set_mode is not None:
             loop.set_mode(scan.set_mode)
+        if scan.unwritten:
+            loop.unwritten(before, "the plant cannot be written")
         if scan.missed:
             loop.gap(scan.missed)
+        before = loop.mv
         command = loop.miss("the plant cannot be read") if scan.sample is None else loop.scan(scan.sample)
         done.append(Scanned(scan, command))
         stands = command.mv if command.writes else stands
@@ -142,7 +147,33 @@ def _scans(m: Manifest, good: Sample) -> Generator[Scan, Sample, None]:
     good = yield Scan("two faults in a row", None)
     good = yield Scan("a good sample between faults", good)
     good = yield Scan("a fault while it recovers", None)
-    yield from some(recovery + 2, "the last recovery")
+    yield from some(recovery + 2, "after a fault while it recovers")
+    good = yield Scan("a command did not arrive, and the MV was moved", _moved(m, good), unwritten=True)
+    yield from some(recovery, "after an MV that was moved")
+    no_pv = _with(_moved(m, good), "pv", 0, nan)
+    good = yield Scan("a command did not arrive, the MV was moved, and a PV is not finite", no_pv, unwritten=True)
+    yield from some(recovery, "after an MV that was moved")
+    good = yield Scan(
+        "a command did not arrive, and there is no read-back", replace(good, mv_applied=None), unwritten=True
+    )
+    yield from some(recovery, "after a command that did not arrive")
+    good = yield Scan("by hand again", good, set_mode=Mode.MANUAL)
+    good = yield Scan("by hand a command did not arrive, and the MV was moved", _moved(m, good), unwritten=True)
+    yield from some(2, "by hand again")
+    good = yield Scan("back to AUTO", good, set_mode=Mode.AUTO)
+    yield from some(2, "the last samples")
+
+
+def _moved(m: Manifest, good: Sample) -> Sample:
+    """The sample after somebody has moved each MV far from where it stood."""
+    assert good.mv_applied is not None
+    to = [
+        (s.low + (0.8 if at < s.middle else 0.2) * (s.high - s.low))
+        if s.values is None
+        else next((v for v in s.values if v != at), at)
+        for s, at in zip(m.mv, np.asarray(good.mv_applied).tolist(), strict=True)
+    ]
+    return replace(good, mv_applied=np.array(to, dtype=np.float64))
 
 
 def _doubtful(m: Manifest) -> Iterator[tuple[str, _Spoil]]:

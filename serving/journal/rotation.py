@@ -8,12 +8,12 @@ EVENT_SHARE, EVENT_BYTES = 0.05, 400  # of the size for scans; of an event with 
 LEAST_EVENTS = 1_000
 SLACK = 0.1  # of the events, by which there may be more until some go
 
-# Alarms that are active, and the newest that nobody has acknowledged; with them their ends and acknowledgments.
+# Of each alarm its newest event, which says whether it is active; and the newest alarms that nobody has acknowledged.
+# With them their ends and acknowledgments.
 KEPT = (
     "create temp table if not exists kept (id integer primary key)",
     "delete from kept",
-    """insert into kept select e.id from event e where e.raised
-        and not exists (select 1 from event n where n.alarm = e.alarm and n.id > e.id)""",
+    "insert into kept select max(id) from event where alarm != '' group by alarm",
     """insert or ignore into kept select e.id from event e where e.raised
         and not exists (select 1 from event a where a.about = e.id) order by e.id desc limit :unseen""",
     """insert or ignore into kept select n.id from (
@@ -44,7 +44,7 @@ def shorten_scans(base: sqlite3.Connection, max_bytes: float) -> None:
 def shorten_events(base: sqlite3.Connection, most: int) -> None:
     """Drop the oldest events beyond ``most``.
 
-    Alarms that are active stay; of those that are over and not acknowledged, as many as are half of ``most``.
+    Which alarms are active stays; of those that are over and not acknowledged, as many as are half of ``most``.
     """
     (count,) = base.execute("select count(*) from event").fetchone()
     if count <= most * (1 + SLACK):

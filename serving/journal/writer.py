@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import sqlite3
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import astuple
+from itertools import groupby, islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from serving.errors import LoopError
 from serving.journal.entries import Event, Scan, columns
-from serving.journal.file import opened
+from serving.journal.file import locked, opened
 from serving.journal.packing import packed
 from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
 from serving.manifest import Manifest
@@ -24,7 +29,7 @@ from serving.words import named
 FLUSH_S = 0.25  # so much is lost at most when the process dies
 BLOCK = 600  # scans that are packed together
 FRESH = 1200  # the last scans, a row each
-WAITING = 200_000  # scans that wait in memory while the disk takes none
+WAITING = 200_000  # scans and events that wait in memory while the disk takes none
 
 
 class Journal:
@@ -33,9 +38,10 @@ class Journal:
     The file is in WAL mode: a process that dies, whatever it was doing, leaves a whole file without its last
     ``FLUSH_S`` at most. With ``fsync`` "power loss" each write waits for the disk. Older scans are packed, and beyond
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
-    takes nothing, scans wait in memory, and ``trouble`` says why.
+    takes nothing, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are ``lost``, scans
+    before events; what a run is stays. Once the journal writes again, an alarm in it says how many they were.
 
-    Raises LoopError for a file that is no journal.
+    Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
 
     def __init__(
@@ -52,6 +58,11 @@ class Journal:
         self._most_events = self._events = most_events(self.max_bytes)  # written since the last look at how many
         self._queue = queue.SimpleQueue[Any]()
         self._base = opened(path, write=True, fsync=fsync)
+        try:
+            self._lock = locked(path)
+        except LoopError:
+            self._base.close()
+            raise
         self._closing = threading.Event()
         self._waiting: list[Any] = []
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
@@ -88,20 +99,24 @@ class Journal:
         self._queue.put(None)
         self._thread.join()
         self._base.close()
+        os.close(self._lock)
 
     # ------------------------------------------------------------------ the writer
     def _run(self) -> None:
-        run = 0
+        run = told = 0  # of what is lost, as much as stands in the journal
         while True:
             self._take()
             if not self._waiting and self._closing.is_set():
                 return
             try:
                 run = self._write(run)
+                lost, told = self.lost - told, self.lost
                 if self.trouble:
-                    self.tell("the journal writes again")
-                self.trouble = ""
-                self._waiting.clear()
+                    self.tell("the journal writes again" + (LOSS.format(lost) if lost else ""))
+                self.trouble, self._waiting = "", _loss(lost) if lost else []
+                if self._waiting:
+                    run = self._write(run)
+                    self._waiting.clear()
                 self._pack()
                 self._rotate()
             except Exception as error:
@@ -112,9 +127,17 @@ class Journal:
                 self.trouble = named(error)
                 if self._closing.is_set():
                     return
-                if len(self._waiting) > WAITING:
-                    self.lost += len(self._waiting) - WAITING
-                    del self._waiting[: len(self._waiting) - WAITING]
+                self._drop()
+
+    def _drop(self) -> None:
+        """Give up the oldest of what waits beyond ``WAITING``: scans, then events. Runs stay: scans need them."""
+        for kind in ("scan", "event"):
+            surplus = len(self._waiting) - WAITING
+            if surplus > 0:
+                old = list(islice((i for i, (k, _) in enumerate(self._waiting) if k == kind), surplus))
+                gone = set(old)
+                self._waiting = [item for i, item in enumerate(self._waiting) if i not in gone]
+                self.lost += len(old)
 
     def _take(self) -> None:
         """Wait for something to write, then gather for ``FLUSH_S``."""
@@ -164,13 +187,16 @@ class Journal:
             rows = self._base.execute(
                 "select id, run, time, mode, numbers, quality, reason from scan order by id limit ?", (BLOCK,)
             ).fetchall()
-            rows = [row for row in rows if row[1] == rows[0][1]]
+            # One run a block. Releases that let two loops write one journal left runs that alternate, and the ids of a
+            # block have no gap.
+            run = rows[0][1]
+            rows = next(list(same) for _, same in groupby(rows, key=itemgetter(1)))
             with self._base:
                 self._base.execute(
                     "insert into block values (?, ?, ?, ?, ?, ?)",
-                    (rows[0][0], rows[-1][0], rows[0][1], rows[0][2], rows[-1][2], packed(rows)),
+                    (rows[0][0], rows[-1][0], run, rows[0][2], rows[-1][2], packed(rows)),
                 )
-                self._base.execute("delete from scan where id <= ?", (rows[-1][0],))
+                self._base.execute("delete from scan where run = ? and id <= ?", (run, rows[-1][0]))
                 shorten_scans(self._base, self.max_bytes)
             count -= len(rows)
 
@@ -180,3 +206,16 @@ class Journal:
             self._events = 0
             with self._base:
                 shorten_events(self._base, self._most_events)
+
+
+LOSS = "; {} scans and events are lost that the disk did not take"
+
+
+def _loss(n: int) -> list[Any]:
+    """An alarm that is over and that somebody has to see."""
+    what = "the journal could not be written" + LOSS.format(n)
+    found = Event(time.time(), "fault", "journal", what, alarm="journal", raised=True)
+    return [
+        ("event", found),
+        ("event", Event(found.time_s, "fault", "journal", "over: it writes again", alarm="journal")),
+    ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from serving.manifest import Manifest
 from serving.monitor.beside import SQUARES, BesideModel
 from serving.monitor.chart import Chart
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from serving.monitor.squares import LEAST_SIGMA, log_mean_square, rms_ratio
 
 Array: TypeAlias = NDArray[np.float64]
 
-LEAST_SIGMA = 0.2  # of the logarithm of a block's mean square
 LEAST_SCORE = 1.0  # of a score: what white errors give
 
 
@@ -32,7 +32,16 @@ class Answers(Remembers):
     validation", IEEE Trans. Automatic Control 32 (1987) 583.
     """
 
-    KEPT = ("model", "blocks", "count", "told_square", "squares", "scores", "sizes", "shapes")
+    KEPT: ClassVar[Kept] = {
+        "model": ANY,
+        "blocks": COUNT,
+        "count": COUNT,
+        "told_square": SIZE,
+        "squares": SIZE,
+        "scores": ANY,
+        "sizes": ANY,
+        "shapes": ANY,
+    }
 
     def __init__(
         self, manifest: Manifest, *, block: int, model: int, learn: int, weekly: float, rate: float, told: bool = False
@@ -90,7 +99,7 @@ class Answers(Remembers):
                 squares = np.concatenate([self.model.square, self.told_square])
                 sigma = np.sqrt(np.maximum(squares, 1e-18))
                 scores = self.model.basis.T @ self.scores / (sigma * np.sqrt(self.count))
-                self.sizes.add(np.log(self.squares / self.count + 1e-18), time_s)
+                self.sizes.add(log_mean_square(self.squares, self.count), time_s)
                 self.shapes.add(scores.T.ravel(), time_s)
         self.drop()
 
@@ -100,7 +109,7 @@ class Answers(Remembers):
 
     def ratio(self, i: int) -> float:
         """The root mean square error of PV ``i`` of late over that of the time in which it learnt."""
-        return float(np.exp(self.sizes.shift(i) / 2))
+        return rms_ratio(self.sizes.shift(i))
 
     def changed(self, i: int) -> float | None:
         """Since when PV ``i`` answers otherwise [s since 1970]; None where it does not."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,8 @@ from serving.monitor.answers import Answers
 from serving.monitor.beside import ranges
 from serving.monitor.chart import Chart
 from serving.monitor.estimates import estimated
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import ANY, COUNT, Kept, Remembers
+from serving.monitor.pace import WEEK_S
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -23,7 +24,6 @@ SAME_LENGTH, SAME_RECIPE = 0.1, 0.02  # of the first one's scans, of a set point
 ALIKE = 3  # batches that make a plant one of batches: an operator who takes a loop by hand now and then makes none
 OTHERS = 5  # batches of another recipe in a row: it is the recipe now
 LEAST_SHIFT = 0.002  # of a range: less is not worth a word
-WEEK_S = 7 * 86_400.0
 FOREVER = 10**9  # scans: a block ends with its batch alone
 
 
@@ -35,7 +35,17 @@ class Batches(Remembers):
     normal. In a plant that runs on and on there are none, and nothing is computed.
     """
 
-    KEPT = ("length", "recipe", "alike", "others", "sums", "counts", "scans", "chart", "answers")
+    KEPT: ClassVar[Kept] = {
+        "length": COUNT,
+        "recipe": ANY,
+        "alike": COUNT,
+        "others": COUNT,
+        "sums": ANY,
+        "counts": COUNT,
+        "scans": COUNT,
+        "chart": ANY,
+        "answers": ANY,
+    }
 
     def __init__(self, manifest: Manifest, rate: float) -> None:
         m = manifest

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from serving.manifest import Manifest, Signal
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class BesideModel(Remembers):
     By recursive least squares, until ``freeze``. y are all PVs.
     """
 
-    KEPT = ("theta", "p", "scans", "square", "frozen")
+    KEPT: ClassVar[Kept] = {"theta": ANY, "p": ANY, "scans": COUNT, "square": SIZE, "frozen": ANY}
 
     def __init__(self, manifest: Manifest) -> None:
         m = manifest

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from math import log, sqrt
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import ANY, COUNT, POSITIVE, SIZE, TIME_S, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -58,31 +58,31 @@ class Chart(Remembers):
         Figures that are averaged to one.
     """
 
-    KEPT = (
-        "pool",
-        "doublings",
-        "weekly",
-        "sums",
-        "pooled",
-        "figures",
-        "count",
-        "mean",
-        "scatter",
-        "slack",
-        "limit",
-        "up",
-        "down",
-        "last",
-        "recent",
-        "off",
-        "offs",
-        "found",
-        "rises",
-        "began_s",
-        "since_s",
-    )
     RISE, RISES = 1.5, 4
     MOST = 0.5  # of the limit that one figure counts
+    KEPT: ClassVar[Kept] = {
+        "pool": (1, 10**9),
+        "doublings": (0, DOUBLINGS),
+        "weekly": POSITIVE,
+        "sums": ANY,
+        "pooled": COUNT,
+        "figures": ANY,
+        "count": COUNT,
+        "mean": ANY,
+        "scatter": POSITIVE,
+        "slack": SIZE,
+        "limit": POSITIVE,
+        "up": SIZE,
+        "down": SIZE,
+        "last": ANY,
+        "recent": ANY,
+        "off": ANY,
+        "offs": SIZE,
+        "found": (0, 1),
+        "rises": (0, RISES),
+        "began_s": TIME_S,
+        "since_s": TIME_S,
+    }
 
     def __init__(
         self, n: int, learn: int, *, weekly: float, rate: float, least: float = 0.0, both: bool = True, pool: int = 1

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import COUNT, SIGN, SIZE, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class Swing(Remembers):
     (2003) 91.
     """
 
-    KEPT = ("side", "since", "intervals", "largest", "amplitudes")
+    KEPT: ClassVar[Kept] = {"side": SIGN, "since": COUNT, "intervals": COUNT, "largest": SIZE, "amplitudes": SIZE}
 
     def __init__(self, band: float) -> None:
         self.band = band

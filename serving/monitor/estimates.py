@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from serving.monitor.chart import Chart
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from serving.monitor.squares import LEAST_SIGMA, log_mean_square
 
 Array: TypeAlias = NDArray[np.float64]
-
-LEAST_SIGMA = 0.2  # of the logarithm of a block's mean square
 
 
 def estimated(info: tuple[str, ...]) -> list[int]:
@@ -23,7 +22,7 @@ def estimated(info: tuple[str, ...]) -> list[int]:
 class Estimates(Remembers):
     """The mean square of each estimate over blocks of ``block`` scans: its logarithm goes into a chart."""
 
-    KEPT = ("sums", "count", "chart")
+    KEPT: ClassVar[Kept] = {"sums": SIZE, "count": COUNT, "chart": ANY}
 
     def __init__(self, info: tuple[str, ...], *, block: int, learn: int, weekly: float, rate: float) -> None:
         self.block = block
@@ -40,5 +39,5 @@ class Estimates(Remembers):
         self.sums = self.sums + info[self.places] ** 2
         self.count += 1
         if self.count >= self.block:
-            self.chart.add(np.log(self.sums / self.count + 1e-18), time_s)
+            self.chart.add(log_mean_square(self.sums, self.count), time_s)
             self.sums, self.count = np.zeros(len(self.places)), 0

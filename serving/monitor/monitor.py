@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from math import ceil, inf, isfinite
 from typing import Any, Self, TypeAlias
 
@@ -17,13 +18,15 @@ from serving.monitor.batches import Batches
 from serving.monitor.chart import Chart
 from serving.monitor.error import Swing, harris_index
 from serving.monitor.estimates import Estimates
+from serving.monitor.memory import TIME_S, number
 from serving.monitor.numbers import numbers
-from serving.monitor.pace import LEARN_S, dead_times, pooled, settle_scans
-from serving.monitor.plight import Plight
+from serving.monitor.pace import DAY_S, LEARN_S, WEEK_S, dead_times, pooled, settle_scans
+from serving.monitor.plight import AT_END, Plight
 from serving.monitor.residual import Foresight
 from serving.monitor.rest import RestMap
 from serving.monitor.shares import Share
-from serving.monitor.verdict import Verdict
+from serving.monitor.squares import log_mean_square
+from serving.monitor.verdict import Verdict, failed
 from serving.monitor.verdicts import verdicts
 
 Array: TypeAlias = NDArray[np.float64]
@@ -31,11 +34,9 @@ Array: TypeAlias = NDArray[np.float64]
 LEARN_RESTS, LEARN_MODEL, LEARN_BLOCKS = 300, 20, 40  # periods of rest, blocks of the model, blocks of a chart
 BLOCK = 10  # settling times: a block holds some moves of the set point
 FALSE_ALARMS = 0.25  # a week that are allowed to all charts together
-DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
 LEAST_DAY, MOST_DAY = 2_000, 200_000  # scans over which a share is taken
 BAND = 0.005  # of a set point's range: smaller errors are no swing
 HARRIS_SCANS = 500
-AT_END = 1e-6  # of the range
 NEAR_REST = 0.02  # of a set point's range: a mean error beyond is no rest
 
 
@@ -174,7 +175,7 @@ class Monitor:
         mean = self._e_sum / self._n
         if not self._ends and (np.abs(mean) <= NEAR_REST * self._sp_span).all():
             self.rest.add(np.array(self._sp), self._mv_sum / self._n, time_s)
-        self.spread.add(np.log(self._e2_sum / self._n / self._sp_span**2 + 1e-18), time_s)
+        self.spread.add(log_mean_square(self._e2_sum / self._sp_span**2, self._n), time_s)
         for i, window in enumerate(self._window):
             if len(window) == HARRIS_SCANS:
                 self.harris[i].add(harris_index(np.array(window), self.dead_time[i]))
@@ -204,12 +205,21 @@ class Monitor:
 
     # ------------------------------------------------------------------ what it says
     def verdicts(self) -> list[Verdict]:
-        """A plain line on each thing that is watched."""
-        return verdicts(self)
+        """A plain line on each thing that is watched. It never raises, and its figures are finite."""
+        try:
+            with np.errstate(all="ignore"):
+                found = verdicts(self)
+        except Exception as error:  # whatever was learnt, the loop's state is told
+            return [failed(f"{type(error).__name__}: {error}")]
+        return [replace(v, value=_finite(v.value), limit=_finite(v.limit)) for v in found]
 
     def numbers(self) -> dict[str, float]:
-        """What was measured, for those who draw it over months."""
-        return numbers(self)
+        """What was measured, for those who draw it over months. It never raises, and every number is finite."""
+        try:
+            with np.errstate(all="ignore"):
+                return numbers(self)
+        except Exception:  # ``verdicts`` says what fails
+            return {}
 
     # ------------------------------------------------------------------ over a restart
     PARTS = (
@@ -239,16 +249,34 @@ class Monitor:
         }
 
     @classmethod
-    def restored(cls, manifest: Manifest, state: dict[str, Any]) -> Self:
-        """The monitor that gave ``state``. ValueError, KeyError or TypeError where it is another controller's."""
-        made = cls(manifest, started_s=float(state["started_s"]))
-        if state["law"] != manifest.law or state["settle"] != made.settle:
+    def restored(cls, manifest: Manifest, state: Any) -> Self:
+        """The monitor that gave ``state``. ValueError where it is another controller's, or could be no monitor's."""
+        if not isinstance(state, dict) or not isinstance(parts := state.get("parts"), dict):
+            raise ValueError("what was learnt is no monitor's")
+        made = cls(manifest, started_s=number(state.get("started_s"), "started_s", TIME_S))
+        if state.get("law") != manifest.law or state.get("settle") != made.settle:
             raise ValueError("what was learnt is of another controller")
         for name in cls.PARTS:
-            part, kept = getattr(made, name), state["parts"][name]
-            if isinstance(part, list):
-                for one, memory in zip(part, kept, strict=True):
-                    one.recall(memory)
-            else:
+            part, kept = getattr(made, name), parts.get(name)
+            if not isinstance(part, list):
                 part.recall(kept)
+                continue
+            if not isinstance(kept, list) or len(kept) != len(part):
+                raise ValueError(f"what was learnt of {name} is not of {len(part)} signals")
+            for one, memory in zip(part, kept, strict=True):
+                one.recall(memory)
+        made._tried()
         return made
+
+    def _tried(self) -> None:
+        """ValueError where no verdict can be given: numbers that are each well may not go together."""
+        try:
+            with np.errstate(all="ignore"):
+                verdicts(self)
+                numbers(self)
+        except Exception as error:
+            raise ValueError(f"what was learnt gives no verdict: {type(error).__name__}: {error}") from None
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is None or isfinite(value) else None

@@ -8,7 +8,8 @@ from serving.manifest import Manifest
 
 SETTLE, LEAST_SETTLE, MOST_SETTLE = 100, 20, 2000  # scans
 DEAD, MOST_DEAD = 2, 200  # scans
-LEARN_S = 86_400.0  # that rests and blocks are learnt at least: loads of a fast plant need not be fast
+DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
+LEARN_S = DAY_S  # that rests and blocks are learnt at least: loads of a fast plant need not be fast
 NOISE = "_noise"  # how the names of the validation's tests with noise end
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from serving.manifest import Manifest
 from serving.monitor.beside import ranges
 from serving.monitor.chart import Chart
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from serving.monitor.squares import LEAST_SIGMA, log_mean_square, rms_ratio
 
 Array: TypeAlias = NDArray[np.float64]
-
-LEAST_SIGMA = 0.2  # of the logarithm of a block's mean square
 
 
 class Foresight(Remembers):
@@ -23,7 +22,7 @@ class Foresight(Remembers):
     The logarithm of each block's mean square goes into a chart upwards. ``told``: whether the law tells it at all.
     """
 
-    KEPT = ("sums", "count", "chart")
+    KEPT: ClassVar[Kept] = {"sums": SIZE, "count": COUNT, "chart": ANY}
 
     def __init__(self, manifest: Manifest, *, block: int, learn: int, weekly: float, rate: float) -> None:
         m = manifest
@@ -51,11 +50,11 @@ class Foresight(Remembers):
             self.sums = self.sums + error**2
             self.count += 1
             if self.count >= self.block:
-                self.chart.add(np.log(self.sums / self.count + 1e-18), time_s)
+                self.chart.add(log_mean_square(self.sums, self.count), time_s)
                 self.sums, self.count = np.zeros(self.n_cv), 0
         self._expected = None if info is None else info[self._places]
         return error
 
     def ratio(self, i: int) -> float:
         """The root mean square error of late over that of the time in which it learnt."""
-        return float(np.exp(self.chart.shift(i) / 2))
+        return rms_ratio(self.chart.shift(i))

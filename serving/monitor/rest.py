@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from serving.manifest import Signal
 from serving.monitor.chart import Chart
-from serving.monitor.memory import Remembers
+from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -31,7 +31,18 @@ class RestMap(Remembers):
     of the MV from one set point to another beside those of the map tell the plant's gain, whatever the load is.
     """
 
-    KEPT = ("theta", "p", "judged", "sxy", "sxx", "syy", "moves", "last", "last_phi", "chart")
+    KEPT: ClassVar[Kept] = {
+        "theta": ANY,
+        "p": ANY,
+        "judged": COUNT,
+        "sxy": ANY,
+        "sxx": SIZE,
+        "syy": SIZE,
+        "moves": SIZE,
+        "last": ANY,
+        "last_phi": ANY,
+        "chart": ANY,
+    }
 
     def __init__(
         self, sp: Sequence[Signal], mv: Sequence[Signal], *, learn: int, weekly: float, rate: float, pool: int = 1

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from serving.monitor.memory import Remembers
+from typing import ClassVar
+
+from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
 
 
 class Share(Remembers):
@@ -11,7 +13,7 @@ class Share(Remembers):
     share(k) = share(k-1) + (x(k) - share(k-1)) / min(k, memory)
     """
 
-    KEPT = ("value", "first", "count")
+    KEPT: ClassVar[Kept] = {"value": SIZE, "first": ANY, "count": COUNT}
 
     def __init__(self, learn: int, memory: int) -> None:
         self.learn, self.memory_scans = learn, memory

@@ -29,9 +29,14 @@ def unknown(name: str, text: str) -> Verdict:
     return Verdict(name, "not known yet", text)
 
 
+def failed(trouble: str) -> Verdict:
+    """The monitor itself has an error."""
+    return Verdict("monitor", "watch", f"the monitor itself failed: {trouble}")
+
+
 def when(time_s: float | np.floating[Any]) -> str:
-    """A time [s since 1970] as an operator reads it."""
-    return datetime.fromtimestamp(float(time_s), UTC).strftime("%d %b %H:%M UTC")
+    """A time [s since 1970] in UTC; the page writes what it finds in this form in the zone of its own clock."""
+    return datetime.fromtimestamp(float(time_s), UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def unit_of(s: Signal) -> str:

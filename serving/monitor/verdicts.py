@@ -20,12 +20,12 @@ A chart is a CUSUM whose limit follows from the false alarms a week that are all
 
 from __future__ import annotations
 
-from math import exp
 from typing import TYPE_CHECKING
 
 from serving.monitor.batches import PARTS
 from serving.monitor.residual import Foresight
-from serving.monitor.verdict import Level, Verdict, unit_of, unknown, when
+from serving.monitor.squares import rms_ratio
+from serving.monitor.verdict import Level, Verdict, failed, unit_of, unknown, when
 
 if TYPE_CHECKING:
     from serving.monitor.monitor import Monitor
@@ -41,11 +41,11 @@ RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a line
 
 
 def verdicts(m: Monitor) -> list[Verdict]:
-    """All of them."""
+    """All of them; whoever asks is to be ready for any error, for what was learnt came from a file."""
     parts = (_plight, _residual, _answers, _estimates, _batches, _rest, _variability, _swing, _shares)
     found = [verdict for part in parts for verdict in part(m)]
     if m.trouble:
-        found.append(Verdict("monitor", "watch", f"the monitor itself failed: {m.trouble}"))
+        found.append(failed(m.trouble))
     return found
 
 
@@ -118,7 +118,7 @@ def _estimates(m: Monitor) -> list[Verdict]:
             if not m.batches.known:
                 found.append(unknown(name, f"what the law corrects is still measured: {chart.done:.0%} done"))
             continue
-        ratio = exp(chart.shift(i) / 2)
+        ratio = rms_ratio(chart.shift(i))
         if chart.found[i]:
             text = f"what the law corrects of its model is {ratio:.2g} times that of the first days"
             found.append(Verdict(name, "watch", f"{text}, since {when(chart.since_s[i])}", ratio))
@@ -187,7 +187,7 @@ def _variability(m: Monitor) -> list[Verdict]:
             if not m.batches.known:
                 found.append(unknown(name, f"the error at rest is still measured: {drift.done:.0%} done"))
         elif drift.found[i]:
-            ratio = exp(drift.shift(i) / 2)
+            ratio = rms_ratio(drift.shift(i))
             text = f"the error at rest is {ratio:.2g} times that of the first days, since {when(drift.since_s[i])}"
             found.append(Verdict(name, "watch", text, ratio))
         else:
@@ -203,7 +203,7 @@ def _swing(m: Monitor) -> list[Verdict]:
     found = []
     drift = m.spread
     for i, (s, swing) in enumerate(zip(m.manifest.sp, m.swings, strict=True)):
-        r, quiet = swing.regularity(), exp(drift.mean[i] / 2) * (s.high - s.low)
+        r, quiet = swing.regularity(), rms_ratio(float(drift.mean[i])) * (s.high - s.low)
         loud = LOUD * quiet if drift.learnt else PLAIN * (s.high - s.low)
         if not drift.learnt and not m.batches.known and not (r > SWINGS and swing.amplitude() > loud):
             found.append(unknown(f"swing of {s.name}", "the error at rest is still measured"))

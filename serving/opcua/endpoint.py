@@ -19,7 +19,7 @@ from serving.errors import EndpointError, LoopError
 from serving.guard import Sample
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
-from serving.opcua.lease import NodeLease
+from serving.opcua.lease import LeaseRefusedError, NodeLease
 from serving.opcua.link import BAD, GOOD, UNCERTAIN, Link, Reading, variant, words
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
@@ -104,13 +104,16 @@ class OpcUaEndpoint:
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
         self.unwritten = ""  # why the last MV did not reach the plant
+        self._unbeaten = ""  # why the last heartbeat did not
+        self._told_lost = ""  # what was said of the connection since it was lost
         self.connections = self.starts = 0
         self._started_s: float | None = None  # when the server started, by its own clock
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
         self._beats, self._scans, self._next_s, self._wrote = 0, 0, 0.0, 0
         self._written: tuple[Array, float] | None = None  # the last MV that was passed on, and when
-        self._called = 0  # the scan of the last call to write
-        # Which connection has shown where the plant is (0: the present one has not), and which one `read` told of.
+        self._called = self._asked = 0  # the scans of the last calls to write and to hand_back
+        # Which connection has shown where the plant is (0: the present one has not, since a write failed if one did),
+        # and which one `read` told of.
         self._shown, self._told = 0, 0
         self.lease = NodeLease(self.period_s)
         self._handed_back, self._watched = False, (float("nan"), 0)
@@ -150,34 +153,39 @@ class OpcUaEndpoint:
         age = now - values.arrived_s + values.age_s
         if self.trouble and age > self.max_age_s:
             raise EndpointError(self.trouble)
-        # An MV of long ago is none that the plant has now; an old PV may come with a young MV.
-        mv = values.mv if now - values.arrived_s <= self.max_age_s else None
+        # An MV of long ago, or from before a write that failed, is none that the plant has now; an old PV may come with
+        # a young MV.
+        mv = values.mv if self._told and now - values.arrived_s <= self.max_age_s else None
         return Sample(values.pv, mv, values.dv, age * self.speed, values.fault)
 
     def write(self, mv: Array) -> None:
         """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection.
 
-        A connection that was made anew takes none before ``read`` has told where the MV stands.
+        A connection that was made anew takes none before ``read`` has told where the MV stands, and so does one on
+        which a write has failed. An MV that still waits for a slow answer is not lost: this one goes out in its place.
         """
+        now, before, self._called = self._scans, self._called, self._scans
+        if now - before > 1:
+            self.unwritten = ""  # of a time after which nothing was written: it says nothing of now
         refused = self.unwritten
         if self._link is None or self._shown == 0 or self._told != self._shown:
-            self.unwritten, self._written = "", None
-            raise EndpointError(self.trouble or refused or "not connected")
-        if not refused and self._stands(mv):
-            return
-        if self._outbox:
-            refused = refused or "the MV of the scan before is still on its way"
+            unread = "where the MV stands has not been read yet"
+            self._refuse(self.trouble or refused or ("not connected" if self._link is None else unread))
         if refused:
-            # The loop holds the MV before this one, so this one must not go out.
-            self.unwritten, self._written = "", None
-            raise EndpointError(refused)
-        self._outbox.append(np.array(mv))
-        self._stir()
+            self._refuse(refused)
+        if not self._stands(mv, now - before <= 1):
+            self._outbox.append(np.array(mv))
+            self._stir()
 
-    def _stands(self, mv: Array) -> bool:
-        """Whether this very MV was passed on less than ``rewrite_s`` ago, and at each scan since."""
-        now, last, mine = self.clock(), self._written, self._scans - self._called <= 1
-        self._called = self._scans
+    def _refuse(self, why: str) -> None:
+        """The loop holds the MV before this one, so neither this one may go out nor one that waits."""
+        self._outbox.clear()
+        self.unwritten, self._written = "", None
+        raise EndpointError(why)
+
+    def _stands(self, mv: Array, mine: bool) -> bool:
+        """Whether this very MV was passed on less than ``rewrite_s`` ago, and, as ``mine`` says, at each scan since."""
+        now, last = self.clock(), self._written
         young = last is not None and now - last[1] < self.server.rewrite_s / self.speed
         if mine and young and last is not None and np.array_equal(last[0], mv):
             self._wrote = self._scans  # the lease is still needed
@@ -189,8 +197,9 @@ class OpcUaEndpoint:
         """Ask the plant's own controller to take the plant; EndpointError until the server has confirmed it."""
         if self.nodes.hand_back is None:
             raise LoopError("nodes.hand_back is not set: the loop knows no node by which to hand the plant back")
-        if self._handed_back:
-            self._handed_back = False
+        confirmed, before, self._asked = self._handed_back, self._asked, self._scans
+        self._handed_back = False
+        if confirmed and self._scans - before <= 1:  # an older answer is to a request of before the loop wrote again
             return
         if self._link is not None:
             self._outbox.append(_HAND_BACK)
@@ -237,6 +246,7 @@ class OpcUaEndpoint:
                 self._written, self._shown = None, 0
                 self._link = link
                 pause = FIRST_RETRY_S
+                self._told_lost = ""
                 self.tell(f"connected to {self.server.endpoint}{anew}")
                 await self._exchange(link, plan)
             except Exception as error:
@@ -264,9 +274,10 @@ class OpcUaEndpoint:
         return ": it has started anew"
 
     def _lost(self, why: str) -> None:
-        if why != self.trouble:
+        """Say it once. A silent server has been the trouble for some scans already, and was not told as lost."""
+        if why != self._told_lost:
             self.tell(why)
-        self.trouble = why
+        self.trouble = self._told_lost = why
 
     async def _rest(self, seconds: float) -> None:
         """Wait; not longer than until the endpoint is closed."""
@@ -282,6 +293,7 @@ class OpcUaEndpoint:
         """Read and write until the connection is lost, which raises EndpointError, or the endpoint closed."""
         assert self._wake is not None
         ages, silent, read_at = Ages(len(plan.timed)), 0, -float("inf")
+        self._unbeaten = ""
         while not self._closed.is_set():
             now = self.clock()
             due = self._next_s if self._next_s > read_at else read_at + self.period_s
@@ -312,34 +324,45 @@ class OpcUaEndpoint:
 
     async def _send(self, link: Link, plan: Plan) -> None:
         """Write what waits. A server that refuses is a fault; one that does not answer loses the connection."""
-        last = self._outbox.popleft()
-        while self._outbox:
-            last = self._outbox.popleft()
+        last: Array | str | None = None
+        with suppress(IndexError):  # the loop may take out what waits
+            while True:
+                last = self._outbox.popleft()
+        if last is None:
+            return
         handing = isinstance(last, str)
         try:
             rows = [plan.hand_back()] if isinstance(last, str) else plan.variants(last)
         except EndpointError as error:
-            self.unwritten = first_line(error)
+            self._failed(first_line(error))
             return
         if plan.lease is not None:
             try:
                 await self.lease.take(link, plan.lease, self.answer_s)
             except EndpointError as error:
-                self.unwritten = first_line(error)
+                self._failed(first_line(error))
                 return
         self._wrote = self._scans
         try:
             statuses = await link.write(rows, self.answer_s)
         except EndpointError as error:
-            self.unwritten = first_line(error)
+            self._failed(first_line(error))
             raise
         names = ["hand_back"] if handing else plan.mv_names
         wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != GOOD]
-        self.unwritten = f"the server refuses {', '.join(wrong)}" if wrong else ""
+        if wrong:
+            self._failed(f"the server refuses {', '.join(wrong)}")
+        else:
+            self.unwritten = ""
         self._handed_back = handing and not wrong
         if ua.StatusCodes.BadTypeMismatch in statuses:
             # With the next connection all types are asked for anew.
             raise EndpointError(f"{self.unwritten}: a node's type has changed")
+
+    def _failed(self, why: str) -> None:
+        """A write did not arrive: only a reading that is asked for from now on tells where the MV stands."""
+        self._shown = 0
+        self.unwritten = why
 
     async def _lease(self, link: Link, node: ua.NodeId, answer: Reading) -> None:
         """Keep the lease while MVs are written, and let it go when they are not: a shadow needs none."""
@@ -347,14 +370,31 @@ class OpcUaEndpoint:
         if self.lease.held and self._scans - self._wrote > SILENT_SCANS:
             await self.lease.give_back(link, node, self.answer_s)
         elif self.lease.held:
-            await self.lease.renew(link, node, self.answer_s)
+            try:
+                await self.lease.renew(link, node, self.answer_s)
+            except LeaseRefusedError as error:
+                self.unwritten = self.unwritten or first_line(error)  # also while an MV stands and none is sent
 
     async def _beat(self, link: Link, plan: Plan) -> None:
-        """Count the scans on the server's side, while there are any."""
-        if plan.heartbeat is not None and self._scans != self._beats:
-            self._beats = self._scans
-            node, kind, most = plan.heartbeat
-            await link.write([(node, variant(float(self._scans % most), kind, 0.0, float(most)))], self.answer_s)
+        """Count the scans on the server's side, while there are any. A plant that gets no count must not be written.
+
+        A node that has another type now is counted in that one from the next scan on.
+        """
+        if plan.heartbeat is None or self._scans == self._beats:
+            return
+        self._beats = self._scans
+        node, kind, most = plan.heartbeat
+        try:
+            count = variant(float(self._scans % most), kind, 0.0, float(most))
+        except EndpointError as error:
+            self._unbeaten = f"heartbeat: {first_line(error)}"
+        else:
+            (status,) = await link.write([(node, count)], self.answer_s)
+            self._unbeaten = "" if status >> 30 == GOOD else f"the server refuses heartbeat: {words(status)}"
+        if self._unbeaten:
+            (now,) = await link.read([node], self.answer_s)
+            if now.kind is not None:
+                plan.beat_in(node, now.kind)
 
     def _valued(self, plan: Plan, answers: list[Reading], ages: Ages) -> Values:
         """The answers as values, with the first thing that is wrong with them."""
@@ -381,6 +421,7 @@ class OpcUaEndpoint:
             mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
         if self.nodes.watchdog and not fault:
             fault = self._dead(found["watchdog"])
+        fault = fault or self._unbeaten
         n = len(m.pv) + len(m.mv) + len(plan.dv_names)
         return Values(
             arrived,

@@ -6,13 +6,18 @@ import math
 import os
 import secrets
 import socket
+from contextlib import suppress
 
 from asyncua import ua
 
 from serving.errors import EndpointError
-from serving.opcua.link import Link
+from serving.opcua.link import GOOD, Link, words
 
 SCANS = 5  # of the slower loop, without a renewal: the one that had the lease is gone
+
+
+class LeaseRefusedError(EndpointError):
+    """The server does not take what is written into the lease's node."""
 
 
 class NodeLease:
@@ -55,7 +60,7 @@ class NodeLease:
             return
         if self.other:
             raise EndpointError(f"the plant is controlled by {self.other}")
-        await self.renew(link, node, timeout_s)
+        await self._count_on(link, node, timeout_s)
         (answer,) = await link.values([node], timeout_s)
         found = "" if answer.Value is None else str(answer.Value.Value)
         if _owner(found) != self.owner:
@@ -63,7 +68,14 @@ class NodeLease:
         self.held, self._text, self._still = True, found, 0
 
     async def renew(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
-        """Write the next count."""
+        """Write the next count. EndpointError, and the lease is lost, where the server refuses it."""
+        try:
+            await self._count_on(link, node, timeout_s)
+        except LeaseRefusedError:
+            self.held = False  # the others see no count move, and take it
+            raise
+
+    async def _count_on(self, link: Link, node: ua.NodeId, timeout_s: float) -> None:
         self._count = (self._count + 1) % 1_000_000
         await self._write(link, node, f"{self.owner} {self.period_s:g} {self._count}", timeout_s)
 
@@ -71,10 +83,13 @@ class NodeLease:
         """Let others have it at once."""
         if self.held:
             self.held = False
-            await self._write(link, node, "", timeout_s)
+            with suppress(LeaseRefusedError):  # then they have it once its count has not moved
+                await self._write(link, node, "", timeout_s)
 
     async def _write(self, link: Link, node: ua.NodeId, text: str, timeout_s: float) -> None:
-        await link.write([(node, ua.Variant(text, ua.VariantType.String))], timeout_s)
+        (status,) = await link.write([(node, ua.Variant(text, ua.VariantType.String))], timeout_s)
+        if status >> 30 != GOOD:
+            raise LeaseRefusedError(f"the server refuses lease: {words(status)}")
 
 
 def _owner(text: str) -> str:

@@ -66,10 +66,14 @@ class Plan:
         plan.written, rest = typed[: len(plan.mv_points)], typed[len(plan.mv_points) :]
         if nodes.heartbeat:
             (node, kind), *rest = rest
-            plan.heartbeat = (node, kind, 2 if kind is ua.VariantType.Boolean else 100)
+            plan.beat_in(node, kind)
         if nodes.hand_back is not None:
             plan._hand_back = rest[0]
         return plan
+
+    def beat_in(self, node: ua.NodeId, kind: ua.VariantType) -> None:
+        """Count the heartbeat in this type of its node."""
+        self.heartbeat = (node, kind, 2 if kind is ua.VariantType.Boolean else 100)
 
     def variants(self, mv: Array) -> list[tuple[ua.NodeId, ua.Variant]]:
         """What to write for an MV (n_mv,): raw numbers in the nodes' own types, within the range."""

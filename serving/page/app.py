@@ -33,7 +33,8 @@ STATIC = Path(__file__).parent / "static"
 BODY_S = 5.0  # in which the body of a change must be here
 LONGEST_SPAN_S = 400 * 86_400.0
 TELL_S = 60.0  # between two lines about wrong tokens
-TRENDS = 2  # that are computed at a time
+TRENDS, WAITING_TRENDS = 2, 10  # that are computed at a time, and that may wait for it
+TRENDS_LATER_S = 2  # after which a trend beyond them may be asked for again
 
 
 class PageApp:
@@ -41,11 +42,11 @@ class PageApp:
 
     def __init__(self, journal: Path, ask: Ask, token: str, tell: Callable[[str], None] = lambda _: None) -> None:
         self.journal, self.ask, self.token, self.tell = journal, ask, token, tell
-        self.live = Live(journal, ask)
+        self.live = Live(journal, ask, tell)
         self._about = Shared(lambda: self._asked({"do": "about"}))
         self._described = Shared(self._describe)
         self._told = -math.inf
-        self._trends = asyncio.Semaphore(TRENDS)
+        self._trends, self._waiting = asyncio.Semaphore(TRENDS), 0
 
     def asgi(self, hosts: Sequence[str], scheme: str) -> Starlette:
         """The application, for those who ask for one of ``hosts``."""
@@ -111,10 +112,21 @@ class PageApp:
             raise HTTPException(400, f"from and to must be in order and at most {LONGEST_SPAN_S:.0f} s apart")
         if not 1 <= points <= MOST_POINTS:
             raise HTTPException(400, f"points must lie in 1 .. {MOST_POINTS}")
-        async with self._trends:
-            return Response(
-                await asyncio.to_thread(self._trend, begin, end, int(points)), media_type="application/json"
-            )
+        if self._waiting >= WAITING_TRENDS:
+            after = {"Retry-After": str(TRENDS_LATER_S)}
+            raise HTTPException(503, "many trends are being drawn; ask for this one again in a moment", after)
+        self._waiting += 1
+        try:
+            await self._trends.acquire()
+        finally:
+            self._waiting -= 1
+        try:
+            if await request.is_disconnected():
+                return Response(status_code=503)  # nobody reads it
+            text = await asyncio.to_thread(self._trend, begin, end, int(points))
+        finally:
+            self._trends.release()
+        return Response(text, media_type="application/json")
 
     def _trend(self, begin: float, end: float, points: int) -> str:
         with closing(JournalReader(self.journal)) as reader:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sqlite3
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,6 +15,7 @@ from serving.journal import JournalReader
 from serving.journal.reader import Entry
 from serving.page.shared import Shared
 from serving.page.trend import plain
+from serving.words import named
 
 Ask: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -29,16 +29,20 @@ ENTRIES = 200
 
 
 class Live:
-    """Reads the journal and asks the loop for all pages together, as long as there is one."""
+    """Reads the journal and asks the loop for all pages together, as long as there is one.
 
-    def __init__(self, journal: Path, ask: Ask) -> None:
-        self.journal, self._ask = journal, ask
+    What fails meanwhile is counted (``failed``), told when it is another thing than before, and tried again.
+    """
+
+    def __init__(self, journal: Path, ask: Ask, tell: Callable[[str], None] = lambda _: None) -> None:
+        self.journal, self._ask, self._tell = journal, ask, tell
+        self.failed, self._trouble = 0, ""
         self._pages: set[asyncio.Queue[str | None]] = set()
         self._task: asyncio.Task[None] | None = None
         self._beginning = asyncio.Lock()
         self._newest_state = Shared(self._asked_state)
         self._last_id, self._state_at = 0, 0.0
-        self._log: dict[int, str] = {}
+        self._log: dict[int, str] | None = None  # nobody has looked yet
         self._state: dict[str, Any] = {}
 
     async def state(self, longest_s: float = 0.5) -> dict[str, Any]:
@@ -94,6 +98,8 @@ class Live:
         async with self._beginning:
             if self._task is None or self._task.done():
                 self._last_id = (await asyncio.to_thread(self._read, None))[1]
+                if self._log is None:
+                    await asyncio.to_thread(self._entries)  # what is there already is no news
                 self._task = asyncio.create_task(self._run())
 
     async def _run(self) -> None:
@@ -102,14 +108,26 @@ class Live:
             await asyncio.sleep(POLL_S)
             texts: list[str] = []
             # A journal that cannot be read now may be read the next time; the state is told meanwhile.
-            with suppress(LoopwrightError, sqlite3.Error, OSError):
+            try:
                 texts, self._last_id = await asyncio.to_thread(self._read, self._last_id)
                 texts += await asyncio.to_thread(self._entries)
+            except Exception as error:
+                self._fails(error)
             if time.monotonic() - began > STATE_S or any("event: log" in text for text in texts):
                 began = time.monotonic()
-                texts.append(_message("state", await self.state(0.0)))
+                try:
+                    texts.append(_message("state", await self.state(0.0)))
+                except Exception as error:
+                    self._fails(error)
             for text in texts:
                 self._send(text)
+
+    def _fails(self, error: Exception) -> None:
+        self.failed += 1
+        trouble = named(error)
+        if trouble != self._trouble:
+            self._trouble = trouble
+            self._tell(f"page: some news could not be read, and are read again: {trouble}")
 
     def _send(self, text: str) -> None:
         for page in list(self._pages):
@@ -130,12 +148,14 @@ class Live:
                 return [], newest
             if newest - after_id > MOST_SCANS:
                 return [_message("reset", {}, newest)], newest
-            runs = {run["id"]: run["columns"] for run in reader.runs()}
+            runs: dict[int, list[str]] = {}
             texts: list[str] = []
             rows: list[tuple[float, ...]] = []
             columns: list[str] = []
             last = after_id
             for id_, run, scan in reader.scans(after_id):
+                # Of the same state of the file as the scans: another controller may take over meanwhile.
+                runs = runs or {r["id"]: r["columns"] for r in reader.runs()}
                 if rows and runs[run] != columns:
                     texts.append(_scans(columns, rows, last))
                     rows = []
@@ -149,9 +169,10 @@ class Live:
         """Messages of the events that are new, over or acknowledged since the last time."""
         with closing(JournalReader(self.journal)) as reader:
             found = {entry.id: json.dumps(shown(entry)) for entry in reader.entries(ENTRIES)}
-        first, news = not self._log, [text for id_, text in sorted(found.items()) if self._log.get(id_) != text]
-        self._log = found
-        return [] if first else [f"event: log\ndata: {text}\n\n" for text in news]
+        before, self._log = self._log, found
+        if before is None:
+            return []
+        return [f"event: log\ndata: {text}\n\n" for id_, text in sorted(found.items()) if before.get(id_) != text]
 
 
 def shown(entry: Entry) -> dict[str, Any]:

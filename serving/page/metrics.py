@@ -42,6 +42,8 @@ def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tu
         yield f"{name}_total", "counter", words, [(none, value)]
     yield "last_scan_seconds", "gauge", "Time of the last scan, since 1970.", [(none, state["time"])]
     yield "journal_ok", "gauge", "1 while the journal can be written.", [(none, int(not state.get("journal")))]
+    lost = "Scans and events that the journal never got, because the disk took none."
+    yield "journal_lost_total", "counter", lost, [(none, state.get("journal_lost"))]
     for name, key, group, words in GROUPS:
         signals = about["signals"][group]
         values = state.get(key) or [None] * len(signals)

@@ -14,17 +14,20 @@ MOST_CONNECTIONS = 200
 class Impatient(H11Protocol):
     """Closes a connection that is open for ``REQUEST_S`` without a whole request, or takes no answer for ``STALLED_S``.
 
-    Beyond the most connections the one that has idled longest goes, so that whoever opens many keeps nobody out.
+    Beyond the most connections the one that has idled longest goes, else the one that is open longest, whatever is
+    answered on it: whoever opens many keeps nobody out, and a page that had to go comes back by itself.
     """
 
+    _began = 0.0
     _deadline: asyncio.TimerHandle | None = None
     _stalled: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin."""
         super().connection_made(transport)
+        self._began = self.loop.time()
         if len(self.connections) > MOST_CONNECTIONS:
-            self._longest_idle().give_up()
+            self._to_go().give_up()
         self._watch()
 
     def pause_writing(self) -> None:
@@ -79,8 +82,9 @@ class Impatient(H11Protocol):
             self._stalled.cancel()
             self._stalled = None
 
-    def _longest_idle(self) -> Impatient:
-        """The connection whose deadline comes first; this one where all others are being answered."""
-        idle = [c for c in self.connections if isinstance(c, Impatient) and not c.transport.is_closing()]
-        waits = [(c._deadline.when(), i) for i, c in enumerate(idle) if c._deadline is not None]
-        return idle[min(waits)[1]] if waits else self
+    def _to_go(self) -> Impatient:
+        """The idle connection whose deadline comes first; the one that is open longest where all are busy."""
+        others = [c for c in self.connections if isinstance(c, Impatient) and not c.transport.is_closing()]
+        idle = [(c._deadline.when(), i) for i, c in enumerate(others) if c._deadline is not None]
+        busy = [(c._began, i) for i, c in enumerate(others) if c is not self]
+        return others[min(idle or busy)[1]] if idle or busy else self

@@ -60,11 +60,12 @@ class Page:
             return False
 
     def hosts(self, port: int) -> list[str]:
-        """What a browser's Host header may say."""
+        """What a browser's Host header may say: at the port of its scheme it names none."""
         host, _ = self.address
         shown = f"[{host}]" if ":" in host else host
-        known = [f"{name}:{port}" for name in dict.fromkeys((shown, "localhost", "127.0.0.1", "[::1]"))]
-        return [*known, *(n.lower() for n in self.names)]
+        names = list(dict.fromkeys((shown.lower(), "localhost", "127.0.0.1", "[::1]")))
+        bare = names if port == (80 if self.certificate is None else 443) else []
+        return [*(f"{name}:{port}" for name in names), *bare, *(n.lower() for n in self.names)]
 
     def token(self) -> str:
         """The token in ``token_file``; empty without one. LoopError where it is too short to be one."""

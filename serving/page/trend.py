@@ -14,6 +14,8 @@ Array: TypeAlias = NDArray[np.float64]
 
 GAP = 5  # periods without a scan: a gap in the line
 MOST_POINTS = 2_000
+MOST_CHANGES = 4  # of the mode for each point: two rows a point are drawn whole, each with a gap before it
+MODES = ("", "AUTO", "SHADOW", "MANUAL", "HOLD")  # the last is what an operator must not miss
 
 
 class Thinned:
@@ -66,36 +68,71 @@ class Thinned:
 
 
 class Modes:
-    """The changes of mode, ``(time, mode)``, as scans come in; the mode is empty where none did."""
+    """The changes of mode, ``(time, mode)``, as scans come in; the mode is empty where none did.
 
-    def __init__(self) -> None:
+    ``changes`` has all of the first ``MOST_CHANGES`` times ``points``; ``thinned`` gives at most one a bin.
+    """
+
+    def __init__(self, begin_s: float, bin_s: float, points: int) -> None:
+        self.begin_s, self.bin_s, self.points = begin_s, bin_s, points
         self.changes: list[tuple[float, str]] = []
+        self._bins: dict[int, tuple[float, str, str]] = {}  # the first change's time, what is shown, the last mode
         self._last: float | None = None
+        self._present = ""
 
     def add(self, times: Array, modes: list[str], longest_s: float) -> None:
         """Scans at ``times`` (n,), in order; a pause longer than ``longest_s`` is a gap."""
         last = times[0] if self._last is None else self._last
         before = np.concatenate([[last], times[:-1]])
         gaps = times - before > longest_s
-        present = self.changes[-1][1] if self.changes else ""
         for t, since, gap, mode in zip(times.tolist(), before.tolist(), gaps.tolist(), modes, strict=True):
             if gap:
-                self.changes.append((since, ""))
-            if gap or mode != present:
-                self.changes.append((t, mode))
-                present = mode
+                self._change(since, "")
+            if mode != self._present:
+                self._change(t, mode)
         self._last = float(times[-1])
+
+    def _change(self, time_s: float, mode: str) -> None:
+        self._present = mode
+        if len(self.changes) < MOST_CHANGES * self.points:
+            self.changes.append((time_s, mode))
+        bin_ = min(max(int((time_s - self.begin_s) / self.bin_s), 0), self.points - 1)
+        first, shown, _ = self._bins.get(bin_, (time_s, mode, mode))
+        self._bins[bin_] = first, _graver(shown, mode), mode
+
+    def thinned(self) -> list[tuple[float, str]]:
+        """At most one change a bin. A bin shows of its modes the one that an operator must not miss."""
+        made: list[tuple[float, str]] = []
+        drawn = last = ""
+        for bin_ in sorted({*self._bins, *(b + 1 for b in self._bins)}):
+            first, shown, after = self._bins.get(bin_, (0.0, last, last))
+            begin_s = self.begin_s + bin_ * self.bin_s
+            if drawn != last:  # the bin before showed another mode than its last
+                first, shown = begin_s, _graver(shown, last)
+            if shown != drawn:
+                made.append((first, shown))
+            drawn, last = shown, after
+        return made
+
+
+def _graver(one: str, other: str) -> str:
+    """Which of two modes is shown where there is room for one."""
+    return max(one, other, key=lambda mode: MODES.index(mode) if mode in MODES else 0)
 
 
 def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> dict[str, Any]:
-    """What is drawn from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode.
+    """What is drawn from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode, thinned alike.
 
     The mode is empty from the last scan before a gap to the first one after it.
     """
-    runs = {run["id"]: run for run in reader.runs()}
-    thinned, whole, modes, count = Thinned(begin_s, end_s, points), list[tuple[Array, dict[str, Array]]](), Modes(), 0
-    longest = GAP * max((run["period_s"] / run["speed"] for run in runs.values()), default=1.0)
+    thinned, whole, count = Thinned(begin_s, end_s, points), list[tuple[Array, dict[str, Array]]](), 0
+    modes = Modes(begin_s, thinned.bin_s, points)
+    runs: dict[int, dict[str, Any]] = {}
+    longest = float(GAP)
     for run, numbers, mode in reader.tables(begin_s, end_s):
+        if not runs:  # of the same state of the file as the scans: another controller may take over meanwhile
+            runs = {r["id"]: r for r in reader.runs()}
+            longest = GAP * max(r["period_s"] / r["speed"] for r in runs.values())
         times = numbers[:, 0]
         columns = {name: numbers[:, i + 1] for i, name in enumerate(runs[run]["columns"])}
         thinned.add(times, columns)
@@ -108,7 +145,7 @@ def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> d
     return {
         "time": times.tolist(),
         "columns": {name: plain(values) for name, values in columns.items()},
-        "modes": modes.changes,
+        "modes": modes.changes if count <= 2 * points else modes.thinned(),
     }
 
 

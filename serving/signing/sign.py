@@ -16,7 +16,7 @@ from serving.manifest import MANIFEST_KEY, Manifest
 from serving.signing import bundle
 from serving.signing.keys import PrivateKey
 from serving.signing.reading import contents
-from serving.signing.statement import Statement
+from serving.signing.statement import Statement, utc
 from serving.signing.verify import MAX_SIDECAR, signature_of
 
 
@@ -25,12 +25,14 @@ def sign(
 ) -> Path:
     """Write the signature of a controller's file and of its manifest's JSON file; the signature's file.
 
-    ``expires`` is when the signature ends (None: never), ``now`` when it was made (None: by this machine's clock).
+    ``expires`` is when the signature ends (None: never), ``now`` when it was made (None: by this machine's clock). Each
+    names its time zone; UTC is written.
 
     Raises ArtifactError where the file is no controller, and SignatureError where the JSON file beside it is not its
-    manifest or ``expires`` lies in the past.
+    manifest, ``expires`` lies in the past, or a time names no zone.
     """
-    path, now = Path(path), now or datetime.now(UTC)
+    path, now = Path(path), utc(now or datetime.now(UTC), "now")
+    expires = None if expires is None else utc(expires, "expires")
     if expires is not None and expires <= now:
         raise SignatureError(f"the signature would have expired on {expires:%Y-%m-%d %H:%M} UTC; give a day to come")
     statement = Statement(path.name, _files(path), now.replace(microsecond=0), expires)

@@ -56,7 +56,7 @@ class Statement:
                     "ignore_paths": [ignored],
                 },
                 "resources": [{"name": n, "algorithm": "sha256", "digest": self.files[n]} for n in names],
-                OWN: {name: f"{time:{_TIME}}" for name, time in times.items() if time is not None},
+                OWN: {name: f"{utc(time, name):{_TIME}}" for name, time in times.items() if time is not None},
             },
         }
         return json.dumps(tree).encode()
@@ -83,6 +83,13 @@ class Statement:
         if root(list(files.values())) != digest:
             raise SignatureError("the subject's digest is not that of the files that were signed: sign them again")
         return cls(name, files, *_times(predicate.get(OWN, {})))
+
+
+def utc(time: datetime, name: str) -> datetime:
+    """The same instant in UTC; SignatureError where the time names no zone, so nobody knows which instant it is."""
+    if time.utcoffset() is None:
+        raise SignatureError(f"{name} is {time}, without a time zone; give one: datetime(2027, 1, 31, tzinfo=UTC)")
+    return time.astimezone(UTC)
 
 
 def root(digests: list[str]) -> str:

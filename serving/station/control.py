@@ -26,14 +26,15 @@ PATIENCE_S = 10.0
 class Control:
     """Answers whoever of this user knocks at the socket of a journal. Others cannot enter its folder.
 
-    ``answer`` gets each request as it came and is called in threads of its own; what it raises on purpose is told.
+    Whoever opens it has the journal's lock. ``answer`` gets each request as it came and is called in threads of its
+    own; what it raises on purpose is told.
     """
 
     def __init__(self, journal: Path, answer: Callable[[Any], Answer]) -> None:
         self._journal, self._answer = journal, answer
         self.path = door(journal)
         with suppress(FileNotFoundError):
-            self.path.unlink()  # of a loop that was killed; the lease says that none lives
+            self.path.unlink()  # of a loop that was killed; the journal's lock says that none lives
         self._server = self._opened()
 
     def tend(self) -> None:

@@ -10,11 +10,14 @@ from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from serving.errors import LoopError
-from serving.journal import JournalReader
+from serving.journal import JournalReader, Scan
 
 WRITTEN = ("pv", "dv", "applied", "sp")  # groups of columns; the MV as the actuator has it from then on
+MEASURED = ("pv", "applied", "dv")  # in the order of a scan's statuses
+GOOD, UNCERTAIN = 0, 1  # the two highest bits of a status
 LATE = 1.5  # periods to the next scan from which it does not say what the actuator had
 
 
@@ -23,6 +26,8 @@ def export(journal: Path, out: Path) -> int:
 
     The MV of a row is the one that the actuator has from this scan to the next, as the next one reads it back: a model
     of rows whose MV acted before their PVs would take what the controller made of a PV for what moved it.
+    A value whose quality was not good is an empty cell: nobody measured it. One of uncertain quality counts where the
+    loop used it, as ``server.uncertain`` says.
     Times are the plant's: where its time runs faster than the clock's, so do they, and runs follow each other.
     """
     reader = JournalReader(journal)
@@ -43,7 +48,7 @@ def export(journal: Path, out: Path) -> int:
                 if run != of:
                     of, began = run, max(found[run]["began"], last + period)
                 last = began + (scan.time_s - found[run]["began"]) * speed
-                row = _Row(run, last, dict(zip(runs[run], scan.numbers, strict=True)), scan.mode)
+                row = _Row(run, last, _believed(scan, runs[run]), scan.mode)
                 if waiting is not None:
                     table.writerow(waiting.cells(names, row if last - waiting.time_s < LATE * period else None))
                 waiting = row
@@ -57,6 +62,21 @@ def export(journal: Path, out: Path) -> int:
         reader.close()
         draft.unlink(missing_ok=True)
     return count
+
+
+def _believed(scan: Scan, columns: Sequence[str]) -> dict[str, float]:
+    """The numbers of a scan by column, NaN for what was measured with a quality that is not to be believed.
+
+    A loop that does not use values of uncertain quality has a fault at each; one that it uses comes without.
+    """
+    worst = GOOD if scan.reason else UNCERTAIN
+    bad = [status >> 30 > worst for status in scan.quality]  # empty: all is good
+    pvs, mvs, dvs = ([c for c in columns if c.startswith(f"{group} ")] for group in MEASURED)
+    wrong = {name for name, is_bad in zip([*pvs, *mvs, *dvs], bad, strict=False) if is_bad}
+    if len(bad) < len(pvs + mvs + dvs) and any(bad[len(pvs + mvs) :]):
+        wrong.update(dvs)  # not every DV is read, and the journal does not say which ones are
+    numbers = zip(columns, scan.numbers, strict=True)
+    return {name: math.nan if name in wrong else value for name, value in numbers}
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,22 +103,42 @@ class _Row:
 
 
 def tag_table(journal: Path, out: Path) -> None:
-    """Write the tags of the exported file: roles, names, units and ranges, as the last controller had them."""
+    """Write the tags of the exported file: roles, names and units as the last controller had them.
+
+    A range is the widest of all runs, so that no reading of an earlier controller counts as impossible. What the last
+    controller may command of an MV stands beside it where that is less.
+    """
     with closing(JournalReader(journal)) as reader:
-        last = reader.runs()[-1]
-    fields = ["tag", "role", "name", "unit", "unit_certain", "low", "high", "max_move_per_min"]
+        runs = reader.runs()
+    last = runs[-1]
+    fields = ["tag", "role", "name", "unit", "unit_certain", "low", "high"]
+    fields += ["command_low", "command_high", "max_move_per_min"]
     with out.open("w", encoding="utf-8", newline="") as text:
         table = csv.DictWriter(text, fields)
         table.writeheader()
         for group, role in (("pv", "pv"), ("mv", "mv"), ("dv", "dv"), ("sp", "sp")):
             for s in last["signals"][group]:
-                row = {"tag": _tag(f"{'applied' if group == 'mv' else group} {s['name']}"), "role": role}
-                row |= {"name": s["name"], "unit": s["unit"], "low": s["low"], "high": s["high"]}
+                row: dict[str, Any] = {
+                    "tag": _tag(f"{'applied' if group == 'mv' else group} {s['name']}"),
+                    "role": role,
+                }
+                low, high = _widest(runs, group, s)
+                row |= {"name": s["name"], "unit": s["unit"], "low": low, "high": high}
+                if group == "mv" and (low, high) != (s["low"], s["high"]):
+                    row |= {"command_low": s["low"], "command_high": s["high"]}
                 row["unit_certain"] = "yes"  # loop.toml states it, and no reading is in another one
                 if s.get("max_move") is not None:
                     row["max_move_per_min"] = s["max_move"] * 60 / last["period_s"]
                 table.writerow(row)
         table.writerow({"tag": "MODE", "role": "mode", "name": "MODE"})
+
+
+def _widest(runs: Sequence[Mapping[str, Any]], group: str, signal: Mapping[str, Any]) -> tuple[float, float]:
+    """The range of a signal over the runs that have it in this unit."""
+    same = [
+        s for run in runs for s in run["signals"][group] if (s["name"], s["unit"]) == (signal["name"], signal["unit"])
+    ]
+    return min(s["low"] for s in same), max(s["high"] for s in same)
 
 
 def _tag(column: str) -> str:

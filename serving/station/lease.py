@@ -6,12 +6,14 @@ import hashlib
 import ipaddress
 import os
 import socket
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from serving.errors import LoopError
 from serving.station.places import runtime_folder
+from serving.words import first_line
 
 OPC_UA_PORT = 4840
 
@@ -19,7 +21,8 @@ OPC_UA_PORT = 4840
 class Lease:
     """Locks for the nodes of a server that a loop writes, kept until ``release`` or the end of the process.
 
-    The locks are files in a folder for temporary ones: ``tend`` keeps them young, and makes one anew that is gone.
+    The locks are files in a folder for temporary ones: ``tend`` keeps them young, and makes one anew that is gone. A
+    node that another loop has locked meanwhile is lost: ``lost`` says so, until ``tend`` has it back.
 
     Raises LoopError that names the process which has one.
     """
@@ -27,6 +30,8 @@ class Lease:
     def __init__(self, endpoint: str, nodes: Iterable[str], folder: Path | None = None) -> None:
         self._folder, self._endpoint, self._address = folder, endpoint, address_of(endpoint)
         self._held: dict[str, int] = {}  # handles by node
+        self._lost: dict[str, str] = {}  # by node, who has it
+        self._tending = threading.Lock()
         try:
             for node in nodes:
                 self._held[node] = self._locked(node)
@@ -35,14 +40,34 @@ class Lease:
             raise
 
     def tend(self) -> None:
-        """Keep the files. LoopError where one was removed and another loop has it now."""
-        for node, handle in self._held.items():
-            path = self._path(node)
-            if path.exists() and os.path.samestat(path.stat(), os.fstat(handle)):
-                os.utime(path)
-            else:
-                self._held[node] = self._locked(node)
-                os.close(handle)
+        """Keep all files. LoopError where one was removed and another loop has it now, OSError where one cannot be."""
+        troubles: list[LoopError | OSError] = []
+        with self._tending:
+            for node in list(self._held):
+                try:
+                    self._tend(node)
+                except (LoopError, OSError) as error:
+                    troubles.append(error)
+        if troubles:
+            raise troubles[0]
+
+    @property
+    def lost(self) -> str:
+        """Why this loop may not write, as far as it was looked at: another one has a node. Empty: it may."""
+        return next(iter(self._lost.values()), "")
+
+    def _tend(self, node: str) -> None:
+        path, handle = self._path(node), self._held[node]
+        if path.exists() and os.path.samestat(path.stat(), os.fstat(handle)):
+            os.utime(path)
+            return
+        try:
+            self._held[node] = self._locked(node)
+        except LoopError as error:
+            self._lost[node] = first_line(error)
+            raise
+        os.close(handle)
+        self._lost.pop(node, None)
 
     def release(self) -> None:
         """Let others have the nodes."""

@@ -82,7 +82,7 @@ class Recorder:
     def _tried(self, loop: ControlLoop) -> None:
         """Say once why a trial began anew."""
         reason = "" if loop.successor is None else loop.successor.reason
-        if reason and reason != self._trial and loop.successor is not None:
+        if reason and kind_of(reason) != kind_of(self._trial) and loop.successor is not None:
             self.note("swap", "loop", f"the trial of {named(loop.successor.controller)} begins anew", reason)
         self._trial = reason
 

@@ -180,6 +180,10 @@ class Settings:
             return self.page
         return Page(self.page) if self.page else None
 
+    def over_s(self, period_s: float) -> float:
+        """Time [s] over which an MV goes to where a law wants it that takes over."""
+        return TRANSFER * period_s if self.transfer_s is None else self.transfer_s
+
     def max_age_s(self, period_s: float) -> float:
         """Age from which on a sample is refused."""
         return MAX_AGE * period_s if self.guards.max_age_s is None else self.guards.max_age_s

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -17,7 +18,7 @@ from serving.clock import MonotonicClock
 from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
 from serving.grid import RunReport
-from serving.guard import Guard, Sample
+from serving.guard import Guard, Sample, implausible
 from serving.journal import Journal, JournalReader
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
@@ -135,18 +136,21 @@ class Station:
             stack.callback(self.endpoint.close)
             self.endpoint.start()
             first = self._first_values()
+            if self.ended:
+                self.recorder.note("change", "loop", "ended before the first scan: nothing was written")
+                return RunReport(0, 0, 0, 0.0)
             pv = None if first is None else first.pv[: len(m.sp)]
             self.loop = ControlLoop(
                 self.controller,
                 self.endpoint,
                 sp=_near(pv, m.sp),
-                mv=_near(None if first is None else first.mv, m.mv),
+                mv=None if first is None else _begun_at(first.mv, m.mv),
                 mode=Mode(s.start),
                 guards=self.guards,
                 recover_after=s.hold.recover_after or None,
                 clock=self.clock,
                 warm_lead_s=WARM_LEAD_S * s.speed,
-                transfer_s=20 * m.period_s if s.transfer_s is None else s.transfer_s,
+                transfer_s=s.over_s(m.period_s),
                 fallback=self.fallback,
             )
             self.recorder.begin(self.controller)
@@ -159,8 +163,10 @@ class Station:
 
     def _tend(self, control: Control) -> None:
         """Keep the files that lie in a folder for temporary ones."""
-        self.lease.tend()
-        control.tend()
+        try:
+            self.lease.tend()
+        finally:
+            control.tend()
 
     def _untended(self, trouble: str) -> None:
         what = trouble or "over: the locks of this loop are kept again"
@@ -208,6 +214,17 @@ class Station:
         values = self.endpoint.values
         if values is not None and self.scans:
             self._plant_side(self.loop, values)
+        self._let_go(self.loop)
+
+    def _let_go(self, loop: ControlLoop) -> None:
+        """Write nothing while another loop has the lock of a node, whoever asks for it."""
+        if loop.mode is Mode.SHADOW or not self.lease.lost:
+            return
+        with suppress(LoopError, OSError):
+            self.lease.tend()  # the other loop may have ended since
+        if self.lease.lost:
+            self.recorder.note("change", "loop", f"mode {loop.mode} -> {Mode.SHADOW}", self.lease.lost)
+            loop.set_mode(Mode.SHADOW)
 
     def _plant_side(self, loop: ControlLoop, values: Values) -> None:
         """Set points and mode, where the plant's own operator changed them."""
@@ -217,12 +234,18 @@ class Station:
             what = "the plant's server has, or may have, started anew: the set points and the mode that stand there"
             self.recorder.note("connection", "opcua", f"{what} are no wish of its operator until they change")
         if changed:
-            wanted = loop.sp
-            for i, s in enumerate(self.manifest.sp):
-                wanted[i] = changed.get(s.name, wanted[i])
-            self._from_plant(lambda: loop.set_sp(wanted), f"set point {_shown(wanted, self.manifest.sp)}")
+            self._set_points(loop, changed)
         if mode:
             self._from_plant(lambda: loop.set_mode(Mode(mode)), f"mode {mode}")
+
+    def _set_points(self, loop: ControlLoop, changed: Mapping[str, float]) -> None:
+        """Each for itself: one outside its range takes no other one with it."""
+        for i, s in enumerate(self.manifest.sp):
+            if s.name in changed:
+                wanted = loop.sp
+                wanted[i] = changed[s.name]
+                what = f"set point {_shown(wanted[i : i + 1], (s,))}"
+                self._from_plant(partial(loop.set_sp, wanted), what)
 
     def _from_plant(self, act: Callable[[], None], what: str) -> None:
         try:
@@ -239,8 +262,8 @@ class Station:
         self._moved(self.loop)
         self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
         self.last, self.stepped = (sample, command, time.time()), self.recorder.controller
-        self.watching.seen(self.stepped, self.last)
         self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
+        self.watching.seen(self.stepped, self.last)
         for seen in self._watchers:
             seen(sample, command)
 
@@ -248,6 +271,8 @@ class Station:
         """Say where an MV stands that somebody else moved while the loop could not write."""
         if loop.found is None or self.last is None or np.array_equal(loop.found, self.last[1].mv):
             return
+        if np.isnan(self.last[1].mv).any():
+            return  # nobody knew where it was left
         found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self.last[1].mv))
         self.recorder.note("change", "plant", f"the MV stands at {found}, not at {left}: the loop goes on from there")
 
@@ -262,7 +287,8 @@ class Station:
 
     def _opened(self, file: str, sha256: str | None) -> Controller:
         """A controller that is to be tried; a relative path lies beside the one in charge."""
-        return TrustedController(self.settings.controller.parent / file, sha256, self.trusted)
+        charge = self.controller if self.loop is None else self.loop.controller
+        return TrustedController(charge.path.parent / file, sha256, self.trusted)
 
     def answer(self, tree: Any) -> Answer:
         """What a request gets, from any thread: a view, or the change once a scan has carried it out."""
@@ -333,6 +359,13 @@ def _near(values: Array | None, signals: tuple[Signal, ...]) -> list[float]:
     if values is None or not np.isfinite(values).all():
         return [s.middle for s in signals]
     return [_allowed(v, s) for v, s in zip(values.tolist(), signals, strict=True)]
+
+
+def _begun_at(mv: Array, signals: tuple[Signal, ...]) -> list[float] | None:
+    """The MVs that a loop begins with; None where no actuator can stand there: the first good sample then tells."""
+    if implausible(signals, mv.tolist()):
+        return None
+    return [_allowed(v, s) for v, s in zip(mv.tolist(), signals, strict=True)]
 
 
 def _allowed(value: float, signal: Signal) -> float:

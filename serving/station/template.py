@@ -7,12 +7,13 @@ from pathlib import Path
 
 from serving.controller import Controller
 from serving.manifest import Signal
+from serving.station.settings import MAX_AGE, TRANSFER
 
 
 def template(controller: Controller, path: Path, endpoint: str, journal: str = "loop.journal") -> str:
     """The text of a loop.toml beside which ``path`` lies, for a plant at ``endpoint``."""
     m = controller.manifest
-    period = m.period_s
+    period, over = m.period_s, TRANSFER * m.period_s
     lines = [
         f"# The loop of {m.law} for {m.case}, a scan every {period:g} s.",
         "# `loopwright loop check` reads every node and writes none.",
@@ -22,7 +23,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         'start = "SHADOW"  # the law is computed and shown, nothing is written; or MANUAL, AUTO',
         "# speed = 10  # times the clock, for a plant that is simulated as fast: `loopwright plant serve --speed 10`",
         'page = "127.0.0.1:8080"  # the operator\'s page; leave it out for none',
-        f"transfer_s = {20 * period:g}  # [s] in which an MV crosses its range at most once after a change to AUTO",
+        f"transfer_s = {over:g}  # [s] in which an MV crosses its range at most once after a change to AUTO",
         "",
         "[server]",
         f'endpoint = "{endpoint}"',
@@ -63,7 +64,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         f'# hand_back = {{ node = "{_id("Control", "Owner")}", value = 0 }}',
         "",
         "[guards]  # when a sample is refused: the loop holds",
-        f"max_age_s = {1.5 * period:g}",
+        f"max_age_s = {MAX_AGE * period:g}",
         "margin = 0.05  # share of a PV's range by which it may exceed it",
         "frozen = 0  # samples for which a PV may stand still to the bit; 0: for ever",
         f"# rate = {_table(m.pv, lambda s: (s.high - s.low) / 10)}  # largest change a scan",

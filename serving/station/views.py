@@ -82,6 +82,7 @@ def state(station: Station) -> View:
         "connection": station.endpoint.trouble,
         "connections": station.endpoint.connections,
         "journal": station.journal.trouble,
+        "journal_lost": station.journal.lost,
         "missed": station.missed,
         "faults": station.faults,
         "verdicts": [asdict(v) for v in station.watching.monitor.verdicts()],

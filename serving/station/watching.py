@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import time
 from contextlib import closing, suppress
 from math import ceil
@@ -25,12 +26,19 @@ class Watching:
     def __init__(self, controller: Controller, recorder: Recorder) -> None:
         self._recorder = recorder
         self._of = controller
+        self._trouble = ""  # what was said last of what failed here
         self._levels = self._active()
         self._scans = 0  # the clock may be set; scans go on
         self.monitor = self._begun(controller)
 
     def seen(self, controller: Controller, scan: tuple[Sample | None, Command, float]) -> None:
-        """A scan, with its time; now and then what the verdicts have become."""
+        """A scan, with its time; now and then what the verdicts have become. It never raises."""
+        try:
+            self._seen(controller, scan)
+        except Exception as error:  # a scan is more than what is thought of it
+            self._failed(f"{type(error).__name__}: {error}")
+
+    def _seen(self, controller: Controller, scan: tuple[Sample | None, Command, float]) -> None:
         if controller is not self._of:
             self.keep()
             self._over(self._levels)
@@ -46,21 +54,39 @@ class Watching:
             self.keep()
 
     def keep(self) -> None:
-        """Write down what was learnt."""
-        self._recorder.journal.keep(_name(self._of), json.dumps(self.monitor.state()))
+        """Write down what was learnt; a monitor whose numbers are none learns anew."""
+        try:
+            text = json.dumps(self.monitor.state(), allow_nan=False)
+        except ValueError:
+            self.monitor = self._anew(self._of, "it holds numbers that are not finite")
+            return
+        self._recorder.journal.keep(_name(self._of), text)
 
     def _begun(self, controller: Controller) -> Monitor:
         kept = None
-        with suppress(LoopError), closing(JournalReader(self._recorder.journal.path)) as reader:
+        with suppress(LoopError, sqlite3.Error), closing(JournalReader(self._recorder.journal.path)) as reader:
             kept = reader.learnt(_name(controller))
         if kept is not None:
-            with suppress(ValueError, KeyError, TypeError):
+            try:
                 return Monitor.restored(controller.manifest, json.loads(kept))
+            except (ValueError, RecursionError) as error:
+                return self._anew(controller, str(error))
         return Monitor(controller.manifest, started_s=time.time())
+
+    def _anew(self, controller: Controller, why: str) -> Monitor:
+        self._recorder.note("monitor", "monitor", f"what was learnt cannot be used, so it learns anew: {why}")
+        return Monitor(controller.manifest, started_s=time.time())
+
+    def _failed(self, trouble: str) -> None:
+        """Say once what failed."""
+        if trouble != self._trouble:
+            self._trouble = trouble
+            with suppress(Exception):  # it may be this very journal
+                self._recorder.note("monitor", "monitor", f"the monitor cannot be looked at: {trouble}")
 
     def _active(self) -> dict[str, str]:
         """The verdicts whose alarms a loop before this one left active; those of another controller end."""
-        with suppress(LoopError), closing(JournalReader(self._recorder.journal.path)) as reader:
+        with suppress(LoopError, sqlite3.Error), closing(JournalReader(self._recorder.journal.path)) as reader:
             active = [e.event for e in reader.active() if e.event.kind == "monitor"]
             levels = {event.alarm.removeprefix(ALARM): [*event.what.split(": "), ""][1] for event in active}
             runs = reader.runs()

@@ -1,13 +1,13 @@
-"""One spelling of each term: in the manual, and in the docstrings and messages of the code."""
+"""One spelling of each term: in the manual, and in the comments and messages of code and pages."""
 
 from __future__ import annotations
 
-import ast
 import re
 from pathlib import Path
 
 import pytest
 from pages import DOCS, PAGES, ROOT, without_code
+from words_of_code import of_page, of_script, words_of
 
 # What is written -> how it is spelled here. A word in backticks is a name, and stands as it is.
 WRONG = {
@@ -40,14 +40,16 @@ KEPT = {
 }
 
 
-def strings(path: Path) -> list[tuple[int, str]]:
-    """(line, text) of every docstring and message of a Python file; single words are keys and names."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return [
-        (node.lineno, node.value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value
-    ]
+FOREIGN = {"serving/page/static/uPlot.iife.min.js"}  # written by others
+
+
+def sources() -> list[Path]:
+    """Files of ours whose words people read, beside the manual; not what npm fetched."""
+    kinds = ("*.py", "*.c", "*.js", "*.mjs", "*.html", "*.html.j2")
+    folders = ("serving", "pipeline", "examples", "docs/_ext")
+    found = sorted({path for folder in folders for kind in kinds for path in (ROOT / folder).rglob(kind)})
+    ours = [path for path in found if "node_modules" not in path.parts and not path.is_symlink()]
+    return [path for path in ours if path.relative_to(ROOT).as_posix() not in FOREIGN]
 
 
 def misspelt(text: str) -> list[tuple[str, str]]:
@@ -67,11 +69,12 @@ def test_pages_spell_terms_as_the_glossary_does(page: Path) -> None:
 
 
 def test_the_code_spells_terms_as_the_glossary_does() -> None:
+    files = sources()
+    assert {".py", ".c", ".js", ".mjs", ".html", ".j2"} <= {path.suffix for path in files}
     wrong = [
         f"{path.relative_to(ROOT)}:{line}: {found!r}; write {right}"
-        for folder in ("serving", "pipeline", "examples", "docs/_ext")
-        for path in sorted((ROOT / folder).rglob("*.py"))
-        for line, text in strings(path)
+        for path in files
+        for line, text in words_of(path)
         for found, right in misspelt(text)
         if found not in KEPT.get(path.relative_to(ROOT).as_posix(), set())
     ]
@@ -84,6 +87,30 @@ def test_the_test_sees_a_wrong_spelling() -> None:
         ("dead-time", "dead time"),
     ]
     assert misspelt("A set-point change of the set point; `setpoint` is a name.") == []
+
+
+def test_words_of_scripts_are_told_from_their_code() -> None:
+    code = r"""
+const setpoint = a / 2 / b; // the setpoint of a comment
+const s = { readback: 'readback', quote: /["'`]/g }, t = "the deadtime is long"; /* two
+ lines of feed-forward */
+say(`the setpoint ${x ? `is a ${"bad readback"}` : { windup: 1 }.windup} lies on-line`);
+char c = '"', *words = "no normalisation";
+"""
+    found = {(line, word) for line, text in of_script(code) if " " in text.strip() for word, _ in misspelt(text)}
+    assert found == {
+        (2, "setpoint"),
+        (3, "deadtime"),
+        (3, "feed-forward"),
+        (5, "setpoint"),
+        (5, "on-line"),
+        (5, "readback"),
+        (6, "normalisation"),
+    }
+    page = """<p title="the setpoint here">A readback.</p><code>the setpoint</code><style>.setpoint a {}</style>
+<script>const setpoint = "on-line words";</script><!-- a deadtime -->"""
+    words = {(line, word) for line, text in of_page(page) for word, _ in misspelt(text)}
+    assert words == {(1, "setpoint"), (1, "readback"), (2, "on-line"), (2, "deadtime")}
 
 
 def test_the_glossary_has_the_terms_that_the_tables_use() -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 import pytest
-from kits import DAMAGES, EMBED, ROOT, SHIPPED, SOME, as_version_1, kit_of, name, spoilt, verdict_on
+from kits import DAMAGES, EMBED, OLD, ROOT, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
 
 CMAKE = shutil.which("cmake")
 if CMAKE is None or shutil.which("cc") is None:
@@ -86,12 +86,13 @@ def test_c_refuses_results_and_takes_measured_disturbances(host: Path, disobedie
 def test_c_does_not_pass_a_damaged_kit(host: Path, damage: str, tmp_path: Path) -> None:
     done = run(host, "--conformance", spoilt(PID, tmp_path, DAMAGES[damage]))
     assert done.returncode == 1, done.stdout + done.stderr
-    expected = "largest difference 0.001, 0 wrong" if damage in {"mv", "state"} else "largest difference 0, 1 wrong"
-    assert expected in done.stdout
+    expected = {"mv": "0.001, 0 wrong", "state": "0.001, 0 wrong", "moved": "0.8, 0 wrong"}.get(damage, "0, 1 wrong")
+    assert f"largest difference {expected}" in done.stdout
 
 
-def test_c_reads_a_kit_of_version_1(host: Path, tmp_path: Path) -> None:
-    done = run(host, "--conformance", spoilt(PID, tmp_path, as_version_1))
+@pytest.mark.parametrize("version", OLD)
+def test_c_reads_an_old_kit(host: Path, version: int, tmp_path: Path) -> None:
+    done = run(host, "--conformance", spoilt(PID, tmp_path, OLD[version]))
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -127,6 +128,23 @@ def test_the_c_loop_writes_nothing_before_it_has_read_the_plant(tmp_path: Path) 
     assert first.endswith("HOLD - the plant cannot be read")
     assert second.endswith("HOLD - the plant cannot be read")
     assert third == "written 250"  # the read-back: where the made-up plant's actuator stands
+
+
+def test_the_folder_of_onnxruntime_counts_from_where_the_user_stands(tmp_path: Path) -> None:
+    """And a Python without onnxruntime is one line, not a traceback."""
+    script = ["bash", str(ROOT / "tools" / "onnxruntime_c.sh"), "here"]
+    bare = tmp_path / "python"
+    bare.write_text(f'#!/bin/sh\nexec {sys.executable} -S -I "$@"\n')
+    bare.chmod(0o755)
+    for python, status in ((str(bare), 1), (sys.executable, 0)):
+        environment = {**os.environ, "PYTHON": python}
+        done = subprocess.run(script, capture_output=True, text=True, env=environment, cwd=tmp_path)
+        assert done.returncode == status, done.stderr
+        assert (tmp_path / "here").exists() is (status == 0)
+        said = f"onnxruntime_c.sh: {python} has no package onnxruntime with a libonnxruntime.so"
+        assert (done.stderr.startswith(said) and done.stderr.count("\n") == 1) if status else done.stderr == ""
+    assert (tmp_path / "here" / "lib" / "libonnxruntime.so").is_file()
+    assert (tmp_path / "here" / "include" / "onnxruntime_c_api.h").is_file()
 
 
 def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:

@@ -152,6 +152,7 @@ def test_a_call_that_is_not_allowed_says_why(opened: ExitStack) -> None:
             (lambda u=u: u.begin(mv_start=9e3), "mv_start.T_j = 9000 K is not allowed: its range is 0 to 500"),
             (lambda u=u: (u.reset(), u.begin(), u.set(mv=1.0)), "of mv, cannot be set because it is an output"),
             (lambda u=u: u.set(mv_start=250.0), "of mv_start, cannot be set after the initialization"),
+            (lambda u=u: u.set(use_mv_applied=False), "use_mv_applied cannot be set after the initialization"),
             (lambda u=u: u.fmu.doStep(7.0, 0.5), "the step begins at 7 s, but the last one ended at 0 s"),
             (lambda u=u: u.fmu.doStep(0.0, np.nan), "a communication step of nan s from 0 s on is not allowed"),
             (lambda u=u: u.fmu.doStep(0.0, 1e300), "a communication step of 1e+300 s from 0 s on is not allowed"),

@@ -96,7 +96,7 @@ def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert "none of cc, gcc, clang is there; apt-get install gcc brings one" in refused(capsys, *words)
     with monkeypatch.context() as here:
         here.setitem(sys.modules, "fmpy", None)
-        assert "needs the package fmpy, which is not installed: pip install" in refused(capsys, *words)
+        assert "an FMU needs the package fmpy: pip install 'loopwright[fmu]'" in refused(capsys, *words)
     with monkeypatch.context() as here:
         here.setattr(sys, "platform", "win32")
         assert "an FMU is built on Linux" in refused(capsys, *words)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kits import DAMAGES, EMBED, SHIPPED, SOME, as_version_1, kit_of, name, spoilt, verdict_on
+from kits import DAMAGES, EMBED, OLD, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
 
 NODE = shutil.which("node")
 if NODE is None or not (EMBED / "node" / "node_modules").is_dir():
@@ -55,12 +55,14 @@ def test_node_refuses_results_and_takes_measured_disturbances(disobedient_file: 
 def test_node_does_not_pass_a_damaged_kit(damage: str, tmp_path: Path) -> None:
     done = run("--conformance", spoilt(PID, tmp_path, DAMAGES[damage]))
     assert done.returncode == 1, done.stdout + done.stderr
-    expected = "0.00100, 0 wrong" if damage in {"mv", "state"} else "0.00, 1 wrong"
+    larger = {"mv": "0.00100, 0 wrong", "state": "0.00100, 0 wrong", "moved": "0.800, 0 wrong"}
+    expected = larger.get(damage, "0.00, 1 wrong")
     assert f"largest difference {expected}" in done.stdout
 
 
-def test_node_reads_a_kit_of_version_1(tmp_path: Path) -> None:
-    done = run("--conformance", spoilt(PID, tmp_path, as_version_1))
+@pytest.mark.parametrize("version", OLD)
+def test_node_reads_an_old_kit(version: int, tmp_path: Path) -> None:
+    done = run("--conformance", spoilt(PID, tmp_path, OLD[version]))
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -79,7 +81,7 @@ def test_the_node_loop_scans_once_a_period() -> None:
 LOOP = """
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
-const [host, file, unread, unwritten] = process.argv.slice(1).map((w) => (isNaN(w) ? w : Number(w)));
+const [host, file, unread, unwritten, moved] = process.argv.slice(1).map((w) => (isNaN(w) ? w : Number(w)));
 const ort = createRequire(host)("onnxruntime-node");
 const { Controller, Loop } = await import(host.replace("node/host", "javascript/controller"));
 const { MadeUpPlant, run, start } = await import(host.replace("node/host", "javascript/run"));
@@ -92,10 +94,14 @@ class Plant extends MadeUpPlant {
     const sample = super.read();
     if (this.k <= unread) throw new Error("no answer yet");
     if (this.k === 4) throw new Error("no answer");
+    if (moved && this.k === unwritten + 1) return { ...sample, pv: [0.499, 300], mv_applied: [600] }; // no such MV
     return { ...sample, pv: [0.499, 300] };
   }
   write(mv) {
-    if (this.k === unwritten) throw new Error("no way");
+    if (this.k === unwritten) {
+      if (moved) this.mv = [moved]; // by its operator
+      throw new Error("no way");
+    }
     written.push([...mv]);
     super.write(mv);
   }
@@ -114,19 +120,41 @@ await run(loop, plant, {
   },
 });
 let refused = [];
+try { loop.setMv([200]); } catch (error) { refused.push(error.message); }
+loop.setMode("MANUAL");
+loop.setMv([200]);
+loop.unwritten("no way");
+try { loop.setMv([210]); } catch (error) { refused.push(error.message); }
+// After a lost command: no read-back at all gives the old MV back, but not after an implausible one.
+loop.setMode("HOLD");
+const sample = { pv: [0.499, 300], dv: [], mv_applied: null, age_s: 0 };
+const nothingReadBack = await loop.scan(sample);
+loop.unwritten("no way");
+await loop.scan({ ...sample, mv_applied: [600] });
+const afterAnImplausibleOne = await loop.scan(sample);
 for (const bad of [[2], [NaN], [], [0.1, 0.2]])
   try { loop.setSp(bad); } catch (error) { refused.push(error.message); }
-console.log(JSON.stringify({ scans, refused, written, sp: [...loop.sp] }));
+const lost = [nothingReadBack.mv, afterAnImplausibleOne.mv];
+console.log(JSON.stringify({ scans, lost, refused, written, sp: [...loop.sp] }));
 """
 
 
-def ran(unread: int, unwritten: int) -> dict[str, Any]:
+def ran(unread: int, unwritten: int, moved: float = 0.0) -> dict[str, Any]:
     """A loop on a clock of the test's, two gaps, and a plant that is not read at the first ``unread`` scans.
 
-    Nor can it be read at the fourth one, nor written at the one of the number ``unwritten``.
+    Nor can it be read at the fourth one, nor written at the one of the number ``unwritten``; there its operator then
+    sets the MV to ``moved``, and the next read-back is implausible.
     """
     host, file = EMBED / "node" / "host.mjs", kit_of(PID) / "pid.onnx"
-    command = [str(NODE), "--input-type=module", "-e", LOOP, str(host), str(file), str(unread), str(unwritten)]
+    command = [
+        str(NODE),
+        "--input-type=module",
+        "-e",
+        LOOP,
+        str(host),
+        str(file),
+        *map(str, (unread, unwritten, moved)),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
@@ -162,14 +190,85 @@ def test_faults_hold_the_mv_in_node(told: dict[str, Any]) -> None:
     assert [k for k, scan in scans.items() if scan["mode"] == "HOLD"] == [3, 4, 9, 10]
     assert scans[3]["reason"] == "the plant cannot be read"
     assert scans[9]["reason"] == "the plant cannot be written: no way"
+    assert scans[3]["mv"] == scans[2]["mv"]
+    assert scans[9]["mv"] is None  # the last command did not arrive: where the MV stands is not known
     for fault in (3, 9):
-        assert scans[fault]["mv"] == scans[fault + 1]["mv"] == scans[fault - 1]["mv"]
+        assert scans[fault + 1]["mv"] == scans[fault - 1]["mv"]
         assert scans[fault - 1]["mv"] != scans[fault - 2]["mv"]  # the law was moving it
         assert not any(scans[fault]["state"])
 
 
+def test_a_plant_that_reads_nothing_back_gets_its_old_mv_back_in_node(told: dict[str, Any]) -> None:
+    assert told["lost"] == [[200], None]  # none after an implausible read-back: the plant does read back
+
+
+def test_what_the_plant_s_operator_set_meanwhile_is_held_in_node() -> None:
+    """A command does not arrive, the MV is moved, and the next read-back is implausible."""
+    found = ran(0, 10, 350.0)
+    scans = {scan["k"]: scan for scan in found["scans"]}
+    assert [scans[k]["mv"] for k in (9, 10)] == [None, None]
+    assert scans[10]["reason"].startswith("applied MV T_j is 600 K, outside its range")
+    assert scans[11]["mv"] == found["written"][9] == [350.0]  # nine were written before
+    assert [scans[k]["mode"] for k in (9, 10, 11, 12)] == ["HOLD", "HOLD", "HOLD", "AUTO"]
+    assert abs(scans[12]["mv"][0] - 350) < 1  # the law begins there
+
+
+STRANGE = """
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+const [host, file] = process.argv.slice(1);
+const ort = createRequire(host)("onnxruntime-node");
+const { Controller, Loop } = await import(host.replace("node/host", "javascript/controller"));
+const { run } = await import(host.replace("node/host", "javascript/run"));
+const manifest = JSON.parse(readFileSync(file.replace("onnx", "json")));
+const controller = await Controller.load(ort, readFileSync(file), manifest, "cpu");
+const loop = new Loop(controller, { sp: [0.5], mode: "AUTO", recoverAfter: 1 });
+const good = { pv: [0.499, 300], dv: [], mv_applied: [250], age_s: 0 };
+const thrown = (what) => { throw what; };
+const reads = [
+  () => undefined, () => null, () => 7, () => "good", () => ({}), () => Promise.reject(), () => thrown(null),
+  () => ({ ...good, pv: [Symbol(), 300] }), () => ({ ...good, pv: undefined }), () => ({ ...good, age_s: Symbol() }),
+  () => ({ ...good, mv_applied: [Symbol()] }), () => ({ ...good, mv_applied: 0 }), () => ({ ...good, pv: [1n, 300] }),
+  () => ({ get pv() { return thrown(Object.create(null)); } }), () => good,
+];
+const writes = [
+  () => {}, () => thrown(undefined), () => Promise.reject(Symbol("no")), () => thrown(Object.create(null)),
+  (mv) => mv.fill(NaN), () => {},
+];
+let time = 0, k = 0, w = 0, scans = [];
+await run(loop, { read: () => (reads[k++] ?? (() => good))(), write: (mv) => writes[Math.min(w++, 5)](mv) }, {
+  scans: reads.length + writes.length,
+  period: 1,
+  now: () => time,
+  sleep: async (seconds) => { time += seconds; },
+  seen: ({ mode, mv, reason }) => scans.push({ mode, mv: mv && [...mv], reason }),
+});
+console.log(JSON.stringify({ scans, reads: reads.length }));
+"""
+
+
+def test_the_node_loop_survives_whatever_its_plant_returns_and_throws() -> None:
+    host, file = EMBED / "node" / "host.mjs", kit_of(PID) / "pid.onnx"
+    command = [str(NODE), "--input-type=module", "-e", STRANGE, str(host), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    blind, seeing = found["scans"][: found["reads"] - 1], found["scans"][found["reads"] - 1 :]
+    assert all(scan["mode"] == "HOLD" and scan["reason"] and scan["mv"] is None for scan in blind)
+    assert [blind[k]["reason"] for k in (0, 1, 5, 6)] == ["the plant cannot be read"] * 4
+    assert blind[8]["reason"] == "PV has no values instead of 2"
+    assert len(seeing) == 7
+    lost = [scan["reason"] for scan in seeing if scan["mv"] is None]
+    whys = ("undefined", "Symbol(no)", "an error without words")
+    assert lost == [f"the plant cannot be written: {why}" for why in whys]
+    assert seeing[-1]["mode"] == "AUTO"
+    assert all(0 <= scan["mv"][0] <= 500 for scan in seeing if scan["mv"] is not None)
+
+
 def test_what_an_operator_may_not_set_is_refused_in_node(told: dict[str, Any]) -> None:
-    assert len(told["refused"]) == 4
+    assert len(told["refused"]) == 6
+    assert told["refused"][0] == "the MV is set by hand in MANUAL only; the loop is in AUTO"
+    assert told["refused"][1].startswith("the last MV did not reach the plant")
     assert told["sp"] == [0.5]
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from chromium import CHROMIUM
 
 from pipeline.cases import CASES
 from pipeline.commands.playground import page_of
@@ -29,14 +30,14 @@ from pipeline.playground.web_runtime import kept
 from pipeline.simulation.scenario import Scenario
 from serving import Controller, ControlLoop, Mode, Sample
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
 if not kept().exists():
     pytest.skip("onnxruntime-web is not here (python -m pipeline.playground.web_runtime)", allow_module_level=True)
 
-from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Browser, Page, expect
 
+pytest_plugins = ["browser_of_tests"]
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 PICTURES = os.environ.get("LOOPWRIGHT_PICTURES")
 CASE = "henson_seborg_cstr"
@@ -62,15 +63,6 @@ def site(folder: Path) -> Iterator[str]:
         yield f"http://127.0.0.1:{server.server_port}/"
         server.shutdown()
         thread.join()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as p:
-        # Containers have no user namespaces; the page is our own.
-        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield made
-        made.close()
 
 
 @pytest.fixture

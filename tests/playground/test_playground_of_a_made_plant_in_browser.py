@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from chromium import CHROMIUM, launched
 from torch import Tensor
 
 from pipeline.evaluation.case import Case
@@ -26,13 +26,12 @@ from pipeline.playground.web_runtime import kept
 from pipeline.simulation.scenario import Scenario
 from serving import Controller, ControlLoop, Mode, Sample, Signal
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
 if not kept().exists():
     pytest.skip("onnxruntime-web is not here (python -m pipeline.playground.web_runtime)", allow_module_level=True)
 
-from playwright.sync_api import expect, sync_playwright  # noqa: E402
+from playwright.sync_api import expect
 
 CHANGE, END = 30, 80
 
@@ -116,8 +115,7 @@ def test_two_loops_and_a_measured_disturbance_run_as_in_python(tmp_path: Path) -
     told = about(case, [controller], None)
     assert told["beside"] == ["feedforward", "feedforward"]
     write_one_file(tmp_path / "basin.html", Playground(told, plant_graphs(plant), [controller]), kept())
-    with sync_playwright() as p:
-        browser = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with launched() as browser:
         page = browser.new_page()
         page.goto((tmp_path / "basin.html").as_uri())
         expect(page.locator("body")).to_have_attribute("data-ready", "yes")
@@ -135,7 +133,6 @@ def test_two_loops_and_a_measured_disturbance_run_as_in_python(tmp_path: Path) -
         page.evaluate(f"playground.steps({END - CHANGE})")
         expect(page.locator('[data-chart="rain"]')).to_be_visible()
         columns = page.evaluate("playground.simulation.columns")
-        browser.close()
 
     loop = ControlLoop(controller, sp=[4.0, 30.0], mv=plant.start[1], mode=Mode.AUTO, recover_after=5)
     x, mv = plant.start

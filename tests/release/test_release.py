@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from base64 import b64decode
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import module_from_spec, spec_from_file_location
@@ -218,6 +219,21 @@ def test_the_bill_is_valid_and_holds_the_page_s_script(
     ours = edges[bill["metadata"]["component"]["bom-ref"]]
     assert {held[name]["bom-ref"] for name in ("uPlot", "onnxruntime_c_api.h")} <= set(ours)
     assert held["onnxruntime_c_api.h"]["licenses"] == [{"expression": "MIT"}]
+    lock = json.loads((ROOT / "pipeline/playground/npm/package-lock.json").read_text())["packages"]
+    page = (tmp_path / f"loopwright-{serving.__version__}-licences.md").read_text()
+    by_purl = {component["purl"]: component for component in bill["components"]}
+    for path, row in lock.items():
+        if path:  # what npm fetches for the playground
+            name = path.removeprefix("node_modules/")
+            component = by_purl[f"pkg:npm/{name.replace('@', '%40')}@{row['version']}"]
+            assert component["licenses"] == [{"expression": row["license"]}]
+            assert bytes.fromhex(component["hashes"][0]["content"]) == b64decode(
+                row["integrity"].removeprefix("sha512-")
+            )
+            assert f"| {name} | {row['version']} | {row['license']} | npm, for loopwright playground |" in page
+    web = by_purl["pkg:npm/onnxruntime-web@1.30.0"]["bom-ref"]
+    assert web in ours
+    assert len(edges[web]) == len(lock["node_modules/onnxruntime-web"]["dependencies"])
     assert "file:" not in json.dumps(bill)
     assert str(Path.home()) not in json.dumps(bill)
     assert "| asyncua |" in (tmp_path / f"loopwright-{serving.__version__}-licences.md").read_text()

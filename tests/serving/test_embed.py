@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kits import DAMAGES, as_version_1, kit_of, spoilt, verdict_on
+from kits import DAMAGES, OLD, kit_of, spoilt, verdict_on
 
 from pipeline.export.gate import export
 from pipeline.laws import ControlLaw
@@ -86,8 +86,9 @@ def test_python_s_conformance_run_passes_the_kit_and_no_damaged_one(damage: str 
     assert verdict.same_bits == verdict.steps
 
 
-def test_python_s_conformance_run_reads_a_kit_of_version_1(tmp_path: Path) -> None:
-    kit = spoilt(SHIPPED[0], tmp_path, as_version_1)
+@pytest.mark.parametrize("version", OLD)
+def test_python_s_conformance_run_reads_an_old_kit(version: int, tmp_path: Path) -> None:
+    kit = spoilt(SHIPPED[0], tmp_path, OLD[version])
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(EXAMPLES / "conformance.py"), str(kit)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)

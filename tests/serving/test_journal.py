@@ -12,12 +12,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from processes import within
 
 from serving import Controller, LoopError
-from serving.journal import Event, Journal, JournalReader, Scan, columns
+from serving.journal import Event, Journal, JournalReader, Scan, columns, writer
 from serving.journal.entries import Kind
+from serving.journal.file import TABLES
 from serving.journal.packing import packed, unpacked
-from serving.journal.rotation import LEAST_EVENTS, SLACK
+from serving.journal.reader import EVENT
+from serving.journal.rotation import LEAST_EVENTS, SLACK, shorten_events
 from serving.journal.writer import BLOCK, FRESH
 
 pytest_plugins = ["small_laws"]
@@ -131,8 +136,8 @@ def test_events_are_bounded_and_no_alarm_is_lost_that_somebody_has_yet_to_see(
     reader = JournalReader(path)
     found = reader.events()
     assert LEAST_EVENTS <= len(found) <= (1 + SLACK) * LEAST_EVENTS
-    assert [i for i, _ in found[:6]] == [1, 2, 3, 4, 8, found[5][0]]
-    assert [e.what for _, e in found[5:]] == [f"set point {k}" for k in range(5 * LEAST_EVENTS)][5 - len(found) :]
+    assert [i for i, _ in found[:7]] == [1, 2, 3, 4, 6, 8, found[6][0]]  # 6 is the newest of its alarm
+    assert [e.what for _, e in found[6:]] == [f"set point {k}" for k in range(5 * LEAST_EVENTS)][6 - len(found) :]
     assert [e.event.what for e in reader.active()] == ["standing", "standing and seen"]
     shown = {e.event.what: e for e in reader.entries()}
     assert shown["standing and seen"].acknowledged is not None
@@ -210,6 +215,52 @@ def test_a_killed_process_loses_at_most_its_last_second(tmp_path: Path, controll
         assert times[-1] - (found[-1][2].time_s if found else times[0]) < 1.0
 
 
+def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path: Path, controller: Controller) -> None:
+    path, link = tmp_path / "loop.journal", tmp_path / "link.journal"
+    first = Journal(path)
+    link.symlink_to(path)
+    for name in (path, link):
+        with pytest.raises(LoopError, match=rf"{name.name} is written by another loop \(process {os.getpid()}\); end"):
+            Journal(name)
+    script = "import sys; from pathlib import Path; from serving.journal import Journal; Journal(Path(sys.argv[1]))"
+    other = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False)
+    assert other.returncode == 1
+    assert f"{path} is written by another loop (process {os.getpid()})" in other.stderr
+    first.begin(controller.manifest, controller.sha256, 1e9)
+    given = scans(FRESH + 2 * BLOCK)
+    for scan in given:
+        first.scan(scan)
+    first.close()
+    reader = JournalReader(path)
+    assert all(same(a, b) for a, (_, _, b) in zip(given, reader.scans(), strict=True))
+    reader.close()
+    Journal(link).close()
+
+
+def test_runs_that_alternate_lose_nothing_when_they_are_packed(tmp_path: Path, controller: Controller) -> None:
+    """Two loops that wrote one journal, before a second one was refused, left such files."""
+    path, given = tmp_path / "loop.journal", scans(FRESH + 2 * BLOCK)
+    journal = Journal(path)
+    for _ in range(2):
+        journal.begin(controller.manifest, controller.sha256, 1e9)
+    journal.close()
+    base, rng = sqlite3.connect(path), np.random.default_rng(0)
+    runs = [1 + int(rng.random() < 0.5) for _ in given]
+    rows = [(run, s.time_s, s.mode, np.array(s.numbers).tobytes()) for run, s in zip(runs, given, strict=True)]
+    base.executemany("insert into scan (run, time, mode, numbers) values (?, ?, ?, ?)", rows)
+    base.commit()
+    base.close()
+    journal = Journal(path)
+    journal.event(Event(1e9, "change", "anna", "mode AUTO"))
+    journal.close()
+    reader = JournalReader(path)
+    found = list(reader.scans())
+    assert [(i, run) for i, run, _ in found] == [(k + 1, run) for k, run in enumerate(runs)]
+    assert all(np.array_equal(a.numbers, b.numbers, equal_nan=True) for a, (_, _, b) in zip(given, found, strict=True))
+    assert len(list(reader.scans(after_id=100))) == len(given) - 100
+    reader.close()
+
+
 def test_what_is_no_journal_is_named(tmp_path: Path) -> None:
     foreign = tmp_path / "other.db"
     base = sqlite3.connect(foreign)
@@ -253,3 +304,80 @@ def test_a_disk_that_takes_nothing_loses_nothing(
     reader = JournalReader(tmp_path / "loop.journal")
     assert all(same(a, b) for a, (_, _, b) in zip(given, reader.scans(), strict=True))
     reader.close()
+
+
+def test_what_a_full_disk_costs_is_said_and_no_run_is_lost(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More waits than may: the oldest scans go, and the rest is still of a run."""
+    monkeypatch.setattr(writer, "WAITING", 20)
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    told: list[str] = []
+    journal = Journal(tmp_path / "loop.journal", tell=told.append)
+    write, full = journal._write, [True]
+
+    def sometimes(run: int) -> int:
+        if full:
+            raise sqlite3.OperationalError("database or disk is full")
+        return write(run)
+
+    monkeypatch.setattr(journal, "_write", sometimes)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    journal.event(Event(1e9, "fault", "loop", "PV T: bad", alarm="fault", raised=True))
+    given = scans(50)
+    for scan in given:
+        journal.scan(scan)
+    assert within(20, lambda: journal.lost == 32)  # 20 of 52 stay: the run, the event and 18 scans
+    full.clear()
+    journal.close()
+    loss = "; 32 scans and events are lost that the disk did not take"
+    assert told == [
+        "the journal cannot be written: OperationalError: database or disk is full", f"the journal writes again{loss}",
+    ]  # fmt: skip
+    reader = JournalReader(tmp_path / "loop.journal")
+    found = list(reader.scans())
+    assert [run for _, run, _ in found] == [1] * 18
+    assert all(same(a, b) for a, (_, _, b) in zip(given[-18:], found, strict=True))
+    assert len(reader.runs()) == 1
+    newest, *rest = [e for e in reader.entries() if e.event.raised]
+    assert newest.event.what == f"the journal could not be written{loss}"
+    assert newest.over_s is not None
+    assert [e.event.what for e in rest] == ["PV T: bad"] == [e.event.what for e in reader.active()]
+    reader.close()
+
+
+def test_an_alarm_that_is_over_stays_over() -> None:
+    """One that became worse before it ended: the first event is kept for whoever has not seen it, with its end."""
+    given = [("gain", True, 0), ("gain", True, 0), ("", False, 2), ("gain", False, 0), *[("", False, 0)] * 3000]
+    before, after = rotated(given, LEAST_EVENTS)
+    assert before == after == []
+
+
+EVENTS = st.lists(
+    st.tuples(st.sampled_from(["", "", "fault", "gain", "connection"]), st.booleans(), st.integers(0, 40)), max_size=60
+)
+
+
+@given(EVENTS, st.integers(1, 40))
+@settings(max_examples=300, deadline=None)
+def test_the_same_alarms_are_active_before_and_after_the_oldest_events_went(
+    given: list[tuple[str, bool, int]], most: int
+) -> None:
+    before, after = rotated(given, most)
+    assert before == after
+
+
+def rotated(given: list[tuple[str, bool, int]], most: int) -> tuple[list[int], list[int]]:
+    """The active alarms before and after the events, as (alarm, raised, about), were shortened to ``most``."""
+    base = sqlite3.connect(":memory:")
+    base.executescript(TABLES)
+    rows = [(1e9 + i, "change", "loop", "", "", alarm, alarm != "" and raised, 0 if alarm else about)
+            for i, (alarm, raised, about) in enumerate(given)]  # fmt: skip
+    base.executemany(f"insert into event ({EVENT}) values (?, ?, ?, ?, ?, ?, ?, ?)", rows)
+    reader = JournalReader.__new__(JournalReader)
+    reader._base = base
+    before = [e.id for e in reader.active()]
+    shorten_events(base, most)
+    after = [e.id for e in reader.active()]
+    base.close()
+    return before, after

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from pipeline.historian.tags import read_tags
-from serving import Controller
+from serving import Controller, Signal
 from serving.journal import Journal, Scan, columns
 from serving.station.export import export, tag_table
 
@@ -81,3 +83,74 @@ def test_the_table_of_tags_says_that_units_are_certain(tmp_path: Path, controlle
     tag_table(tmp_path / "loop.journal", tmp_path / "tags.csv")
     tags = {tag.tag: tag for tag in read_tags(tmp_path / "tags.csv")}
     assert all(tag.unit_certain for tag in tags.values() if tag.role != "mode")
+
+
+BAD, UNCERTAIN, GOOD = 0x8000_0000, 0x4000_0000, 0x0000_0001
+FAULT = "PV level: BadSensorFailure"
+
+
+@pytest.mark.parametrize(
+    ("quality", "reason", "empty"),
+    [
+        ((), "", []),
+        ((GOOD,) * 4, "", []),
+        ((BAD, 0, 0, 0), FAULT, ["level.PV"]),
+        ((BAD, 0, 0, 0), "", ["level.PV"]),
+        ((0, BAD, 0, 0), FAULT, ["T.PV"]),
+        ((0, 0, BAD, 0), FAULT, ["valve.OP"]),
+        ((0, 0, 0, BAD), "", ["inflow.DV"]),
+        ((0, UNCERTAIN, 0, 0), "", []),  # the loop used it
+        ((0, UNCERTAIN, 0, 0), "PV T: UncertainLastUsableValue", ["T.PV"]),
+    ],
+)
+def test_what_was_not_measured_is_an_empty_cell(
+    tmp_path: Path, controller: Controller, quality: tuple[int, ...], reason: str, empty: list[str]
+) -> None:
+    names = columns(controller.manifest)
+    journal = Journal(tmp_path / "loop.journal")
+    journal.begin(controller.manifest, controller.sha256, 1e9, 1.0)
+    for k in range(3):
+        numbers = tuple(np.nan if name.startswith("mv ") else 0.0 for name in names)
+        journal.scan(Scan(1e9 + 0.5 * k, "HOLD", numbers, quality, reason))
+    journal.close()
+    export(tmp_path / "loop.journal", tmp_path / "loop.csv")
+    table = pd.read_csv(tmp_path / "loop.csv").drop(columns=["time", "MODE"])
+    assert [name for name in table if table[name].isna().all()] == empty
+    assert table.drop(columns=empty).notna().all().all()
+
+
+def test_of_dvs_that_are_not_all_read_none_is_believed_where_one_is_bad(tmp_path: Path, controller: Controller) -> None:
+    m = replace(controller.manifest, dv=(Signal("a", "1", 0.0, 1.0), Signal("b", "1", 0.0, 1.0)))
+    journal = Journal(tmp_path / "loop.journal")
+    journal.begin(m, "", 1e9, 1.0)
+    for k, status in enumerate((0, BAD, 0)):  # two PVs, an MV, and one of the two DVs
+        quality = (0, 0, 0, status)
+        journal.scan(Scan(1e9 + 0.5 * k, "AUTO", (0.5,) * len(columns(m)), quality, ""))
+    journal.close()
+    export(tmp_path / "loop.journal", tmp_path / "loop.csv")
+    table = pd.read_csv(tmp_path / "loop.csv")
+    assert table[["a.DV", "b.DV"]].isna().to_numpy().tolist() == [[False] * 2, [True] * 2, [False] * 2]
+    assert table[["level.PV", "T.PV", "valve.OP"]].notna().all().all()
+
+
+def test_the_ranges_are_the_widest_of_all_runs(tmp_path: Path, controller: Controller) -> None:
+    """After a swap to a narrower controller the readings of the wider one are still readings."""
+    wide = controller.manifest
+    (valve,), (level, temperature) = wide.mv, wide.pv
+    narrow = replace(
+        wide,
+        pv=(replace(level, low=0.5, high=1.5), replace(temperature, unit="degC", low=0.0, high=50.0)),
+        mv=(replace(valve, low=20.0),),
+    )
+    journal = Journal(tmp_path / "loop.journal")
+    for m in (wide, narrow):
+        journal.begin(m, controller.sha256, 1e9, 1.0)
+    journal.close()
+    tag_table(tmp_path / "loop.journal", tmp_path / "tags.csv")
+    tags = {tag.tag: tag for tag in read_tags(tmp_path / "tags.csv")}
+    ranges = {name: (tag.low, tag.high) for name, tag in tags.items()}
+    assert ranges["level.PV"] == (level.low, level.high)
+    assert ranges["T.PV"] == (0.0, 50.0)  # another unit: nothing to compare
+    assert ranges["valve.OP"] == (valve.low, valve.high)
+    assert (tags["valve.OP"].command_low, tags["valve.OP"].command_high) == (20.0, valve.high)
+    assert tags["level.PV"].command_low is None

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from serving import Command, Controller, Manifest, Mode, Sample, Signal
 from serving.monitor import Monitor
@@ -326,19 +329,112 @@ def test_a_settling_time_is_that_of_the_tests_without_noise() -> None:
     assert settle_scans(manifest()) == 100
 
 
-@pytest.mark.parametrize("spoil", ["law", "shape", "missing", "kind"])
-def test_what_another_controller_learnt_is_refused(spoil: str) -> None:
-    state = json.loads(json.dumps(Monitor(manifest(), started_s=0.0).state()))
-    if spoil == "law":
-        state["law"] = "another"
-    elif spoil == "shape":
-        state["parts"]["rest"]["theta"] = [[0.0]]
-    elif spoil == "missing":
-        del state["parts"]["foresight"]
-    else:
-        state["parts"]["saturated"]["value"] = "x"
-    with pytest.raises((ValueError, KeyError, TypeError)):
+def learnt() -> Any:
+    """What a monitor keeps whose charts have learnt."""
+    monitor = Monitor(manifest(), started_s=0.0)
+    loop(monitor, 9_000, seed=0)
+    return json.loads(json.dumps(monitor.state()))
+
+
+LEARNT = learnt()
+ANOTHER: list[tuple[str, Any]] = [
+    ("law", "another"), ("law", None), ("settle", 1), ("settle", None), ("started_s", "now"), ("started_s", math.nan),
+    ("started_s", 1e15), ("parts", []), ("parts", None), ("parts rest theta", [[0.0]]), ("parts foresight", None),
+    ("parts swings", {}), ("parts swings", []), ("parts swings 0", 1), ("parts saturated value", "x"),
+    ("parts saturated value", None), ("parts saturated value", math.nan), ("parts saturated value", True),
+    ("parts saturated value", 10**400), ("parts saturated count", None), ("parts saturated count", 1.5),
+    ("parts saturated count", -1), ("parts spread since_s", [1e15]), ("parts spread since_s", ["1"]),
+    ("parts spread mean", [None]), ("parts spread mean", [[1.0]]), ("parts spread mean", [math.inf]),
+    ("parts spread scatter", [0.0]), ("parts spread pool", 0), ("parts spread pool", True),
+    ("parts spread weekly", 0.0), ("parts spread limit", [-1.0]), ("parts spread found", [2.0]),
+    ("parts spread rises", [1e9]),
+    ("parts swings 0 intervals", ["a"]), ("parts swings 0 intervals", "abc"), ("parts swings 0 intervals", [[1]]),
+    ("parts swings 0 intervals", [1] * 100_000), ("parts swings 0 since", -3), ("parts answers model frozen", 1),
+    ("parts answers model p", [[1.0], [1.0, 2.0]]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("place", "kept"), ANOTHER, ids=[f"{i} {place}" for i, (place, _) in enumerate(ANOTHER)])
+def test_what_another_controller_learnt_or_nobody_is_refused(place: str, kept: Any) -> None:
+    *way, last = (int(step) if step.isdigit() else step for step in place.split())
+    state = json.loads(json.dumps(LEARNT))
+    at = state
+    for step in way:
+        at = at[step]
+    assert at[last] is not None
+    at[last] = kept
+    with pytest.raises(ValueError, match=r"learnt|must be|is missing|in place of|is no|outside"):
         Monitor.restored(manifest(), state)
+    if isinstance(at, dict):
+        del at[last]
+        with pytest.raises(ValueError, match=r"learnt|must be|is missing|in place of|is no|outside"):
+            Monitor.restored(manifest(), state)
+
+
+def answers_well(state: Any) -> None:
+    """A memory is refused; or its monitor gives verdicts and numbers, now and after some scans, that are JSON."""
+    try:
+        monitor = Monitor.restored(manifest(), state)
+    except ValueError:
+        return
+    for n in (0, 250):
+        loop(monitor, n, seed=1, began=9_000)
+        assert {v.level for v in monitor.verdicts()} <= {"as validated", "watch", "retrain", "not known yet"}
+        json.dumps([asdict(v) for v in monitor.verdicts()], allow_nan=False)
+        json.dumps(monitor.numbers(), allow_nan=False)
+
+
+NUMBERS = st.one_of(
+    st.integers(),
+    st.floats(),
+    st.sampled_from([0, 1, -1, 300, 1e5, 1e15, 1e99, -1e99, 10**12, 10**400, math.nan, math.inf, -math.inf]),
+)
+TREES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.text(), NUMBERS),
+    lambda tree: st.one_of(st.lists(tree), st.dictionaries(st.text(), tree)),
+    max_leaves=8,
+)
+
+
+@given(TREES)
+def test_a_memory_that_is_any_tree_is_refused(tree: Any) -> None:
+    answers_well(tree)
+    answers_well({**LEARNT, "parts": tree})
+    answers_well({**LEARNT, "parts": {**LEARNT["parts"], "spread": tree}})
+
+
+def forged(tree: Any, data: st.DataObject) -> Any:
+    """A memory with some value replaced: by a number in all places of an array, or by any tree."""
+    if isinstance(tree, dict) and tree:
+        name = data.draw(st.sampled_from(sorted(tree)))
+        return {**tree, name: forged(tree[name], data)}
+    if isinstance(tree, list) and tree and isinstance(tree[0], dict):
+        return [forged(tree[0], data), *tree[1:]]
+    if isinstance(tree, list) and data.draw(st.booleans()):
+        return np.full(np.shape(tree), data.draw(st.floats(-1e100, 1e100))).tolist()
+    if isinstance(tree, int) and data.draw(st.booleans()):
+        return data.draw(st.integers(0, 10**12))
+    return data.draw(st.one_of(NUMBERS, TREES))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of numbers that nothing could have measured
+@settings(max_examples=150)
+@given(st.data())
+def test_a_forged_memory_is_refused_or_does_no_harm(data: st.DataObject) -> None:
+    state = LEARNT
+    for _ in range(data.draw(st.integers(1, 3))):
+        state = forged(state, data)
+    answers_well(state)
+
+
+def test_a_monitor_that_fails_says_so_and_never_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = Monitor.restored(manifest(), LEARNT)
+    monkeypatch.setattr(monitor, "plight", None)
+    monkeypatch.setattr(monitor, "saturated", None)
+    (said,) = monitor.verdicts()
+    assert (said.name, said.level) == ("monitor", "watch")
+    assert "the monitor itself failed" in said.text
+    assert monitor.numbers() == {}
 
 
 def test_every_shipped_controller_has_a_monitor(controller: Controller) -> None:

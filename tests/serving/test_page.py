@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ from fake_loop import BEGIN, Browser, FakeLoop, opened
 from processes import lives, within
 
 from serving import Controller, LoopError
-from serving.journal import JournalReader
+from serving.journal import Event, Journal, JournalReader, Scan
+from serving.page.live import Live
 from serving.page.process import PageProcess
 from serving.page.settings import Page
-from serving.page.trend import Thinned, trend
+from serving.page.trend import Modes, Thinned, trend
 
 pytest_plugins = ["small_laws"]
 
@@ -255,6 +257,7 @@ def test_a_token_is_made_or_comes_from_its_file(tmp_path: Path) -> None:
     page = Page("[::1]:8080", token_file=tmp_path / "token")
     assert page.address == ("::1", 8080)
     assert "[::1]:8080" in page.hosts(8080)
+    assert "[::1]" not in page.hosts(8080)
     with pytest.raises(LoopError, match="token_file cannot be read"):
         page.token()
     (tmp_path / "token").write_text("short\n")
@@ -262,6 +265,18 @@ def test_a_token_is_made_or_comes_from_its_file(tmp_path: Path) -> None:
         page.token()
     (tmp_path / "token").write_text("long enough to be one\n")
     assert page.token() == "long enough to be one"
+
+
+def test_a_page_at_its_scheme_s_own_port_is_asked_for_without_it() -> None:
+    """A browser says no :443 and no :80."""
+    plain = Page("127.0.0.1:80", names=("loop",))
+    files = {"certificate": Path("c.pem"), "private_key": Path("k.pem")}
+    safe = Page("10.0.0.5:443", allow_remote=True, **files)
+    for page, own, other in ((plain, 80, 443), (safe, 443, 80)):
+        bare = {host.rpartition(":")[0] for host in page.hosts(own)} & set(page.hosts(own))
+        assert {"localhost", "127.0.0.1", "[::1]", page.address[0]} == bare
+        assert set(page.hosts(own)) - set(page.names) >= {f"{host}:{own}" for host in bare}
+        assert not bare & set(page.hosts(other))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -298,3 +313,81 @@ def test_a_trend_over_another_controller_and_a_pause(tmp_path: Path, controller:
     assert drawn["columns"]["pv T"][50] is None
     assert None in coarse["columns"]["pv T"]
     assert coarse["time"] == sorted(coarse["time"])
+
+
+@pytest.mark.parametrize("view", ["news", "trend"])
+def test_a_controller_that_takes_over_while_the_journal_is_read_is_no_trouble(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch, view: str
+) -> None:
+    made = FakeLoop(tmp_path, controller, scans=50)
+    assert within(10, lambda: made.writer.behind == 0)
+    runs, swaps = JournalReader.runs, list[int]()
+
+    def meanwhile(reader: JournalReader) -> list[dict[str, Any]]:
+        """Runs, and right after them another controller and its first scan."""
+        found = runs(reader)
+        if not swaps:
+            swaps.append(made.scans)
+            made.writer.begin(controller.manifest, "another", BEGIN + made.scans)
+            made.add(1)
+            assert within(10, lambda: made.writer.behind == 0)
+        return found
+
+    monkeypatch.setattr(JournalReader, "runs", meanwhile)
+    live = Live(made.journal, made.answer)
+
+    def last() -> float:
+        if view == "news":
+            return float(json.loads(live._read(1)[0][-1].split("data: ")[1])["time"][-1])
+        with closing(JournalReader(made.journal)) as reader:
+            return float(trend(reader, BEGIN, BEGIN + 200, 500)["time"][-1])
+
+    assert last() in {BEGIN + 49, BEGIN + 50}
+    assert last() == BEGIN + 50
+    assert swaps == [50]
+    made.close()
+
+
+def test_the_first_event_of_an_empty_journal_is_news(tmp_path: Path) -> None:
+    with closing(Journal(tmp_path / "loop.journal")) as journal:
+        live = Live(journal.path, lambda _: {})
+        assert live._entries() == []  # what is there at first; here it is nothing
+        journal.event(Event(BEGIN, "change", "anna", "mode SHADOW -> AUTO"))
+        assert within(10, lambda: journal.behind == 0)
+        (news,) = live._entries()
+        assert "mode SHADOW -> AUTO" in news
+        assert live._entries() == []
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_changes_of_mode_are_thinned_and_no_hold_is_lost(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, n = 50, 5_000
+    times = np.sort(rng.uniform(0, 1000, n))
+    names = rng.choice(["AUTO", "HOLD", "MANUAL", "SHADOW"], n, p=[0.6, 0.01, 0.2, 0.19]).tolist()
+    modes = Modes(0.0, 1000 / points, points)
+    for part in np.array_split(np.arange(n), 9):
+        modes.add(times[part], [names[i] for i in part], 5.0)
+    drawn = modes.thinned()
+    at = [t for t, _ in drawn]
+    assert len(drawn) <= points + 1
+    assert at == sorted(at)
+    assert all(one != other for (_, one), (_, other) in pairwise(drawn))
+    assert drawn[-1][1] == names[-1]
+    bins = (times / (1000 / points)).astype(int)
+    for k in range(points):
+        held = "HOLD" in {names[i] for i in np.flatnonzero(bins == k)}
+        end = [mode for t, mode in drawn if t < (k + 1) * 1000 / points][-1]
+        assert (end == "HOLD") == held, k
+
+
+def test_a_trend_of_a_loop_that_changes_its_mode_at_each_scan_is_short(tmp_path: Path, controller: Controller) -> None:
+    made = FakeLoop(tmp_path, controller, scans=0)
+    for k in range(20_000):
+        made.writer.scan(Scan(BEGIN + k, "AUTO" if k % 2 else "HOLD", (0.5,) * made.columns))
+    made.close()
+    with closing(JournalReader(made.journal)) as reader:
+        drawn = trend(reader, BEGIN, BEGIN + 20_000, 100)
+        close = trend(reader, BEGIN, BEGIN + 50, 100)
+    assert len(drawn["modes"]) <= 101
+    assert len(close["modes"]) == 51  # with few scans there is nothing to thin

@@ -19,6 +19,7 @@ from page_requests import BODY, broken, whole
 from processes import within
 
 from serving import Controller
+from serving.page import app as page_app
 from serving.page import live, patience
 from serving.page.app import PageApp
 
@@ -261,6 +262,58 @@ def test_many_connections_keep_nobody_out(loop: FakeLoop, monkeypatch: pytest.Mo
 
 
 LIVE = "GET /api/live HTTP/1.1"
+TREND = "GET /api/trend?from=0&to=100 HTTP/1.1"
+
+
+def test_many_busy_connections_keep_nobody_out(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Streams and trends that somebody keeps waiting: those that are open longest go when a newcomer comes."""
+    monkeypatch.setattr(patience, "MOST_CONNECTIONS", 20)
+    go = threading.Event()
+    with serving_here(loop) as (app, browser, server):
+        monkeypatch.setattr(app, "_trend", lambda *_: str(go.wait(60)))
+        busy = [connected(browser.port, raw(browser.port, "token", LIVE, body=b"")) for _ in range(12)]
+        assert within(10, lambda: len(app.live._pages) == 12)
+        busy += [connected(browser.port, raw(browser.port, "token", TREND, body=b"")) for _ in range(8)]
+        assert within(10, lambda: app._waiting == 6)
+        try:
+            for _ in range(5):
+                assert browser.get("/healthz")[0] == 200
+            assert ends(busy[0])
+            assert within(10, lambda: len(app.live._pages) < 12)
+            assert len(server.server_state.connections) <= 20
+        finally:
+            go.set()
+            for wire in busy:
+                wire.close()
+
+
+def test_trends_beyond_a_few_that_wait_are_put_off_and_none_is_drawn_for_who_has_gone(
+    loop: FakeLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn, go = list[float](), threading.Event()
+    with serving_here(loop) as (app, browser, _):
+
+        def slow(begin: float, end: float, points: int) -> str:
+            drawn.append(begin)
+            assert go.wait(60)
+            return "{}"
+
+        monkeypatch.setattr(app, "_trend", slow)
+        waiting = [
+            connected(browser.port, raw(browser.port, "token", TREND, body=b""))
+            for _ in range(page_app.TRENDS + page_app.WAITING_TRENDS)
+        ]
+        assert within(10, lambda: app._waiting == page_app.WAITING_TRENDS)
+        status, headers, body = browser.get("/api/trend?from=0&to=100")
+        assert (status, headers["Retry-After"]) == (503, "2")
+        assert "again" in json.loads(body)["error"]
+        for wire in waiting:
+            wire.close()
+        assert browser.get("/healthz")[0] == 200  # the server has seen them go
+        go.set()
+        assert within(10, lambda: app._waiting == 0)
+        assert browser.get("/api/trend?from=7&to=100")[0] == 200
+        assert drawn == [0.0] * page_app.TRENDS + [7.0]
 
 
 def test_as_many_pages_as_are_allowed_are_sent_news(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,15 +375,19 @@ def test_the_loop_is_asked_once_for_all_who_ask_at_a_time(loop: FakeLoop) -> Non
         assert len(asked) < 10
 
 
-def test_news_go_on_after_a_journal_that_could_not_be_read(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [OSError("being exchanged"), KeyError(7), RuntimeError("odd")])
+def test_news_go_on_after_a_journal_that_could_not_be_read(
+    loop: FakeLoop, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     with serving_here(loop) as (app, browser, _):
-        failed = list[int]()
+        failed, told = list[int](), list[str]()
         read = app.live._read
+        monkeypatch.setattr(app.live, "_tell", told.append)
 
         def unreadable(after_id: int | None) -> tuple[list[str], int]:
             if after_id is not None and len(failed) < 2:
                 failed.append(after_id)
-                raise OSError("being exchanged")
+                raise error
             return read(after_id)
 
         monkeypatch.setattr(app.live, "_read", unreadable)
@@ -340,3 +397,6 @@ def test_news_go_on_after_a_journal_that_could_not_be_read(loop: FakeLoop, monke
             came = b""
             while b"event: scans" not in came:
                 came += wire.recv(65_536)
+        assert app.live.failed == 2
+        assert len(told) == 1
+        assert str(error) in told[0]

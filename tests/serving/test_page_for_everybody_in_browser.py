@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from datetime import UTC, datetime
+from itertools import pairwise
 from math import inf
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
+from zoneinfo import ZoneInfo
 
 import pytest
 from chromium import CHROMIUM, come_in
 from fake_loop import BEGIN, FakeLoop
+
+from serving.journal import Event
+from serving.monitor.verdict import when
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
@@ -267,3 +273,50 @@ def test_values_are_filled_in_place(page: Page, loop: FakeLoop) -> None:
     loop.state["pv"] = [0.61, 0.4]
     expect(page.locator('[data-signal="PV a"] .number')).to_have_text("0.610")
     assert page.evaluate("window.first.isConnected")
+
+
+def test_what_is_read_by_keyboard_stays_while_scans_come_in(page: Page, loop: FakeLoop) -> None:
+    page.focus("#charts")
+    read = page.locator("#time-shown")
+    under_cursor = page.locator('[data-chart="a"] .u-series').first.locator(".u-value")
+
+    def scans() -> None:
+        loop.add(1)
+        expect(page.locator('[data-chart="a"]')).to_have_attribute("data-rows", str(loop.scans))
+
+    said = []
+    for _ in range(4):
+        page.keyboard.press(",")
+        said.append(str(read.text_content()))
+        scans()
+        expect(read).to_have_text(said[-1])
+        expect(under_cursor).to_have_text(said[-1].split(": ")[0])
+    seconds = [text.split(": ")[0] for text in said]
+    moments = [re.findall(r"(\d\d):(\d\d):(\d\d)$", text)[0] for text in seconds]
+    at = [3600 * int(h) + 60 * int(m) + int(s) for h, m, s in moments]
+    assert [one - other for one, other in pairwise(at)] == [1, 1, 1]
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("End")
+    page.keyboard.press(",")  # another view: from its newest scan
+    expect(read).to_contain_text(re.compile(rf"{clock(BEGIN + loop.scans - 1)}: a "))
+
+
+def clock(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).strftime("%H:%M:%S")
+
+
+def test_every_time_on_the_page_is_in_the_zone_of_its_clock(
+    browser: Browser, loop: FakeLoop, served: tuple[FakeLoop, str, str]
+) -> None:
+    since = when(BEGIN)
+    verdict = {"name": "u moves", "level": "watch", "text": f"u is at its end since {since}, and the error stays"}
+    loop.state["verdicts"] = [verdict]
+    loop.writer.event(Event(BEGIN, "monitor", "monitor", f"u moves: watch: {verdict['text']}"))
+    there = datetime.fromtimestamp(BEGIN, ZoneInfo("Asia/Kolkata"))
+    page = come_in(browser, served, timezone_id="Asia/Kolkata")
+    for said in (page.locator("#verdicts .what"), page.locator("#events .what", has_text="u moves")):
+        expect(said).to_contain_text(re.compile(rf"since {there:%d} \w+ {there:%H:%M}, and"))
+    expect(page.locator("#events time").first).to_contain_text(f"{there:%H:%M}")
+    expect(page.locator("body")).not_to_contain_text("UTC")
+    assert "GMT+5:30" in str(page.locator("#clock").text_content())
+    page.close()

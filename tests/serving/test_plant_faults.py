@@ -21,7 +21,7 @@ from asyncua import Client, ua
 from plant_servers import Plant, Wire
 from processes import within
 
-from serving import Mode, Sample
+from serving import Controller, Mode, Sample
 from serving.journal import JournalReader, Scan
 from serving.loop import Command
 from serving.opcua.settings import HandBack, ModeNode, Nodes, Point, Server
@@ -171,6 +171,9 @@ FAULTS: dict[str, tuple[Fault, str]] = {
 }  # fmt: skip
 
 
+CONNECTED = 40  # periods from the end of a fault until AUTO where the connection stands; a busy machine has its share
+RECONNECTED = 200  # where it has to be made anew: pauses between two tries grow to 50 periods, and a try takes up to 10
+CUT = {"slow answers", "half-open connection", "server frozen", "server killed"}
 ANEW = {"server killed", "an MV node that is deleted"}  # then the MV's node is made anew
 
 
@@ -238,6 +241,7 @@ def test_a_fault_holds_and_is_recovered_from(
     with capsys.disabled():
         print(f"\n{name:28} HOLD after {until_hold:2} periods, AUTO {until_auto:3} after its end: {reason}")
     assert until_hold <= 5
+    assert until_auto <= (RECONNECTED if name in CUT else CONNECTED)
 
 
 def test_a_plant_whose_watchdog_stands_is_held_within_three_periods(plant: Plant, wire: Wire, tmp_path: Path) -> None:
@@ -257,6 +261,7 @@ def test_a_plant_whose_watchdog_stands_is_held_within_three_periods(plant: Plant
         running.end()
 
 
+LEARNT_WITHIN = 3  # of the loop's own periods: so soon a plant knows that its loop is gone
 LOOP = """
 controller = "{file}"
 start = "AUTO"
@@ -278,6 +283,7 @@ T_j = {{ node = "nsu=urn:loopwright:plant;s=MV.T_j", read_back = "nsu=urn:loopwr
 def test_a_plant_learns_within_three_periods_that_its_loop_was_killed(plant: Plant, tmp_path: Path) -> None:
     """By the server's own count of periods: a busy machine changes nothing about that."""
     file = ROOT / "artifacts" / CASE / f"{LAW}.onnx"
+    served_period_s = PERIOD_S * SPEED  # of the plant's own time
     (tmp_path / "loop.toml").write_text(LOOP.format(file=file, speed=SPEED, endpoint=plant.endpoint))
     since = len(plant.actuator())
     command = [sys.executable, "-m", "pipeline", "loop", "run", str(tmp_path / "loop.toml")]
@@ -299,7 +305,8 @@ def test_a_plant_learns_within_three_periods_that_its_loop_was_killed(plant: Pla
     last = max(i for i in range(since + 1, len(rows)) if rows[i]["beat"] != rows[i - 1]["beat"])
     assert last <= killed + 1
     learnt = next(i for i in range(last, len(rows)) if not rows[i]["alive"])
-    assert rows[learnt]["k"] - rows[last]["k"] == 3
+    silent_s = (rows[learnt]["k"] - rows[last]["k"]) * served_period_s
+    assert 0 < silent_s <= LEARNT_WITHIN * Controller(file).manifest.period_s
     assert not any(row["alive"] for row in rows[learnt:])
     assert read(plant, "Control.LoopAlive") is False
     assert len({row["asked"][0] for row in rows[learnt:]}) == 1  # the actuator keeps what it has

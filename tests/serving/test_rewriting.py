@@ -29,6 +29,7 @@ def endpoint(controller: Controller, rewrite_s: float, clock: Clock) -> OpcUaEnd
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, rewrite_s=rewrite_s)
     made = OpcUaEndpoint(m, server, Nodes(**nodes), max_age_s=1.0, clock=clock)
     made._link = object()  # type: ignore[assignment]
+    made._shown = made._told = 1  # it is known where the MV stands
     return made
 
 

@@ -10,7 +10,7 @@ import re
 import shutil
 import stat
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +197,23 @@ def test_a_signature_that_ends_soon_says_so(
     assert bool(said) == bool(words)
     sign(unsigned, private("anna"), now=NOW)
     assert verified(unsigned, [public("anna")], now=NOW).ending(expires) == ""  # for ever
+
+
+def test_a_time_of_another_zone_is_written_as_the_same_instant_in_utc(
+    unsigned: Path, private: Private, public: Public
+) -> None:
+    """And a time without a zone, which could be any instant of a day, is refused."""
+    lima = timezone(timedelta(hours=-5))
+    sign(unsigned, private("anna"), now=NOW.astimezone(lima), expires=datetime(2027, 1, 31, 12, 0, tzinfo=lima))
+    found = verified(unsigned, [public("anna")], now=NOW)
+    assert (found.signed, found.expires) == (NOW, datetime(2027, 1, 31, 17, 0, tzinfo=UTC))
+    with pytest.raises(SignatureError, match=r"expires is 2027-01-31 00:00:00, without a time zone; give one"):
+        sign(unsigned, private("anna"), now=NOW, expires=datetime(2027, 1, 31))
+    with pytest.raises(SignatureError, match=r"now is 2026-01-31 00:00:00, without a time zone"):
+        sign(unsigned, private("anna"), now=datetime(2026, 1, 31))
+    past = datetime(2020, 1, 31, 12, 0, tzinfo=lima)
+    with pytest.raises(SignatureError, match="would have expired on 2020-01-31 17:00 UTC"):
+        sign(unsigned, private("anna"), now=NOW, expires=past)
 
 
 def test_a_clock_before_the_signature_cannot_tell_whether_it_expired(

@@ -65,8 +65,7 @@ def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixtu
     status, said = loopwright(capsys, "state")
     assert (status, json.loads(said)["mode"]) == (0, "SHADOW")
     assert loopwright(capsys, "mode", "manual", *who) == (0, "mode SHADOW -> MANUAL\n")
-    # Refused while an MV has not arrived, as on a busy machine.
-    assert within(20, lambda: loopwright(capsys, "mv", "T_j=260", *who)[0] == 0)
+    assert loopwright(capsys, "mv", "T_j=260", *who)[0] == 0
     assert loopwright(capsys, "sp", "C_A=0.5", *who)[0] == 0
     assert loopwright(capsys, "mode", "auto", *who)[0] == 0
     state = json.loads(loopwright(capsys, "state")[1])
@@ -91,8 +90,7 @@ def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixtu
     events = loop.events()
     assert "change anna: mode SHADOW -> MANUAL" in events
     assert "change anna: MV T_j 250 -> 260 K" in events
-    at_the_door = [event for event in events if "refused" in event and "did not reach the plant" not in event]
-    assert at_the_door == []  # what is refused there never came to the loop
+    assert not any("refused" in event for event in events)  # what is refused there never came to the loop
 
 
 def test_a_controller_is_tried_takes_over_and_is_put_back(

@@ -6,9 +6,10 @@ import asyncio
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -171,13 +172,18 @@ def test_locks_are_kept_from_those_who_clean_temporary_folders(tmp_path: Path) -
     lease.tend()
     with pytest.raises(LoopError, match=rf"is written by another loop \(process {os.getpid()}\)"):
         Lease("opc.tcp://127.0.0.1:4841", nodes[1:], folder)
-    # A second loop that came while the file was gone has the node: the first one says so, and keeps what it has.
+    # A second loop that came while the file was gone has the node: the first one says so, and keeps the other node.
     next(path for path in folder.iterdir() if path == lease._path(nodes[0])).unlink()
     other = Lease("opc.tcp://127.0.0.1:4841", nodes[:1], folder)
+    os.utime(lease._path(nodes[1]), (0, 0))
+    assert lease.lost == ""
     with pytest.raises(LoopError, match=r"MV.u at .* is written by another loop"):
         lease.tend()
+    assert "MV.u at opc.tcp://127.0.0.1:4841 is written by another loop" in lease.lost
+    assert time.time() - lease._path(nodes[1]).stat().st_mtime < 600
     other.release()
     lease.tend()
+    assert lease.lost == ""
     lease.release()
     Lease("opc.tcp://127.0.0.1:4841", nodes, folder).release()
 
@@ -210,7 +216,7 @@ def test_tending_goes_on_whatever_it_meets() -> None:
     tending = Tending(act, said.append, every_s=0.001)
     assert within(20, lambda: len(calls) > 5)
     tending.close()
-    assert said == ["LoopError: another loop has it", ""]
+    assert said == ["another loop has it", ""]
 
 
 def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,6 +230,38 @@ def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path, mo
         door(journal).unlink()
         assert within(20, lambda: locks[0].exists() and door(journal).exists())
         assert ask(journal, {"do": "state"})["mode"] == "SHADOW"
+    finally:
+        loop.end()
+
+
+def test_a_loop_that_learns_that_another_one_has_its_lock_writes_no_more(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = Event()
+
+    def tending(act: Callable[[], None], trouble: Callable[[str], None]) -> Tending:
+        return Tending(lambda: act() if gone.is_set() else None, trouble, every_s=0.05)
+
+    monkeypatch.setattr(station, "Tending", tending)
+    loop = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
+    node = loop.settings.nodes.points("mv")["T_j"].node
+    try:
+        assert within(20, lambda: mode(loop)[0] is Mode.AUTO)
+        loop.station.lease._path(node).unlink()
+        other = Lease(plant.endpoint, [node], tmp_path / "a")
+        gone.set()
+        assert within(20, lambda: mode(loop)[0] is Mode.SHADOW)
+        ask(loop.settings.journal.file, {"do": "mode", "value": "AUTO", "who": "anna"})
+        scans = loop.station.scans
+        assert within(20, lambda: loop.station.scans > scans + 5)
+        assert mode(loop)[0] is Mode.SHADOW
+        events = loop.events()
+        assert "change loop: mode AUTO -> SHADOW" in events
+        assert any(e.startswith("fault loop: ") and "is written by another loop" in e for e in events)
+        other.release()
+        ask(loop.settings.journal.file, {"do": "mode", "value": "AUTO", "who": "anna"})
+        assert within(20, lambda: mode(loop)[0] is Mode.AUTO)
+        assert within(20, lambda: "fault loop: over: the locks of this loop are kept again" in loop.events())
     finally:
         loop.end()
 

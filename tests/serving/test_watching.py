@@ -2,19 +2,112 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
+from processes import within
 
 from serving import Command, Controller, Mode
-from serving.monitor import Verdict
+from serving.journal import Journal, JournalReader
+from serving.monitor import Monitor, Verdict
 from serving.station.recorder import Recorder
+from serving.station.station import Station
 from serving.station.watching import Watching
 
 FILE = Path(__file__).parents[2] / "artifacts" / "ph_neutralization" / "pid.onnx"
+
+
+def scan_of(controller: Controller, k: int, time_s: float) -> tuple[None, Command, float]:
+    """One scan of a loop that holds."""
+    m = controller.manifest
+    mv, sp = np.array([s.middle for s in m.mv]), np.array([s.middle for s in m.sp])
+    return None, Command(k, Mode.HOLD, sp, mv, None, None, reason="lost"), time_s
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[Recorder]:
+    journal = Journal(tmp_path / "loop.journal")
+    yield Recorder(journal, lambda _: None)
+    journal.close()
+
+
+def told(recorder: Recorder) -> list[str]:
+    """What the journal says of the monitor, once all of it is written."""
+    assert within(10, lambda: recorder.journal.behind == 0)
+    with closing(JournalReader(recorder.journal.path)) as reader:
+        return [event.what for _, event in reader.events() if event.kind == "monitor"]
+
+
+@pytest.mark.parametrize("forgery", ["since_s", "text", "deep", "number", "list", "json"])
+def test_a_forged_memory_in_the_journal_is_told_once_and_the_monitor_learns_anew(
+    recorder: Recorder, forgery: str
+) -> None:
+    controller = Controller(FILE)
+    state = Monitor(controller.manifest, started_s=1e9).state()
+    state["parts"]["spread"]["since_s"] = [1e15]
+    forged = {
+        "since_s": json.dumps(state), "text": '"x"', "deep": "[" * 100_000, "number": "1" * 10_000, "list": "[]",
+        "json": "{",
+    }  # fmt: skip
+    recorder.journal.keep(f"monitor {controller.sha256}", forged[forgery])
+    assert told(recorder) == []
+    watching = Watching(controller, recorder)
+    (said,) = told(recorder)
+    assert "learns anew" in said
+    watching.seen(controller, scan_of(controller, 0, 1e9))
+    assert watching.monitor.verdicts()
+    watching.keep()
+    assert len(told(recorder)) == 1
+    Watching(controller, recorder)  # the next start finds what this one kept
+    assert len(told(recorder)) == 1
+
+
+def test_a_monitor_whose_numbers_are_none_is_not_kept_and_learns_anew(recorder: Recorder) -> None:
+    controller = Controller(FILE)
+    watching = Watching(controller, recorder)
+    watching.keep()
+    watching.monitor.hold.value = float("nan")
+    watching.keep()
+    (said,) = told(recorder)
+    assert "not finite" in said
+    assert watching.monitor.hold.value == 0.0
+    Watching(controller, recorder)
+    assert len(told(recorder)) == 1
+
+
+def test_what_fails_in_watching_is_told_once_and_raises_nothing(
+    recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controller = Controller(FILE)
+    watching = Watching(controller, recorder)
+
+    def broken(*_: object) -> None:
+        raise OverflowError("year 31690708 is out of range")
+
+    monkeypatch.setattr(watching, "_seen", broken)
+    for k in range(3):
+        watching.seen(controller, scan_of(controller, k, 1e9 + k))
+    (said,) = told(recorder)
+    assert "OverflowError" in said
+
+
+def test_a_scan_is_written_down_before_anybody_looks_at_it() -> None:
+    did = list[str]()
+    station = SimpleNamespace(
+        loop=SimpleNamespace(found=None), endpoint=SimpleNamespace(values=None), scans=0, faults=0, _watchers=[],
+        _moved=lambda loop: None,
+        recorder=SimpleNamespace(controller=None, scan=lambda *_: did.append("journal")),
+        watching=SimpleNamespace(seen=lambda *_: did.append("monitor")),
+    )  # fmt: skip
+    _, command, _ = scan_of(Controller(FILE), 0, 1e9)
+    Station._observe(cast(Station, station), None, command)
+    assert did == ["journal", "monitor"]
 
 
 @pytest.mark.parametrize("set_by_s", [0.0, -3_600.0, 86_400.0])
@@ -29,9 +122,7 @@ def test_an_alarm_is_written_down_within_one_look_whatever_the_clock_does(
     watching = Watching(controller, cast(Recorder, recorder))
 
     def scan(k: int, time_s: float) -> None:
-        mv, sp = np.array([s.middle for s in m.mv]), np.array([s.middle for s in m.sp])
-        command = Command(k, Mode.HOLD, sp, mv, None, None, reason="lost")
-        watching.seen(controller, (None, command, time_s))
+        watching.seen(controller, scan_of(controller, k, time_s))
 
     scan(0, 1e9)
     verdicts = [Verdict("HOLD", "watch", "the loop holds")]

@@ -1,12 +1,13 @@
 """Write the bill of materials and the licences: ``python bill.py CLOSURE ENVIRONMENT FOLDER``.
 
 CLOSURE is what closure.py prints, ENVIRONMENT the bill that cyclonedx-py makes of the same Python. FOLDER gets
-loopwright-VERSION.cdx.json (CycloneDX 1.6): what each extra brings, and what lies in the wheel itself; and
-loopwright-VERSION-licences.md, the same for people, copyleft first.
+loopwright-VERSION.cdx.json (CycloneDX 1.6): what each extra brings, what lies in the wheel itself, and what npm fetches
+for ``loopwright playground``; and loopwright-VERSION-licences.md, the same for people, copyleft first.
 """
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import re
@@ -21,10 +22,13 @@ from licences import BSD, Kind, UnclearError, has_choice, kind, licence, reviewe
 ROOT = Path(__file__).parents[2]
 NAME, OURS = "loopwright", "Apache-2.0 AND MIT"
 STATIC, C_HEADER = ROOT / "serving/page/static", ROOT / "pipeline/hosts/c/onnxruntime"
+ON_THE_PAGE = "onnxruntime-web"  # which the page loads
+NPM_LOCK, PLAYGROUND = ROOT / "pipeline/playground/npm/package-lock.json", "npm, for loopwright playground"
 BROUGHT, LIES_IN = "loopwright:brought-by", "loopwright:lies-in"
 ABOUT = """What pip brings with loopwright {version} and each of its extras, in the versions of constraints.txt{python}.
 "runtime" is `pip install loopwright` alone. The page's uPlot and onnxruntime's C header lie in
-loopwright's own wheel.
+loopwright's own wheel. `loopwright playground` has npm fetch onnxruntime-web and the packages that it names, and copies
+two files of onnxruntime-web into each page that it writes.
 
 The list goes by what each package states of itself. A package may bundle libraries, whose licences lie in its own
 folder. On Linux PyTorch can come with NVIDIA's CUDA packages (`nvidia-*`), which are proprietary and not listed:
@@ -52,11 +56,50 @@ def rows(closure: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def bill(packages: list[dict[str, Any]], environment: dict[str, Any], vendored: list[dict[str, Any]]) -> dict[str, Any]:
+def fetched() -> list[dict[str, Any]]:
+    """The packages that npm fetches for the playground, as its lock names them. Raises UnclearError."""
+    found, unclear = [], []
+    for path, row in sorted(json.loads(NPM_LOCK.read_text(encoding="utf-8"))["packages"].items()):
+        if not path:  # the lock's own
+            continue
+        name, expression = path.rpartition("node_modules/")[2], row.get("license", "")
+        try:
+            found.append({**row, "name": name, "expression": expression, "kind": kind(expression), "by": [PLAYGROUND]})
+        except UnclearError as error:
+            unclear.append(f"{name} {row['version']}: {error}")
+    if unclear:
+        raise UnclearError("; ".join(unclear))
+    return found
+
+
+def _npm_component(package: dict[str, Any]) -> dict[str, Any]:
+    algorithm, digest = package["integrity"].split("-", 1)
+    return {
+        "bom-ref": _npm_url(package),
+        "type": "library",
+        "name": package["name"],
+        "version": package["version"],
+        "purl": _npm_url(package),
+        "licenses": [{"expression": package["expression"]}],
+        "hashes": [{"alg": algorithm.upper().replace("SHA", "SHA-"), "content": base64.b64decode(digest).hex()}],
+        "properties": [{"name": BROUGHT, "value": PLAYGROUND}],
+    }
+
+
+def _npm_url(package: dict[str, Any]) -> str:
+    return f"pkg:npm/{package['name'].replace('@', '%40')}@{package['version']}"
+
+
+def bill(
+    packages: list[dict[str, Any]],
+    environment: dict[str, Any],
+    vendored: list[dict[str, Any]],
+    npm: list[dict[str, Any]],
+) -> dict[str, Any]:
     """The CycloneDX bill: the environment's components that a user gets, with their licences, beneath loopwright."""
     known = {_canonical(c["name"]): c for c in environment["components"]}
     ours = known[NAME]
-    components = [_component(known[p["name"]], p) for p in packages] + vendored
+    components = [_component(known[p["name"]], p) for p in packages] + vendored + [_npm_component(p) for p in npm]
     refs = {c["bom-ref"] for c in components} | {ours["bom-ref"]}
     edges = [
         {"ref": edge["ref"], "dependsOn": sorted(ref for ref in edge.get("dependsOn", ()) if ref in refs)}
@@ -66,7 +109,10 @@ def bill(packages: list[dict[str, Any]], environment: dict[str, Any], vendored: 
     for edge in edges:
         if edge["ref"] == ours["bom-ref"]:
             edge["dependsOn"] += [c["bom-ref"] for c in vendored]
+            edge["dependsOn"] += [_npm_url(p) for p in npm if p["name"] == ON_THE_PAGE]
     edges += [{"ref": c["bom-ref"]} for c in vendored]
+    urls = {p["name"]: _npm_url(p) for p in npm}  # a name stands once: the lock holds no second version
+    edges += [{"ref": _npm_url(p), "dependsOn": [urls[name] for name in p.get("dependencies", ())]} for p in npm]
     main = {key: ours[key] for key in ("bom-ref", "description", "name", "version")}
     main |= {"type": "library", "purl": f"pkg:pypi/{NAME}@{ours['version']}", "licenses": [{"expression": OURS}]}
     metadata = {**environment["metadata"], "component": main}
@@ -147,11 +193,11 @@ def _canonical(name: str) -> str:
 def main(closure: str, environment: str, folder: str) -> int:
     """Write both files; 2 after a line on standard error where a licence is unclear or the bill is not valid."""
     try:
-        packages, vendored = rows(json.loads(Path(closure).read_text())), [uplot(), header()]
+        packages, vendored, npm = rows(json.loads(Path(closure).read_text())), [uplot(), header()], fetched()
     except UnclearError as error:
         print(f"bill: {error}", file=sys.stderr)
         return 2
-    whole = bill(packages, json.loads(Path(environment).read_text()), vendored)
+    whole = bill(packages, json.loads(Path(environment).read_text()), vendored, npm)
     text = json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
     wrong = JsonStrictValidator(SchemaVersion.V1_6).validate_str(text)
     if wrong is not None:
@@ -161,10 +207,10 @@ def main(closure: str, environment: str, folder: str) -> int:
     python = f" on Python {sys.version_info.major}.{sys.version_info.minor}"
     Path(folder, f"{NAME}-{version}.cdx.json").write_text(text, encoding="utf-8")
     Path(folder, f"{NAME}-{version}-licences.md").write_text(
-        page(packages, vendored, version, python), encoding="utf-8"
+        page(packages + npm, vendored, version, python), encoding="utf-8"
     )
-    copyleft = sorted(p["name"] for p in packages if p["kind"] > Kind.PERMISSIVE)
-    print(f"{len(packages) + len(vendored)} components, each with its licence; copyleft: {', '.join(copyleft)}")
+    copyleft = sorted(p["name"] for p in packages + npm if p["kind"] > Kind.PERMISSIVE)
+    print(f"{len(whole['components'])} components, each with its licence; copyleft: {', '.join(copyleft)}")
     return 0
 
 

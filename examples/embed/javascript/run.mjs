@@ -1,4 +1,6 @@
 // A loop on an absolute time grid, and a made-up plant to put yours in place of.
+import { wordsOf } from "./controller.mjs";
+
 const middle = (s) => {
   const at = (s.low + s.high) / 2;
   return s.values ? s.values.reduce((a, b) => (Math.abs(b - at) < Math.abs(a - at) ? b : a)) : at;
@@ -6,6 +8,7 @@ const middle = (s) => {
 
 // Scan once a period at start + k period: lateness never becomes drift, and a period that has passed whole is skipped.
 // now() gives seconds that only grow, sleep(seconds) a promise, plant {read(), write(mv)}, seen(command) gets each command.
+// Whatever read and write return or throw, the loop goes on; it waits for both, so give them a limit of time.
 export async function run(loop, plant, { scans, now, sleep, period = loop.controller.manifest.period_s, seen = () => {} }) {
   const start = now();
   for (let k = 0; k < scans; k++) {
@@ -19,7 +22,6 @@ export async function run(loop, plant, { scans, now, sleep, period = loop.contro
       late -= missed * period;
     }
     let sample = null;
-    const before = loop.mv;
     try {
       sample = await plant.read();
     } catch {
@@ -27,9 +29,9 @@ export async function run(loop, plant, { scans, now, sleep, period = loop.contro
     }
     let command = await loop.scan(sample);
     try {
-      if (command.mv) await plant.write(command.mv);
+      if (command.mv) await plant.write([...command.mv]);
     } catch (error) {
-      command = loop.unwritten(before, `the plant cannot be written: ${error.message}`);
+      command = loop.unwritten(`the plant cannot be written: ${wordsOf(error)}`);
     }
     seen({ k, late, ...command });
   }

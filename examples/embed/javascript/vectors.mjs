@@ -83,6 +83,7 @@ export async function conform(ort, provider, bytes, manifest, vectors, host, ver
   const scans = [];
   for (const row of vectors.scans) {
     if (row.set_mode) loop.setMode(row.set_mode);
+    if (row.unwritten) loop.unwritten("the plant cannot be written"); // since version 3: the command of the scan before
     if (row.missed) loop.gap(row.missed);
     const { pv, dv, mv_applied, age_s } = row.sample ?? {};
     const sample = row.sample && { pv: numbers(pv), dv: numbers(dv), mv_applied: numbers(mv_applied), age_s: fromHex(age_s) };

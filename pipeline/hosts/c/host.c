@@ -454,6 +454,10 @@ static bool controller_open(Controller *c, const char *path) {
 static Outcome controller_step(Controller *c, const double *const given[STATE]) {
   for (int i = 0; i < INPUTS; i++) {
     const double *values = i == STATE ? c->state : given[i];
+    if (c->uses[i] && c->n_in[i] && !values) {
+      failed(c, "%s is missing; no MV is computed without it", INPUT[i]);
+      return REFUSED_INPUT;
+    }
     for (size_t k = 0; c->uses[i] && k < c->n_in[i]; k++) {
       if (!isfinite(values[k])) {
         failed(c, "%s[%zu] is %g; no MV is computed from it", INPUT[i], k, values[k]);
@@ -501,13 +505,15 @@ typedef struct {
   bool fault;        /* a fault changed the mode to HOLD */
   int recover_after; /* good samples after which HOLD returns to AUTO; 0: only the operator returns it */
   int good;
+  bool lost;      /* the last command did not reach the plant, and nothing has told since where the MV stands */
   double max_gap; /* missed periods in a row after which the law starts cold */
   double *sp, *mv, *applied, *before; /* mv is NAN while nobody knows where it stands */
   char reason[WORDS]; /* of the last scan; empty: no fault */
 } Loop;
 
-/* Whether l->mv may be written: before the first good sample with a read-back, or loop_set, nothing may. */
-static bool loop_writes(const Loop *l) { return !isnan(l->mv[0]); }
+/* Whether l->mv may be written: not before the first good sample with a read-back, or loop_set; nor after a command that
+   did not arrive, until a read-back tells where the MV stands. */
+static bool loop_writes(const Loop *l) { return !isnan(l->mv[0]) && !l->lost; }
 
 static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
   *l = (Loop){.c = c, .mode = mode, .recover_after = recover_after, .max_gap = 3};
@@ -527,10 +533,14 @@ static void loop_close(Loop *l) {
   free(l->before);
 }
 
-/* Set points (SP) or the MV (MV) from an operator, in MANUAL, or that the plant has, at the start. False, and nothing
-   changed, outside the ranges. */
+/* Set points (SP); or the MV (MV) from an operator in MANUAL, or that the plant has, while it is not known. False, and
+   nothing changed, outside the ranges, for the MV in another mode, and after a command that did not arrive. */
 static bool loop_set(Loop *l, int which, const double *values) {
   const Signals *signals = &l->c->signals[which];
+  if (which == MV && l->lost)
+    return failed(l->c, "the last MV did not reach the plant, so where the MV stands is not known; wait");
+  if (which == MV && l->mode != MANUAL && !isnan(l->mv[0]))
+    return failed(l->c, "the MV is set by hand in MANUAL only; the loop is in %s", MODE[l->mode]);
   for (size_t i = 0; i < signals->n; i++) {
     const Signal *s = &signals->at[i];
     if (!may_be(s, values[i], 0) || (s->values && !among(s, values[i])))
@@ -562,23 +572,42 @@ static void loop_fault(Loop *l, const char *reason) {
   }
 }
 
-/* The last MV never reached the plant: the one before it stays. */
+/* The last MV never reached the plant, and others may move it meanwhile: nothing is written until a scan has found where
+   it stands. */
 static void loop_unwritten(Loop *l, const char *reason) {
   if (l->mode != MANUAL) memcpy(l->mv, l->before, l->c->n_in[MV] * sizeof *l->mv);
+  l->lost = true;
   loop_fault(l, reason);
+}
+
+/* The first MV whose read-back no actuator can hold; n_in[MV] if there is none. */
+static size_t implausible(const Controller *c, const double *applied) {
+  size_t k = 0;
+  for (; k < c->n_in[MV]; k++) {
+    const Signal *s = &c->signals[MV].at[k];
+    if (s->values ? !among(s, applied[k]) : !may_be(s, applied[k], READ_BACK_MARGIN)) break;
+  }
+  return k;
+}
+
+static void clip(const Controller *c, const double *applied, double *to) {
+  const Signal *s = c->signals[MV].at;
+  for (size_t k = 0; k < c->n_in[MV]; k++) to[k] = fmin(fmax(applied[k], s[k].low), s[k].high);
 }
 
 /* Why not to act on a sample, in c->words; true if there is no reason. */
 static bool trusted(Controller *c, const Sample *sample) {
-  const double *const values[STATE] = {[PV] = sample->pv, [DV] = c->uses[DV] ? sample->dv : NULL, [MV] = sample->mv_applied};
-  for (int i = PV; i <= MV; i++)
-    for (size_t k = 0; values[i] && k < c->n_in[i]; k++)
+  const double *const values[STATE] = {[PV] = sample->pv, [DV] = sample->dv};
+  for (int i = PV; i <= DV; i++) {
+    if (i == DV && !c->uses[DV]) continue;
+    if (!values[i] && c->n_in[i]) return failed(c, "the sample has no %s", INPUT[i]);
+    for (size_t k = 0; k < c->n_in[i]; k++)
       if (!isfinite(values[i][k])) return failed(c, "%s %s is %g", INPUT[i], c->signals[i].at[k].name, values[i][k]);
-  for (size_t k = 0; sample->mv_applied && k < c->n_in[MV]; k++) {
-    const Signal *s = &c->signals[MV].at[k];
-    double value = sample->mv_applied[k];
-    if (s->values ? !among(s, value) : !may_be(s, value, READ_BACK_MARGIN))
-      return failed(c, "applied MV %s is %g %s, which no actuator can hold", s->name, value, s->unit);
+  }
+  size_t wrong = sample->mv_applied ? implausible(c, sample->mv_applied) : c->n_in[MV];
+  if (wrong < c->n_in[MV]) {
+    const Signal *s = &c->signals[MV].at[wrong];
+    return failed(c, "applied MV %s is %g %s, which no actuator can hold", s->name, sample->mv_applied[wrong], s->unit);
   }
   for (size_t k = 0; k < c->n_in[PV]; k++) {
     const Signal *s = &c->signals[PV].at[k];
@@ -590,13 +619,27 @@ static bool trusted(Controller *c, const Sample *sample) {
   return true;
 }
 
+/* Where the MV stands after a command that did not arrive: at the next sound read-back, also that of a sample which is
+   refused for another reason. A good sample without one says that nothing is read back: the MV before it stays. After an
+   implausible one the old MV is nothing to go back to. */
+static void loop_found(Loop *l, const double *applied, bool good_one) {
+  if (!l->lost || (!applied && !good_one)) return;
+  l->lost = applied && implausible(l->c, applied) < l->c->n_in[MV];
+  if (l->lost)
+    for (size_t k = 0; k < l->c->n_in[MV]; k++) l->mv[k] = NAN;
+  else if (applied)
+    clip(l->c, applied, l->mv);
+}
+
 /* One period: l->mv is what to write if loop_writes, l->mode and l->reason say why. sample NULL: the plant cannot be
    read. */
 static void loop_scan(Loop *l, const Sample *sample) {
   Controller *c = l->c;
   size_t n = c->n_in[MV];
+  bool good_one = sample && trusted(c, sample);
+  if (sample) loop_found(l, sample->mv_applied, good_one);
   memcpy(l->before, l->mv, n * sizeof *l->mv);
-  if (!sample || !trusted(c, sample)) {
+  if (!good_one) {
     loop_fault(l, sample ? c->words : "the plant cannot be read");
     return;
   }
@@ -604,8 +647,7 @@ static void loop_scan(Loop *l, const Sample *sample) {
     loop_fault(l, "there is no read-back, so where the MV stands is not known and nothing is written");
     return;
   }
-  memcpy(l->applied, sample->mv_applied ? sample->mv_applied : l->mv, n * sizeof *l->mv);
-  for (size_t k = 0; k < n; k++) l->applied[k] = fmin(fmax(l->applied[k], c->signals[MV].at[k].low), c->signals[MV].at[k].high);
+  clip(c, sample->mv_applied ? sample->mv_applied : l->mv, l->applied);
   if (!loop_writes(l)) memcpy(l->mv, l->applied, n * sizeof *l->mv);
   const double *const given[STATE] = {[SP] = l->sp, [PV] = sample->pv, [DV] = sample->dv, [MV] = l->applied};
   if (controller_step(c, given) != STEPPED) {
@@ -754,6 +796,8 @@ static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[S
   const Json *given = json_get(row, "sample");
   for (int i = 0; i < 3; i++)
     if (!strcmp(json_word(row, "set_mode"), MODE[i])) loop_set_mode(l, (Mode)i);
+  const Json *unwritten = json_get(row, "unwritten"); /* since version 3: the command of the scan before did not arrive */
+  if (unwritten && unwritten->kind == J_TRUE) loop_unwritten(l, "the plant cannot be written");
   double missed = json_number(json_get(row, "missed"));
   if (missed > 0) loop_gap(l, missed);
   Sample sample = {numbers(json_get(given, "pv"), c->n_in[PV], room[PV]), numbers(json_get(given, "dv"), c->n_in[DV], room[DV]),

@@ -100,8 +100,9 @@ export class Loop {
   // recoverAfter: good samples after which HOLD returns to AUTO; null: only the operator returns it.
   constructor(controller, { sp, mv = null, mode = "MANUAL", recoverAfter = null, maxGap = 3 }) {
     Object.assign(this, { controller, mode, recoverAfter, maxGap, fault: "", good: 0, state: controller.cold() });
+    this.lost = false; // the last command did not reach the plant, and nothing has told since where the MV stands
     this.sp = within(sp, controller.manifest.sp, "set point");
-    this.mv = mv && within(mv, controller.manifest.mv, "MV");
+    this.mv = this.before = mv && within(mv, controller.manifest.mv, "MV");
   }
 
   setMode(mode) {
@@ -114,6 +115,7 @@ export class Loop {
 
   setMv(mv) {
     if (this.mode !== "MANUAL") throw new Refused(`the MV is set by hand in MANUAL only; the loop is in ${this.mode}`);
+    if (this.lost) throw new Refused("the last MV did not reach the plant, so where the MV stands is not known; wait");
     this.mv = within(mv, this.controller.manifest.mv, "MV");
   }
 
@@ -127,19 +129,28 @@ export class Loop {
     if (periods > this.maxGap) this.state = this.controller.cold();
   }
 
-  // One period. sample: {pv, dv, mv_applied or null, age_s}, or null where the plant could not be read.
-  // -> {mode, mv, law, info, reason}; mv is null while it is not known where the MV stands: then write nothing.
+  // One period. sample: {pv, dv, mv_applied or null, age_s}, or null where the plant could not be read. Nothing that it
+  // holds throws. -> {mode, mv, law, info, reason}; mv is null while it is not known where the MV stands: then write nothing.
   async scan(sample) {
-    const reason = sample === null ? "the plant cannot be read" : this.#refusal(sample);
+    let given = null, reason = "the plant cannot be read";
+    try {
+      given = taken(sample);
+      if (given) reason = this.#refusal(given);
+    } catch (error) {
+      reason = `the sample cannot be used: ${wordsOf(error)}`;
+    }
+    this.#found(given, reason);
+    this.before = this.mv;
+    if (!reason && !given.mv_applied && !this.mv) reason = UNKNOWN;
     if (reason) return this.#miss(reason);
-    const applied = sample.mv_applied === null ? this.mv : this.#clipped(sample.mv_applied);
+    const applied = given.mv_applied ? this.#clipped(given.mv_applied) : this.mv;
     this.mv ??= applied;
     let step;
     try {
-      step = await this.controller.step({ sp: this.sp, pv: sample.pv, dv: sample.dv, mv_applied: applied, state: this.state });
+      step = await this.controller.step({ sp: this.sp, pv: given.pv, dv: given.dv, mv_applied: applied, state: this.state });
     } catch (error) {
       if (this.mode === "AUTO") this.mv = applied;
-      return this.#miss(error.message);
+      return this.#miss(wordsOf(error));
     }
     this.state = step.state_next;
     if (this.fault && ++this.good === this.recoverAfter) this.setMode("AUTO");
@@ -147,37 +158,51 @@ export class Loop {
     return { mode: this.mode, mv: [...this.mv], law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault };
   }
 
-  // The command in place of the last one, which never reached the plant: the MV before it stays.
-  unwritten(before, reason) {
-    if (this.mode !== "MANUAL") this.mv = before;
+  // The command in place of the last one, which never reached the plant. Others may move the MV meanwhile: nothing is
+  // written until a scan has found where it stands.
+  unwritten(reason) {
+    if (this.mode !== "MANUAL") this.mv = this.before;
+    this.lost = true;
     return this.#miss(reason);
+  }
+
+  // Where the MV stands after a command that did not arrive: at the next sound read-back, also that of a sample which is
+  // refused for another reason. A good sample without one says that nothing is read back: the MV before it stays. After an
+  // implausible one the old MV is nothing to go back to.
+  #found(given, reason) {
+    const applied = given?.mv_applied;
+    if (!this.lost || (!applied && reason)) return;
+    this.lost = Boolean(applied && this.#implausible(applied));
+    if (applied) this.mv = this.lost ? null : this.#clipped(applied);
   }
 
   // No past any more. In AUTO a fault: the MV is held until recoverAfter good samples, or until the operator acts.
   #miss(reason) {
     Object.assign(this, { state: this.controller.cold(), good: 0 });
     if (this.mode === "AUTO" || this.fault) Object.assign(this, { mode: "HOLD", fault: reason });
-    return { mode: this.mode, mv: this.mv && [...this.mv], law: null, info: null, reason };
+    return { mode: this.mode, mv: this.lost ? null : this.mv && [...this.mv], law: null, info: null, reason };
   }
 
   #refusal({ pv, dv, mv_applied, age_s }) {
     const m = this.controller.manifest;
-    const vectors = [["PV", m.pv, pv], ...(m.inputs.includes("dv") ? [["DV", m.dv, dv]] : []), ["applied MV", m.mv, mv_applied]];
-    for (const [label, signals, values] of vectors) {
-      if (values === null && signals === m.mv) continue;
-      if (values?.length !== signals.length) return `${label} has ${values?.length} values instead of ${signals.length}`;
-      const bad = signals.findIndex((_, i) => !Number.isFinite(values[i]));
-      if (bad >= 0) return `${label} ${signals[bad].name} is ${word(values[bad])}`;
-    }
-    for (const [i, s] of m.mv.entries()) {
-      if (mv_applied === null) continue;
-      if (s.values && !s.values.includes(mv_applied[i])) return `applied MV ${s.name} is ${short(mv_applied[i])}, none of ${s.values.join(", ")}`;
-      if (!s.values && beyond(s, mv_applied[i], READ_BACK_MARGIN)) return `applied MV ${outside(s, mv_applied[i])}`;
-    }
+    const vectors = [["PV", m.pv, pv], ...(m.inputs.includes("dv") ? [["DV", m.dv, dv]] : [])];
+    const reason = vectors.map((vector) => notFinite(...vector)).find(Boolean) ?? (mv_applied ? this.#implausible(mv_applied) : "");
+    if (reason) return reason;
     const out = m.pv.findIndex((s, i) => beyond(s, pv[i], PV_MARGIN));
     if (out >= 0) return `PV ${outside(m.pv[out], pv[out])}`;
-    if (!(age_s >= 0 && age_s <= m.period_s)) return `the sample is ${age_s} s old; allowed are ${m.period_s} s`;
-    return mv_applied === null && !this.mv ? UNKNOWN : "";
+    return age_s >= 0 && age_s <= m.period_s ? "" : `the sample is ${age_s} s old; allowed are ${m.period_s} s`;
+  }
+
+  // Why no actuator can have this MV, else empty.
+  #implausible(applied) {
+    const signals = this.controller.manifest.mv;
+    const reason = notFinite("applied MV", signals, applied);
+    if (reason) return reason;
+    for (const [i, s] of signals.entries()) {
+      if (s.values && !s.values.includes(applied[i])) return `applied MV ${s.name} is ${short(applied[i])}, none of ${s.values.join(", ")}`;
+      if (!s.values && beyond(s, applied[i], READ_BACK_MARGIN)) return `applied MV ${outside(s, applied[i])}`;
+    }
+    return "";
   }
 
   #clipped(applied) {
@@ -198,8 +223,31 @@ export function within(values, signals, what) {
   return [...values];
 }
 
+// A copy of a sample, with null for what is not there; null for no sample.
+function taken(sample) {
+  if (sample === null || sample === undefined) return null;
+  const { pv = null, dv = null, mv_applied = null, age_s } = sample;
+  const copied = (values) => (values === null ? null : Array.from(values));
+  return { pv: copied(pv), dv: copied(dv), mv_applied: copied(mv_applied), age_s };
+}
+
+function notFinite(label, signals, values) {
+  if (values?.length !== signals.length) return `${label} has ${values?.length ?? "no"} values instead of ${signals.length}`;
+  const bad = signals.findIndex((_, i) => !Number.isFinite(values[i]));
+  return bad >= 0 ? `${label} ${signals[bad].name} is ${word(values[bad])}` : "";
+}
+
+// What an error says; anything may be thrown.
+export function wordsOf(error) {
+  try {
+    return String(error?.message ?? error);
+  } catch {
+    return "an error without words";
+  }
+}
+
 const beyond = (s, value, margin) => value < s.low - margin * (s.high - s.low) || value > s.high + margin * (s.high - s.low);
 const outside = (s, value) => `${s.name} is ${short(value)} ${s.unit}, outside its range [${short(s.low)}, ${short(s.high)}] ${s.unit}`;
 const short = (value) => String(+value.toPrecision(DIGITS));
 // A value that is not finite, as the runtime writes it.
-const word = (value) => (Number.isNaN(value) ? "nan" : value > 0 ? "inf" : "-inf");
+const word = (value) => (typeof value === "number" ? (Number.isNaN(value) ? "nan" : value > 0 ? "inf" : "-inf") : "no number");

@@ -12,7 +12,7 @@ from typing import Any
 from pipeline.errors import PlantError
 
 REAL = {"Real", "Float64"}
-INSTALL = "pip install '.[fmu]' in the repository's folder (`make setup` does it too)"
+INSTALL = "pip install 'loopwright[fmu]'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ def fmpy() -> Any:
     try:
         return importlib.import_module("fmpy")
     except ImportError:
-        raise PlantError(f"an FMU needs the package fmpy, which is not installed: {INSTALL}") from None
+        raise PlantError(f"an FMU needs the package fmpy: {INSTALL}") from None
 
 
 def described(path: Path) -> Description:

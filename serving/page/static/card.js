@@ -1,6 +1,6 @@
 // The controller's card, the monitor's verdicts, and swapping.
 import { ask } from "./dialog.js";
-import { element, figure } from "./format.js";
+import { element, figure, here } from "./format.js";
 
 const $ = (id) => document.getElementById(id);
 const TRIAL = 60;
@@ -29,7 +29,7 @@ export function describe(about) {
   ];
   const made = element("details", {}, element("summary", {}, "How it was made"), list(making));
   const picture = c.picture && element("img", { src: c.picture, alt: "closed loop of its validation", loading: "lazy" });
-  const notes = (about.warnings || []).map((words) => element("p", { class: "note" }, `◆ ${words}`));
+  const notes = (about.warnings || []).map((words) => element("p", { class: "note" }, `◆ ${here(words)}`));
   $("card-body").replaceChildren(list(facts), ...notes, scenarios(c), made, picture || "", candidates(about));
 }
 
@@ -148,6 +148,6 @@ function verdict(v) {
     element("span", { class: "sign", "aria-hidden": "true" }, SIGNS[v.level] || "○"),
     element("span", { class: "name" }, v.name),
     element("span", { class: "level" }, v.level),
-    element("span", { class: "what" }, v.text),
+    element("span", { class: "what" }, here(v.text)),
   );
 }

@@ -47,7 +47,7 @@ export class Charts {
     this.back = back;
     this.made = [];
     this.whole = false;
-    this.read = null; // the row that the keyboard reads
+    this.read = null; // the time that the keyboard reads: scans come in, and rows go, meanwhile
     new ResizeObserver(() => this.resize()).observe(box);
   }
 
@@ -63,8 +63,12 @@ export class Charts {
     });
   }
 
-  draw(from, to) {
+  // Another time is looked at: reading begins with its newest scan again.
+  forget() {
     this.read = null;
+  }
+
+  draw(from, to) {
     for (const { chart, plot } of this.made) {
       const numbers = this.data.of(chart.lines.map((l) => l.column));
       plot.setData(numbers, false);
@@ -73,6 +77,17 @@ export class Charts {
       const rows = plot.root.querySelectorAll(".u-series");
       numbers.forEach((values, i) => i && rows[i].classList.toggle("empty", values.every((v) => v === null)));
       newest(plot);
+    }
+    if (this.read !== null) queueMicrotask(() => this.point()); // uPlot has its new scales only then
+  }
+
+  // The cursor of every chart at the time that is read, or away where that is not shown.
+  point() {
+    if (this.read === null) return;
+    for (const { plot } of this.made) {
+      const { min, max } = plot.scales.x;
+      const shown = this.read >= min && this.read <= max;
+      plot.setCursor(shown ? { left: plot.valToPos(this.read, "x"), top: 1 } : { left: -10, top: -10 }, false);
     }
   }
 
@@ -83,13 +98,14 @@ export class Charts {
     const { min, max } = this.made[0].plot.scales.x;
     const [first, last] = [time.findIndex((t) => t >= min), time.findLastIndex((t) => t <= max)];
     if (first < 0 || last < first) return "";
-    this.read = this.read === null ? last : Math.min(last, Math.max(first, this.read + by));
-    const said = this.made.map(({ chart, plot }) => {
-      plot.setCursor({ left: plot.valToPos(time[this.read], "x"), top: 1 }, false);
-      const values = chart.lines.map((l) => [l.label, this.data.columns[l.column]?.[this.read]]).filter(([, v]) => v !== null && v !== undefined);
+    const row = this.read === null ? last : Math.min(last, Math.max(first, nearest(time, this.read) + by));
+    this.read = time[row];
+    this.point();
+    const said = this.made.map(({ chart }) => {
+      const values = chart.lines.map((l) => [l.label, this.data.columns[l.column]?.[row]]).filter(([, v]) => v !== null && v !== undefined);
       return `${chart.name} ${values.map(([label, v]) => `${label} ${number(v, scaled(chart.signal, v))}`).join(", ") || "–"} ${unit(chart.signal)}`.trim();
     });
-    return `${clock(time[this.read])}: ${said.join("; ")}`;
+    return `${clock(time[row])}: ${said.join("; ")}`;
   }
 
   width() {
@@ -130,9 +146,16 @@ export class Charts {
         drawClear: [(u) => bands(u, this.data, color)],
         setSelect: [(u) => this.selected(u)],
         setCursor: [(u) => (u.cursor.left < 0 ? newest(u) : u.root.classList.add("reading"))],
-        ready: [(u) => u.over.addEventListener("dblclick", () => this.back())],
+        ready: [(u) => this.listen(u.over)],
       },
     };
+  }
+
+  listen(over) {
+    over.addEventListener("dblclick", () => this.back());
+    over.addEventListener("pointermove", ({ movementX, movementY }) => {
+      if (movementX || movementY) this.forget(); // the cursor is the pointer's from here on
+    });
   }
 
   // The whole range of the signal, or what is there with some air, at least 1 % of the range.
@@ -158,6 +181,13 @@ function newest(u) {
   u.root.classList.remove("reading");
   const last = u.data[0].findLastIndex((t) => t <= u.scales.x.max);
   if (last >= 0) u.setLegend({ idx: last }, false);
+}
+
+// The row whose time lies nearest.
+function nearest(time, at) {
+  const next = time.findIndex((t) => t >= at);
+  if (next < 0) return time.length - 1;
+  return next > 0 && at - time[next - 1] < time[next] - at ? next - 1 : next;
 }
 
 // A signal with its range, or a number of the law, which has none.

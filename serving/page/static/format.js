@@ -27,6 +27,19 @@ export function clock(seconds) {
   return (today ? "" : DAY.format(date) + " ") + CLOCK.format(date);
 }
 
+const MINUTE = new Intl.DateTimeFormat(undefined, { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
+const UTC = /(\d{4}-\d\d-\d\d) (\d\d:\d\d) UTC/g;
+
+// A text of the loop, which says times in UTC, with the times of this page's zone.
+export function here(text) {
+  return text.replace(UTC, (words, day, minute) => {
+    const date = new Date(`${day}T${minute}Z`);
+    if (Number.isNaN(date.getTime())) return words;
+    const today = new Date().toDateString() === date.toDateString();
+    return (today ? "" : DAY.format(date) + " ") + MINUTE.format(date);
+  });
+}
+
 const UNITS = [["d", 86400], ["h", 3600], ["min", 60], ["s", 1]];
 
 // A span in its largest whole unit, or with three digits.

@@ -1,7 +1,7 @@
 // Alarms, and the journal of what happened.
 import { get } from "./api.js";
 import { ask } from "./dialog.js";
-import { clock, element, say } from "./format.js";
+import { clock, element, here, say } from "./format.js";
 
 const $ = (id) => document.getElementById(id);
 const MOST = 300;
@@ -61,16 +61,16 @@ function alarm(e) {
     { class: `alarm ${level}`, "data-id": e.id, "data-level": level },
     element("span", { class: "sign", "aria-hidden": "true" }, sign),
     element("time", {}, clock(e.time)),
-    element("span", { class: "what" }, e.what + (e.reason ? ` (${e.reason})` : "")),
+    element("span", { class: "what" }, here(e.what) + (e.reason ? ` (${e.reason})` : "")),
     element("span", { class: "stands" }, stands),
     e.acknowledged
       ? element("span", { class: "seen" }, seen)
-      : element("button", { type: "button", class: "acknowledge", "aria-label": `Acknowledge… ${clock(e.time)} ${e.what}`, onclick: () => acknowledge(e) }, "Acknowledge…"),
+      : element("button", { type: "button", class: "acknowledge", "aria-label": `Acknowledge… ${clock(e.time)} ${here(e.what)}`, onclick: () => acknowledge(e) }, "Acknowledge…"),
   );
 }
 
 function acknowledge(e) {
-  ask({ title: "Acknowledge the alarm", words: `${clock(e.time)}: ${e.what}`, request: () => ({ do: "acknowledge", value: e.id }) });
+  ask({ title: "Acknowledge the alarm", words: `${clock(e.time)}: ${here(e.what)}`, request: () => ({ do: "acknowledge", value: e.id }) });
 }
 
 function happened(e) {
@@ -84,6 +84,7 @@ function happened(e) {
 }
 
 function happenedTo(e) {
-  if (e.kind === "acknowledged") return `acknowledged: ${e.what}`;
-  return e.what.startsWith("over") ? `the ${e.kind} is ${e.what}` : e.what;
+  const what = here(e.what);
+  if (e.kind === "acknowledged") return `acknowledged: ${what}`;
+  return what.startsWith("over") ? `the ${e.kind} is ${what}` : what;
 }

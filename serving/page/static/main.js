@@ -43,6 +43,7 @@ function look(act) {
   const [from, to] = view.bounds();
   const times = view.live ? `the last ${duration(view.span)}` : `${clock(from)} to ${clock(to)}`;
   say($("time-shown"), times);
+  charts.forget();
   charts.draw(from, to);
   clearTimeout(again);
   again = setTimeout(reload, SETTLE_MS);

@@ -23,7 +23,13 @@ static void tell(const Instance *i, int status, const char *category, const char
   to->logger(to->environment, i->name ? i->name : "", (fmi2Status)status, category, format);
 }
 
-/* The path in a URI file:///..., file:/... or file://host/...; anything else is taken for a path. false: no memory. */
+static int hex_digit(char c) {
+  const char *digits = "0123456789abcdef0123456789ABCDEF", *at = c ? strchr(digits, c) : NULL;
+  return at ? (int)(at - digits) % 16 : -1;
+}
+
+/* The path in a URI file:///..., file:/... or file://host/...; anything else is taken for a path. A percent sign without
+   two hexadecimal digits behind it stands for itself. false: no memory. */
 static bool path_of(const char *uri, char **path) {
   if (!strncmp(uri, "file:", 5)) {
     uri += 5;
@@ -33,10 +39,9 @@ static bool path_of(const char *uri, char **path) {
   }
   char *to = *path = malloc(strlen(uri) + 1);
   while (to && *uri) {
-    unsigned code;
-    bool escaped = *uri == '%' && sscanf(uri + 1, "%2x", &code) == 1;
-    *to++ = escaped ? (char)code : *uri;
-    uri += escaped ? 3 : 1;
+    int high = *uri == '%' ? hex_digit(uri[1]) : -1, low = high < 0 ? -1 : hex_digit(uri[2]);
+    *to++ = low < 0 ? *uri : (char)(16 * high + low);
+    uri += low < 0 ? 1 : 3;
   }
   if (to) *to = 0;
   return to != NULL;

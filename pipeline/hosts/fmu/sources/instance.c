@@ -180,6 +180,8 @@ static bool get_boolean(Instance *i, unsigned reference, bool *value) {
 
 static bool set_boolean(Instance *i, unsigned reference, bool value) {
   if (reference != VR_USE_APPLIED || !i->n[G_APPLIED]) return REFUSE(i, "variable %u cannot be set as a Boolean", reference);
+  if (i->memory[PHASE] == STEPPING || i->memory[PHASE] == TERMINATED) /* it is a fixed parameter, as mv_start is */
+    return REFUSE(i, "use_mv_applied cannot be set after the %s", i->memory[PHASE] == STEPPING ? "initialization" : "end");
   i->memory[USE_APPLIED] = value;
   return true;
 }

@@ -1,0 +1,196 @@
+"""How a loop begins on its plant: it writes no MV that neither the plant, an operator nor the law has named."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from processes import within as in_time
+
+from serving import Controller, Mode, Sample, VirtualClock
+from serving.journal import JournalReader
+from serving.loop import Command, within
+from serving.opcua.endpoint import Values
+from serving.opcua.settings import Nodes, Server
+from serving.station import station
+from serving.station.lease import Lease
+from serving.station.settings import Hold, JournalSettings, Settings
+from serving.station.station import Station
+from serving.station.views import state
+
+PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+NODES: dict[str, Any] = {"pv": {"C_A": "ns=2;s=a", "T": "ns=2;s=b"}, "mv": {"T_j": "ns=2;s=c"}}
+
+
+class Plant:
+    """In the place of the endpoint: what it shows, and what was written there."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self.values: Values | None = None
+        self.trouble, self.connections = "", 1
+        self.written: list[float] = []
+        self.shows(250.0)
+
+    def shows(self, mv: float, fault: str = "") -> None:
+        pv = np.array([0.9, math.nan if fault else 330.0])
+        self.values = Values(0.0, pv, np.array([mv]), np.zeros(0), 0.0, fault, (0, 0, 0))
+
+    def start(self) -> None:
+        """Nothing: it is there."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+    def read(self) -> Sample:
+        assert self.values is not None
+        return Sample(self.values.pv, self.values.mv, self.values.dv, 0.0, self.values.fault)
+
+    def write(self, mv: np.ndarray) -> None:
+        self.written.append(float(mv[0]))
+
+
+@pytest.fixture
+def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Station, Any]]:
+    monkeypatch.setattr(station, "OpcUaEndpoint", Plant)
+    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
+    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
+
+    def make(start: str, **changed: Any) -> tuple[Station, Any]:
+        server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
+        made = Station(
+            Settings(
+                PID,
+                server,
+                Nodes(**NODES),
+                start=start,  # type: ignore[arg-type]
+                hold=Hold(recover_after=2),
+                journal=JournalSettings(tmp_path / "loop.journal"),
+                **changed,
+            )
+        )
+        return made, made.endpoint
+
+    return make
+
+
+def events(made: Station) -> list[str]:
+    with closing(JournalReader(made.settings.journal.file)) as reader:
+        return [f"{e.who}: {e.what}" for _, e in reader.events()]
+
+
+@pytest.mark.parametrize("start", ["AUTO", "MANUAL"])
+def test_a_loop_that_is_ended_while_it_waits_for_a_pv_writes_nothing(
+    start: str, make_station: Callable[..., tuple[Station, Any]]
+) -> None:
+    made, plant = make_station(start)
+    plant.shows(250.0, "PV T: Bad")
+    thread = threading.Thread(target=made.run)
+    thread.start()
+    assert not in_time(0.2, lambda: made.scans > 0)
+    made.end()
+    thread.join(20)
+    assert not thread.is_alive()
+    assert (plant.written, made.scans) == ([], 0)
+    assert events(made) == ["loop: ended before the first scan: nothing was written"]
+
+
+@pytest.mark.parametrize("start", ["AUTO", "MANUAL"])
+def test_an_actuator_outside_the_controllers_range_is_left_there(
+    start: str, make_station: Callable[..., tuple[Station, Any]]
+) -> None:
+    """It stands at 550 K, and the controller's range ends at 500 K."""
+    made, plant = make_station(start)
+    plant.shows(550.0)
+    reasons: list[str] = []
+    journalled: list[Any] = []
+
+    def seen(_: Sample | None, command: Command) -> None:
+        reasons.append(command.reason)
+        journalled.append(json.loads(json.dumps(state(made), allow_nan=False))["mv"])
+        if made.scans == 8:
+            assert plant.written == []
+            plant.shows(498.0)
+
+    made.watch(seen)
+    made.run(12)
+    assert journalled[:8] == [None] * 8
+    assert "applied MV T_j is 550 K, outside its range" in reasons[7]
+    assert plant.written[0] == 498.0
+    assert not any("nan" in line for line in events(made))
+    with closing(JournalReader(made.settings.journal.file)) as reader:
+        rows = [scan.numbers[3] for _, _, scan in reader.scans()]  # behind a set point and two PVs
+    assert len(rows) == 12
+    assert all(math.isnan(mv) for mv in rows[:8])
+    assert rows[8] == 498.0
+
+
+def test_a_shadow_without_first_values_takes_no_middle_for_the_mv(
+    make_station: Callable[..., tuple[Station, Any]],
+) -> None:
+    made, plant = make_station("SHADOW")
+    plant.shows(250.0, "PV T: Bad")
+    shown: list[Any] = []
+
+    def seen(_: Sample | None, command: Command) -> None:
+        shown.append((command.mode, json.loads(json.dumps(state(made), allow_nan=False))["mv"]))
+        assert made.loop is not None
+        if made.scans == 3:
+            assert np.isnan(made.loop.mv).all()
+            plant.shows(310.0)
+        if made.scans == 5:
+            made.loop.set_mode(Mode.MANUAL)
+
+    made.watch(seen)
+    made.run(8)
+    assert shown[:5] == [(Mode.SHADOW, None)] * 5
+    assert plant.written == [310.0] * 3
+
+
+def test_a_set_point_of_the_plants_side_outside_its_range_takes_no_other_one_with_it(
+    make_station: Callable[..., tuple[Station, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, _ = make_station("SHADOW")
+    a = made.manifest.sp[0]
+    signals = tuple(replace(a, name=name) for name in ("one", "two", "three"))
+    monkeypatch.setattr(Station, "manifest", property(lambda _: SimpleNamespace(sp=signals)))
+
+    class Loop:
+        points = np.array([0.1, 0.2, 0.3])
+
+        @property
+        def sp(self) -> np.ndarray:
+            return self.points.copy()
+
+        def set_sp(self, wanted: Any) -> None:
+            self.points = within(wanted, signals, "set point")
+
+    loop: Any = Loop()
+    made._set_points(loop, {"one": 0.5, "two": 99.0, "three": 0.7})
+    assert loop.sp.tolist() == [0.5, 0.2, 0.7]
+    made.journal.close()
+    said = events(made)
+    assert [line.split(" (")[0] for line in said] == [
+        f"plant: set point one 0.5 {a.unit}",
+        f"plant: refused: set point two 99 {a.unit}",
+        f"plant: set point three 0.7 {a.unit}",
+    ]
+
+
+def test_a_controller_that_is_tried_lies_beside_the_one_in_charge(
+    make_station: Callable[..., tuple[Station, Any]], tmp_path: Path
+) -> None:
+    made, _ = make_station("SHADOW")
+    shutil.copy(PID, tmp_path / "elsewhere.onnx")
+    assert made._opened("pid.onnx", None).path == PID
+    made.loop = SimpleNamespace(controller=Controller(tmp_path / "elsewhere.onnx"))  # type: ignore[assignment]
+    assert made._opened("elsewhere.onnx", None).path == tmp_path / "elsewhere.onnx"
