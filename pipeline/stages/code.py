@@ -44,7 +44,7 @@ APART = {
     "design": {
         *(("", what) for what in TESTS),
         # What trained the models has had its effect.
-        *(("pipeline.models", what) for what in ("pipeline.metrics", "pipeline.records")),
+        *(("pipeline.models", what) for what in ("pipeline.metrics", "pipeline.records", "pipeline.historian")),
         # The parity gate says whether the runtime agrees with the law, and changes nothing.
         *(("", what) for what in ("serving.controller", "serving.graph_audit")),
     },

@@ -32,7 +32,7 @@ const UTC = /(\d{4}-\d\d-\d\d) (\d\d:\d\d) UTC/g;
 
 // A text of the loop, which says times in UTC, with the times of this page's zone.
 export function here(text) {
-  return text.replace(UTC, (words, day, minute) => {
+  return (text ?? "").replace(UTC, (words, day, minute) => {
     const date = new Date(`${day}T${minute}Z`);
     if (Number.isNaN(date.getTime())) return words;
     const today = new Date().toDateString() === date.toDateString();
