@@ -32,8 +32,10 @@ class Chart(Remembers):
 
     The first ``learn`` figures give mean, scatter s and correlation f = 1 + 2 sum rho: they are worth learn / f
     independent ones. Below WORTH of those, pairs are averaged, and learning lasts twice as long. Scatter and mean
-    count with the unfavourable ends of their 90 % intervals: a higher scatter, and a k above SLACK. The limit is that
-    of a sum of long-run variance f (a Brownian motion) whose mean time to a false alarm is A figures:
+    count with the unfavourable ends of their 90 % intervals: a higher scatter, and a k above SLACK. Where the scatter
+    s is below ``least``, ``least`` takes its place and f (s / least)^2 that of f, but at least 1: z scatters by less
+    then, and hangs together all the same. The limit is that of a sum of long-run variance f (a Brownian motion) whose
+    mean time to a false alarm is A figures:
 
         limit = f / (2 k) ln(1 + 2 k^2 A / f) - 1.17,    A = figures a week / false alarms a week
 
@@ -142,16 +144,17 @@ class Chart(Remembers):
 
     def _reckon(self) -> None:
         self.mean, s = self.figures.mean(axis=0), self.figures.std(axis=0, ddof=1)
-        f = np.where(s > self.least, correlation(self.figures), 1.0)  # a smaller scatter is not the measure anyway
-        worth = self.learn / f
+        f = correlation(self.figures)
+        wide = s * np.array([upper_scatter(self.learn / one - 1) for one in f.tolist()])
+        self.scatter = np.maximum(wide, self.least) + 1e-12
+        f = np.maximum(f * (wide / self.scatter) ** 2, 1.0)  # long-run variance of (x - mean) / scatter
         if self.n and self.learn / f.mean() < WORTH and self.doublings < DOUBLINGS:
             half = self.learn // 2
             self.figures[:half] = self.figures[: 2 * half].reshape(half, 2, self.n).mean(axis=1)
             self.count, self.pool, self.doublings = half, 2 * self.pool, self.doublings + 1
             return
         run_length = self.weekly / self.pool / self.rate * (2 if self.both else 1)
-        self.scatter = np.maximum(s * np.array([upper_scatter(w - 1) for w in worth.tolist()]), self.least) + 1e-12
-        self.slack = SLACK + ONE_SIDED / np.sqrt(worth)
+        self.slack = SLACK + ONE_SIDED * np.sqrt(f / self.learn)
         self.limit = np.array([run_limit(SLACK, run_length, one) for one in f.tolist()])
         self.recent = self.mean.copy()
         self.figures = np.zeros((self.learn, self.n))

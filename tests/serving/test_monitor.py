@@ -80,6 +80,15 @@ def test_false_alarms_are_as_rare_as_asked_for_whether_or_not_figures_hang_toget
     assert np.sum(first < len(figures)) <= 20
 
 
+@pytest.mark.parametrize("scatter", [0.1, 0.5, 0.8, 0.95])
+def test_figures_that_scatter_by_less_than_matters_hang_together_all_the_same(scatter: float) -> None:
+    """``least`` is no reason to call them white: as rare as above, and learnt no later where they hardly scatter."""
+    figures = scatter * ar1(np.random.default_rng(9), 0.9, 600 + 4_000, 100)
+    _, first = charted(figures, 300, rate=0.2, least=1.0)
+    assert np.sum(first < len(figures)) <= 20
+    assert scatter > 0.1 or charted(figures[:60, :1], 60, least=1.0)[0].learnt
+
+
 def test_a_shift_is_found_soon_and_its_time_is_told() -> None:
     rng = np.random.default_rng(4)
     figures = rng.normal(size=(300, 50))
