@@ -14,6 +14,7 @@ from serving.manifest import Signal
 Array: TypeAlias = NDArray[np.float64]
 
 SAME = 1e-3  # of an MV's range: a read-back no farther than that from where it was expected has not moved
+ROUNDING = 1e-9  # of an MV's range: less is no offset, and the read-back itself is where the MV stands
 SETTLED = 5  # equal commands in a row: a read-back that lags has followed
 
 
@@ -29,6 +30,7 @@ class Standing:
         span = np.array([s.high - s.low for s in signals])
         self._low, self._high = np.array([s.low for s in signals]), np.array([s.high for s in signals])
         self._same = SAME * span
+        self._least = ROUNDING * span
         self._most = np.array([0.0 if s.values is not None else READ_BACK_MARGIN for s in signals]) * span
         self.mv = mv.copy()  # shape: (n_mv,)
         self._rested = 0
@@ -48,7 +50,7 @@ class Standing:
         if not self.lost:
             off = applied - self.mv
             if self._rested >= SETTLED:
-                self._seen = np.where(np.abs(off) <= self._most, off, 0.0)
+                self._seen = np.where((self._least < np.abs(off)) & (np.abs(off) <= self._most), off, 0.0)
             return None
         found = np.clip(applied - self._offset, self._low, self._high)
         self.mv, self.lost = np.where(np.abs(found - self.mv) <= self._same, self.mv, found), False

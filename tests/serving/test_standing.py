@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from serving import Controller, ControlLoop, EndpointError, Fallback, LoopError, Mode, Sample, VirtualClock
-from serving.standing import SAME, SETTLED
+from serving import Controller, ControlLoop, EndpointError, Fallback, LoopError, Mode, Sample, Signal, VirtualClock
+from serving.standing import SAME, SETTLED, Standing
 
 pytest_plugins = ["small_laws"]
 RANGE = 100.0
@@ -279,3 +279,16 @@ def test_a_move_that_no_read_back_shows_yet_is_written_over(make_loop: Callable[
     outage(loop, line, 10, 71.0)  # moved last of all, so that the first read-back is older
     loop.run(3)
     assert line.written == [40.0] * 3
+
+
+def test_a_difference_of_rounding_is_no_offset() -> None:
+    """Else the MV that a loop holds after a loss would differ from the plant's own in its last bits."""
+    standing = Standing((Signal("u", "%", 0.0, 100.0),), np.array([50.0]))
+    for _ in range(10):
+        standing.commanded(np.array([50.0]))
+        standing.seen(np.array([50.0 + 1e-13]))
+    standing.commanded(np.array([50.0]))
+    standing.lost = True
+    found = standing.seen(np.array([70.0 + 1e-13]))
+    assert found is not None
+    assert found.tolist() == [70.0 + 1e-13]
