@@ -218,6 +218,8 @@ def test_a_fault_holds_and_is_recovered_from(
     name: str, plant: Plant, wire: Wire, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (begin, end), words = FAULTS[name]
+    before = len(plant.actuator())
+    assert within(20, lambda: len(plant.actuator()) > before + 1)  # the last command of the loop before has arrived
     since = len(plant.actuator())
     running = Running(tmp_path, wire.port)
     assert running.ask(lambda loop: loop.set_sp([0.93]), "set point") == ""
