@@ -1,13 +1,15 @@
 """The closed circle: a loop on a served plant, its journal as data, a controller of these data in that loop.
 
-``python tests/closed_circle.py record FOLDER`` runs a loop and exports its journal; then `loopwright new` and
-`loopwright run` make a controller of it; ``python tests/closed_circle.py swap FOLDER CONTROLLER`` swaps it in.
+``python tests/closed_circle.py record FOLDER [CASE]`` runs a loop and exports its journal; then `loopwright new` and
+`loopwright run` make a controller of it; ``python tests/closed_circle.py swap FOLDER CONTROLLER [CASE]`` swaps it in.
+CASE is a key of CIRCLES, by default the first.
 """
 
 from __future__ import annotations
 
 import random
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from plant_servers import Plant, RunningLoop
@@ -16,33 +18,60 @@ from processes import within
 from pipeline.__main__ import main
 from serving.station.control import ask
 
-CASE, LAW = "ph_neutralization", "pid"
-SPEED = 1200.0  # a period of 60 s in 50 ms
-ROWS = 1_500
+LAW = "pid"
 
 
-def begun(folder: Path) -> tuple[Plant, RunningLoop]:
+@dataclass(frozen=True)
+class Circle:
+    """A plant and its operation: set points of ``span``, each for ``hold`` scans; after the swap a move between two."""
+
+    case: str
+    sp: str
+    speed: float
+    max_age_s: tuple[float, float]  # as written, as a plant that runs so fast needs it
+    rows: int
+    span: tuple[float, float]
+    hold: tuple[int, int]
+    move: tuple[float, float]
+    near: float
+
+
+CIRCLES = {
+    # A period of 60 s in 50 ms.
+    "ph_neutralization": Circle(
+        "ph_neutralization", "pH", 1200.0, (90, 1200), 1_500, (6.6, 8.8), (5, 40), (7.2, 7.6), 0.15
+    ),
+    # A second PV is measured, and is in the journal. A period of 2 s in 67 ms.
+    "reversible_cstr": Circle(
+        "reversible_cstr", "C_B", 30.0, (3, 60), 3_000, (0.35, 0.54), (15, 120), (0.40, 0.48), 0.01
+    ),
+}
+
+
+def begun(folder: Path, circle: Circle) -> tuple[Plant, RunningLoop]:
     """The plant and its loop, in AUTO."""
     folder.mkdir(parents=True, exist_ok=True)
-    plant = Plant(folder, CASE, SPEED, "--noise")
+    plant = Plant(folder, circle.case, circle.speed, "--noise")
     plant.start()
     path = folder / "loop.toml"
     path.unlink(missing_ok=True)
-    file = Path("artifacts", CASE, f"{LAW}.onnx")
+    file = Path("artifacts", circle.case, f"{LAW}.onnx")
     assert main(["loop", "init", str(file), "--endpoint", plant.endpoint, "--out", str(path)]) == 0
-    text = path.read_text().replace('page = "127.0.0.1:8080"', f"speed = {SPEED}").replace("SHADOW", "AUTO", 1)
-    path.write_text(text.replace("max_age_s = 90", "max_age_s = 1200"))
+    text = path.read_text().replace('page = "127.0.0.1:8080"', f"speed = {circle.speed}").replace("SHADOW", "AUTO", 1)
+    written, patient = (f"max_age_s = {age:g}" for age in circle.max_age_s)
+    assert written in text
+    path.write_text(text.replace(written, patient))
     return plant, RunningLoop(path)
 
 
-def record(folder: Path) -> None:
+def record(folder: Path, circle: Circle) -> None:
     """Set points that move now and then, and the journal as an export."""
-    plant, loop = begun(folder)
+    plant, loop = begun(folder, circle)
     rng, journal = random.Random(0), loop.settings.journal.file
     try:
-        while loop.station.scans < ROWS:
-            ask(journal, {"do": "sp", "value": {"pH": rng.uniform(6.6, 8.8)}, "who": "engineer"})
-            until = loop.station.scans + rng.randint(5, 40)
+        while loop.station.scans < circle.rows:
+            ask(journal, {"do": "sp", "value": {circle.sp: rng.uniform(*circle.span)}, "who": "engineer"})
+            until = loop.station.scans + rng.randint(*circle.hold)
             assert within(60, lambda: loop.station.scans >= until)  # noqa: B023
     finally:
         loop.end()
@@ -50,19 +79,20 @@ def record(folder: Path) -> None:
     assert main(["loop", "export", str(journal), "--out", str(folder / "loop.csv")]) == 0
 
 
-def swap(folder: Path, controller: Path) -> None:
+def swap(folder: Path, controller: Path, circle: Circle) -> None:
     """The new controller takes over, and holds a set point."""
-    plant, loop = begun(folder / "swap")
+    plant, loop = begun(folder / "swap", circle)
     journal = loop.settings.journal.file
     try:
-        ask(journal, {"do": "sp", "value": {"pH": 7.2}, "who": "engineer"})
+        ask(journal, {"do": "sp", "value": {circle.sp: circle.move[0]}, "who": "engineer"})
         ask(journal, {"do": "swap", "value": {"file": str(controller.absolute()), "trial": 40}, "who": "engineer"})
         assert within(60, lambda: loop.station.loop is not None and loop.station.loop.replaced is not None)
-        ask(journal, {"do": "sp", "value": {"pH": 7.6}, "who": "engineer"})
+        ask(journal, {"do": "sp", "value": {circle.sp: circle.move[1]}, "who": "engineer"})
 
         def held() -> bool:
             now = ask(journal, {"do": "state"})
-            return now["mode"] == "AUTO" and now["pv"] is not None and abs(now["pv"][0] - 7.6) < 0.15
+            near = now["pv"] is not None and abs(now["pv"][0] - circle.move[1]) < circle.near
+            return near and now["mode"] == "AUTO"
 
         assert within(60, held), ask(journal, {"do": "state"})
     finally:
@@ -72,7 +102,8 @@ def swap(folder: Path, controller: Path) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "record":
-        record(Path(sys.argv[2]))
+    doing, folder, *rest = sys.argv[1:]
+    if doing == "record":
+        record(Path(folder), CIRCLES[(*rest, *CIRCLES)[0]])
     else:
-        swap(Path(sys.argv[2]), Path(sys.argv[3]))
+        swap(Path(folder), Path(rest[0]), CIRCLES[(*rest[1:], *CIRCLES)[0]])
