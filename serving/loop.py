@@ -261,7 +261,7 @@ class ControlLoop:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         reason = self._refusal(sample)
         self._blind = ""
-        left = self._stands(sample, refused=bool(reason))
+        shown, left = self._stands(sample, refused=bool(reason))
         if left:
             words = left if reason in {None, left} else f"{reason}; {left}"
             return self._missed(f"{words}: nothing is written before it is back")
@@ -270,7 +270,7 @@ class ControlLoop:
         applied = self._mv
         past = tuple(self._past) if self.successor is not None else ()
         try:
-            applied = self._read_back(sample)
+            applied = self._read_back(sample) if shown is None else shown
             if isnan(self._mv[0]):
                 self._mv = applied.copy()
             step = self.controller.step(sp=self._sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
@@ -343,8 +343,9 @@ class ControlLoop:
                 self._mv = self.fallback.toward(self._mv, m.mv, m.period_s)
 
     def _overdue(self) -> bool:
-        since = (self._held - 1) * self.controller.manifest.period_s
-        return bool(self._fault) and self.fallback is not None and since >= self.fallback.after_s
+        if not self._fault or self.fallback is None:
+            return False
+        return (self._held - 1) * self.controller.manifest.period_s >= self.fallback.after_s
 
     def _handing_back(self) -> bool:
         return self._overdue() and self.fallback is not None and self.fallback.hand_back
@@ -394,28 +395,28 @@ class ControlLoop:
                 return np.clip(applied, lows, highs)
         return applied
 
-    def _stands(self, sample: Sample, *, refused: bool) -> str:
-        """Where the MV stands, as far as the sample tells: ``found`` where that was not known.
+    def _stands(self, sample: Sample, *, refused: bool) -> tuple[Array | None, str]:
+        """The read-back (n_mv,), as ``_read_back`` gives it, and where the MV stands: ``found`` if that was not known.
 
         A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where that
-        was not known and the MV stands outside its range, somebody has moved it there: why it is left there.
+        was not known and the MV stands outside its range, somebody has moved it there: the text says why it is left.
         """
         self._standing.commanded(self._given)
         self.found = None
         try:
             given = sample.mv_applied
             if given is not None and np.asarray(given).dtype.kind not in "fiu":
-                return ""
+                return None, ""
             applied = None if given is None else self._read_back(sample)
         except Exception:  # no sample, or no MV that any actuator can have
-            return self._left(sample) if self._standing.lost else ""
+            return None, self._left(sample) if self._standing.lost else ""
         if applied is not None:
             self.found = self._standing.seen(applied)
         elif not refused:
             self._standing.lost = False
         if self.found is not None:
             self._mv = self.found.copy()
-        return ""
+        return applied, ""
 
     def _left(self, sample: Sample) -> str:
         """Why the MV is left where it stands: the plant has one that the loop may not command."""
