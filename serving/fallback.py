@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from serving.errors import LoopError
 from serving.manifest import Signal
+from serving.ranges import within
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -43,6 +44,14 @@ class Fallback:
                 raise LoopError(f"{name} is {values}; it needs finite numbers")
         if self.rate is not None and not all(r > 0 for r in self.rate):
             raise LoopError(f"rate is {self.rate}; each must be above zero")
+
+    def check(self, signals: Sequence[Signal]) -> None:
+        """LoopError where the safe MV is none of these MVs, or the rates are not as many."""
+        if self.mv is None or self.rate is None:
+            return
+        within(self.mv, signals, "safe MV")
+        if len(self.rate) != len(signals):
+            raise LoopError(f"the fallback has {len(self.rate)} rates; it needs {len(signals)}, one an MV")
 
     def toward(self, mv: Array, signals: Sequence[Signal], period_s: float) -> Array:
         """The MV (n_mv,) one period nearer to the safe one; a discrete MV goes there at once."""

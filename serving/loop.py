@@ -2,79 +2,34 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from collections.abc import Callable
 from math import inf, isnan, nan
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from serving.applied import AppliedMV
 from serving.clock import Clock, MonotonicClock
+from serving.command import Command
 from serving.controller import Controller
 from serving.endpoint import Endpoint, HandsBack
-from serving.errors import ContractError, LoopError, SampleError
+from serving.errors import LoopError
 from serving.fallback import Fallback
-from serving.fitted import fitted
 from serving.grid import RunReport, run_on_grid
-from serving.guard import Guard, Sample, default_guards, implausible, refused
-from serving.manifest import Manifest, Signal
-from serving.standing import Standing
+from serving.guard import Guard, Sample, default_guards
+from serving.in_charge import Guards, InCharge
+from serving.mode import LoopMode, Mode, mode_of
+from serving.ranges import within
 from serving.successor import Successor
 from serving.transfer import Transfer
 from serving.words import first_line
 
+__all__ = ["WARM_LEAD_S", "Command", "ControlLoop", "Mode", "within"]
+
 Array: TypeAlias = NDArray[np.float64]
 
 WARM_LEAD_S = 4e-4  # within the clock's spin, so that the processor does not sleep between warm-up and deadline
-
-
-class Mode(StrEnum):
-    """The source of the MV: MANUAL the operator, AUTO the law, HOLD the last applied MV, SHADOW the plant's own side.
-
-    In SHADOW nothing is written.
-    """
-
-    MANUAL = "MANUAL"
-    AUTO = "AUTO"
-    HOLD = "HOLD"
-    SHADOW = "SHADOW"
-
-
-def _known(mode: Mode) -> Mode:
-    """``mode``, also given as its name; LoopError for anything else, as a loop in no mode would write the old MV."""
-    try:
-        return Mode(mode)
-    except ValueError:
-        raise LoopError(f"the mode is {mode!r}; it must be one of {', '.join(Mode)}") from None
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """The result of one scan. ``reason`` names a fault; it is empty without one.
-
-    A host that runs the loop itself writes ``mv`` where ``writes`` is true: not in SHADOW, and not while ``mv`` is NaN
-    because no sample has told yet where the MV stands. Where ``hand_back`` is true, it gives the plant back to the
-    plant's own controller, and then sets the mode to SHADOW.
-    """
-
-    scan: int
-    mode: Mode
-    sp: Array  # shape: (n_sp,)
-    mv: Array  # shape: (n_mv,), to be written; NaN while it is not known where the MV stands
-    law_mv: Array | None  # the law's MV, also in MANUAL; None if the law was not stepped or its step failed
-    info: Array | None  # shape: (n_info,)
-    reason: str = ""
-    successor_mv: Array | None = None  # shape: (n_mv,), of a controller that is tried beside the law; else None
-    hand_back: bool = False
-
-    @property
-    def writes(self) -> bool:
-        """Whether ``mv`` is to be written."""
-        return self.mode is not Mode.SHADOW and not isnan(self.mv[0])  # all of it is known, or none
 
 
 class ControlLoop:
@@ -139,7 +94,7 @@ class ControlLoop:
         sp: ArrayLike,
         mv: ArrayLike | None = None,
         mode: Mode = Mode.MANUAL,
-        guards: Sequence[Guard] | Callable[[Manifest], Sequence[Guard]] | None = None,
+        guards: Guards | None = None,
         recover_after: int | None = None,
         clock: Clock | None = None,
         warm_lead_s: float = WARM_LEAD_S,
@@ -147,52 +102,72 @@ class ControlLoop:
         transfer_s: float = 0.0,
         fallback: Fallback | None = None,
     ) -> None:
-        mode = _known(mode)
+        mode = mode_of(mode)
         if recover_after is not None and recover_after < 1:
             raise LoopError(f"recover_after is {recover_after}; it must be at least 1, or None")
         if not 0 <= transfer_s < inf:
             raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
-        self.controller = controller
+        self._charge = InCharge(controller, default_guards if guards is None else guards)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
-        made = default_guards if guards is None else guards
-        self._made = made if callable(made) else None  # what makes the guards; None: they are the host's own
-        self.guards: tuple[Guard, ...] = tuple(made(manifest) if callable(made) else made)
         self.recover_after = recover_after
         self.clock: Clock = clock or MonotonicClock()
         self.warm_lead_s = min(warm_lead_s, manifest.period_s / 4)
         self.max_gap = max_gap
         self.fallback = fallback
-        if fallback is not None and fallback.hand_back and not isinstance(endpoint, HandsBack | None):
-            raise LoopError(f"{type(endpoint).__name__} cannot hand the plant back: it has no method hand_back")
-        if fallback is not None and fallback.mv is not None and fallback.rate is not None:
-            within(fallback.mv, manifest.mv, "safe MV")
-            if len(fallback.rate) != len(manifest.mv):
-                raise LoopError(f"the fallback has {len(fallback.rate)} rates; it needs {len(manifest.mv)}, one an MV")
+        if fallback is not None:
+            fallback.check(manifest.mv)
+            if fallback.hand_back and not isinstance(endpoint, HandsBack | None):
+                raise LoopError(f"{type(endpoint).__name__} cannot hand the plant back: it has no method hand_back")
         self._sp = within(sp, manifest.sp, "set point")
         self._mv = np.full(len(manifest.mv), nan) if mv is None else within(mv, manifest.mv, "MV")
-        self._ranges = [(s.low, s.high, s.values) for s in manifest.mv]
-        self._mode = mode
-        self._fault = ""  # the fault that changed the mode to HOLD; empty without one
+        self._mode = LoopMode(mode)
         self._blind = ""  # why the last sample was refused; empty after a good one, and before the first
-        self._good = 0
-        self._held = 0  # scans since that fault began
         self._scan = 0
-        self._state = controller.cold_state()
-        self._standing, self._given = Standing(manifest.mv, self._mv), self._mv
+        self._applied = AppliedMV(manifest.mv, self._mv)
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
-        self.successor: Successor | None = None  # tried beside the controller, see ``swap``
-        self.replaced: Controller | None = None  # the one that was in charge before the present one
-        self._past: deque[Sample] = deque(maxlen=_memory(self.guards))
+
+    # ------------------------------------------------------------------ who is in charge
+    @property
+    def controller(self) -> Controller:
+        """The controller in charge."""
+        return self._charge.controller
+
+    @property
+    def successor(self) -> Successor | None:
+        """The controller that is tried beside it, see ``swap``."""
+        return self._charge.successor
+
+    @property
+    def replaced(self) -> Controller | None:
+        """The controller that was in charge before it."""
+        return self._charge.replaced
+
+    @property
+    def guards(self) -> tuple[Guard, ...]:
+        """The guards of the controller in charge."""
+        return self._charge.guards
+
+    def swap(self, controller: Controller, trial: int) -> None:
+        """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.
+
+        Until then its MV stands in ``Command.successor_mv``. It may read fewer PVs and measured disturbances than the
+        loop does. LoopError where its period, set points or MVs are others, or it has a signal that the loop has not.
+        """
+        self._charge.swap(controller, trial, self.manifest)
+
+    def keep(self) -> None:
+        """End the trial of a successor; the controller in charge stays."""
+        self._charge.successor = None
 
     # ------------------------------------------------------------------ operator
     @property
     def mode(self) -> Mode:
         """Present mode."""
-        return self._mode
+        return self._mode.now
 
     @property
     def sp(self) -> Array:
@@ -207,7 +182,7 @@ class ControlLoop:
     @property
     def fault(self) -> str:
         """The fault that changed the mode to HOLD; empty without one."""
-        return self._fault
+        return self._mode.fault
 
     def set_mode(self, mode: Mode) -> None:
         """Set the mode, as a Mode or its name; it takes effect at the next scan.
@@ -215,12 +190,12 @@ class ControlLoop:
         LoopError for another word, and where a shadow that knows no good sample now is to move the plant: where the MV
         stands is not known.
         """
-        mode = _known(mode)
-        if self._mode is Mode.SHADOW and mode is not Mode.SHADOW and self._blind:
+        mode = mode_of(mode)
+        if self.mode is Mode.SHADOW and mode is not Mode.SHADOW and self._blind:
             raise LoopError(f"the last sample was refused ({self._blind}), so where the MV stands is not known; wait")
-        if mode is not self._mode:
+        if mode is not self.mode:
             self._transfer.begin()
-        self._mode, self._fault, self._good, self._held = mode, "", 0, 0
+        self._mode.set(mode)
 
     def set_sp(self, sp: ArrayLike) -> None:
         """Change the set points (n_sp,); LoopError outside their ranges."""
@@ -231,9 +206,9 @@ class ControlLoop:
 
         LoopError too after a command that did not reach the plant, until it is known where the MV stands.
         """
-        if self._mode is not Mode.MANUAL:
-            raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self._mode}")
-        if self._standing.lost:
+        if self.mode is not Mode.MANUAL:
+            raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self.mode}")
+        if self._applied.lost:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
         self._mv = within(mv, self.controller.manifest.mv, "MV")
 
@@ -241,61 +216,50 @@ class ControlLoop:
         """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
         self.set_mode(Mode.SHADOW)
 
-    def swap(self, controller: Controller, trial: int) -> None:
-        """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.
-
-        Until then its MV stands in ``Command.successor_mv``. It may read fewer PVs and measured disturbances than the
-        loop does. LoopError where its period, set points or MVs are others, or it has a signal that the loop has not.
-        """
-        if trial < 1:
-            raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
-        new = fitted(controller, self.manifest)
-        self.successor = Successor(new, trial, () if self._made is None else tuple(self._made(new.manifest)))
-
-    def keep(self) -> None:
-        """End the trial of a successor; the controller in charge stays."""
-        self.successor = None
-
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
-        reason = self._refusal(sample)
+        reason = self._charge.refusal(sample)
         self._blind = ""
-        left = self._stands(sample, refused=bool(reason))
-        if left:
-            words = left if reason in {None, left} else f"{reason}; {left}"
+        self._applied.arrived()
+        shown = self._applied.look(sample, self._mv, refused=bool(reason))
+        self.found = shown.found
+        if shown.left:
+            self._mv = np.full(len(self._mv), nan)
+            words = shown.left if reason in {None, shown.left} else f"{reason}; {shown.left}"
             return self._missed(f"{words}: nothing is written before it is back")
+        if self.found is not None:
+            self._mv = self.found.copy()
         if reason:
             return self._missed(reason)
-        applied = self._mv
-        past = tuple(self._past) if self.successor is not None else ()
+        applied = self._mv if shown.applied is None else shown.applied
         try:
-            applied = self._read_back(sample)
+            if shown.applied is None:
+                applied = self._applied.read_back(sample, self._mv)
             if isnan(self._mv[0]):
                 self._mv = applied.copy()
-            step = self.controller.step(sp=self._sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
-            if self._past.maxlen:
-                self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
+            step = self._charge.step(sample, self._sp, applied)
         except Exception as error:  # the plant needs an MV after any error
-            if self._mode in {Mode.AUTO, Mode.SHADOW}:
+            if self.mode in {Mode.AUTO, Mode.SHADOW}:
                 self._mv = applied
             return self._missed(first_line(error))
-        self._state = step.state
-        if self._fault and not self._handing_back():  # once asked, the plant's own controller may have it already
-            self._good += 1
-            if self.recover_after is not None and self._good >= self.recover_after:
-                self.set_mode(Mode.AUTO)
-        if self._mode is Mode.AUTO:
+        # Once it was asked, the plant's own controller may have the plant already.
+        if self.fault and not self._handing_back() and self._mode.recovers(self.recover_after):
+            self.set_mode(Mode.AUTO)
+        if self.mode is Mode.AUTO:
             self._mv = np.array(self._transfer.limited(step.mv, applied))  # the host gets step.mv, may write into it
-        elif self._mode is Mode.SHADOW:
+        elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
-        beside = self._beside(sample, applied, past)
+        before = self.controller
+        beside = self._charge.beside(sample, self._sp, applied)
+        if self.controller is not before:
+            self._transfer.begin()
         self._lasting()
-        return self._command(step.mv, step.info, self._fault, beside)
+        return self._command(step.mv, step.info, self.fault, beside)
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
-        self._standing.commanded(self._given)
+        self._applied.arrived()
         self.found = None
         return self._missed(reason)
 
@@ -310,9 +274,9 @@ class ControlLoop:
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        if self._mode is not Mode.MANUAL:
+        if self.mode is not Mode.MANUAL:
             self._mv = np.array(before if self.found is None else self.found, dtype=np.float64)
-        self._standing.lost = True
+        self._applied.lose()
         self._lose(reason)
         self._scan -= 1
         return self._command(None, None, reason)
@@ -320,119 +284,27 @@ class ControlLoop:
     def gap(self, periods: int) -> None:
         """So many periods passed without a scan; the law starts cold after more than ``max_gap``."""
         if periods > self.max_gap:
-            self._state = self.controller.cold_state()
-            if self.successor is not None:
-                self.successor.miss(f"{periods} periods were missed")
+            self._charge.begin_cold(f"{periods} periods were missed")
 
     def _lose(self, reason: str) -> None:
         """No past any more; in AUTO a fault."""
-        self._state = self.controller.cold_state()
-        self._past.clear()
-        self._good = 0
-        if self.successor is not None:
-            self.successor.miss(reason)
-        if self._mode is Mode.AUTO or self._fault:
-            self._mode, self._fault = Mode.HOLD, reason
+        self._charge.forget(reason)
+        self._mode.lose(reason)
 
     def _lasting(self) -> None:
         """Count the scans of a fault, and go where the fallback says once it has lasted."""
-        if self._fault:
-            self._held += 1
-            if self._overdue() and self.fallback is not None:
-                m = self.controller.manifest
-                self._mv = self.fallback.toward(self._mv, m.mv, m.period_s)
-
-    def _overdue(self) -> bool:
-        since = (self._held - 1) * self.controller.manifest.period_s
-        return bool(self._fault) and self.fallback is not None and since >= self.fallback.after_s
+        self._mode.hold()
+        if self.fallback is not None and self._mode.overdue(self.fallback, self.manifest.period_s):
+            self._mv = self.fallback.toward(self._mv, self.manifest.mv, self.manifest.period_s)
 
     def _handing_back(self) -> bool:
-        return self._overdue() and self.fallback is not None and self.fallback.hand_back
-
-    def _beside(self, sample: Sample, applied: Array, past: Collection[Sample]) -> Array | None:
-        """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
-        if self.successor is None:
-            return None
-        new = self.successor
-        new.step(sample, self._sp, applied, past)
-        if new.ready:
-            self.replaced, self.successor = self.controller, None
-            self.controller, self._state = new.controller, new.state
-            if self._made is not None:
-                self.guards = tuple(new.guards)
-                self._past = deque(self._past, maxlen=_memory(self.guards))
-            self._transfer.begin()
-        return new.mv
-
-    def _refusal(self, sample: Sample) -> str | None:
-        if not isinstance(sample, Sample):
-            return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
-        if sample.fault:
-            return str(sample.fault)
-        return refused(self.guards, sample, self._past)
-
-    def _read_back(self, sample: Sample) -> Array:
-        """The applied MV (n_mv,) within its range; the last command if there is no read-back.
-
-        Raises ContractError for a wrong shape, and SampleError for an implausible value or where there is neither. HOLD
-        commands the read-back, so this check does not depend on the guards.
-        """
-        if sample.mv_applied is None:
-            if isnan(self._mv[0]):
-                raise SampleError("there is no read-back, so where the MV stands is not known and nothing is written")
-            return self._mv
-        applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
-        if applied.shape != self._mv.shape:
-            raise ContractError(f"applied MV has the shape {applied.shape} instead of {self._mv.shape}")
-        values = applied.tolist()
-        for value, (low, high, allowed) in zip(values, self._ranges, strict=True):
-            if not low <= value <= high or (allowed is not None and value not in allowed):
-                reason = implausible(self.controller.manifest.mv, values)
-                if reason:
-                    raise SampleError(reason)
-                lows, highs, _ = zip(*self._ranges, strict=True)
-                return np.clip(applied, lows, highs)
-        return applied
-
-    def _stands(self, sample: Sample, *, refused: bool) -> str:
-        """Where the MV stands, as far as the sample tells: ``found`` where that was not known.
-
-        A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where that
-        was not known and the MV stands outside its range, somebody has moved it there: why it is left there.
-        """
-        self._standing.commanded(self._given)
-        self.found = None
-        try:
-            given = sample.mv_applied
-            if given is not None and np.asarray(given).dtype.kind not in "fiu":
-                return ""
-            applied = None if given is None else self._read_back(sample)
-        except Exception:  # no sample, or no MV that any actuator can have
-            return self._left(sample) if self._standing.lost else ""
-        if applied is not None:
-            self.found = self._standing.seen(applied)
-        elif not refused:
-            self._standing.lost = False
-        if self.found is not None:
-            self._mv = self.found.copy()
-        return ""
-
-    def _left(self, sample: Sample) -> str:
-        """Why the MV is left where it stands: the plant has one that the loop may not command."""
-        with suppress(Exception):  # no sample, or no MV at all
-            applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
-            if applied.shape == self._mv.shape and np.isfinite(applied).all():
-                reason = implausible(self.controller.manifest.mv, applied.tolist()) or ""
-                if reason:
-                    self._mv = np.full(len(applied), nan)
-                return reason
-        return ""
+        return self._mode.handing_back(self.fallback, self.manifest.period_s)
 
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
-        self._given = self._mv.copy()
-        back = self._handing_back()
-        return Command(self._scan - 1, self._mode, self._sp.copy(), self._mv.copy(), law_mv, info, reason, beside, back)
+        self._applied.command(self._mv)
+        back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
+        return Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back)
 
     # ------------------------------------------------------------------ running
     def run(
@@ -470,25 +342,3 @@ class ControlLoop:
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")
         return run_on_grid(self, self.endpoint, n, until=until, before=before, observe=observe)
-
-
-def _memory(guards: Sequence[Guard]) -> int:
-    return max((g.memory for g in guards), default=0)
-
-
-def within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
-    """``values`` as (n,); LoopError outside the signals' ranges."""
-    try:
-        vector = np.array(values, dtype=np.float64, ndmin=1)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise LoopError(f"the {what} is no vector of numbers: {error}") from error
-    if vector.shape != (len(signals),):
-        names = ", ".join(f"{s.name} [{s.unit}]" for s in signals)
-        raise LoopError(f"the {what} has the shape {vector.shape}; it needs ({len(signals)},): {names}")
-    for s, value in zip(signals, vector.tolist(), strict=True):
-        if s.values is not None and value not in s.values:
-            raise LoopError(f"the {what} {s.name} = {value:g} is none of {', '.join(f'{v:g}' for v in s.values)}")
-        if not s.low <= value <= s.high:
-            unit = "" if s.unit == "-" else f" {s.unit}"
-            raise LoopError(f"the {what} {s.name} = {value}{unit} is outside [{s.low:g}, {s.high:g}]{unit}")
-    return vector

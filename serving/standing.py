@@ -42,14 +42,14 @@ class Standing:
         """A command (n_mv,) went out, and nothing was heard of its loss."""
         if self.lost:
             return
-        self._rested = self._rested + 1 if np.array_equal(mv, self.mv) else 0
+        self._rested = self._rested + 1 if mv.tolist() == self.mv.tolist() else 0
         self.mv, self._offset = mv.copy(), self._seen
 
     def seen(self, applied: Array) -> Array | None:
         """A read-back (n_mv,). Where the MVs stand after a loss, else None: HOLD then keeps what it has."""
         if not self.lost:
-            off = applied - self.mv
             if self._rested >= SETTLED:
+                off = applied - self.mv
                 self._seen = np.where((self._least < np.abs(off)) & (np.abs(off) <= self._most), off, 0.0)
             return None
         found = np.clip(applied - self._offset, self._low, self._high)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from pathlib import Path
@@ -19,11 +20,43 @@ from typing import Any
 from processes import within
 
 from pipeline.simulation import opcua_server
-from serving.journal import JournalReader
+from serving import Command, Mode, Sample
+from serving.journal import JournalReader, Scan
+from serving.station.requests import Change
 from serving.station.settings import Settings
 from serving.station.station import Station
 
 ROOT = Path(__file__).parents[1]
+CASE, PID = "thiosulfate_cstr", ROOT / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+SPACE = "nsu=urn:loopwright:plant;s="
+LOOP = """
+controller = "{pid}"
+start = "{start}"
+speed = {speed}
+{more}
+[server]
+endpoint = "{endpoint}"
+security = "None"
+insecure = true
+[nodes]
+{nodes}
+[nodes.pv]
+C_A = "{space}PV.C_A"
+T = "{space}PV.T"
+[nodes.mv]
+T_j = {{ node = "{space}MV.T_j", read_back = "{space}RB.T_j" }}
+"""
+
+
+def loop_toml(
+    folder: Path, endpoint: str, *, speed: float, start: str = "AUTO", nodes: str = "", more: str = ""
+) -> Path:
+    """The file of a loop of PID on a served ``CASE``; ``nodes`` are lines of [nodes], ``more`` tables of their own."""
+    path = folder / "loop.toml"
+    path.write_text(
+        LOOP.format(pid=PID, start=start, speed=speed, endpoint=endpoint, space=SPACE, nodes=nodes, more=more)
+    )
+    return path
 
 
 def free_port() -> int:
@@ -114,15 +147,43 @@ class Wire:
 
 
 class RunningLoop:
-    """A station in a thread, as a loop.toml says."""
+    """A station in a thread, as a loop.toml or its settings say, with what it did."""
 
-    def __init__(self, path: Path) -> None:
-        self.settings = Settings.read(path)
+    def __init__(self, settings: Path | Settings) -> None:
+        self.settings = Settings.read(settings) if isinstance(settings, Path) else settings
         self.told: list[str] = []
+        self.commands: list[Command] = []
         self.station = Station(self.settings, tell=self.told.append)
+        self.station.watch(self._seen)
         self.thread = threading.Thread(target=self.station.run, daemon=True)
         self.thread.start()
         assert within(30, lambda: self.station.scans > 2), self.told
+
+    def _seen(self, _: Sample | None, command: Command) -> None:
+        self.commands.append(command)
+
+    def ask(self, act: Callable[..., None], what: str) -> str:
+        """How a change went."""
+        said: list[str] = []
+        self.station.ask(Change(act, what, "test", done=said.append))
+        assert within(10, lambda: bool(said))
+        return said[0]
+
+    def becomes(self, mode: Mode, seconds: float = 30.0, scans: int = 1) -> int:
+        """Wait until so many scans in a row have a mode; the place of the first of them from now."""
+        start = len(self.commands)
+
+        def there() -> bool:
+            last = self.commands[start:][-scans:]
+            return len(last) == scans and all(c.mode is mode for c in last)
+
+        assert within(seconds, there), (mode, self.told, [(c.mode, c.reason) for c in self.commands[start:]][-10:])
+        return next(i for i, c in enumerate(self.commands[start:]) if c.mode is mode)
+
+    def scans(self) -> list[Scan]:
+        """What its journal holds."""
+        with closing(JournalReader(self.settings.journal.file)) as reader:
+            return [scan for _, _, scan in reader.scans()]
 
     def events(self) -> list[str]:
         with closing(JournalReader(self.settings.journal.file)) as reader:

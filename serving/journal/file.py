@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
 
 from serving.errors import LoopError
+from serving.file_lock import LockTakenError, locked
 
 SCHEMA = 2
 TABLES = """
@@ -53,31 +53,18 @@ def opened(path: Path, *, write: bool, fsync: str = "crash") -> sqlite3.Connecti
     return base
 
 
-def locked(path: Path) -> int:
+def sole_writer(path: Path) -> int:
     """A handle of the lock that the one writer of a journal keeps until it closes it, or its process ends.
 
     The lock is a file beside the journal: closing a second handle of SQLite's own file would drop SQLite's locks.
     LoopError where another writer has it.
     """
-    try:
-        import fcntl
-    except ModuleNotFoundError:
-        raise LoopError("a journal is written on Linux and macOS; on Windows run the loop in WSL") from None
     lock = path.resolve().with_name(path.resolve().name + ".lock")
     try:
-        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
-    except OSError as error:
-        raise LoopError(f"{lock} cannot be opened: {error.strerror}") from None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        owner = os.read(handle, 100).decode(errors="replace")
-        os.close(handle)
-        if not isinstance(error, BlockingIOError):
-            raise LoopError(f"{lock} cannot be locked: {error.strerror}") from None
+        return locked(lock)
+    except LockTakenError as error:
         raise LoopError(
-            f"{path} is written by another loop (process {owner}); end that one first, or name another file"
+            f"{path} is written by another loop (process {error.owner}); end that one first, or name another file"
         ) from None
-    os.truncate(handle, 0)
-    os.write(handle, str(os.getpid()).encode())
-    return handle
+    except OSError as error:
+        raise LoopError(f"{lock} cannot be opened or locked: {error.strerror}") from None

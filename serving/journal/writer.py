@@ -20,7 +20,7 @@ import numpy as np
 
 from serving.errors import LoopError
 from serving.journal.entries import Event, Scan, columns
-from serving.journal.file import locked, opened
+from serving.journal.file import opened, sole_writer
 from serving.journal.packing import packed
 from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
 from serving.manifest import Manifest
@@ -59,7 +59,7 @@ class Journal:
         self._queue = queue.SimpleQueue[Any]()
         self._base = opened(path, write=True, fsync=fsync)
         try:
-            self._lock = locked(path)
+            self._lock = sole_writer(path)
         except LoopError:
             self._base.close()
             raise

@@ -78,12 +78,12 @@ class Answers(Remembers):
             return
         self.count += 1
         phi, errors = found
-        told = np.zeros(0) if error is None else error[: self.n_told]
-        errors = np.concatenate([errors, told])
+        told = None if error is None else error[: self.n_told]
         if self.model.frozen:
+            errors = errors if told is None else np.concatenate([errors, told])
             self.squares = self.squares + errors**2
             self.scores = self.scores + phi[:, None] * errors
-        elif self.n_told:
+        elif told is not None:
             self.told_square = self.told_square + (told**2 - self.told_square) / min(self.model.scans, SQUARES)
         if self.count >= self.block:
             self.end(time_s, 1)

@@ -37,6 +37,10 @@ class BesideModel(Remembers):
         self.square = np.zeros(self.n_y)  # mean square of its errors while it learnt
         self._past = np.zeros(self.n_phi)
         self._past[-1] = 1.0
+        n_y, n_u, first = self.n_y, self.n_u, PAST_PV * self.n_y  # where each entry of the next phi stands in this one
+        self._older = np.arange(self.n_phi)
+        self._older[n_y:first] -= n_y
+        self._older[first + n_u : -1] -= n_u
         self._filled = 0
         self._basis: Array | None = None
 
@@ -50,14 +54,13 @@ class BesideModel(Remembers):
         told = None
         if self._filled >= PAST_MV:
             error = y - past @ self.theta
-            told = past.copy(), error
+            told = past, error
             if not self.frozen:
                 self._learn(past, error)
-        n_y, first, end = self.n_y, PAST_PV * self.n_y, self.n_phi - 1
-        past[n_y:first] = past[: first - n_y].copy()
-        past[:n_y] = y
-        past[first + self.n_u : end] = past[first : end - self.n_u].copy()
-        past[first : first + self.n_u] = (mv - self._low_u) / self._span_u
+        first = PAST_PV * self.n_y
+        self._past = past[self._older]
+        self._past[: self.n_y] = y
+        self._past[first : first + self.n_u] = (mv - self._low_u) / self._span_u
         self._filled += 1
         return told
 
@@ -75,9 +78,9 @@ class BesideModel(Remembers):
 
     def _learn(self, phi: Array, error: Array) -> None:
         p_phi = self.p @ phi
-        gain = p_phi / (1.0 + phi @ p_phi)
-        self.theta = self.theta + np.outer(gain, error)
-        self.p = self.p - np.outer(gain, p_phi)
+        gain = (p_phi / (1.0 + phi @ p_phi))[:, None]
+        self.theta = self.theta + gain * error
+        self.p = self.p - gain * p_phi
         self.scans += 1
         # Errors of a model that is still wild say nothing of its noise.
         self.square = self.square + (error**2 - self.square) / max(min(self.scans, SQUARES), 20)

@@ -120,8 +120,9 @@ class Monitor:
             self._gap()
             return
         pv, mv = np.asarray(sample.pv, dtype=np.float64), command.mv
-        error = pv[: len(self._span)] - command.sp
-        errors, shares = error.tolist(), ((mv - self._mv_low) / self._mv_span).tolist()
+        sp = command.sp.tolist()
+        errors = [value - at for value, at in zip(pv.tolist(), sp, strict=False)]  # the first PVs are controlled
+        shares = ((mv - self._mv_low) / self._mv_span).tolist()
         if not isfinite(sum(errors) + sum(shares)):
             self._gap()
             return
@@ -135,12 +136,11 @@ class Monitor:
         self.answers.add(pv, mv, missed, time_s)
         self.estimates.add(command.info, time_s)
         self.batches.add((command.sp, pv, mv, command.info), time_s)
-        sp = command.sp.tolist()
         if sp != self._sp:
             self._moved(sp)
         self._still += 1
         if self._still > 2 * self.settle:
-            self._rest(time_s, error, mv, saturated)
+            self._rest(time_s, errors, mv, saturated)
 
     def _shares(self, shares: list[float], command: Command) -> bool:
         saturated = any(s <= AT_END or s >= 1 - AT_END for s in shares)
@@ -161,14 +161,15 @@ class Monitor:
         self._sp, self._still = sp, 0
         self._clear()
 
-    def _rest(self, time_s: float, error: Array, mv: Array, saturated: bool) -> None:
+    def _rest(self, time_s: float, errors: list[float], mv: Array, saturated: bool) -> None:
         """A scan at set points that stand still; a period of rest is whole after ``settle`` of them."""
         self._n += 1
-        self._mv_sum = self._mv_sum + mv
-        self._e_sum = self._e_sum + error
-        self._e2_sum = self._e2_sum + error**2
+        error = np.array(errors)
+        self._mv_sum += mv
+        self._e_sum += error
+        self._e2_sum += error * error
         self._ends += saturated
-        for window, value in zip(self._window, error.tolist(), strict=True):
+        for window, value in zip(self._window, errors, strict=True):
             window.append(value)
         if self._n < self.settle:
             return

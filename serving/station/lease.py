@@ -12,6 +12,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from serving.errors import LoopError
+from serving.file_lock import LockTakenError, locked
 from serving.station.places import runtime_folder
 from serving.words import first_line
 
@@ -24,7 +25,7 @@ class Lease:
     The locks are files in a folder for temporary ones: ``tend`` keeps them young, and makes one anew that is gone. A
     node that another loop has locked meanwhile is lost: ``lost`` says so, until ``tend`` has it back.
 
-    Raises LoopError that names the process which has one.
+    Raises LoopError that names the process which has one, OSError where a lock cannot be opened.
     """
 
     def __init__(self, endpoint: str, nodes: Iterable[str], folder: Path | None = None) -> None:
@@ -35,7 +36,7 @@ class Lease:
         try:
             for node in nodes:
                 self._held[node] = self._locked(node)
-        except LoopError:
+        except (LoopError, OSError):
             self.release()
             raise
 
@@ -78,21 +79,12 @@ class Lease:
         return runtime_folder(self._folder) / hashlib.sha256(f"{self._address} {node}".encode()).hexdigest()[:32]
 
     def _locked(self, node: str) -> int:
-        path = self._path(node)
-        import fcntl  # which Windows lacks; the line above has said so there
-
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            owner = os.read(handle, 100).decode(errors="replace")
-            os.close(handle)
+            return locked(self._path(node))
+        except LockTakenError as error:
             raise LoopError(
-                f"{node} at {self._endpoint} is written by another loop (process {owner}); end that one first"
+                f"{node} at {self._endpoint} is written by another loop (process {error.owner}); end that one first"
             ) from None
-        os.truncate(handle, 0)
-        os.write(handle, str(os.getpid()).encode())
-        return handle
 
 
 def address_of(endpoint: str) -> str:

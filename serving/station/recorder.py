@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
+from math import nan
 from typing import TypeAlias
 
 import numpy as np
@@ -70,7 +71,7 @@ class Recorder:
         numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
         self.journal.scan(Scan(time.time(), command.mode.value, numbers, quality, command.reason))
         # A reason whose numbers change, such as an age, is the same fault.
-        if kind_of(command.reason) != kind_of(self._fault):
+        if command.reason != self._fault and kind_of(command.reason) != kind_of(self._fault):
             before, self._fault = self._fault, command.reason
             what = command.reason or f"over: {before}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.reason))
@@ -99,13 +100,21 @@ def named(controller: Controller) -> str:
 
 def _numbers(m: Manifest, sample: Sample | None, command: Command) -> Iterator[float]:
     """The columns of ``serving.journal.columns``."""
-    nan_mv, nan_pv = np.full(len(m.mv), np.nan), np.full(len(m.pv), np.nan)
-    applied = None if sample is None else sample.mv_applied
-    yield from command.sp
-    yield from nan_pv if sample is None else sample.pv
-    yield from command.mv if command.writes else nan_mv
-    yield from nan_mv if applied is None else applied
-    yield from nan_mv if command.law_mv is None else command.law_mv
-    yield from nan_mv if command.successor_mv is None else command.successor_mv
-    yield from np.full(len(m.dv), np.nan) if sample is None else sample.dv
-    yield from np.full(len(m.info), np.nan) if command.info is None else command.info
+    n_mv = len(m.mv)
+    yield from _listed(command.sp, len(m.sp))
+    yield from _listed(None if sample is None else sample.pv, len(m.pv))
+    yield from _listed(command.mv if command.writes else None, n_mv)
+    yield from _listed(None if sample is None else sample.mv_applied, n_mv)
+    yield from _listed(command.law_mv, n_mv)
+    yield from _listed(command.successor_mv, n_mv)
+    yield from _listed(None if sample is None else sample.dv, len(m.dv))
+    yield from _listed(command.info, len(m.info))
+
+
+def _listed(values: Array | None, n: int) -> Iterable[float]:
+    """``values``, or ``n`` times NaN. A list is gone through several times as fast as an array."""
+    if values is None:
+        return [nan] * n
+    # A refused sample may hold anything.
+    numbers: Iterable[float] = values.tolist() if isinstance(values, np.ndarray) else values
+    return numbers

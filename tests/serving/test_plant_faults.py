@@ -10,96 +10,36 @@ import asyncio
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 from asyncua import Client, ua
-from plant_servers import Plant, Wire
+from plant_servers import CASE, PID, ROOT, SPACE, Plant, RunningLoop, Wire, loop_toml
 from processes import within
 
-from serving import Controller, Mode, Sample
-from serving.journal import JournalReader, Scan
-from serving.loop import Command
-from serving.opcua.settings import HandBack, ModeNode, Nodes, Point, Server
+from serving import Controller, Mode
+from serving.journal import Scan
+from serving.opcua.settings import HandBack, ModeNode
 from serving.standing import SAME
-from serving.station.requests import Change
-from serving.station.settings import Hold, JournalSettings, Settings
-from serving.station.station import Station
+from serving.station.settings import Hold, Settings
 
-ROOT = Path(__file__).parents[2]
-CASE, LAW = "thiosulfate_cstr", "pid"
 SPEED = 2.5  # 0.5 s periods in 0.2 s
 PERIOD_S = 0.5 / SPEED
 RECOVER = 3
 START = 250.0  # the MV of the plant's start
-SPACE = "nsu=urn:loopwright:plant;s="
 
 
-class Running:
-    """A station in a thread, with what it did."""
-
-    def __init__(self, folder: Path, port: int, **changed: Any) -> None:
-        nodes = {
-            "pv": {"C_A": f"{SPACE}PV.C_A", "T": f"{SPACE}PV.T"},
-            "mv": {"T_j": Point(f"{SPACE}MV.T_j", read_back=f"{SPACE}RB.T_j")},
-            "heartbeat": f"{SPACE}Control.Heartbeat",
-            "watchdog": f"{SPACE}Control.Watchdog",
-            **changed.pop("nodes", {}),
-        }
-        server = {"endpoint": f"opc.tcp://127.0.0.1:{port}", "security": "None", "insecure": True, "connect_s": 2.0}
-        self.journal = folder / "loop.journal"
-        self.told: list[str] = []
-        self.station = Station(
-            Settings(
-                controller=ROOT / "artifacts" / CASE / f"{LAW}.onnx",
-                server=Server(**{**server, **changed.pop("server", {})}),
-                nodes=Nodes(**nodes),
-                start=changed.pop("start", "AUTO"),
-                speed=SPEED,
-                hold=changed.pop("hold", Hold(recover_after=RECOVER)),
-                journal=JournalSettings(self.journal),
-                **changed,
-            ),
-            tell=self.told.append,
-        )
-        self.commands: list[Command] = []
-        self.station.watch(self._seen)
-        self.thread = threading.Thread(target=self.station.run, daemon=True)
-        self.thread.start()
-
-    def _seen(self, _: Sample | None, command: Command) -> None:
-        self.commands.append(command)
-
-    def ask(self, act: Callable[..., None], what: str) -> str:
-        """How a change went."""
-        said: list[str] = []
-        self.station.ask(Change(act, what, "test", done=said.append))
-        assert within(10, lambda: bool(said))
-        return said[0]
-
-    def becomes(self, mode: Mode, seconds: float = 30.0, scans: int = 1) -> int:
-        """Wait until so many scans in a row have a mode; the place of the first of them from now."""
-        start = len(self.commands)
-
-        def there() -> bool:
-            last = self.commands[start:][-scans:]
-            return len(last) == scans and all(c.mode is mode for c in last)
-
-        assert within(seconds, there), (mode, self.told, [(c.mode, c.reason) for c in self.commands[start:]][-10:])
-        return next(i for i, c in enumerate(self.commands[start:]) if c.mode is mode)
-
-    def end(self) -> list[Scan]:
-        self.station.end()
-        self.thread.join(30)
-        assert not self.thread.is_alive()
-        reader = JournalReader(self.journal)
-        found = [scan for _, _, scan in reader.scans()]
-        reader.close()
-        return found
+def begun(folder: Path, port: int, **changed: Any) -> RunningLoop:
+    """A loop whose settings are ``changed``."""
+    watched = f'heartbeat = "{SPACE}Control.Heartbeat"\nwatchdog = "{SPACE}Control.Watchdog"'
+    settings = Settings.read(loop_toml(folder, f"opc.tcp://127.0.0.1:{port}", speed=SPEED, nodes=watched))
+    nodes, server = replace(settings.nodes, **changed.pop("nodes", {})), replace(settings.server, connect_s=2.0)
+    hold = changed.pop("hold", Hold(recover_after=RECOVER))
+    return RunningLoop(replace(settings, nodes=nodes, server=server, hold=hold, **changed))
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +161,7 @@ def test_a_fault_holds_and_is_recovered_from(
     before = len(plant.actuator())
     assert within(20, lambda: len(plant.actuator()) > before + 1)  # the last command of the loop before has arrived
     since = len(plant.actuator())
-    running = Running(tmp_path, wire.port)
+    running = begun(tmp_path, wire.port)
     assert running.ask(lambda loop: loop.set_sp([0.93]), "set point") == ""
     running.becomes(Mode.AUTO, scans=8)
     begin(plant, wire)
@@ -234,7 +174,8 @@ def test_a_fault_holds_and_is_recovered_from(
     until_auto = running.becomes(Mode.AUTO, 60)
     running.becomes(Mode.AUTO, scans=5)
     n = len(running.commands)
-    found = running.end()
+    running.end()
+    found = running.scans()
     assert any(words in r for r in reasons), reasons
     assert len(held) == 1
     besides = {"server frozen": in_flight(found)}.get(name, {START} if name in ANEW else set())
@@ -248,7 +189,7 @@ def test_a_fault_holds_and_is_recovered_from(
 
 def test_a_plant_whose_watchdog_stands_is_held_within_three_periods(plant: Plant, wire: Wire, tmp_path: Path) -> None:
     """Its values go on, with new source times: nothing else would tell."""
-    running = Running(tmp_path, wire.port)
+    running = begun(tmp_path, wire.port)
     try:
         running.becomes(Mode.AUTO, 120, scans=8)
         write(plant, "Faults.Control.Watchdog", "frozen")
@@ -264,31 +205,15 @@ def test_a_plant_whose_watchdog_stands_is_held_within_three_periods(plant: Plant
 
 
 LEARNT_WITHIN = 3  # of the loop's own periods: so soon a plant knows that its loop is gone
-LOOP = """
-controller = "{file}"
-start = "AUTO"
-speed = {speed}
-[server]
-endpoint = "{endpoint}"
-security = "None"
-insecure = true
-[nodes]
-heartbeat = "nsu=urn:loopwright:plant;s=Control.Heartbeat"
-[nodes.pv]
-C_A = "nsu=urn:loopwright:plant;s=PV.C_A"
-T = "nsu=urn:loopwright:plant;s=PV.T"
-[nodes.mv]
-T_j = {{ node = "nsu=urn:loopwright:plant;s=MV.T_j", read_back = "nsu=urn:loopwright:plant;s=RB.T_j" }}
-"""
 
 
 def test_a_plant_learns_within_three_periods_that_its_loop_was_killed(plant: Plant, tmp_path: Path) -> None:
     """By the server's own count of periods: a busy machine changes nothing about that."""
-    file = ROOT / "artifacts" / CASE / f"{LAW}.onnx"
     served_period_s = PERIOD_S * SPEED  # of the plant's own time
-    (tmp_path / "loop.toml").write_text(LOOP.format(file=file, speed=SPEED, endpoint=plant.endpoint))
+    beats_at = f'heartbeat = "{SPACE}Control.Heartbeat"'
+    path = loop_toml(tmp_path, plant.endpoint, speed=SPEED, nodes=beats_at)
     since = len(plant.actuator())
-    command = [sys.executable, "-m", "pipeline", "loop", "run", str(tmp_path / "loop.toml")]
+    command = [sys.executable, "-m", "pipeline", "loop", "run", str(path)]
     with (tmp_path / "said").open("w") as said:
         loop = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said)
     try:
@@ -308,7 +233,7 @@ def test_a_plant_learns_within_three_periods_that_its_loop_was_killed(plant: Pla
     assert last <= killed + 1
     learnt = next(i for i in range(last, len(rows)) if not rows[i]["alive"])
     silent_s = (rows[learnt]["k"] - rows[last]["k"]) * served_period_s
-    assert 0 < silent_s <= LEARNT_WITHIN * Controller(file).manifest.period_s
+    assert 0 < silent_s <= LEARNT_WITHIN * Controller(PID).manifest.period_s
     assert not any(row["alive"] for row in rows[learnt:])
     assert read(plant, "Control.LoopAlive") is False
     assert len({row["asked"][0] for row in rows[learnt:]}) == 1  # the actuator keeps what it has
@@ -316,7 +241,7 @@ def test_a_plant_learns_within_three_periods_that_its_loop_was_killed(plant: Pla
 
 def test_an_mv_node_of_another_type_is_written_in_that_type(plant: Plant, wire: Wire, tmp_path: Path) -> None:
     """The server refuses, the loop holds and asks for the types anew, and goes on by itself."""
-    running = Running(tmp_path, wire.port)
+    running = begun(tmp_path, wire.port)
     running.becomes(Mode.AUTO, scans=8)
     for kind in ("int", ""):
         before = len(running.commands)
@@ -331,7 +256,7 @@ def test_an_mv_node_of_another_type_is_written_in_that_type(plant: Plant, wire: 
 def test_the_plants_own_operator_sets_mode_and_set_point(plant: Plant, wire: Wire, tmp_path: Path) -> None:
     write(plant, "Control.Mode", 1, ua.VariantType.Int32)  # from before; no wish of now
     mode = ModeNode(f"{SPACE}Control.Mode", {"MANUAL": 0, "AUTO": 1, "SHADOW": 2})
-    running = Running(tmp_path, wire.port, start="SHADOW", nodes={"mode": mode, "sp": {"C_A": f"{SPACE}SP.C_A"}})
+    running = begun(tmp_path, wire.port, start="SHADOW", nodes={"mode": mode, "sp": {"C_A": f"{SPACE}SP.C_A"}})
     running.becomes(Mode.SHADOW, scans=6)
     write(plant, "Control.Mode", 0, ua.VariantType.Int32)
     running.becomes(Mode.MANUAL)
@@ -345,7 +270,7 @@ def test_the_plants_own_operator_sets_mode_and_set_point(plant: Plant, wire: Wir
     running.end()
 
 
-def told(running: Running, words: str) -> list[str]:
+def told(running: RunningLoop, words: str) -> list[str]:
     return [line for line in running.told if words in line]
 
 
@@ -358,7 +283,7 @@ def test_what_a_plant_shows_that_started_anew_is_no_wish_until_it_changes(tmp_pa
     try:
         write(plant, "Control.Mode", 1, ua.VariantType.Int32)
         write(plant, "SP.C_A", 0.9)
-        running = Running(tmp_path, wire.port, nodes={"mode": mode, "sp": {"C_A": f"{SPACE}SP.C_A"}})
+        running = begun(tmp_path, wire.port, nodes={"mode": mode, "sp": {"C_A": f"{SPACE}SP.C_A"}})
         running.becomes(Mode.AUTO, scans=8)
         assert running.commands[-1].sp.tolist() == [0.9]
 
@@ -395,7 +320,7 @@ def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
     spoilt: str, plant: Plant, wire: Wire, tmp_path: Path
 ) -> None:
     """HOLD goes on from where the MV stands, also while a PV is bad; MANUAL too."""
-    running = Running(tmp_path, wire.port, hold=Hold(recover_after=60))  # it holds for all that is looked at below
+    running = begun(tmp_path, wire.port, hold=Hold(recover_after=60))  # it holds for all that is looked at below
     running.becomes(Mode.AUTO, 120, scans=8)
     for begin, moved in ((Mode.HOLD, 311.0), (Mode.MANUAL, 287.0)):
         if begin is Mode.MANUAL:
@@ -422,7 +347,7 @@ def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
 
 
 def test_a_plant_is_handed_back_and_asked_for_again(plant: Plant, wire: Wire, tmp_path: Path) -> None:
-    running = Running(
+    running = begun(
         tmp_path,
         wire.port,
         nodes={"hand_back": HandBack(f"{SPACE}Control.Owner", 0)},
@@ -444,7 +369,7 @@ def test_a_servers_clock_may_be_an_hour_off_and_may_be_set(plant: Plant, wire: W
     """Ages are judged by how source times advance: an offset is none, and a clock that is set costs a few scans."""
     write(plant, "Faults.Clock", -3600.0)
     try:
-        running = Running(tmp_path, wire.port)
+        running = begun(tmp_path, wire.port)
         running.becomes(Mode.AUTO, scans=30)
         assert {c.mode for c in running.commands[10:]} == {Mode.AUTO}
         for offset in (3600.0, 0.0):

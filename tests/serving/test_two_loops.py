@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from asyncua import Client
-from plant_servers import Plant, RunningLoop
+from plant_servers import CASE, SPACE, Plant, RunningLoop, loop_toml
 from processes import within
 
 from pipeline.__main__ import main
@@ -26,30 +26,14 @@ from serving.station.control import Control, ask, door
 from serving.station.lease import Lease, address_of
 from serving.station.tending import Tending
 
-PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
-LOOP = """
-controller = "{pid}"
-start = "{start}"
-speed = 5.0
-[guards]
-max_age_s = 5
-[server]
-endpoint = "{endpoint}"
-security = "None"
-insecure = true
-[nodes]
-lease = "nsu=urn:loopwright:plant;s=Control.Lease"
-[nodes.pv]
-C_A = "nsu=urn:loopwright:plant;s=PV.C_A"
-T = "nsu=urn:loopwright:plant;s=PV.T"
-[nodes.mv]
-T_j = {{ node = "nsu=urn:loopwright:plant;s=MV.T_j", read_back = "nsu=urn:loopwright:plant;s=RB.T_j" }}
-"""
+SPEED = 5.0
+LEASE = f'lease = "{SPACE}Control.Lease"'
+PATIENT = "[guards]\nmax_age_s = 5"
 
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", 5.0)
+    made = Plant(tmp_path_factory.mktemp("plant"), CASE, SPEED)
     made.start()
     yield made
     made.end()
@@ -59,8 +43,7 @@ def machine(folder: Path, plant: Plant, start: str, monkeypatch: pytest.MonkeyPa
     """A loop that another one finds by the node alone: its file locks lie in a folder of its own."""
     folder.mkdir(mode=0o700)
     monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, folder))
-    (folder / "loop.toml").write_text(LOOP.format(pid=PID, start=start, endpoint=plant.endpoint))
-    return RunningLoop(folder / "loop.toml")
+    return RunningLoop(loop_toml(folder, plant.endpoint, speed=SPEED, start=start, nodes=LEASE, more=PATIENT))
 
 
 def lease(plant: Plant, text: str | None = None) -> Any:
@@ -124,8 +107,8 @@ def test_the_second_loop_holds_until_the_first_is_gone(
 def test_a_check_tells_of_a_lease_or_a_watchdog_that_would_stop_the_loop(
     plant: Plant, tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, wrong: str
 ) -> None:
-    path = tmp_path / "loop.toml"
-    path.write_text(LOOP.format(pid=PID, start="AUTO", endpoint=plant.endpoint).replace(old, new))
+    path = loop_toml(tmp_path, plant.endpoint, speed=SPEED, nodes=LEASE, more=PATIENT)
+    path.write_text(path.read_text().replace(old, new))
     lease(plant, "")
     assert main(["loop", "check", str(path)]) == (2 if wrong else 0)
     said = capsys.readouterr()

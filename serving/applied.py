@@ -1,0 +1,103 @@
+"""The MV that the plant has, as a sample tells: read back, or the last one that was commanded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from math import isnan
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.errors import ContractError, SampleError
+from serving.guard import Sample, implausible
+from serving.manifest import Signal
+from serving.standing import Standing
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Shown(NamedTuple):
+    """What one sample shows of the MV."""
+
+    applied: Array | None = None  # shape: (n_mv,), the read-back within its range; None where there is no sound one
+    found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
+    left: str = ""  # why it is left there: it stands where the loop may not command it
+
+
+class AppliedMV:
+    """Reads the applied MV out of samples, and finds it again after commands that did not reach the plant."""
+
+    def __init__(self, signals: Sequence[Signal], mv: Array) -> None:
+        self._signals = tuple(signals)
+        self._ranges = [(s.low, s.high, s.values) for s in signals]
+        self._standing = Standing(signals, mv)
+        self._given = mv  # shape: (n_mv,), the last command
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last command did not arrive, and no read-back has come since."""
+        return self._standing.lost
+
+    def lose(self) -> None:
+        """The last command did not arrive."""
+        self._standing.lost = True
+
+    def command(self, mv: Array) -> None:
+        """What is commanded now (n_mv,); whether it arrives is known at the next scan."""
+        self._given = mv.copy()
+
+    def arrived(self) -> None:
+        """A scan begins, and nothing was heard of a loss."""
+        self._standing.commanded(self._given)
+
+    def look(self, sample: Sample, last: Array, *, refused: bool) -> Shown:
+        """What the sample shows; ``last`` is the last command (n_mv,), ``refused`` whether the sample is of no use.
+
+        A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where it
+        was not known where the MV stands, and it stands outside its range, somebody has moved it there.
+        """
+        try:
+            given = sample.mv_applied
+            if given is not None and np.asarray(given).dtype.kind not in "fiu":
+                return Shown()
+            applied = None if given is None else self.read_back(sample, last)
+        except Exception:  # no sample, or no MV that any actuator can have
+            return Shown(left=self._outside(sample) if self.lost else "")
+        if applied is not None:
+            return Shown(applied, self._standing.seen(applied))
+        if not refused:
+            self._standing.lost = False
+        return Shown()
+
+    def read_back(self, sample: Sample, last: Array) -> Array:
+        """The applied MV (n_mv,) within its range; the last command if there is no read-back.
+
+        Raises ContractError for a wrong shape, and SampleError for an implausible value or where there is neither. HOLD
+        commands the read-back, so this check does not depend on the guards.
+        """
+        if sample.mv_applied is None:
+            if isnan(last[0]):
+                raise SampleError("there is no read-back, so where the MV stands is not known and nothing is written")
+            return last
+        applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
+        if applied.shape != last.shape:
+            raise ContractError(f"applied MV has the shape {applied.shape} instead of {last.shape}")
+        values = applied.tolist()
+        for value, (low, high, allowed) in zip(values, self._ranges, strict=True):
+            if not low <= value <= high or (allowed is not None and value not in allowed):
+                reason = implausible(self._signals, values)
+                if reason:
+                    raise SampleError(reason)
+                lows, highs, _ = zip(*self._ranges, strict=True)
+                return np.clip(applied, lows, highs)
+        return applied
+
+    def _outside(self, sample: Sample) -> str:
+        """Why no loop can have commanded the MV that the plant has; empty where the sample does not tell."""
+        with suppress(Exception):  # no sample, or no MV at all
+            applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
+            if applied.shape == self._given.shape and np.isfinite(applied).all():
+                return implausible(self._signals, applied.tolist()) or ""
+        return ""
