@@ -472,12 +472,15 @@ def test_an_mv_that_stays_at_its_end_beside_an_error_is_jammed_and_one_without_e
 
 def test_an_mv_that_turns_round_at_each_scan_flutters_and_noise_does_not() -> None:
     rng = np.random.default_rng(3)
-    to_and_fro = 50 + 10 * (-1.0) ** np.arange(100)
+    to_and_fro = 50 + 10 * (-1.0) ** np.arange(120)
     assert watched(to_and_fro, 0.0).flutters(0)
-    assert not watched(to_and_fro[:30], 0.0).flutters(0)
+    assert not watched(to_and_fro[:80], 0.0).flutters(0)
     assert not watched(50 + 0.1 * (to_and_fro - 50), 0.0).flutters(0)
     # Independent values turn round at two of three scans, steps of a walk at half of them.
-    assert not watched(50 + 10 * rng.normal(size=2_000), 0.0).flutters(0)
+    noisy = Plight([Signal("u", "%", 0.0, 100.0)], 50)
+    for k, value in enumerate(50 + 10 * rng.normal(size=20_000)):
+        noisy.add(np.array([value]), 0.0, float(k))
+        assert not noisy.flutters(0), k
     assert not watched(50 + 5 * np.sin(np.arange(2_000) / 5) + rng.normal(size=2_000), 0.0).flutters(0)
     discrete = Plight([Signal("v", "-", 0.0, 1.0, values=(0.0, 1.0))], 50)
     for k in range(100):
