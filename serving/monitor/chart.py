@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import log, sqrt
+from statistics import NormalDist
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -13,9 +14,10 @@ from serving.monitor.memory import ANY, COUNT, POSITIVE, SIZE, TIME_S, Kept, Rem
 Array: TypeAlias = NDArray[np.float64]
 
 SLACK = 1.0  # scatters by which a figure may lie off without a trace
-ONE_SIDED = 1.645  # normal quantile of .95: the unfavourable ends of what was learnt
+DOUBT = 0.05  # that what was learnt of any one of a chart's figures flatters
 OVERSHOOT = 1.166  # of a sum of normal figures over its limit, in scatters [Siegmund]
 LEAST_LIMIT = 4.0
+LEAST_ROOT = 0.2  # of chi2 / nu: the approximation holds no further
 FEWEST = 3.0  # degrees of freedom that a scatter is believed to have at least
 WORTH, DOUBLINGS = 12.0, 2  # independent figures that learning needs; how often it may last twice as long for them
 
@@ -32,7 +34,8 @@ class Chart(Remembers):
 
     The first ``learn`` figures give mean, scatter s and correlation f = 1 + 2 sum rho: they are worth learn / f
     independent ones. Below WORTH of those, pairs are averaged, and learning lasts twice as long. Scatter and mean
-    count with the unfavourable ends of their 90 % intervals: a higher scatter, and a k above SLACK. Where the scatter
+    count with the unfavourable ends of their intervals, a higher scatter and a k above SLACK, at a level of DOUBT / n:
+    of many figures one or two were calmer by chance than they will be. Where the scatter
     s is below ``least``, ``least`` takes its place and f (s / least)^2 that of f, but at least 1: z scatters by less
     then, and hangs together all the same. The limit is that of a sum of long-run variance f (a Brownian motion) whose
     mean time to a false alarm is A figures:
@@ -145,7 +148,8 @@ class Chart(Remembers):
     def _reckon(self) -> None:
         self.mean, s = self.figures.mean(axis=0), self.figures.std(axis=0, ddof=1)
         f = correlation(self.figures)
-        wide = s * np.array([upper_scatter(self.learn / one - 1) for one in f.tolist()])
+        z = NormalDist().inv_cdf(1 - DOUBT / max(self.n, 1))
+        wide = s * np.array([upper_scatter(self.learn / one - 1, z) for one in f.tolist()])
         self.scatter = np.maximum(wide, self.least) + 1e-12
         f = np.maximum(f * (wide / self.scatter) ** 2, 1.0)  # long-run variance of (x - mean) / scatter
         if self.n and self.learn / f.mean() < WORTH and self.doublings < DOUBLINGS:
@@ -154,7 +158,7 @@ class Chart(Remembers):
             self.count, self.pool, self.doublings = half, 2 * self.pool, self.doublings + 1
             return
         run_length = self.weekly / self.pool / self.rate * (2 if self.both else 1)
-        self.slack = SLACK + ONE_SIDED * np.sqrt(f / self.learn)
+        self.slack = SLACK + z * np.sqrt(f / self.learn)
         self.limit = np.array([run_limit(SLACK, run_length, one) for one in f.tolist()])
         self.recent = self.mean.copy()
         self.figures = np.zeros((self.learn, self.n))
@@ -187,13 +191,14 @@ def run_limit(slack: float, figures: float, f: float = 1.0) -> float:
     return max(limit, LEAST_LIMIT)
 
 
-def upper_scatter(freedom: float) -> float:
-    """What a scatter of so many degrees of freedom is multiplied by for the upper end of its 90 % interval.
+def upper_scatter(freedom: float, z: float) -> float:
+    """What a scatter of so many degrees of freedom is multiplied by for the upper end of its interval.
 
-    sqrt(nu / chi2_.05(nu)), by Wilson's and Hilferty's chi2 = nu (1 - 2 / (9 nu) - 1.645 sqrt(2 / (9 nu)))^3.
+    sqrt(nu / chi2(nu)), by Wilson's and Hilferty's chi2 = nu (1 - 2 / (9 nu) - z sqrt(2 / (9 nu)))^3, with the normal
+    quantile z of the level.
     """
     nu = max(freedom, FEWEST)
-    return 1 / sqrt((1 - 2 / (9 * nu) - ONE_SIDED * sqrt(2 / (9 * nu))) ** 3)
+    return 1 / sqrt(max(1 - 2 / (9 * nu) - z * sqrt(2 / (9 * nu)), LEAST_ROOT) ** 3)
 
 
 def correlation(x: Array) -> Array:

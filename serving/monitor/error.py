@@ -11,7 +11,7 @@ from serving.monitor.memory import COUNT, SIGN, SIZE, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 
-CROSSINGS = 10  # intervals between crossings that regularity needs
+CROSSINGS = 20  # intervals between crossings that regularity needs: ten of noise and loads are regular by chance
 ORDER = 15  # of the error's autoregressive model
 LEAST = 1e-12
 

@@ -20,7 +20,7 @@ from serving.monitor.error import Swing, harris_index
 from serving.monitor.estimates import Estimates
 from serving.monitor.memory import TIME_S, number
 from serving.monitor.numbers import numbers
-from serving.monitor.pace import DAY_S, LEARN_S, WEEK_S, dead_times, pooled, settle_scans
+from serving.monitor.pace import DAY_S, WEEK_S, blocks, dead_times, pooled, settle_scans
 from serving.monitor.plight import AT_END, Plight
 from serving.monitor.residual import Foresight
 from serving.monitor.rest import RestMap
@@ -69,15 +69,16 @@ class Monitor:
         self.rest = RestMap(m.sp, m.mv, learn=rests, pool=pool, weekly=weekly, rate=rate)
         # The logarithm of the error's mean square at rest.
         self.spread = Chart(
-            len(m.sp), LEARN_RESTS, pool=pool, weekly=weekly, rate=rate / len(m.sp), least=0.3, both=False
+            len(m.sp), rests // pool, pool=pool, weekly=weekly, rate=rate / len(m.sp), least=0.3, both=False
         )
-        block = max(BLOCK * self.settle, ceil(LEARN_S / (LEARN_MODEL + LEARN_BLOCKS) / period))
+        block_s, times = blocks(LEARN_MODEL + LEARN_BLOCKS, BLOCK * self.settle * period)
+        block, model, learn = ceil(block_s / period), round(times * LEARN_MODEL), round(times * LEARN_BLOCKS)
         weekly = WEEK_S / (block * period)
-        self.foresight = Foresight(m, block=block, learn=LEARN_BLOCKS, weekly=weekly, rate=rate)
+        self.foresight = Foresight(m, block=block, learn=learn, weekly=weekly, rate=rate)
         self.answers = Answers(
-            m, block=block, model=LEARN_MODEL, learn=LEARN_BLOCKS, weekly=weekly, rate=rate, told=self.foresight.told
+            m, block=block, model=model, learn=learn, weekly=weekly, rate=rate, told=self.foresight.told
         )
-        self.estimates = Estimates(m.info, block=block, learn=LEARN_BLOCKS, weekly=weekly, rate=rate)
+        self.estimates = Estimates(m.info, block=block, learn=learn, weekly=weekly, rate=rate)
         self.batches = Batches(m, rate)
         self.swings = [Swing(BAND * (s.high - s.low)) for s in m.sp]
         self.plight = Plight(m.mv, 2 * self.settle)

@@ -9,7 +9,8 @@ from serving.manifest import Manifest
 SETTLE, LEAST_SETTLE, MOST_SETTLE = 100, 20, 2000  # scans
 DEAD, MOST_DEAD = 2, 200  # scans
 DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
-LEARN_S = DAY_S  # that rests and blocks are learnt at least: loads of a fast plant need not be fast
+LEARN_S = 3 * DAY_S  # that rests and blocks are learnt at least: loads of a fast plant need not be fast
+FINE_S = DAY_S  # that the fewest figures of a fast plant last at least
 NOISE = "_noise"  # how the names of the validation's tests with noise end
 
 
@@ -31,6 +32,12 @@ def dead_times(m: Manifest) -> list[int]:
 
 
 def pooled(least: int, figure_s: float) -> tuple[int, int]:
-    """(figures to learn, figures that make one): ``least`` made ones, or so many that they last LEARN_S."""
-    pool = max(ceil(LEARN_S / figure_s / least), 1)
-    return least * pool, pool
+    """(figures to learn, figures that make one): ``least`` made ones last FINE_S, all of them LEARN_S."""
+    pool = max(ceil(FINE_S / figure_s / least), 1)
+    return max(least, ceil(LEARN_S / (pool * figure_s))) * pool, pool
+
+
+def blocks(least: int, shortest_s: float) -> tuple[float, float]:
+    """(seconds of a block, times ``least`` blocks that are learnt): ``least`` last FINE_S, all of them LEARN_S."""
+    block_s = max(shortest_s, FINE_S / least)
+    return block_s, max(LEARN_S / (least * block_s), 1.0)

@@ -14,7 +14,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 FAR = 0.1  # of a set point's range: an error beyond it is one that the MV should remove
 AT_END = 1e-6  # of the range
-MEMORY = 40  # scans over which turns and moves are averaged
+MEMORY = 100  # scans over which turns and moves are averaged: of 40 noisy ones four of five turn round now and then
 TURNING, MOVING = 0.8, 0.05  # share of moves that turn round; mean move, of the range
 
 

@@ -50,7 +50,7 @@ def test_a_drift_is_found_and_the_same_run_without_it_is_quiet(
         monkeypatch.setattr(monitor, "LEARN_RESTS", 60)
         monkeypatch.setattr(monitor, "LEARN_MODEL", 6)
         monkeypatch.setattr(monitor, "LEARN_BLOCKS", 10)
-        monkeypatch.setattr(monitor, "LEARN_S", 0.0)
+        monkeypatch.setattr(pace, "FINE_S", 0.0)
         monkeypatch.setattr(pace, "LEARN_S", 0.0)
     parameter, share, verdict, within = DRIFTS[name]
     watched = benchmark.learnt(name, seed=7)

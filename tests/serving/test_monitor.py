@@ -54,7 +54,7 @@ def test_the_unfavourable_end_of_a_scatter_is_that_of_its_distribution() -> None
     rng = np.random.default_rng(1)
     for freedom in (4, 10, 50):
         s = rng.normal(size=(20_000, freedom + 1)).std(axis=1, ddof=1)
-        assert np.mean(s * upper_scatter(freedom) >= 1) == pytest.approx(0.95, abs=0.01)
+        assert np.mean(s * upper_scatter(freedom, 1.645) >= 1) == pytest.approx(0.95, abs=0.01)
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.5, 0.9])
@@ -95,7 +95,7 @@ def test_a_shift_is_found_soon_and_its_time_is_told() -> None:
     figures[200:] += 4.0
     chart, first = charted(figures, 100)
     assert (first >= 200).all()
-    assert (first < 210).all()
+    assert (first < 215).all()  # of 50 figures: the slack allows for the one whose learning time flattered most
     assert (np.abs(chart.since_s - 200) <= 3).all()
     assert chart.shift(0) == pytest.approx(4.0, abs=1.0)
 
@@ -472,12 +472,15 @@ def test_an_mv_that_stays_at_its_end_beside_an_error_is_jammed_and_one_without_e
 
 def test_an_mv_that_turns_round_at_each_scan_flutters_and_noise_does_not() -> None:
     rng = np.random.default_rng(3)
-    to_and_fro = 50 + 10 * (-1.0) ** np.arange(100)
+    to_and_fro = 50 + 10 * (-1.0) ** np.arange(120)
     assert watched(to_and_fro, 0.0).flutters(0)
-    assert not watched(to_and_fro[:30], 0.0).flutters(0)
+    assert not watched(to_and_fro[:80], 0.0).flutters(0)
     assert not watched(50 + 0.1 * (to_and_fro - 50), 0.0).flutters(0)
     # Independent values turn round at two of three scans, steps of a walk at half of them.
-    assert not watched(50 + 10 * rng.normal(size=2_000), 0.0).flutters(0)
+    noisy = Plight([Signal("u", "%", 0.0, 100.0)], 50)
+    for k, value in enumerate(50 + 10 * rng.normal(size=20_000)):
+        noisy.add(np.array([value]), 0.0, float(k))
+        assert not noisy.flutters(0), k
     assert not watched(50 + 5 * np.sin(np.arange(2_000) / 5) + rng.normal(size=2_000), 0.0).flutters(0)
     discrete = Plight([Signal("v", "-", 0.0, 1.0, values=(0.0, 1.0))], 50)
     for k in range(100):
