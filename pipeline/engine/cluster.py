@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
+WORKERS = "LOOPWRIGHT_WORKERS"  # how many a cluster of this machine has where nobody says it; unset: one a core
 CONNECT_S = 20.0
 WORKERS_S = 120.0  # for the first worker, whose libraries take some seconds
 PRELOAD = ["pipeline.engine.preload"]
@@ -32,13 +33,14 @@ CONFIG = {
 
 @contextlib.contextmanager
 def local_cluster(workers: int | None = None, say: Callable[[str], object] = lambda _: None) -> Iterator[str]:
-    """Workers on this machine (None: one a core), of one thread each, until the block ends; its scheduler's address.
+    """Workers of one thread on this machine (None: ``usual_workers``) until the block ends; its scheduler's address.
 
     ``say`` is told where a browser shows the work, where the package bokeh, which draws it, is installed.
 
     The address stands in the environment meanwhile, where whatever is started looks for it. The workers come in their
     own time: work that comes before them waits.
     """
+    wanted = workers or usual_workers()
     import dask
 
     # For good: undone at the end, it would take the settings of distributed, which is imported within, with it.
@@ -59,7 +61,7 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] = lam
         before = os.environ.get(ADDRESS)
         try:
             os.environ[ADDRESS] = cluster.scheduler_address
-            cluster.scale(workers or os.cpu_count() or 1)
+            cluster.scale(wanted)
             if _dashboard():
                 say(f"the work at a glance, in a browser: {cluster.dashboard_link}")
             yield cluster.scheduler_address
@@ -70,6 +72,14 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] = lam
             disconnect()
             with contextlib.suppress(TimeoutError):  # of workers that are still starting, which end with us
                 cluster.close(timeout=5)
+
+
+def usual_workers() -> int:
+    """As many workers as WORKERS says, or one a core. Raises PipelineError where it says no number."""
+    asked = os.environ.get(WORKERS, "")
+    if asked and not (asked.isdecimal() and int(asked)):
+        raise PipelineError(f"{WORKERS} is {asked!r}; it takes how many workers a run has here, 1 or more")
+    return int(asked or os.cpu_count() or 1)
 
 
 def workers_here(workers: int | None, option: str) -> contextlib.AbstractContextManager[object]:

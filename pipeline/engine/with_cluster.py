@@ -19,10 +19,11 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from pipeline.engine.cluster import address, local_cluster
+from pipeline.engine.cluster import address, local_cluster, usual_workers
 from pipeline.engine.lifeline import end_with_parent
 from pipeline.engine.outlet import outlet
 from pipeline.engine.start import DOOR
+from pipeline.errors import PipelineError
 
 
 def main(argv: Sequence[str]) -> int:
@@ -31,6 +32,11 @@ def main(argv: Sequence[str]) -> int:
     if not command:
         usage = "usage: python -m pipeline.engine.with_cluster COMMAND..., such as: "
         print(usage + "python -m pipeline.engine.with_cluster dvc repro", file=sys.stderr)
+        return 2
+    try:
+        workers = None if address() else usual_workers()
+    except PipelineError as error:
+        print(error, file=sys.stderr)
         return 2
     stopped = threading.Event()
     own, running = os.getpid(), list[subprocess.Popen[bytes]]()
@@ -46,8 +52,8 @@ def main(argv: Sequence[str]) -> int:
 
         signal.signal(signal.SIGTERM, stop)
         terminal = stack.enter_context(outlet(stopped))
-        if address() is None:
-            stack.enter_context(local_cluster(say=partial(print, flush=True)))
+        if workers:
+            stack.enter_context(local_cluster(workers, say=partial(print, flush=True)))
         process = subprocess.Popen(
             command, stderr=terminal, env={**os.environ, **door.environment}, preexec_fn=lambda: end_with_parent(own)
         )

@@ -18,7 +18,7 @@ from dask_cluster import ROOT, Cluster, joined, two_workers  # noqa: F401
 from engine_pieces import fatal, process_of, refuse, squares, sums_of_squares, watched
 from processes import within
 
-from pipeline.engine.cluster import ADDRESS, connected, disconnect, local_cluster
+from pipeline.engine.cluster import ADDRESS, WORKERS, connected, disconnect, local_cluster, usual_workers
 from pipeline.engine.fingerprint import fingerprint
 from pipeline.engine.parallel import _answers, parallel_map
 from pipeline.engine.pieces import Task
@@ -154,16 +154,30 @@ def test_a_scheduler_without_workers_is_named(tmp_path: Path, monkeypatch: pytes
         made.end()
 
 
-def test_a_cluster_of_this_machine_ends_with_its_block(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_of_this_machine_has_the_workers_asked_for_and_ends_with_its_block(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv(ADDRESS, raising=False)
+    monkeypatch.setenv(WORKERS, "2")
     monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])  # which takes seconds
     said = list[str]()
-    with local_cluster(2, said.append) as at:
+    with local_cluster(say=said.append) as at:
         assert os.environ[ADDRESS] == at
         (line,) = said
         with urlopen(line.split()[-1], timeout=20) as page:
             assert b"Dask" in page.read()
+        connected(at).wait_for_workers(2, timeout=60)
+        assert len(connected(at).scheduler_info(n_workers=-1)["workers"]) == 2
         pids = set(parallel_map(process_of, range(8), "processes"))
         assert os.getpid() not in pids
     assert ADDRESS not in os.environ
     assert within(20, lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+
+
+def test_a_number_of_workers_that_is_none_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(WORKERS, raising=False)
+    assert usual_workers() == os.cpu_count()
+    for wrong in ("0", "-1", "two", "1.5"):
+        monkeypatch.setenv(WORKERS, wrong)
+        with pytest.raises(PipelineError, match=f"^LOOPWRIGHT_WORKERS is '{wrong}'; it takes how many workers"):
+            usual_workers()

@@ -152,3 +152,12 @@ def test_a_command_that_is_missing_is_one_line(folder: Path) -> None:
     )
     assert process.returncode == 2
     assert process.stderr.startswith("usage: python -m pipeline.engine.with_cluster COMMAND")
+
+
+def test_a_number_of_workers_that_is_none_is_one_line(folder: Path) -> None:
+    without = {name: value for name, value in os.environ.items() if name != "DASK_SCHEDULER_ADDRESS"}
+    command = [sys.executable, "-m", "pipeline.engine.with_cluster", "true"]
+    asked = {**without, "LOOPWRIGHT_WORKERS": "none"}
+    process = subprocess.run(command, cwd=folder, env=asked, capture_output=True, text=True, timeout=60)
+    assert process.returncode == 2
+    assert process.stderr == "LOOPWRIGHT_WORKERS is 'none'; it takes how many workers a run has here, 1 or more\n"

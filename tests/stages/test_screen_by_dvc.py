@@ -24,7 +24,7 @@ FIT = "fit@tank-identified"
 
 def told(*command: str, fine: bool = True) -> str:
     """What a command prints in the present folder; unless ``fine`` is false, it must succeed."""
-    environment = {**os.environ, "DVC_NO_ANALYTICS": "1", "PYTHONPATH": ""}
+    environment = {**os.environ, "DVC_NO_ANALYTICS": "1", "PYTHONPATH": "", "LOOPWRIGHT_WORKERS": "1"}
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
     done = subprocess.run(
         [sys.executable, "-m", *command], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
