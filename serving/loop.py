@@ -285,6 +285,7 @@ class ControlLoop:
         """So many periods passed without a scan; the law starts cold after more than ``max_gap``."""
         if periods > self.max_gap:
             self._charge.begin_cold(f"{periods} periods were missed")
+            self._transfer.begin()  # a law that starts cold may want another MV at once
 
     def _lose(self, reason: str) -> None:
         """No past any more; in AUTO a fault."""

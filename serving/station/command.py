@@ -9,6 +9,7 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
@@ -193,15 +194,15 @@ def _run(options: argparse.Namespace) -> int:
     station = Station(settings, tell=tell)
     station.warnings = _warnings(settings)
     for line in station.warnings + station.ending():
-        tell(f"note: {line}")
-    station.watch(_Lines(station.manifest).show)
+        station.tell(f"note: {line}")
+    station.watch(_Lines(station.manifest, station.tell).show)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: station.end())
     report = station.run(options.scans)
     if station.last is not None:
-        tell(_left(station.manifest, station.last[1]))
-    tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
-    tell(f"journal: {settings.journal.file}")
+        station.tell(_left(station.manifest, station.last[1]))
+    station.tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
+    station.tell(f"journal: {settings.journal.file}")
     return 0
 
 
@@ -216,12 +217,12 @@ def _left(manifest: Manifest, last: Command) -> str:
 class _Lines:
     """A line for the first scan, for each change, and for one scan a minute."""
 
-    def __init__(self, manifest: Manifest) -> None:
-        self.manifest, self.every = manifest, max(1, round(60 / manifest.period_s))
+    def __init__(self, manifest: Manifest, tell: Callable[[str], None]) -> None:
+        self.manifest, self.tell, self.every = manifest, tell, max(1, round(60 / manifest.period_s))
         self.last: tuple[str, tuple[float, ...], str] | None = None
 
     def show(self, sample: Sample | None, command: Command) -> None:
-        """Print the scan if it is one of those."""
+        """Tell the scan if it is one of those."""
         now = (command.mode.value, tuple(command.sp.tolist()), command.reason)
         if now == self.last and command.scan % self.every:
             return
@@ -232,7 +233,7 @@ class _Lines:
         parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in zip(m.mv, command.mv.tolist(), strict=True)]
         if not command.writes and command.law_mv is not None:
             parts += [f"(law {s.name} {v:.5g})" for s, v in zip(m.mv, command.law_mv.tolist(), strict=True)]
-        print(f"{command.mode:<6}  {'  '.join(parts)}  {command.reason}".rstrip(), flush=True)
+        self.tell(f"{command.mode:<6}  {'  '.join(parts)}  {command.reason}".rstrip())
 
 
 def _export(options: argparse.Namespace) -> int:

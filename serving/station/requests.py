@@ -85,7 +85,12 @@ def _sp(request: Request, loop: ControlLoop, _: Opened) -> Change:
     wanted = _numbers(request.value, signals, loop.sp.tolist(), "set point")
     within(wanted, signals, "set point")
     what = _moves(loop.sp.tolist(), wanted, signals, "set point")
-    return Change(lambda loop: loop.set_sp(wanted), what, request.who, request.reason)
+
+    def act(loop: ControlLoop) -> None:
+        # Of what stands there then: somebody else may have changed another one since.
+        loop.set_sp(_numbers(request.value, signals, loop.sp.tolist(), "set point"))
+
+    return Change(act, what, request.who, request.reason)
 
 
 def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
@@ -95,7 +100,11 @@ def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
     if loop.mode is not Mode.MANUAL:
         raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {loop.mode}")
     what = _moves(loop.mv.tolist(), wanted, signals, "MV")
-    return Change(lambda loop: loop.set_mv(wanted), what, request.who, request.reason)
+
+    def act(loop: ControlLoop) -> None:
+        loop.set_mv(_numbers(request.value, signals, loop.mv.tolist(), "MV"))
+
+    return Change(act, what, request.who, request.reason)
 
 
 def _swap(request: Request, loop: ControlLoop, opened: Opened) -> Change:

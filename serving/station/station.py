@@ -31,6 +31,7 @@ from serving.station.control import Answer, Control
 from serving.station.lease import Lease
 from serving.station.recorder import Recorder
 from serving.station.requests import Change, Request, change
+from serving.station.said import Said
 from serving.station.settings import Settings
 from serving.station.tending import Tending
 from serving.station.views import about, picture, state
@@ -55,12 +56,15 @@ class Station:
     Between two scans it carries out the changes that were asked for (``ask``) and those of the plant's own operator
     (set points and mode by their nodes). Every scan, change and fault goes into the journal.
 
+    ``tell`` gets a line of each event, in a thread of its own: it may block or raise.
+
     Raises LoopError and ArtifactError where the settings do not fit the controller, another loop writes the same
     nodes, or the journal cannot be opened.
     """
 
     def __init__(self, settings: Settings, *, tell: Callable[[str], None] = lambda _: None) -> None:
-        self.settings, self.tell = settings, tell
+        self.settings, self.said = settings, Said(tell)
+        self.tell = tell = self.said.say
         self.trusted = self._public_keys()
         self.certificate_ends = _certificate_ends(settings.server)
         self.controller = TrustedController(settings.controller, settings.sha256 or None, self.trusted)
@@ -126,7 +130,7 @@ class Station:
         """Connect, and scan until ``end`` or for ``n`` scans."""
         s, m = self.settings, self.manifest
         with ExitStack() as stack:
-            for held in (self.lease.release, self.journal.close):
+            for held in (self.said.end, self.lease.release, self.journal.close):
                 stack.callback(held)
             control = Control(s.journal.file, self.answer)
             stack.callback(control.close)

@@ -125,6 +125,27 @@ def test_a_shipped_law_takes_over_without_a_bump(path: Path, before: Mode) -> No
         assert np.all(move <= 1 / periods * (1 + 1e-12))
 
 
+@by_name
+def test_after_a_gap_a_shipped_law_that_starts_cold_moves_over_the_transfer_too(path: Path) -> None:
+    """A load that its model lacks: what the law has learnt of it is gone after more than ``max_gap`` periods."""
+    controller, periods = Controller(path), 20
+    m, test = controller.manifest, next(iter(CASES[path.parent.name].scenarios().values()))[0]
+    plant = CASES[path.parent.name].plant
+    pv, span = plant.measure(test.x0), np.array([s.high - s.low for s in m.mv])
+    continuous = np.array([s.values is None for s in m.mv])
+    low, high = np.array([s.low for s in m.mv]), np.array([s.high for s in m.mv])
+    applied = np.where(continuous, np.clip(test.mv0 + 0.15 * span, low, high), test.mv0)
+    loaded = Sample(pv, applied, plant.dv_nominal)
+    loop = ControlLoop(
+        controller, sp=pv[: len(m.sp)], mv=test.mv0, mode=Mode.AUTO, transfer_s=periods * m.period_s, guards=()
+    )
+    for _ in range(80):
+        loop.scan(loaded)
+    loop.gap(loop.max_gap + 1)
+    move = (np.abs(loop.scan(loaded).mv - applied) / span)[continuous]
+    assert np.all(move <= 1 / periods * (1 + 1e-9))
+
+
 OTHERS = [(a, b) for a in Mode for b in Mode if a is not b and b is not Mode.AUTO]
 
 

@@ -1,0 +1,65 @@
+"""Lines of a loop reach whoever reads them, and stop nobody where they cannot."""
+
+from __future__ import annotations
+
+import threading
+
+from processes import within
+
+from serving.station.said import WAITING, Said
+
+
+def test_lines_come_in_their_order_and_an_end_waits_for_them() -> None:
+    told: list[str] = []
+    said = Said(told.append)
+    for k in range(100):
+        said.say(str(k))
+    said.end()
+    said.say("after the end")
+    assert told == [*map(str, range(100)), "after the end"]
+
+
+def test_a_reader_that_raises_stops_nothing() -> None:
+    """A disk that is full under a log, a pipe whose reader is gone."""
+    told: list[str] = []
+
+    def tell(line: str) -> None:
+        if line == "bad":
+            raise OSError(28, "No space left on device")
+        told.append(line)
+
+    said = Said(tell)
+    for line in ("one", "bad", "two"):
+        said.say(line)
+    said.end()
+    said.say("bad")
+    assert told == ["one", "two"]
+
+
+def test_a_reader_that_stands_still_holds_nobody_up_and_is_told_what_it_missed() -> None:
+    """A terminal that was halted: lines beyond those that wait are dropped, and counted."""
+    told: list[str] = []
+    began, go_on = threading.Event(), threading.Event()
+
+    def tell(line: str) -> None:
+        began.set()
+        go_on.wait(30)
+        told.append(line)
+
+    said = Said(tell)
+    said.say("first")
+    assert began.wait(10)
+    for k in range(WAITING + 7):
+        said.say(str(k))
+    go_on.set()
+    assert within(10, lambda: len(told) == WAITING + 2)
+    said.end()
+    assert told[:2] == ["first", "0"]
+    assert told[-2:] == [str(WAITING - 1), "7 more lines were not said here: nobody read them in time"]
+
+
+def test_what_was_never_used_has_no_thread() -> None:
+    before = threading.active_count()
+    said = Said(print)
+    said.end()
+    assert threading.active_count() == before
