@@ -87,6 +87,7 @@ class Station:
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
         self.last: tuple[Sample | None, Command, float] | None = None  # with when that was, since 1970
+        self._left_at: Array | None = None  # shape: (n_mv,), the last command that was known
         self.stepped: Controller | None = None  # the controller of that scan
         self.scans = self.faults = self.missed = 0
         self.warnings: list[str] = []
@@ -262,6 +263,8 @@ class Station:
         self._moved(self.loop)
         self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
         self.last, self.stepped = (sample, command, time.time()), self.recorder.controller
+        if not np.isnan(command.mv).any():
+            self._left_at = command.mv
         self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
         self.watching.seen(self.stepped, self.last)
         for seen in self._watchers:
@@ -269,11 +272,9 @@ class Station:
 
     def _moved(self, loop: ControlLoop) -> None:
         """Say where an MV stands that somebody else moved while the loop could not write."""
-        if loop.found is None or self.last is None or np.array_equal(loop.found, self.last[1].mv):
+        if loop.found is None or self._left_at is None or np.array_equal(loop.found, self._left_at):
             return
-        if np.isnan(self.last[1].mv).any():
-            return  # nobody knew where it was left
-        found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self.last[1].mv))
+        found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self._left_at))
         self.recorder.note("change", "plant", f"the MV stands at {found}, not at {left}: the loop goes on from there")
 
     # ------------------------------------------------------------------ requests
