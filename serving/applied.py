@@ -17,13 +17,16 @@ from serving.standing import Standing
 
 Array: TypeAlias = NDArray[np.float64]
 
+UNREAD = "the last MV did not reach the plant: nothing is written before a good read-back tells where the MV stands"
+
 
 class Shown(NamedTuple):
     """What one sample shows of the MV."""
 
     applied: Array | None = None  # shape: (n_mv,), the read-back within its range; None where there is no sound one
     found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
-    left: str = ""  # why it is left there: it stands where the loop may not command it
+    silent: str = ""  # why nothing may be written; empty: it may
+    outside: bool = False  # the MV stands where the loop may not command it
 
 
 class AppliedMV:
@@ -34,6 +37,7 @@ class AppliedMV:
         self._ranges = [(s.low, s.high, s.values) for s in signals]
         self._standing = Standing(signals, mv)
         self._given = mv  # shape: (n_mv,), the last command
+        self._is_read = False  # whether the plant has ever read it back
 
     @property
     def lost(self) -> bool:
@@ -56,19 +60,22 @@ class AppliedMV:
         """What the sample shows; ``last`` is the last command (n_mv,), ``refused`` whether the sample is of no use.
 
         A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where it
-        was not known where the MV stands, and it stands outside its range, somebody has moved it there.
+        was not known where the MV stands, and it stands outside its range, somebody has moved it there. Nothing is
+        written then, and none while the read-back is bad: what would be written is old.
         """
         try:
             given = sample.mv_applied
             if given is not None and np.asarray(given).dtype.kind not in "fiu":
-                return Shown()
+                return self._unread(sample)
             applied = None if given is None else self.read_back(sample, last)
         except Exception:  # no sample, or no MV that any actuator can have
-            return Shown(left=self._outside(sample) if self.lost else "")
+            return self._unread(sample)
         if applied is not None:
+            self._is_read = True
             return Shown(applied, self._standing.seen(applied))
-        if not refused:
-            self._standing.lost = False
+        if refused:
+            return self._unread(sample)
+        self._standing.lost = False
         return Shown()
 
     def read_back(self, sample: Sample, last: Array) -> Array:
@@ -93,6 +100,16 @@ class AppliedMV:
                 lows, highs, _ = zip(*self._ranges, strict=True)
                 return np.clip(applied, lows, highs)
         return applied
+
+    def _unread(self, sample: Sample) -> Shown:
+        """No sound read-back: after a loss nothing is written, unless the plant never reads anything back."""
+        if not self.lost:
+            return Shown()
+        outside = self._outside(sample)
+        if outside:
+            return Shown(silent=f"{outside}: nothing is written before it is back", outside=True)
+        is_read = self._is_read or getattr(sample, "mv_applied", None) is not None
+        return Shown(silent=UNREAD if is_read else "")
 
     def _outside(self, sample: Sample) -> str:
         """Why no loop can have commanded the MV that the plant has; empty where the sample does not tell."""

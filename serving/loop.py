@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import inf, isnan, nan
 from typing import TypeAlias
 
@@ -43,8 +44,8 @@ class ControlLoop:
 
     A command that did not reach the plant (``unwritten``) leaves it unknown where the MV stands: others may move it
     meanwhile. The next read-back tells, also that of a sample which is refused for another reason. HOLD, MANUAL and
-    the fallback go on from there, and nothing writes an old MV over it. Where the MV then stands outside its range,
-    nothing is written until it is back.
+    the fallback go on from there, and nothing writes an old MV over it. Nothing is written while the read-back is bad,
+    nor, where the MV stands outside its range, until it is back. A plant that reads nothing back gets the old MV.
 
     Every written MV lies in its range, in every mode and with any guards; a discrete MV has one
     of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
@@ -224,10 +225,11 @@ class ControlLoop:
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason))
         self.found = shown.found
-        if shown.left:
-            self._mv = np.full(len(self._mv), nan)
-            words = shown.left if reason in {None, shown.left} else f"{reason}; {shown.left}"
-            return self._missed(f"{words}: nothing is written before it is back")
+        if shown.silent:
+            if shown.outside:
+                self._mv = np.full(len(self._mv), nan)
+            doubled = not reason or shown.silent.startswith(reason)
+            return self._missed(shown.silent if doubled else f"{reason}; {shown.silent}", silent=True)
         if self.found is not None:
             self._mv = self.found.copy()
         if reason:
@@ -263,11 +265,12 @@ class ControlLoop:
         self.found = None
         return self._missed(reason)
 
-    def _missed(self, reason: str) -> Command:
+    def _missed(self, reason: str, *, silent: bool = False) -> Command:
         self._blind = reason = reason or "a fault without a reason"
         self._lose(reason)
-        self._lasting()
-        return self._command(None, None, reason)
+        self._lasting(moves=not silent)
+        command = self._command(None, None, reason)
+        return replace(command, mv=np.full(len(self._mv), nan)) if silent else command
 
     def unwritten(self, before: Array, reason: str) -> Command:
         """The command in place of the last one, which never reached the plant: the MV ``before`` it (n_mv,) stays.
@@ -292,10 +295,10 @@ class ControlLoop:
         self._charge.forget(reason)
         self._mode.lose(reason)
 
-    def _lasting(self) -> None:
+    def _lasting(self, *, moves: bool = True) -> None:
         """Count the scans of a fault, and go where the fallback says once it has lasted."""
         self._mode.hold()
-        if self.fallback is not None and self._mode.overdue(self.fallback, self.manifest.period_s):
+        if moves and self.fallback is not None and self._mode.overdue(self.fallback, self.manifest.period_s):
             self._mv = self.fallback.toward(self._mv, self.manifest.mv, self.manifest.period_s)
 
     def _handing_back(self) -> bool:

@@ -6,9 +6,8 @@ import asyncio
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -19,11 +18,15 @@ from serving.errors import EndpointError, LoopError
 from serving.guard import Sample
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
+from serving.opcua.heartbeat import Heartbeat
 from serving.opcua.lease import LeaseRefusedError, NodeLease
-from serving.opcua.link import BAD, GOOD, UNCERTAIN, Link, Reading, variant, words
+from serving.opcua.link import GOOD, Link, Reading, words
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
+from serving.opcua.values import Judge, Values
 from serving.words import first_line, named
+
+__all__ = ["OpcUaEndpoint", "Values"]
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -34,22 +37,6 @@ FADES = 0.98  # what is remembered of the slowest answer, from scan to scan
 ANSWER, LONGEST_ANSWER_S = 0.8, 5.0  # of a period: so long an answer may take
 SILENT_SCANS = 3  # without any answer: the connection is broken off and made anew
 FIRST_RETRY_S, LAST_RETRY_S, GROWTH = 0.2, 10.0, 1.6
-
-
-@dataclass(frozen=True, slots=True)
-class Values:
-    """What one reading brought. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
-
-    arrived_s: float  # on the endpoint's clock
-    pv: Array  # shape: (n_pv,)
-    mv: Array  # shape: (n_mv,)
-    dv: Array  # shape: (n_dv,)
-    age_s: float
-    fault: str
-    quality: tuple[int, ...]
-    asked_sp: Mapping[str, float] = field(default_factory=dict)
-    asked_mode: str = ""
-    starts: int = 0  # how often the server has started anew since the endpoint did
 
 
 _HAND_BACK = "hand back"
@@ -104,19 +91,19 @@ class OpcUaEndpoint:
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
         self.unwritten = ""  # why the last MV did not reach the plant
-        self._unbeaten = ""  # why the last heartbeat did not
         self._told_lost = ""  # what was said of the connection since it was lost
         self.connections = self.starts = 0
         self._started_s: float | None = None  # when the server started, by its own clock
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
-        self._beats, self._scans, self._next_s, self._wrote = 0, 0, 0.0, 0
+        self._scans, self._next_s, self._wrote = 0, 0.0, 0
         self._written: tuple[Array, float] | None = None  # the last MV that was passed on, and when
         self._called = self._asked = 0  # the scans of the last calls to write and to hand_back
         # Which connection has shown where the plant is (0: the present one has not, since a write failed if one did),
         # and which one `read` told of.
         self._shown, self._told = 0, 0
         self.lease = NodeLease(self.period_s)
-        self._handed_back, self._watched = False, (float("nan"), 0)
+        self._judge, self._heartbeat = Judge(manifest, server, nodes), Heartbeat()
+        self._handed_back = False
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closed = threading.Event()
@@ -293,7 +280,7 @@ class OpcUaEndpoint:
         """Read and write until the connection is lost, which raises EndpointError, or the endpoint closed."""
         assert self._wake is not None
         ages, silent, read_at = Ages(len(plan.timed)), 0, -float("inf")
-        self._unbeaten = ""
+        self._heartbeat.trouble = ""
         while not self._closed.is_set():
             now = self.clock()
             due = self._next_s if self._next_s > read_at else read_at + self.period_s
@@ -302,7 +289,7 @@ class OpcUaEndpoint:
             elif now >= due:
                 read_at = now
                 try:
-                    await self._beat(link, plan)
+                    await self._heartbeat.beat(link, plan, self._scans, self.answer_s)
                     answers = await link.read(plan.asked, self.answer_s)
                     if plan.lease is not None:
                         await self._lease(link, plan.lease, answers[-1])
@@ -314,7 +301,9 @@ class OpcUaEndpoint:
                     continue
                 silent = 0
                 self._slowest_s = max(self.clock() - now, FADES * self._slowest_s)
-                self.values = self._valued(plan, answers, ages)
+                self.values = self._judge.values(
+                    plan, answers, ages, self.clock(), unbeaten=self._heartbeat.trouble, starts=self.starts
+                )
                 self.trouble, self._shown = "", self.connections
             else:
                 with suppress(TimeoutError):
@@ -374,73 +363,3 @@ class OpcUaEndpoint:
                 await self.lease.renew(link, node, self.answer_s)
             except LeaseRefusedError as error:
                 self.unwritten = self.unwritten or first_line(error)  # also while an MV stands and none is sent
-
-    async def _beat(self, link: Link, plan: Plan) -> None:
-        """Count the scans on the server's side, while there are any. A plant that gets no count must not be written.
-
-        A node that has another type now is counted in that one from the next scan on.
-        """
-        if plan.heartbeat is None or self._scans == self._beats:
-            return
-        self._beats = self._scans
-        node, kind, most = plan.heartbeat
-        try:
-            count = variant(float(self._scans % most), kind, 0.0, float(most))
-        except EndpointError as error:
-            self._unbeaten = f"heartbeat: {first_line(error)}"
-        else:
-            (status,) = await link.write([(node, count)], self.answer_s)
-            self._unbeaten = "" if status >> 30 == GOOD else f"the server refuses heartbeat: {words(status)}"
-        if self._unbeaten:
-            (now,) = await link.read([node], self.answer_s)
-            if now.kind is not None:
-                plan.beat_in(node, now.kind)
-
-    def _valued(self, plan: Plan, answers: list[Reading], ages: Ages) -> Values:
-        """The answers as values, with the first thing that is wrong with them."""
-        arrived, fault, found = self.clock(), "", dict[str, float]()
-        for (name, point, judged), answer in zip(plan.points, answers, strict=False):
-            usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
-            # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
-            # is a read-back, which says where the MV stands also while a PV is bad.
-            told = usable or (judged and not name.startswith("MV "))
-            found[name] = point.scale * answer.number + point.offset if told else np.nan
-            if fault or not judged:
-                continue
-            if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
-                fault = f"{name}: {answer.words}"
-            elif answer.text:
-                fault = f"{name}: {answer.text}"
-        judge = self.server.source_time == "judge"
-        timed = ages.update(arrived, [answers[i].source_s if judge else None for i in plan.timed])
-        m = self.manifest
-        asked_sp = {s.name: found[f"SP {s.name}"] for s in m.sp if np.isfinite(found.get(f"SP {s.name}", np.nan))}
-        mode = ""
-        if self.nodes.mode is not None:
-            wanted = found["mode"]
-            mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
-        if self.nodes.watchdog and not fault:
-            fault = self._dead(found["watchdog"])
-        fault = fault or self._unbeaten
-        n = len(m.pv) + len(m.mv) + len(plan.dv_names)
-        return Values(
-            arrived,
-            np.array([found[f"PV {s.name}"] for s in m.pv]),
-            np.array([found[f"MV {s.name}"] for s in m.mv]),
-            np.array([found.get(f"DV {s.name}", 0.0) for s in m.dv]),
-            max(timed, default=0.0),
-            fault,
-            tuple(a.status for a in answers[:n]),
-            asked_sp,
-            mode,
-            self.starts,
-        )
-
-    def _dead(self, watchdog: float) -> str:
-        """Why the server's side counts as dead; empty while its watchdog moves."""
-        last, scans = self._watched
-        moves = watchdog != last and not np.isnan(watchdog)  # one that is gone has stopped, too
-        self._watched = (watchdog, 0 if moves else scans + 1)
-        if self._watched[1] < self.nodes.watchdog_scans:
-            return ""
-        return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"

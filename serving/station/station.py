@@ -18,15 +18,17 @@ from serving.clock import MonotonicClock
 from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
 from serving.grid import RunReport
-from serving.guard import Guard, Sample, implausible
+from serving.guard import Guard, Sample
 from serving.journal import Journal, JournalReader
 from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.opcua import certificates
-from serving.opcua.endpoint import OpcUaEndpoint, Values
+from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.link import words
 from serving.opcua.settings import Server
+from serving.opcua.values import Values
 from serving.page.process import PageProcess
+from serving.station.beginning import begun_at, near, usable
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
 from serving.station.recorder import Recorder
@@ -91,6 +93,7 @@ class Station:
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
         self.last: tuple[Sample | None, Command, float] | None = None  # with when that was, since 1970
+        self._left_at: Array | None = None  # shape: (n_mv,), the last command that was known
         self.stepped: Controller | None = None  # the controller of that scan
         self.scans = self.faults = self.missed = 0
         self.warnings: list[str] = []
@@ -147,8 +150,8 @@ class Station:
             self.loop = ControlLoop(
                 self.controller,
                 self.endpoint,
-                sp=_near(pv, m.sp),
-                mv=None if first is None else _begun_at(first.mv, m.mv),
+                sp=near(pv, m.sp),
+                mv=None if first is None else begun_at(first.mv, m.mv),
                 mode=Mode(s.start),
                 guards=self.guards,
                 recover_after=s.hold.recover_after or None,
@@ -191,12 +194,12 @@ class Station:
     def _first_values(self) -> Values | None:
         """The plant as it is. A loop that is to write waits for it; a shadow may begin without."""
         waited, limit = 0.0, self.settings.server.connect_s + 1
-        while not _usable(self.endpoint.values) and not self.ended:
+        while not usable(self.endpoint.values) and not self.ended:
             if self.settings.start == "SHADOW" and waited >= limit:
                 return None
             time.sleep(POLL_S)
             waited += POLL_S
-        return self.endpoint.values if _usable(self.endpoint.values) else None
+        return self.endpoint.values if usable(self.endpoint.values) else None
 
     def _before(self, k: int) -> None:
         """Changes that were asked for, here or on the plant's side."""
@@ -266,6 +269,8 @@ class Station:
         self._moved(self.loop)
         self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
         self.last, self.stepped = (sample, command, time.time()), self.recorder.controller
+        if not np.isnan(command.mv).any():
+            self._left_at = command.mv
         self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
         self.watching.seen(self.stepped, self.last)
         for seen in self._watchers:
@@ -273,11 +278,9 @@ class Station:
 
     def _moved(self, loop: ControlLoop) -> None:
         """Say where an MV stands that somebody else moved while the loop could not write."""
-        if loop.found is None or self.last is None or np.array_equal(loop.found, self.last[1].mv):
+        if loop.found is None or self._left_at is None or np.array_equal(loop.found, self._left_at):
             return
-        if np.isnan(self.last[1].mv).any():
-            return  # nobody knew where it was left
-        found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self.last[1].mv))
+        found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self._left_at))
         self.recorder.note("change", "plant", f"the MV stands at {found}, not at {left}: the loop goes on from there")
 
     # ------------------------------------------------------------------ requests
@@ -349,34 +352,6 @@ def _certificate_ends(server: Server) -> datetime | None:
     with suppress(LoopError):
         return certificates.until(server.certificate)
     return None
-
-
-def _usable(values: Values | None) -> bool:
-    """Whether a loop may begin where these values say that the plant is."""
-    return (
-        values is not None and not values.fault and bool(np.isfinite(values.pv).all() and np.isfinite(values.mv).all())
-    )
-
-
-def _near(values: Array | None, signals: tuple[Signal, ...]) -> list[float]:
-    """A start within the ranges: what the plant has, or the middle where it is not known."""
-    if values is None or not np.isfinite(values).all():
-        return [s.middle for s in signals]
-    return [_allowed(v, s) for v, s in zip(values.tolist(), signals, strict=True)]
-
-
-def _begun_at(mv: Array, signals: tuple[Signal, ...]) -> list[float] | None:
-    """The MVs that a loop begins with; None where no actuator can stand there: the first good sample then tells."""
-    if implausible(signals, mv.tolist()):
-        return None
-    return [_allowed(v, s) for v, s in zip(mv.tolist(), signals, strict=True)]
-
-
-def _allowed(value: float, signal: Signal) -> float:
-    """The nearest value that the signal may have."""
-    if signal.values is not None:
-        return min(signal.values, key=lambda a: abs(a - value))
-    return min(max(value, signal.low), signal.high)
 
 
 def _shown(values: Array, signals: tuple[Signal, ...]) -> str:

@@ -11,7 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from serving import Controller, ControlLoop, EndpointError, Fallback, LoopError, Mode, Sample, Signal, VirtualClock
+from serving import (
+    Command,
+    Controller,
+    ControlLoop,
+    EndpointError,
+    Fallback,
+    LoopError,
+    Mode,
+    Sample,
+    Signal,
+    VirtualClock,
+)
 from serving.standing import SAME, SETTLED, Standing
 
 pytest_plugins = ["small_laws"]
@@ -24,7 +35,7 @@ class Line:
 
     def __init__(self, mv: float = 40.0, lag: int = 0, offset: float = 0.0) -> None:
         self.mv, self.lag, self.offset = mv, lag, offset
-        self.away = self.deaf = self.pv_bad = self.rb_bad = False
+        self.away = self.deaf = self.pv_bad = self.rb_bad = self.rb_gone = False
         self.written: list[float] = []
         self._past = [mv]
         self.owner = 0
@@ -34,7 +45,7 @@ class Line:
         if self.away:
             raise EndpointError("no answer")
         read_back = self._past[-1 - min(self.lag, len(self._past) - 1)] + self.offset
-        applied = np.array([np.nan if self.rb_bad else read_back])
+        applied = None if self.rb_gone else np.array([np.nan if self.rb_bad else read_back])
         return Sample(np.array([0.9, 300.0]), applied, np.zeros(1), fault="PV level: Bad" if self.pv_bad else "")
 
     def write(self, mv: np.ndarray) -> None:
@@ -98,11 +109,65 @@ def test_a_read_back_that_is_bad_waits_for_a_good_one(make_loop: Callable[..., C
     line.rb_bad = True
     loop.run(3)
     line.deaf = False
+    line.written.clear()
     loop.run(1)
-    assert line.written[-1] == 71.0  # found while nothing could be written, and not forgotten by the next refusal
+    assert line.written == []
+    assert loop.mv.tolist() == [71.0]  # found while nothing could be written, and not forgotten by the next refusal
     line.rb_bad = False
     loop.run(2)
     assert line.written[-2:] == [71.0, 71.0]
+
+
+@pytest.mark.parametrize("mode", [Mode.AUTO, Mode.MANUAL, Mode.HOLD])
+@pytest.mark.parametrize("pv_bad", [False, True])
+@pytest.mark.parametrize("gone", [False, True])
+def test_nothing_is_written_while_the_read_back_stays_bad(
+    make_loop: Callable[..., ControlLoop], mode: Mode, pv_bad: bool, gone: bool
+) -> None:
+    """Also on the way to a safe MV: it would begin where the MV no longer is."""
+    line = Line()
+    commands: list[Command] = []
+    loop = make_loop(line, mode=mode, fallback=Fallback(1.0, (20.0,), (6.0,)))
+    loop.run(3)
+    outage(loop, line, 50, 71.0)
+    line.rb_bad, line.rb_gone, line.pv_bad = not gone, gone, pv_bad or gone
+    loop.run(20, observe=lambda _, command: commands.append(command))
+    assert line.written == []
+    assert loop.mode is (Mode.MANUAL if mode is Mode.MANUAL else Mode.HOLD)
+    assert not any(command.writes for command in commands)
+    assert all("nothing is written before a good read-back tells where the MV stands" in c.reason for c in commands)
+    assert all(("PV level: Bad" in c.reason) is line.pv_bad for c in commands)
+    line.rb_bad = line.rb_gone = False
+    loop.run(1)
+    assert line.written == [68.0 if mode is Mode.AUTO else 71.0]  # on the way to the safe MV from where the MV stands
+
+
+@pytest.mark.parametrize("pv_bad", [False, True])
+def test_a_plant_that_never_reads_back_gets_the_old_mv(make_loop: Callable[..., ControlLoop], pv_bad: bool) -> None:
+    """Nothing would ever tell more; a safe MV is reached, too."""
+    line = Line()
+    line.rb_gone = True
+    loop = make_loop(line, mode=Mode.AUTO, fallback=Fallback(30.0, (20.0,), (6.0,)))
+    loop.run(3)
+    left = line.mv
+    outage(loop, line, 50)
+    line.pv_bad = pv_bad
+    loop.run(1)
+    assert line.written == [left]
+    loop.run(80)
+    assert line.written[-1] == 20.0
+
+
+def test_a_plant_whose_read_back_stays_bad_is_handed_back(make_loop: Callable[..., ControlLoop]) -> None:
+    line = Line()
+    loop = make_loop(line, fallback=Fallback(1.0, hand_back=True))
+    loop.run(3)
+    line.away = True
+    loop.run(1)
+    line.away, line.rb_bad = False, True
+    line.written.clear()
+    loop.run(10)
+    assert (line.written, line.owner, loop.mode) == ([], 1, Mode.SHADOW)
 
 
 def test_an_mv_is_not_set_by_hand_while_nobody_knows_where_it_stands(make_loop: Callable[..., ControlLoop]) -> None:
@@ -233,8 +298,8 @@ def test_no_outage_moves_an_mv_that_nobody_moved_and_none_writes_over_one_that_w
 
     - It is where the MV stood ``lag`` periods before the first good read-back, within ``SAME`` of the range. So a move
       that is older than the lag is never written over. A younger one is: no read-back shows it yet.
-    - It is what the loop wrote last, as long as each read-back since is bad.
-    - There is none at all where that read-back lies outside the range by more than ``READ_BACK_MARGIN``.
+    - There is none as long as each read-back since is bad, nor where the first good one lies outside the range by more
+      than ``READ_BACK_MARGIN``.
 
     Within that margin of an end a read-back is clipped, and the bound is the margin: no such move is drawn here.
     """
@@ -257,7 +322,7 @@ def test_no_outage_moves_an_mv_that_nobody_moved_and_none_writes_over_one_that_w
                 stands, told = shown, k >= scans and 0 <= shown <= RANGE
             line.written.clear()
             loop.run(1)
-            if not 0 <= stands <= RANGE or k < scans:
+            if k < scans or not told:
                 assert line.written == []
             elif moved is None:
                 assert line.written == [stands]

@@ -1,0 +1,42 @@
+"""Where a loop begins: on the plant as it is, as far as the first values tell."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.guard import implausible
+from serving.manifest import Signal
+from serving.opcua.values import Values
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+def usable(values: Values | None) -> bool:
+    """Whether a loop may begin where these values say that the plant is."""
+    return (
+        values is not None and not values.fault and bool(np.isfinite(values.pv).all() and np.isfinite(values.mv).all())
+    )
+
+
+def near(values: Array | None, signals: tuple[Signal, ...]) -> list[float]:
+    """A start within the ranges: what the plant has, or the middle where it is not known."""
+    if values is None or not np.isfinite(values).all():
+        return [s.middle for s in signals]
+    return [_allowed(v, s) for v, s in zip(values.tolist(), signals, strict=True)]
+
+
+def begun_at(mv: Array, signals: tuple[Signal, ...]) -> list[float] | None:
+    """The MVs that a loop begins with; None where no actuator can stand there: the first good sample then tells."""
+    if implausible(signals, mv.tolist()):
+        return None
+    return [_allowed(v, s) for v, s in zip(mv.tolist(), signals, strict=True)]
+
+
+def _allowed(value: float, signal: Signal) -> float:
+    """The nearest value that the signal may have."""
+    if signal.values is not None:
+        return min(signal.values, key=lambda a: abs(a - value))
+    return min(max(value, signal.low), signal.high)
