@@ -159,11 +159,17 @@ def legend_below(
         handles, labels = [h for row, _ in found for h in row], [text for _, row in found for text in row]
     for columns in range(min(most, len(labels)), 0, -1):
         legend: Legend = canvas.legend(handles, labels, loc="outside lower center", ncols=columns, **options)
-        canvas.draw_without_rendering()
         if columns == 1 or legend.get_window_extent().width <= canvas.bbox.width:
             break
         legend.remove()
     return legend
+
+
+def lay_out(canvas: Canvas) -> None:
+    """Give the panels their places, without a line drawn."""
+    engine = canvas.get_layout_engine()
+    if engine is not None:
+        engine.execute(canvas)
 
 
 def fit_labels(canvas: Canvas, titles: Iterable[Text] = ()) -> None:
@@ -171,7 +177,7 @@ def fit_labels(canvas: Canvas, titles: Iterable[Text] = ()) -> None:
 
     A label beside a panel breaks before its unit; then the letters become smaller; at last the middle is left out.
     """
-    canvas.draw_without_rendering()
+    lay_out(canvas)
     for axes in canvas.axes:
         _fit(axes.yaxis.label, axes, upright=True)
         _fit(axes.xaxis.label, axes)

@@ -209,6 +209,7 @@ def test_two_workers_find_what_one_process_finds(tmp_path: Path, monkeypatch: py
     """The loops of an own plant on real processes, which see nothing of its files."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{ROOT / 'tests'}")
+    monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])  # which takes each worker seconds
     own = own_stress(tmp_path)
     alone = outcomes_of(own, 40, workers=1)
     with local_cluster(2) as at:
