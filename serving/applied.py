@@ -36,7 +36,7 @@ class AppliedMV:
         self._signals = tuple(signals)
         self._ranges = [(s.low, s.high, s.values) for s in signals]
         self._standing = Standing(signals, mv)
-        self._given = mv  # shape: (n_mv,), the last command
+        self._given, self._written = mv, False  # shape: (n_mv,), the last command, and whether it went to the plant
         self._is_read = False  # whether the plant has ever read it back
 
     @property
@@ -48,13 +48,13 @@ class AppliedMV:
         """The last command did not arrive."""
         self._standing.lost = True
 
-    def command(self, mv: Array) -> None:
-        """What is commanded now (n_mv,); whether it arrives is known at the next scan."""
-        self._given = mv.copy()
+    def command(self, mv: Array, *, written: bool) -> None:
+        """What is commanded now (n_mv,); whether it arrives is known at the next scan. A shadow writes nothing."""
+        self._given, self._written = mv.copy(), written
 
     def arrived(self) -> None:
         """A scan begins, and nothing was heard of a loss."""
-        self._standing.commanded(self._given)
+        self._standing.commanded(self._given, written=self._written)
 
     def look(self, sample: Sample, last: Array, *, refused: bool) -> Shown:
         """What the sample shows; ``last`` is the last command (n_mv,), ``refused`` whether the sample is of no use.

@@ -306,9 +306,10 @@ class ControlLoop:
 
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
-        self._applied.command(self._mv)
         back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
-        return Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back)
+        command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back)
+        self._applied.command(self._mv, written=command.writes)
+        return command
 
     # ------------------------------------------------------------------ running
     def run(

@@ -38,12 +38,19 @@ class Standing:
         self._offset = self._seen = np.zeros(len(signals))
         self.lost = False  # whether the last command did not arrive, and no read-back has come since
 
-    def commanded(self, mv: Array) -> None:
-        """A command (n_mv,) went out, and nothing was heard of its loss."""
+    def commanded(self, mv: Array, *, written: bool) -> None:
+        """A command (n_mv,) went out, and nothing was heard of its loss. ``written`` by this loop, that is.
+
+        In a shadow the MV is what others make of it: what moves then is no offset from a command.
+        """
         if self.lost:
             return
-        self._rested = self._rested + 1 if mv.tolist() == self.mv.tolist() else 0
-        self.mv, self._offset = mv.copy(), self._seen
+        if written:
+            self._rested = self._rested + 1 if mv.tolist() == self.mv.tolist() else 0
+            self._offset = self._seen
+        else:
+            self._rested, self._seen = 0, self._offset
+        self.mv = mv.copy()
 
     def seen(self, applied: Array) -> Array | None:
         """A read-back (n_mv,). Where the MVs stand after a loss, else None: HOLD then keeps what it has."""

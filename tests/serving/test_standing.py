@@ -350,10 +350,34 @@ def test_a_difference_of_rounding_is_no_offset() -> None:
     """Else the MV that a loop holds after a loss would differ from the plant's own in its last bits."""
     standing = Standing((Signal("u", "%", 0.0, 100.0),), np.array([50.0]))
     for _ in range(10):
-        standing.commanded(np.array([50.0]))
+        standing.commanded(np.array([50.0]), written=True)
         standing.seen(np.array([50.0 + 1e-13]))
-    standing.commanded(np.array([50.0]))
+    standing.commanded(np.array([50.0]), written=True)
     standing.lost = True
     found = standing.seen(np.array([70.0 + 1e-13]))
     assert found is not None
     assert found.tolist() == [70.0 + 1e-13]
+
+
+@pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.AUTO])
+def test_what_others_moved_while_the_loop_was_a_shadow_is_no_offset(
+    make_loop: Callable[..., ControlLoop], mode: Mode
+) -> None:
+    """The normal way in: the operator moves the MV a little, then presses AUTO. An outage then moves it by nothing."""
+    line = Line()
+    loop = make_loop(line, mode=Mode.SHADOW)
+    loop.run(2 * SETTLED)
+    line.mv += 0.016 * RANGE
+    loop.run(2)
+    loop.set_mode(mode)
+    loop.run(3 * SETTLED)
+    for _ in range(3):
+        line.pv_bad = True
+        outage(loop, line, 4, line.mv)
+        line.written.clear()
+        stands = line.mv
+        loop.run(3)
+        assert line.written == pytest.approx([stands] * len(line.written), abs=1e-9)
+        assert line.mv == pytest.approx(stands, abs=1e-9)
+        line.pv_bad = False
+        loop.run(2 * SETTLED)
