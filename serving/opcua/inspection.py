@@ -11,9 +11,10 @@ from asyncua import ua
 from serving.errors import EndpointError
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
-from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, Reading, words
+from serving.opcua.link import Link
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point, Server
+from serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, words
 from serving.words import first_line
 
 WRITABLE = 2  # the second bit of an access level

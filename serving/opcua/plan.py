@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from serving.errors import EndpointError
 from serving.manifest import Manifest
-from serving.opcua.link import Link, variant
+from serving.opcua.link import Link
 from serving.opcua.settings import Nodes, Point
+from serving.opcua.values import variant
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -24,8 +24,8 @@ from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.opcua import certificates
 from serving.opcua.endpoint import OpcUaEndpoint, Values
-from serving.opcua.link import words
 from serving.opcua.settings import Server
+from serving.opcua.values import words
 from serving.page.process import PageProcess
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease

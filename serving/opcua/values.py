@@ -1,0 +1,98 @@
+"""Values as a server gives and takes them: with quality and time, in a node's own type."""
+
+from __future__ import annotations
+
+import math
+from datetime import datetime
+from typing import NamedTuple
+
+import numpy as np
+from asyncua import ua
+
+from serving.errors import EndpointError
+
+INTEGERS = {
+    t: (low, high)
+    for t, low, high in (
+        (ua.VariantType.SByte, -(2**7), 2**7 - 1),
+        (ua.VariantType.Byte, 0, 2**8 - 1),
+        (ua.VariantType.Int16, -(2**15), 2**15 - 1),
+        (ua.VariantType.UInt16, 0, 2**16 - 1),
+        (ua.VariantType.Int32, -(2**31), 2**31 - 1),
+        (ua.VariantType.UInt32, 0, 2**32 - 1),
+        (ua.VariantType.Int64, -(2**63), 2**63 - 1),
+        (ua.VariantType.UInt64, 0, 2**64 - 1),
+    )
+}
+FLOATS = {ua.VariantType.Float, ua.VariantType.Double}
+EPOCH = datetime(1970, 1, 1)
+GOOD, UNCERTAIN, BAD = 0, 1, 2  # the two highest bits of a status
+
+
+class Reading(NamedTuple):
+    """A node's value. ``number`` is NaN where there is none, and ``text`` then says what is there instead."""
+
+    number: float
+    status: int
+    source_s: float | None  # source time [s since 1970]; None where the server gives none
+    kind: ua.VariantType | None
+    text: str = ""
+    words_held: str = ""  # of a node that holds a text
+
+    @property
+    def quality(self) -> int:
+        """GOOD, UNCERTAIN or BAD."""
+        return min(self.status >> 30, BAD)
+
+    @property
+    def words(self) -> str:
+        """The status by name."""
+        return words(self.status)
+
+
+def reading(value: ua.DataValue) -> Reading:
+    """A server's answer as a number with its quality and time."""
+    status = int(value.StatusCode.value) if value.StatusCode is not None else 0
+    when = value.SourceTimestamp
+    source = None if when is None else when.timestamp() if when.tzinfo else (when - EPOCH).total_seconds()
+    inner = value.Value
+    kind = None if inner is None else inner.VariantType
+    given = None if inner is None else inner.Value
+    if isinstance(given, bool | int | float) and not isinstance(given, ua.StatusCode):
+        number = float(given)
+        return Reading(number, status, source, kind, "" if math.isfinite(number) else f"{number}")
+    text = "no value" if given is None else f"{type(given).__name__} instead of a number"
+    return Reading(math.nan, status, source, kind, text, given if isinstance(given, str) else "")
+
+
+def variant(value: float, kind: ua.VariantType, low: float, high: float) -> ua.Variant:
+    """``value`` in a node's own type, within ``low`` and ``high`` also after it was rounded to that type.
+
+    EndpointError for a type that holds no number, and where no number of the type lies in the range.
+    """
+    if kind is ua.VariantType.Double:
+        return ua.Variant(value, kind)
+    if kind is ua.VariantType.Float:
+        near = np.float32(value)
+        if not low <= float(near) <= high:
+            near = np.nextafter(near, np.float32(math.inf if float(near) < low else -math.inf))
+        if low <= float(near) <= high:
+            return ua.Variant(float(near), kind)
+        raise EndpointError(f"no number of the type REAL lies within {low:g} .. {high:g}")
+    if kind is ua.VariantType.Boolean:
+        if value not in (0.0, 1.0):
+            raise EndpointError(f"the node is of the type Boolean; {value:g} is neither 0 nor 1")
+        return ua.Variant(value == 1.0, kind)
+    if kind in INTEGERS:
+        whole = round(value)
+        whole = math.ceil(value) if whole < low else math.floor(value) if whole > high else whole
+        least, most = INTEGERS[kind]
+        if low <= whole <= high and least <= whole <= most:
+            return ua.Variant(whole, kind)
+        raise EndpointError(f"no number of the type {kind.name} lies near {value:g} within {low:g} .. {high:g}")
+    raise EndpointError(f"the node is of the type {kind.name}, which holds no number")
+
+
+def words(status: int) -> str:
+    """A status by OPC UA's own name."""
+    return str(ua.StatusCode(ua.UInt32(status)).name)
