@@ -381,9 +381,11 @@ class OpcUaEndpoint:
     async def _lease(self, link: Link, node: ua.NodeId, answer: Reading) -> None:
         """Keep the lease while MVs are written, and let it go when they are not: a shadow needs none."""
         self.lease.seen(answer.words_held)
-        if self.lease.held and self._scans - self._wrote > SILENT_SCANS:
+        if not self.lease.held:
+            self._written = None  # also an MV that stands is sent then: only that takes the lease, or says who has it
+        elif self._scans - self._wrote > SILENT_SCANS:
             await self.lease.give_back(link, node, self.answer_s)
-        elif self.lease.held:
+        else:
             try:
                 await self.lease.renew(link, node, self.answer_s)
             except LeaseRefusedError as error:

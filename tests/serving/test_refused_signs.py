@@ -71,10 +71,12 @@ class MadeUpLink:
 class Scanning:
     """An endpoint on that server, scanned by hand."""
 
-    def __init__(self, controller: Controller, link: MadeUpLink, max_age_s: float = 5.0) -> None:
+    def __init__(
+        self, controller: Controller, link: MadeUpLink, max_age_s: float = 5.0, rewrite_s: float = 0.0
+    ) -> None:
         m = controller.manifest
         nodes = {g: {s.name: f"ns=2;s={g}.{s.name}" for s in m.signals(g)} for g in ("pv", "mv", "dv")}
-        server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
+        server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, rewrite_s=rewrite_s)
         self.told: list[str] = []
         self.link = link
         self.endpoint = OpcUaEndpoint(
@@ -165,6 +167,27 @@ def test_a_lease_that_is_refused_is_lost_and_nothing_more_is_written(scanning: S
     link.refuses.clear()
     assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
     assert link.held[mv] == 1.0
+
+
+def test_a_lease_that_another_loop_took_is_told_also_while_the_mv_rests(
+    controller: Controller, link: MadeUpLink
+) -> None:
+    """An MV that stands is not sent for a long time, and the other loop moves it meanwhile."""
+    scanning = Scanning(controller, link, rewrite_s=1e9)
+    try:
+        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+        for _ in range(5):
+            assert scanning.scan() == ""
+        mv = next(name for name in link.held if "mv." in name)
+        link.held[mv], link.held[LEASE] = "as the other one has it", "other:1:a 1e6 1"
+        assert scanning.becomes("the plant is controlled by other:1:a")
+        assert link.held[LEASE] == "other:1:a 1e6 1"
+        assert link.held[mv] == "as the other one has it"
+        link.held[LEASE] = ""  # it has given it back
+        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+        assert link.held[mv] == 1.0
+    finally:
+        scanning.endpoint.close()
 
 
 def test_a_connection_that_is_lost_by_silence_is_told_once_and_so_is_the_next_one(
