@@ -93,6 +93,12 @@ def variant(value: float, kind: ua.VariantType, low: float, high: float) -> ua.V
     raise EndpointError(f"the node is of the type {kind.name}, which holds no number")
 
 
+def exact(value: float, kind: ua.VariantType) -> ua.Variant:
+    """``value`` itself in a node's own type, or the nearest one of a REAL; EndpointError where the type has it not."""
+    low, high = (-math.inf, math.inf) if kind in FLOATS else (value, value)
+    return variant(value, kind, low, high)
+
+
 def words(status: int) -> str:
     """A status by OPC UA's own name."""
     return str(ua.StatusCode(ua.UInt32(status)).name)
