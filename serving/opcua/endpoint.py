@@ -6,9 +6,8 @@ import asyncio
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -22,8 +21,9 @@ from serving.opcua.ages import Ages
 from serving.opcua.lease import LeaseRefusedError, NodeLease
 from serving.opcua.link import LateError, Link
 from serving.opcua.plan import Plan
+from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import Nodes, Server
-from serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading, variant, words
+from serving.opcua.values import GOOD, Reading, variant, words
 from serving.words import first_line, named
 
 Array: TypeAlias = NDArray[np.float64]
@@ -35,22 +35,6 @@ FADES = 0.98  # what is remembered of the slowest answer, from scan to scan
 ANSWER, LONGEST_ANSWER_S = 0.8, 5.0  # of a period: so long an answer may take
 SILENT_SCANS = 3  # without any answer: the connection is broken off and made anew
 FIRST_RETRY_S, LAST_RETRY_S, GROWTH = 0.2, 10.0, 1.6
-
-
-@dataclass(frozen=True, slots=True)
-class Values:
-    """What one reading brought. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
-
-    arrived_s: float  # on the endpoint's clock
-    pv: Array  # shape: (n_pv,)
-    mv: Array  # shape: (n_mv,)
-    dv: Array  # shape: (n_dv,)
-    age_s: float
-    fault: str
-    quality: tuple[int, ...]
-    asked_sp: Mapping[str, float] = field(default_factory=dict)
-    asked_mode: str = ""
-    starts: int = 0  # how often the server has started anew since the endpoint did
 
 
 _HAND_BACK = "hand back"
@@ -119,7 +103,8 @@ class OpcUaEndpoint:
         # and which one `read` told of.
         self._shown, self._told = 0, 0
         self.lease = NodeLease(self.period_s)
-        self._handed_back, self._watched = False, (float("nan"), 0)
+        self._handed_back = False
+        self._sampling = Sampling(manifest, server, nodes)
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closed = threading.Event()
@@ -328,7 +313,7 @@ class OpcUaEndpoint:
                     continue
                 silent = 0
                 self._slowest_s = max(self.clock() - now, FADES * self._slowest_s)
-                self.values = self._valued(plan, answers, ages)
+                self.values = self._sampling.valued(plan, answers, ages, self.clock(), self._unbeaten, self.starts)
                 self.trouble, self._missed, self._shown = "", "", self.connections
             else:
                 with suppress(TimeoutError):
@@ -411,52 +396,3 @@ class OpcUaEndpoint:
             (now,) = await link.read([node], self.answer_s)
             if now.kind is not None:
                 plan.beat_in(node, now.kind)
-
-    def _valued(self, plan: Plan, answers: list[Reading], ages: Ages) -> Values:
-        """The answers as values, with the first thing that is wrong with them."""
-        arrived, fault, found = self.clock(), "", dict[str, float]()
-        for (name, point, judged), answer in zip(plan.points, answers, strict=False):
-            usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
-            # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
-            # is a read-back, which says where the MV stands also while a PV is bad.
-            told = usable or (judged and not name.startswith("MV "))
-            found[name] = point.scale * answer.number + point.offset if told else np.nan
-            if fault or not judged:
-                continue
-            if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
-                fault = f"{name}: {answer.words}"
-            elif answer.text:
-                fault = f"{name}: {answer.text}"
-        judge = self.server.source_time == "judge"
-        timed = ages.update(arrived, [answers[i].source_s if judge else None for i in plan.timed])
-        m = self.manifest
-        asked_sp = {s.name: found[f"SP {s.name}"] for s in m.sp if np.isfinite(found.get(f"SP {s.name}", np.nan))}
-        mode = ""
-        if self.nodes.mode is not None:
-            wanted = found["mode"]
-            mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
-        if self.nodes.watchdog and not fault:
-            fault = self._dead(found["watchdog"])
-        fault = fault or self._unbeaten
-        n = len(m.pv) + len(m.mv) + len(plan.dv_names)
-        return Values(
-            arrived,
-            np.array([found[f"PV {s.name}"] for s in m.pv]),
-            np.array([found[f"MV {s.name}"] for s in m.mv]),
-            np.array([found.get(f"DV {s.name}", 0.0) for s in m.dv]),
-            max(timed, default=0.0),
-            fault,
-            tuple(a.status for a in answers[:n]),
-            asked_sp,
-            mode,
-            self.starts,
-        )
-
-    def _dead(self, watchdog: float) -> str:
-        """Why the server's side counts as dead; empty while its watchdog moves."""
-        last, scans = self._watched
-        moves = watchdog != last and not np.isnan(watchdog)  # one that is gone has stopped, too
-        self._watched = (watchdog, 0 if moves else scans + 1)
-        if self._watched[1] < self.nodes.watchdog_scans:
-            return ""
-        return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"

@@ -23,7 +23,8 @@ from serving.journal import Journal, JournalReader
 from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.opcua import certificates
-from serving.opcua.endpoint import OpcUaEndpoint, Values
+from serving.opcua.endpoint import OpcUaEndpoint
+from serving.opcua.sampling import Values
 from serving.opcua.settings import Server
 from serving.opcua.values import words
 from serving.page.process import PageProcess
