@@ -59,7 +59,7 @@ def sole_writer(path: Path) -> int:
     The lock is a file beside the journal: closing a second handle of SQLite's own file would drop SQLite's locks.
     LoopError where another writer has it.
     """
-    lock = path.resolve().with_name(path.resolve().name + ".lock")
+    lock = lock_of(path)
     try:
         return locked(lock)
     except LockTakenError as error:
@@ -68,3 +68,8 @@ def sole_writer(path: Path) -> int:
         ) from None
     except OSError as error:
         raise LoopError(f"{lock} cannot be opened or locked: {error.strerror}") from None
+
+
+def lock_of(path: Path) -> Path:
+    """The file that the writer of a journal locks."""
+    return path.resolve().with_name(path.resolve().name + ".lock")

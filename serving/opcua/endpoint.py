@@ -20,10 +20,11 @@ from serving.manifest import Manifest
 from serving.opcua.ages import Ages
 from serving.opcua.heartbeat import Heartbeat
 from serving.opcua.lease import LeaseRefusedError, NodeLease
-from serving.opcua.link import GOOD, Link, Reading, words
+from serving.opcua.link import LateError, Link
 from serving.opcua.plan import Plan
+from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import Nodes, Server
-from serving.opcua.values import Judge, Values
+from serving.opcua.values import GOOD, Reading, words
 from serving.words import first_line, named
 
 __all__ = ["OpcUaEndpoint", "Values"]
@@ -90,6 +91,8 @@ class OpcUaEndpoint:
         self._slowest_s = MOST_LEAD * self.period_s  # until answers are known
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
+        self._missed = ""  # why the last reading failed at once, or the connection did; late answers grow old instead
+        self._given: Values | None = None  # at the last scan
         self.unwritten = ""  # why the last MV did not reach the plant
         self._told_lost = ""  # what was said of the connection since it was lost
         self.connections = self.starts = 0
@@ -102,7 +105,7 @@ class OpcUaEndpoint:
         # and which one `read` told of.
         self._shown, self._told = 0, 0
         self.lease = NodeLease(self.period_s)
-        self._judge, self._heartbeat = Judge(manifest, server, nodes), Heartbeat()
+        self._heartbeat, self._sampling = Heartbeat(), Sampling(manifest, server, nodes)
         self._handed_back = False
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -137,6 +140,9 @@ class OpcUaEndpoint:
         self._stir()
         if values is None:
             raise EndpointError(self.trouble or "no values yet")
+        if self._missed and values is self._given:
+            raise EndpointError(self._missed)  # the reading for this scan has failed, and this is the one before
+        self._given = values
         age = now - values.arrived_s + values.age_s
         if self.trouble and age > self.max_age_s:
             raise EndpointError(self.trouble)
@@ -216,9 +222,9 @@ class OpcUaEndpoint:
         pause = FIRST_RETRY_S
         while not self._closed.is_set():
             try:
-                link = await Link.opened(self.server)
+                link = await Link.opened(self.server, self.period_s)
             except Exception as error:
-                self._lost(first_line(error))
+                self._lost(first_line(error), late=isinstance(error, LateError))
                 await self._rest(pause)
                 pause = min(pause * GROWTH, LAST_RETRY_S)
                 continue
@@ -237,7 +243,8 @@ class OpcUaEndpoint:
                 self.tell(f"connected to {self.server.endpoint}{anew}")
                 await self._exchange(link, plan)
             except Exception as error:
-                self._lost(first_line(error) if isinstance(error, LoopError) else named(error))
+                why = first_line(error) if isinstance(error, LoopError) else named(error)
+                self._lost(why, late=isinstance(error, LateError))
             finally:
                 self._link = None
                 if self._closed.is_set():
@@ -260,8 +267,10 @@ class OpcUaEndpoint:
             return ": it does not say whether it has started anew since"
         return ": it has started anew"
 
-    def _lost(self, why: str) -> None:
+    def _lost(self, why: str, *, late: bool = False) -> None:
         """Say it once. A silent server has been the trouble for some scans already, and was not told as lost."""
+        if not late:
+            self._missed = why
         if why != self._told_lost:
             self.tell(why)
         self.trouble = self._told_lost = why
@@ -281,7 +290,10 @@ class OpcUaEndpoint:
         assert self._wake is not None
         ages, silent, read_at = Ages(len(plan.timed)), 0, -float("inf")
         self._heartbeat.trouble = ""
+        link.on_gone = self._wake.set
         while not self._closed.is_set():
+            if link.gone:
+                raise EndpointError(f"{self.server.endpoint}: {link.gone}")
             now = self.clock()
             due = self._next_s if self._next_s > read_at else read_at + self.period_s
             if self._outbox:
@@ -296,15 +308,17 @@ class OpcUaEndpoint:
                 except EndpointError as error:
                     silent += 1
                     self.trouble = first_line(error)
-                    if silent >= SILENT_SCANS or link.client.uaclient.protocol is None:
+                    if not isinstance(error, LateError):
+                        self._missed = self.trouble
+                    if silent >= SILENT_SCANS or link.gone:
                         raise
                     continue
                 silent = 0
                 self._slowest_s = max(self.clock() - now, FADES * self._slowest_s)
-                self.values = self._judge.values(
-                    plan, answers, ages, self.clock(), unbeaten=self._heartbeat.trouble, starts=self.starts
+                self.values = self._sampling.valued(
+                    plan, answers, ages, self.clock(), self._heartbeat.trouble, self.starts
                 )
-                self.trouble, self._shown = "", self.connections
+                self.trouble, self._missed, self._shown = "", "", self.connections
             else:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(due - now):
@@ -356,9 +370,11 @@ class OpcUaEndpoint:
     async def _lease(self, link: Link, node: ua.NodeId, answer: Reading) -> None:
         """Keep the lease while MVs are written, and let it go when they are not: a shadow needs none."""
         self.lease.seen(answer.words_held)
-        if self.lease.held and self._scans - self._wrote > SILENT_SCANS:
+        if not self.lease.held:
+            self._written = None  # also an MV that stands is sent then: only that takes the lease, or says who has it
+        elif self._scans - self._wrote > SILENT_SCANS:
             await self.lease.give_back(link, node, self.answer_s)
-        elif self.lease.held:
+        else:
             try:
                 await self.lease.renew(link, node, self.answer_s)
             except LeaseRefusedError as error:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from serving.errors import EndpointError
-from serving.opcua.link import GOOD, Link, variant, words
+from serving.opcua.link import Link
 from serving.opcua.plan import Plan
+from serving.opcua.values import GOOD, variant, words
 from serving.words import first_line
 
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 from asyncua import ua
 
 from serving.errors import EndpointError
+from serving.guard import InRange, Sample, implausible
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
-from serving.opcua.link import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Link, Reading, words
+from serving.opcua.link import Link
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point, Server
+from serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
 from serving.words import first_line
 
 WRITABLE = 2  # the second bit of an access level
@@ -37,13 +40,16 @@ class Found:
     note: str = ""
 
 
-def inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[Found]:
-    """A row for every node, and one for the connection. Raises LoopError where the settings do not fit."""
+def inspected(manifest: Manifest, server: Server, nodes: Nodes, margin: float) -> list[Found]:
+    """A row for every node, and one for the connection. Raises LoopError where the settings do not fit.
+
+    ``margin`` is the share of a PV's range by which the loop's guards let it exceed that range.
+    """
     nodes.check(manifest)
-    return asyncio.run(_inspected(manifest, server, nodes))
+    return asyncio.run(_inspected(manifest, server, nodes, margin))
 
 
-async def _inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[Found]:
+async def _inspected(manifest: Manifest, server: Server, nodes: Nodes, margin: float) -> list[Found]:
     link = await Link.opened(server)
     try:
         plan = Plan(nodes, manifest)
@@ -52,13 +58,14 @@ async def _inspected(manifest: Manifest, server: Server, nodes: Nodes) -> list[F
         rows += [(f"MV {s.name}, written", p.node, p, True) for s, p in zip(manifest.mv, plan.mv_points, strict=True)]
         found = []
         for name, node, point, judged in rows:
-            found.append(await _one(link, manifest, server, name, node, point, judged))
-        for name, node in (
-            ("heartbeat", nodes.heartbeat),
-            ("hand_back", nodes.hand_back.node if nodes.hand_back else ""),
-        ):
-            if node:
-                found.append(await _one(link, manifest, server, f"{name}, written", node, Point(node), True))
+            found.append(await _one(link, manifest, server, name, node, point, judged, margin))
+        if nodes.heartbeat:
+            at = nodes.heartbeat
+            found.append(await _one(link, manifest, server, "heartbeat, written", at, Point(at), True, margin))
+        if nodes.hand_back is not None:
+            at, value = nodes.hand_back.node, nodes.hand_back.value
+            row = await _one(link, manifest, server, "hand_back, written", at, Point(at), True, margin)
+            found.append(row if row.wrong else replace(row, wrong=_unfit(value, row.kind)))
         if nodes.lease:
             found.append(await _lease(link, server, nodes.lease))
         return [*found, *_certificates(link, server)]
@@ -112,8 +119,35 @@ def _bad(reading: Reading, node: str) -> str:
     return f"its quality is {words(reading.status)}" + (f"; the server has no node {node}" if unknown else "")
 
 
+def _unfit(value: float, kind: str) -> str:
+    """Why a number cannot be written into a node of a type, by the type's name; empty: it can."""
+    try:
+        exact(value, ua.VariantType[kind])
+    except EndpointError as error:
+        return f"value is {value:g}; {first_line(error)}"
+    return ""
+
+
+def _refused(name: str, signal: Signal, number: float, margin: float) -> str:
+    """Why a guard of the loop refuses a number; empty where none does: only PVs and the MVs read back have one."""
+    values = np.array([number])
+    if name.startswith("PV "):
+        refusal = InRange((signal,), margin).check(Sample(values), ())
+    elif name.startswith("MV ") and not name.endswith(", written"):
+        refusal = implausible((signal,), [number])
+    else:
+        refusal = None
+    return "" if refusal is None else _outside(signal, number)
+
+
+def _outside(signal: Signal, number: float) -> str:
+    if signal.low <= number <= signal.high:
+        return f"{number:.6g} {signal.unit} is no value that it may have" if signal.values is not None else ""
+    return f"{number:.6g} lies outside {signal.low:g} .. {signal.high:g} {signal.unit}; another unit?"
+
+
 async def _one(
-    link: Link, manifest: Manifest, server: Server, name: str, node: str, point: Point, judged: bool
+    link: Link, manifest: Manifest, server: Server, name: str, node: str, point: Point, judged: bool, margin: float
 ) -> Found:
     try:
         (at,) = await link.resolved([node], server.connect_s)
@@ -133,12 +167,14 @@ async def _one(
         wrong = f"its type {kind} holds no number"
     elif name.endswith(", written") and writable is False:
         wrong = "it may not be written by this user"
-    elif signal is not None and not signal.low <= number <= signal.high:
-        wrong = f"{number:.6g} lies outside {signal.low:g} .. {signal.high:g} {signal.unit}; another unit?"
+    elif signal is not None:
+        wrong = _refused(name, signal, number, margin)
     unit, limits = await _properties(link, server, at)
     note = ""
     if signal is not None:
-        wrong, note = wrong or other_unit(unit, point, signal), _other_range(limits, point, signal)
+        outside = "" if wrong or reading.text else _outside(signal, number)
+        wrong = wrong or other_unit(unit, point, signal)
+        note = "; ".join(filter(None, (outside, _other_range(limits, point, signal))))
     quality = "Good" if reading.quality == GOOD else words(reading.status)
     if not judged:
         wrong, note = "", "; ".join(filter(None, (wrong, note)))

@@ -11,7 +11,8 @@ from contextlib import suppress
 from asyncua import ua
 
 from serving.errors import EndpointError
-from serving.opcua.link import GOOD, Link, words
+from serving.opcua.link import Link
+from serving.opcua.values import GOOD, words
 
 SCANS = 5  # of the slower loop, without a renewal: the one that had the lease is gone
 

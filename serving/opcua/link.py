@@ -1,88 +1,78 @@
-"""One connection to an OPC UA server: nodes by name, values with quality and time, values in a node's own type."""
+"""One connection to an OPC UA server: opened, kept, and broken off."""
 
 from __future__ import annotations
 
 import asyncio
-import math
 import socket
 import struct
-from collections.abc import Awaitable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from datetime import datetime
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
 
 from serving.errors import EndpointError, LoopError
 from serving.opcua.certificates import APPLICATION, require_valid
 from serving.opcua.settings import Server
+from serving.opcua.values import EPOCH, Reading, reading, words
 from serving.words import named
 
 T = TypeVar("T")
 
-INTEGERS = {
-    t: (low, high)
-    for t, low, high in (
-        (ua.VariantType.SByte, -(2**7), 2**7 - 1),
-        (ua.VariantType.Byte, 0, 2**8 - 1),
-        (ua.VariantType.Int16, -(2**15), 2**15 - 1),
-        (ua.VariantType.UInt16, 0, 2**16 - 1),
-        (ua.VariantType.Int32, -(2**31), 2**31 - 1),
-        (ua.VariantType.UInt32, 0, 2**32 - 1),
-        (ua.VariantType.Int64, -(2**63), 2**63 - 1),
-        (ua.VariantType.UInt64, 0, 2**64 - 1),
-    )
-}
-FLOATS = {ua.VariantType.Float, ua.VariantType.Double}
-EPOCH = datetime(1970, 1, 1)
-GOOD, UNCERTAIN, BAD = 0, 1, 2  # the two highest bits of a status
+# How long a server is asked to keep a session of which it hears nothing: some periods, within these bounds.
+SESSION, LEAST_SESSION_S, MOST_SESSION_S = 3, 60.0, 3600.0
+KEPT = 2 / 3  # of the time that the server grants: after so long without a request one is made to keep the session
+KEPT_TRY = 1 / 6  # of it: so long such a request may take before the next one
+GONE = {
+    ua.StatusCodes.BadConnectionClosed,
+    ua.StatusCodes.BadSecureChannelClosed,
+    ua.StatusCodes.BadSecureChannelIdInvalid,
+    ua.StatusCodes.BadSecureChannelTokenUnknown,
+    ua.StatusCodes.BadSessionClosed,
+    ua.StatusCodes.BadSessionIdInvalid,
+    ua.StatusCodes.BadSessionNotActivated,
+}  # answers after which no other request has a chance
 
 
-class Reading(NamedTuple):
-    """A node's value. ``number`` is NaN where there is none, and ``text`` then says what is there instead."""
-
-    number: float
-    status: int
-    source_s: float | None  # source time [s since 1970]; None where the server gives none
-    kind: ua.VariantType | None
-    text: str = ""
-    words_held: str = ""  # of a node that holds a text
-
-    @property
-    def quality(self) -> int:
-        """GOOD, UNCERTAIN or BAD."""
-        return min(self.status >> 30, BAD)
-
-    @property
-    def words(self) -> str:
-        """The status by name."""
-        return words(self.status)
+class LateError(EndpointError):
+    """There was no answer in time."""
 
 
 class Link:
-    """A session, made by ``opened``. A call takes at most ``timeout_s`` and raises EndpointError where it fails."""
+    """A session, made by ``opened``. A call takes at most ``timeout_s`` and raises EndpointError where it fails.
+
+    A server closes a session of which it hears nothing for longer than it grants. Where the loop's own requests are
+    that far apart, the link reads the server's state between them, beside whatever else is asked for. asyncua renews
+    the secure channel once three quarters of its lifetime are over. ``gone`` says why the connection is of no use any
+    more, and ``on_gone`` is called when that becomes known.
+    """
 
     def __init__(self, client: Client, server: Server) -> None:
         self.client, self.server = client, server
+        self.on_gone: Callable[[], object] = lambda: None
+        self._gone = ""
+        self._asked_s = 0.0  # when the last request was made that the server has answered
+        self._keeping: asyncio.Task[None] | None = None
         self._securing = False
 
     @classmethod
-    async def opened(cls, server: Server) -> Link:
-        """Connect and log on, within ``server.connect_s``. EndpointError names what refused."""
+    async def opened(cls, server: Server, period_s: float = 0.0) -> Link:
+        """Connect and log on, within ``server.connect_s``. EndpointError names what refused.
+
+        ``period_s`` [s of the machine's clock] lies between two requests of the loop.
+        """
         # What this class does itself, with deadlines of its own, the library need not do beside it.
         client = Client(server.endpoint, timeout=server.connect_s, watchdog_intervall=1e6)
         client.application_uri = APPLICATION
-        client.session_timeout = 60_000
+        client.session_timeout = 1000 * min(max(LEAST_SESSION_S, SESSION * period_s), MOST_SESSION_S)
         link = cls(client, server)
         try:
             await in_time(link._log_on(), server.connect_s)
         except TimeoutError:
             link.abort()
-            raise EndpointError(
-                f"{server.endpoint} does not answer within {server.connect_s:g} s{link._hint()}"
-            ) from None
+            raise LateError(f"{server.endpoint} does not answer within {server.connect_s:g} s{link._hint()}") from None
         except LoopError:
             raise
         except AssertionError:  # asyncua asks for the endpoints in the clear first, and expects an answer
@@ -126,8 +116,44 @@ class Link:
         if server.user:
             client.set_user(server.user)
             client.set_password(server.password())
+        self._asked_s = asyncio.get_running_loop().time()
         await client.connect()
         self._securing = False
+        self._keeping = asyncio.create_task(self._keep())
+        renewing = client._renew_channel_task
+        if renewing is not None:
+            renewing.add_done_callback(self._unrenewed)
+
+    @property
+    def gone(self) -> str:
+        """Why this connection is of no use any more; empty while it may be of use."""
+        return self._gone or ("the connection is lost" if self.client.uaclient.protocol is None else "")
+
+    async def _keep(self) -> None:
+        """Ask for something before the server's patience ends, where nobody else does."""
+        patience_s, time = self.client.session_timeout / 1000, asyncio.get_running_loop().time
+        state = ua.NodeId(ua.Int32(ua.ObjectIds.Server_ServerStatus_State))
+        while True:
+            left_s = self._asked_s + KEPT * patience_s - time()
+            if left_s > 0:
+                await asyncio.sleep(left_s)
+                continue
+            try:
+                await self.values([state], KEPT_TRY * patience_s)
+            except LateError:
+                continue  # the loop's own readings judge a server that is silent
+            except EndpointError:
+                if self.gone:
+                    self.on_gone()
+                    return
+                await asyncio.sleep(KEPT_TRY * patience_s)
+
+    def _unrenewed(self, renewing: asyncio.Task[None]) -> None:
+        """The library tries once: a channel that was not renewed then ends soon."""
+        error = None if renewing.cancelled() else renewing.exception()
+        if error is not None and not self._gone:
+            self._gone = f"the secure channel could not be renewed: {_reason(error)}"
+            self.on_gone()
 
     async def resolved(self, nodes: Sequence[str], timeout_s: float) -> list[ua.NodeId]:
         """The server's ids of nodes. EndpointError for a text that is no id and a namespace that is not there."""
@@ -196,18 +222,25 @@ class Link:
                 with suppress(OSError):
                     wire.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             transport.abort()
+        if self._keeping is not None:
+            self._keeping.cancel()
         for name in ("_supervisor_task", "_stale_watchdog_task", "_renew_channel_task"):
             task = getattr(self.client, name, None)
             if task is not None:
                 task.cancel()
 
     async def _within(self, answer: Any, timeout_s: float) -> Any:
+        asked_s = asyncio.get_running_loop().time()
         try:
-            return await in_time(answer, timeout_s)
+            found = await in_time(answer, timeout_s)
         except TimeoutError:
-            raise EndpointError(f"{self.server.endpoint} does not answer within {timeout_s:.3g} s") from None
+            raise LateError(f"{self.server.endpoint} does not answer within {timeout_s:.3g} s") from None
         except Exception as error:
+            if isinstance(error, ua.UaStatusCodeError) and getattr(error, "code", None) in GONE:
+                self._gone = _reason(error)
             raise EndpointError(f"{self.server.endpoint}: {_reason(error)}") from None
+        self._asked_s = max(self._asked_s, asked_s)
+        return found
 
 
 async def in_time(doing: Awaitable[T], timeout_s: float) -> T:
@@ -247,54 +280,6 @@ def node_id(text: str, spaces: Sequence[str]) -> ua.NodeId:
         return ua.NodeId.from_string(text)
     except Exception:
         raise EndpointError(f"{text!r} is no node id; it is written as 'ns=2;s=TIC101.PV' or 'ns=2;i=1001'") from None
-
-
-def reading(value: ua.DataValue) -> Reading:
-    """A server's answer as a number with its quality and time."""
-    status = int(value.StatusCode.value) if value.StatusCode is not None else 0
-    when = value.SourceTimestamp
-    source = None if when is None else when.timestamp() if when.tzinfo else (when - EPOCH).total_seconds()
-    inner = value.Value
-    kind = None if inner is None else inner.VariantType
-    given = None if inner is None else inner.Value
-    if isinstance(given, bool | int | float) and not isinstance(given, ua.StatusCode):
-        number = float(given)
-        return Reading(number, status, source, kind, "" if math.isfinite(number) else f"{number}")
-    text = "no value" if given is None else f"{type(given).__name__} instead of a number"
-    return Reading(math.nan, status, source, kind, text, given if isinstance(given, str) else "")
-
-
-def variant(value: float, kind: ua.VariantType, low: float, high: float) -> ua.Variant:
-    """``value`` in a node's own type, within ``low`` and ``high`` also after it was rounded to that type.
-
-    EndpointError for a type that holds no number, and where no number of the type lies in the range.
-    """
-    if kind is ua.VariantType.Double:
-        return ua.Variant(value, kind)
-    if kind is ua.VariantType.Float:
-        near = np.float32(value)
-        if not low <= float(near) <= high:
-            near = np.nextafter(near, np.float32(math.inf if float(near) < low else -math.inf))
-        if low <= float(near) <= high:
-            return ua.Variant(float(near), kind)
-        raise EndpointError(f"no number of the type REAL lies within {low:g} .. {high:g}")
-    if kind is ua.VariantType.Boolean:
-        if value not in (0.0, 1.0):
-            raise EndpointError(f"the node is of the type Boolean; {value:g} is neither 0 nor 1")
-        return ua.Variant(value == 1.0, kind)
-    if kind in INTEGERS:
-        whole = round(value)
-        whole = math.ceil(value) if whole < low else math.floor(value) if whole > high else whole
-        least, most = INTEGERS[kind]
-        if low <= whole <= high and least <= whole <= most:
-            return ua.Variant(whole, kind)
-        raise EndpointError(f"no number of the type {kind.name} lies near {value:g} within {low:g} .. {high:g}")
-    raise EndpointError(f"the node is of the type {kind.name}, which holds no number")
-
-
-def words(status: int) -> str:
-    """A status by OPC UA's own name."""
-    return str(ua.StatusCode(ua.UInt32(status)).name)
 
 
 def _reason(error: BaseException) -> str:

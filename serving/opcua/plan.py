@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from serving.errors import EndpointError
 from serving.manifest import Manifest
-from serving.opcua.link import Link, variant
+from serving.opcua.link import Link
 from serving.opcua.settings import Nodes, Point
+from serving.opcua.values import exact, variant
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -90,4 +91,4 @@ class Plan:
         assert self._hand_back is not None
         assert self.nodes.hand_back is not None
         (node, kind), value = self._hand_back, self.nodes.hand_back.value
-        return node, variant(value, kind, value, value)
+        return node, exact(value, kind)

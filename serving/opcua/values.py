@@ -1,93 +1,104 @@
-"""What the answers of one reading say: values in engineering units, and the first thing that is wrong with them."""
+"""Values as a server gives and takes them: with quality and time, in a node's own type."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TypeAlias
+import math
+from datetime import datetime
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from asyncua import ua
 
-from serving.manifest import Manifest
-from serving.opcua.ages import Ages
-from serving.opcua.link import BAD, GOOD, UNCERTAIN, Reading
-from serving.opcua.plan import Plan
-from serving.opcua.settings import Nodes, Server
+from serving.errors import EndpointError
 
-Array: TypeAlias = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Values:
-    """What one reading brought. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
-
-    arrived_s: float  # on the endpoint's clock
-    pv: Array  # shape: (n_pv,)
-    mv: Array  # shape: (n_mv,)
-    dv: Array  # shape: (n_dv,)
-    age_s: float
-    fault: str
-    quality: tuple[int, ...]
-    asked_sp: Mapping[str, float] = field(default_factory=dict)
-    asked_mode: str = ""
-    starts: int = 0  # how often the server has started anew since the endpoint did
+INTEGERS = {
+    t: (low, high)
+    for t, low, high in (
+        (ua.VariantType.SByte, -(2**7), 2**7 - 1),
+        (ua.VariantType.Byte, 0, 2**8 - 1),
+        (ua.VariantType.Int16, -(2**15), 2**15 - 1),
+        (ua.VariantType.UInt16, 0, 2**16 - 1),
+        (ua.VariantType.Int32, -(2**31), 2**31 - 1),
+        (ua.VariantType.UInt32, 0, 2**32 - 1),
+        (ua.VariantType.Int64, -(2**63), 2**63 - 1),
+        (ua.VariantType.UInt64, 0, 2**64 - 1),
+    )
+}
+FLOATS = {ua.VariantType.Float, ua.VariantType.Double}
+EPOCH = datetime(1970, 1, 1)
+GOOD, UNCERTAIN, BAD = 0, 1, 2  # the two highest bits of a status
 
 
-class Judge:
-    """Makes values of answers. It remembers the plant's watchdog from reading to reading."""
+class Reading(NamedTuple):
+    """A node's value. ``number`` is NaN where there is none, and ``text`` then says what is there instead."""
 
-    def __init__(self, manifest: Manifest, server: Server, nodes: Nodes) -> None:
-        self.manifest, self.server, self.nodes = manifest, server, nodes
-        self._watched = float("nan"), 0  # the watchdog, and for how many readings it has stood there
+    number: float
+    status: int
+    source_s: float | None  # source time [s since 1970]; None where the server gives none
+    kind: ua.VariantType | None
+    text: str = ""
+    words_held: str = ""  # of a node that holds a text
 
-    def values(
-        self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, *, unbeaten: str, starts: int
-    ) -> Values:
-        """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
-        fault, found = "", dict[str, float]()
-        for (name, point, judged), answer in zip(plan.points, answers, strict=False):
-            usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
-            # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
-            # is a read-back, which says where the MV stands also while a PV is bad.
-            told = usable or (judged and not name.startswith("MV "))
-            found[name] = point.scale * answer.number + point.offset if told else np.nan
-            if fault or not judged:
-                continue
-            if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
-                fault = f"{name}: {answer.words}"
-            elif answer.text:
-                fault = f"{name}: {answer.text}"
-        judge = self.server.source_time == "judge"
-        timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
-        m = self.manifest
-        asked_sp = {s.name: found[f"SP {s.name}"] for s in m.sp if np.isfinite(found.get(f"SP {s.name}", np.nan))}
-        mode = ""
-        if self.nodes.mode is not None:
-            wanted = found["mode"]
-            mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
-        if self.nodes.watchdog and not fault:
-            fault = self.dead(found["watchdog"])
-        fault = fault or unbeaten
-        n = len(m.pv) + len(m.mv) + len(plan.dv_names)
-        return Values(
-            arrived_s,
-            np.array([found[f"PV {s.name}"] for s in m.pv]),
-            np.array([found[f"MV {s.name}"] for s in m.mv]),
-            np.array([found.get(f"DV {s.name}", 0.0) for s in m.dv]),
-            max(timed, default=0.0),
-            fault,
-            tuple(a.status for a in answers[:n]),
-            asked_sp,
-            mode,
-            starts,
-        )
+    @property
+    def quality(self) -> int:
+        """GOOD, UNCERTAIN or BAD."""
+        return min(self.status >> 30, BAD)
 
-    def dead(self, watchdog: float) -> str:
-        """Why the server's side counts as dead; empty while its watchdog moves."""
-        last, scans = self._watched
-        moves = watchdog != last and not np.isnan(watchdog)  # one that is gone has stopped, too
-        self._watched = (watchdog, 0 if moves else scans + 1)
-        if self._watched[1] < self.nodes.watchdog_scans:
-            return ""
-        return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"
+    @property
+    def words(self) -> str:
+        """The status by name."""
+        return words(self.status)
+
+
+def reading(value: ua.DataValue) -> Reading:
+    """A server's answer as a number with its quality and time."""
+    status = int(value.StatusCode.value) if value.StatusCode is not None else 0
+    when = value.SourceTimestamp
+    source = None if when is None else when.timestamp() if when.tzinfo else (when - EPOCH).total_seconds()
+    inner = value.Value
+    kind = None if inner is None else inner.VariantType
+    given = None if inner is None else inner.Value
+    if isinstance(given, bool | int | float) and not isinstance(given, ua.StatusCode):
+        number = float(given)
+        return Reading(number, status, source, kind, "" if math.isfinite(number) else f"{number}")
+    text = "no value" if given is None else f"{type(given).__name__} instead of a number"
+    return Reading(math.nan, status, source, kind, text, given if isinstance(given, str) else "")
+
+
+def variant(value: float, kind: ua.VariantType, low: float, high: float) -> ua.Variant:
+    """``value`` in a node's own type, within ``low`` and ``high`` also after it was rounded to that type.
+
+    EndpointError for a type that holds no number, and where no number of the type lies in the range.
+    """
+    if kind is ua.VariantType.Double:
+        return ua.Variant(value, kind)
+    if kind is ua.VariantType.Float:
+        near = np.float32(value)
+        if not low <= float(near) <= high:
+            near = np.nextafter(near, np.float32(math.inf if float(near) < low else -math.inf))
+        if low <= float(near) <= high:
+            return ua.Variant(float(near), kind)
+        raise EndpointError(f"no number of the type REAL lies within {low:g} .. {high:g}")
+    if kind is ua.VariantType.Boolean:
+        if value not in (0.0, 1.0):
+            raise EndpointError(f"the node is of the type Boolean; {value:g} is neither 0 nor 1")
+        return ua.Variant(value == 1.0, kind)
+    if kind in INTEGERS:
+        whole = round(value)
+        whole = math.ceil(value) if whole < low else math.floor(value) if whole > high else whole
+        least, most = INTEGERS[kind]
+        if low <= whole <= high and least <= whole <= most:
+            return ua.Variant(whole, kind)
+        raise EndpointError(f"no number of the type {kind.name} lies near {value:g} within {low:g} .. {high:g}")
+    raise EndpointError(f"the node is of the type {kind.name}, which holds no number")
+
+
+def exact(value: float, kind: ua.VariantType) -> ua.Variant:
+    """``value`` itself in a node's own type, or the nearest one of a REAL; EndpointError where the type has it not."""
+    low, high = (-math.inf, math.inf) if kind in FLOATS else (value, value)
+    return variant(value, kind, low, high)
+
+
+def words(status: int) -> str:
+    """A status by OPC UA's own name."""
+    return str(ua.StatusCode(ua.UInt32(status)).name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import os
-import socket
 import sys
 import threading
 from contextlib import suppress
@@ -14,11 +13,13 @@ from typing import Any
 
 import uvicorn
 
+from serving.errors import LoopError
+from serving.page.address import listening
 from serving.page.app import PageApp
 from serving.page.patience import Impatient
 from serving.page.settings import Page
 from serving.station.control import asked
-from serving.words import named
+from serving.words import first_line, named
 
 NICE = 5  # the loop comes first
 
@@ -30,14 +31,12 @@ def main() -> int:
     page = Page(told["listen"], allow_remote=told["allow_remote"], names=tuple(told["names"]), **files)
     with suppress(OSError):
         os.nice(NICE)
-    host, port = page.address
     try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        listening = socket.create_server((host, port), family=family, backlog=128)
-    except OSError as error:
-        _say(error=f"the page cannot listen at {page.listen}: {error.strerror or error}")
+        wire = listening(page)
+    except LoopError as error:
+        _say(error=first_line(error))
         return 2
-    port = listening.getsockname()[1]
+    host, port = page.address[0], wire.getsockname()[1]
     app = PageApp(
         Path(told["journal"]), functools.partial(asked, Path(told["door"])), told["token"], lambda line: _say(line=line)
     )
@@ -63,7 +62,7 @@ def main() -> int:
     threading.Thread(target=_end_with_the_loop, daemon=True).start()
     shown = f"[{host}]" if ":" in host else host
     _say(ready=f"{scheme}://{shown}:{port}")
-    uvicorn.Server(config).run(sockets=[listening])
+    uvicorn.Server(config).run(sockets=[wire])
     return 0
 
 

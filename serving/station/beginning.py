@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from serving.guard import implausible
 from serving.manifest import Signal
-from serving.opcua.values import Values
+from serving.opcua.sampling import Values
 
 Array: TypeAlias = NDArray[np.float64]
 

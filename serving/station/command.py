@@ -148,10 +148,12 @@ def _check(options: argparse.Namespace) -> int:
     controller = Controller(settings.controller, settings.sha256 or None, settings.trusted)
     manifest = controller.manifest
     from serving.opcua.inspection import Found, inspected
+    from serving.station.rehearsal import rehearsed
 
-    settings.guards.of(manifest, settings.max_age_s(manifest.period_s))
-    settings.hold.fallback(manifest.mv)
-    rows = inspected(manifest, settings.server, settings.nodes)
+    here = rehearsed(settings, controller)
+    for line in here.wrong:
+        print(f"would stop the loop: {line}", file=sys.stderr)
+    rows = inspected(manifest, settings.server, settings.nodes, settings.guards.margin)
     names = [f.name for f in fields(Found) if f.name not in {"wrong", "note"}]
     table = [names, *([getattr(row, name) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
@@ -160,13 +162,14 @@ def _check(options: argparse.Namespace) -> int:
     if controller.signed is not None:
         print(f"{controller.path.name}: signed by {controller.signed.words}")
     wrong = [f"{row.signal}: {row.wrong}" for row in rows if row.wrong]
-    for note in [f"{row.signal}: {row.note}" for row in rows if row.note] + _warnings(settings) + ending(controller):
+    notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
+    for note in [*notes, *here.notes, *_warnings(settings), *ending(controller)]:
         print(f"note: {note}")
     for line in wrong:
         print(f"would stop the loop: {line}", file=sys.stderr)
-    if not wrong:
+    if not wrong and not here.wrong:
         print("nothing would stop the loop")
-    return 2 if wrong else 0
+    return 2 if wrong or here.wrong else 0
 
 
 def _warnings(settings: Settings) -> list[str]:

@@ -82,7 +82,7 @@ class Hold:
             raise LoopError('safe MVs go with then = "safe", and it with them')
 
     def fallback(self, mv: tuple[Signal, ...]) -> Fallback | None:
-        """What the loop is to do; LoopError where an MV has no safe value or rate."""
+        """What the loop is to do; LoopError where an MV has no safe value or rate, or one outside its range."""
         if self.then == "stay":
             return None
         if self.then == "hand back":
@@ -94,7 +94,9 @@ class Hold:
                     raise LoopError(f"hold.{word} has {name!r}, which is no MV{nearest(name, names)}")
             if missing := [n for n in names if n not in given]:
                 raise LoopError(f"hold.{word} lacks {', '.join(missing)}")
-        return Fallback(self.max_s, tuple(self.safe[n] for n in names), tuple(self.rate[n] for n in names))
+        found = Fallback(self.max_s, tuple(self.safe[n] for n in names), tuple(self.rate[n] for n in names))
+        found.check(mv)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +136,8 @@ class Settings:
     def __post_init__(self) -> None:
         if not (isfinite(self.speed) and self.speed > 0):
             raise LoopError(f"speed is {self.speed}; it must be above zero (1 is real time)")
+        if self.transfer_s is not None and not (isfinite(self.transfer_s) and self.transfer_s >= 0):
+            raise LoopError(f"transfer_s is {self.transfer_s}; it must be a finite number of seconds, 0 or more")
         if self.trusted == ():
             raise LoopError("trusted names no public key, so no controller could be loaded; name one, or leave it out")
         if self.hold.then == "hand back" and self.nodes.hand_back is None:

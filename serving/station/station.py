@@ -18,19 +18,20 @@ from serving.clock import MonotonicClock
 from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
 from serving.grid import RunReport
-from serving.guard import Guard, Sample
+from serving.guard import Sample
 from serving.journal import Journal, JournalReader
-from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
+from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.opcua import certificates
 from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.link import words
+from serving.opcua.sampling import Values
 from serving.opcua.settings import Server
-from serving.opcua.values import Values
+from serving.opcua.values import words
 from serving.page.process import PageProcess
 from serving.station.beginning import begun_at, near, usable
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
+from serving.station.making import control_loop
 from serving.station.recorder import Recorder
 from serving.station.requests import Change, Request, change
 from serving.station.said import Said
@@ -72,8 +73,7 @@ class Station:
         self.controller = TrustedController(settings.controller, settings.sha256 or None, self.trusted)
         m = self.manifest
         age = settings.max_age_s(m.period_s)
-        self.fallback = settings.hold.fallback(m.mv)
-        self.guards(m)  # refuses what is none
+        control_loop(settings, self.controller)  # settings that do not fit it are said before it is connected
         self.clock = MonotonicClock(settings.speed)
         self.endpoint = OpcUaEndpoint(
             m, settings.server, settings.nodes, max_age_s=age, speed=settings.speed, tell=self._connection
@@ -106,10 +106,6 @@ class Station:
     def manifest(self) -> Manifest:
         """Of the controller that the loop began with: the signals that are read, whichever controller takes over."""
         return self.controller.manifest
-
-    def guards(self, manifest: Manifest) -> tuple[Guard, ...]:
-        """The guards for a controller."""
-        return self.settings.guards.of(manifest, self.settings.max_age_s(manifest.period_s))
 
     def ending(self) -> list[str]:
         """A line for what the loop runs by and that ends soon: its controller's signature, its certificate."""
@@ -147,19 +143,8 @@ class Station:
                 self.recorder.note("change", "loop", "ended before the first scan: nothing was written")
                 return RunReport(0, 0, 0, 0.0)
             pv = None if first is None else first.pv[: len(m.sp)]
-            self.loop = ControlLoop(
-                self.controller,
-                self.endpoint,
-                sp=near(pv, m.sp),
-                mv=None if first is None else begun_at(first.mv, m.mv),
-                mode=Mode(s.start),
-                guards=self.guards,
-                recover_after=s.hold.recover_after or None,
-                clock=self.clock,
-                warm_lead_s=WARM_LEAD_S * s.speed,
-                transfer_s=s.over_s(m.period_s),
-                fallback=self.fallback,
-            )
+            mv = None if first is None else begun_at(first.mv, m.mv)
+            self.loop = control_loop(s, self.controller, self.endpoint, sp=near(pv, m.sp), mv=mv, clock=self.clock)
             self.recorder.begin(self.controller)
             signed = signer(self.controller)
             by = "" if signed is None else f"; {self.controller.path.name} is signed by {signed.words}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from serving.opcua.values import Values
+from serving.opcua.sampling import Values
 
 MODE = "mode"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import socket
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from plant_servers import Plant
+from plant_servers import Plant, RunningLoop
 from processes import within
 
 from pipeline.__main__ import main
 from serving import LoopError, Signal
-from serving.opcua.inspection import other_unit
+from serving.opcua.inspection import _refused, _unfit, other_unit
 from serving.opcua.settings import Point
 from serving.station.lease import Lease
 from serving.station.settings import Settings
@@ -117,6 +118,113 @@ def test_check_refuses_another_unit_unless_it_is_explained(
     assert "would stop the loop: PV T: the server says the unit is K, loop.toml says degC" in capsys.readouterr().err
     changed(settings, 'unit = "degC"', 'unit = "K"')
     assert main(["loop", "check"]) == 0
+
+
+HALF = 'hand_back = { node = "nsu=urn:loopwright:plant;s=Control.Owner", value = 0.5 }'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('then = "stay"', 'then = "safe"\nsafe = { T_j = 900 }\nrate = { T_j = 1 }', "the safe MV T_j = 900"),
+        ("transfer_s = 10", "transfer_s = -5", "transfer_s is -5"),
+        (
+            "watchdog_scans = 3",
+            f"watchdog_scans = 3\n{HALF}",
+            "value is 0.5; no number of the type Int32 lies near 0.5",
+        ),
+        ('file = "loop.journal"', 'file = "nowhere/loop.journal"', "there is no folder"),
+        ('file = "loop.journal"', 'file = "loop.toml"', "loop.toml is no journal"),
+        (
+            'page = "127.0.0.1:0"',
+            'page = { listen = "127.0.0.1:0", token_file = "none.txt" }',
+            "page.token_file cannot be read",
+        ),
+        (
+            'page = "127.0.0.1:0"',
+            'page = { listen = "127.0.0.1:0", certificate = "loop-certificate.der", private_key = "loop-key.pem" }',
+            "the page's certificate or key cannot be used",
+        ),
+    ],
+)
+def test_what_would_stop_the_loop_is_said_by_check_and_not_by_the_plant(
+    settings: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, words: str
+) -> None:
+    changed(settings, old, new)
+    capsys.readouterr()
+    assert main(["loop", "check"]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+    assert "nothing would stop the loop" not in said.out
+
+
+def test_check_tells_of_a_port_and_an_mv_that_others_have(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"127.0.0.1:{other.getsockname()[1]}"
+        changed(settings, "127.0.0.1:0", taken)
+        read = Settings.read(settings)
+        lease = Lease(read.server.endpoint, [p.node for p in read.nodes.points("mv").values()])
+        capsys.readouterr()
+        assert main(["loop", "check"]) == 2
+        lease.release()
+    port, lock = sorted(capsys.readouterr().err.splitlines(), key=lambda line: "written by" in line)
+    assert port.startswith(f"would stop the loop: the page cannot listen at {taken}")
+    assert f"is written by another loop (process {os.getpid()}); end that one first" in lock
+
+
+def test_check_beside_the_loop_itself_finds_nothing_wrong(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    running = RunningLoop(settings)
+    try:
+        capsys.readouterr()
+        assert main(["loop", "check"]) == 0
+    finally:
+        running.end()
+    assert f"note: this loop runs already (process {os.getpid()})" in capsys.readouterr().out
+    assert main(["loop", "check"]) == 0
+    assert "runs already" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "words"),
+    [
+        (2, "Boolean", "neither 0 nor 1"),
+        (1, "Boolean", ""),
+        (0.5, "Int32", "Int32"),
+        (-1, "Byte", "Byte"),
+        (0.1, "Float", ""),
+    ],
+)
+def test_a_number_that_hands_the_plant_back_fits_its_nodes_type(value: float, kind: str, words: str) -> None:
+    found = _unfit(value, kind)
+    assert words in found
+    assert bool(found) is bool(words)
+
+
+@pytest.mark.parametrize(("shown", "stops"), [(610.0, False), (621.0, True)])
+def test_check_agrees_with_the_guards_on_a_pv_beyond_its_range(
+    settings: Path, capsys: pytest.CaptureFixture[str], shown: float, stops: bool
+) -> None:
+    """The range of T ends at 600 K, and guards.margin allows 20 K more."""
+    changed(
+        settings,
+        'T = "nsu=urn:loopwright:plant;s=PV.T"',
+        f'T = {{ node = "nsu=urn:loopwright:plant;s=PV.T", scale = 1e-9, offset = {shown} }}',
+    )
+    capsys.readouterr()
+    assert main(["loop", "check"]) == (2 if stops else 0)
+    said = capsys.readouterr()
+    assert f"PV T: {shown:g} lies outside 200 .. 600 K; another unit?" in (said.err if stops else said.out)
+
+
+def test_no_guard_looks_at_the_value_of_a_dv_a_set_point_or_a_node_that_is_written() -> None:
+    signal = Signal("x", "K", 0.0, 100.0)
+    refused = [
+        name for name in ("PV x", "MV x", "MV x, written", "DV x", "SP x") if _refused(name, signal, 110.0, 0.05)
+    ]
+    assert refused == ["PV x", "MV x"]
+    assert not _refused("MV x", signal, 101.9, 0.05)
+    assert _refused("MV x", signal, 102.1, 0.05)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-// A plant of first order behind node-opcua, a stack that shares nothing with the client's: node server.js PORT FOLDER MS
+// A plant of first order behind node-opcua, a stack that shares nothing with the client's: node server.js PORT FOLDER MS [LIFETIME]
 "use strict";
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
 const { MessageSecurityMode, SecurityPolicy } = require("node-opcua-secure-channel");
@@ -6,7 +6,7 @@ const { OPCUAServer } = require("node-opcua-server");
 const { DataType } = require("node-opcua-variant");
 const { StatusCodes } = require("node-opcua-status-code");
 
-const [port, folder, milliseconds] = process.argv.slice(2);
+const [port, folder, milliseconds, lifetime] = process.argv.slice(2); // LIFETIME of a channel [ms]
 const NAMESPACE = "urn:loopwright:plant";
 
 async function main() {
@@ -17,6 +17,7 @@ async function main() {
     serverCertificateManager: certificates,
     securityPolicies: [SecurityPolicy.Basic256Sha256],
     securityModes: [MessageSecurityMode.SignAndEncrypt],
+    defaultSecureTokenLifetime: lifetime ? Number(lifetime) : undefined,
     allowAnonymous: false,
     userManager: { isValidUser: (user, password) => user === "loopwright" && password === "a secret" },
   });

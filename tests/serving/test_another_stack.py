@@ -34,14 +34,15 @@ NODE = shutil.which("node")
 if NODE is None or not (HERE / "node_modules").is_dir():
     pytest.skip("node or its packages are missing (npm ci in tests/node_opcua)", allow_module_level=True)
 
+LIFETIME_MS = 2_500  # of a secure channel: the shortest that node-opcua grants
 PERIOD_MS = 100  # as fast as the loop's: 0.5 s, five times as fast as the clock
 
 
 class NodeServer:
     """The server as a process; ``lines`` is what it has said of its MV node."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.port = folder, free_port()
+    def __init__(self, folder: Path, *more: str) -> None:
+        self.folder, self.port, self.more = folder, free_port(), more
         self.log = folder / "node.log"
         self.process: subprocess.Popen[str] | None = None
 
@@ -54,7 +55,7 @@ class NodeServer:
         before = self.log.read_text().count('"ready"') if self.log.exists() else 0
         with self.log.open("a") as said:
             self.process = subprocess.Popen(
-                [NODE, str(HERE / "server.js"), str(self.port), str(self.folder), str(PERIOD_MS)],
+                [NODE, str(HERE / "server.js"), str(self.port), str(self.folder), str(PERIOD_MS), *self.more],
                 stdout=said,
                 stderr=said,
             )
@@ -99,6 +100,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeServer]:
 
 @pytest.fixture
 def settings(server: NodeServer, monkeypatch: pytest.MonkeyPatch) -> Path:
+    return settings_of(server, monkeypatch)
+
+
+def settings_of(server: NodeServer, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("LOOP_PASSWORD", "a secret")
     path = server.folder / "loop.toml"
     path.unlink(missing_ok=True)
@@ -174,3 +179,25 @@ def test_a_loop_from_the_shadow_through_a_fault_and_a_killed_server(settings: Pa
     assert {"AUTO", "HOLD", "SHADOW"} == {scan.mode for _, _, scan in scans}
     assert any("BadSensorFailure" in what for what in events)
     assert sum(what.startswith("connected to") for what in events) >= 2
+
+
+def test_a_channel_that_lasts_some_seconds_is_renewed_under_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This server forgets a token after five quarters of its lifetime, and takes nothing more under it."""
+    server = NodeServer(tmp_path, str(LIFETIME_MS))
+    server.start()
+    loop = RunningLoop(settings_of(server, monkeypatch))
+    try:
+        link = loop.station.endpoint._link
+        assert link is not None
+        assert link.client.secure_channel_timeout == LIFETIME_MS
+        assert ask(loop.settings.journal.file, {"do": "mode", "value": "AUTO", "who": "anna"})
+        lifetimes = 3
+        assert within(60, lambda: len(loop.commands) > lifetimes * LIFETIME_MS / PERIOD_MS)
+        assert loop.station.endpoint.connections == 1
+        n = len(server.rows())
+        assert within(20, lambda: len({row["asked"] for row in server.rows()[n:]}) > 2)  # it is written, too
+    finally:
+        loop.end()
+        server.end()

@@ -59,7 +59,7 @@ def test_whatever_ends_the_thread_the_plant_is_to_be_reached_again(
 ) -> None:
     tries, told = [0], list[str]()
 
-    async def opened(_: Server) -> Link:
+    async def opened(_: Server, __: float) -> Link:
         tries[0] += 1
         raise OwnKindOfCancellation if tries[0] == 1 else OSError("refused")
 

@@ -7,6 +7,7 @@ was over, until AUTO.
 from __future__ import annotations
 
 import asyncio
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from processes import within
 
 from serving import Controller, Mode
 from serving.journal import Scan
+from serving.opcua.certificates import make
 from serving.opcua.settings import HandBack, ModeNode
 from serving.standing import SAME
 from serving.station.settings import Hold, Settings
@@ -37,7 +39,8 @@ def begun(folder: Path, port: int, **changed: Any) -> RunningLoop:
     """A loop whose settings are ``changed``."""
     watched = f'heartbeat = "{SPACE}Control.Heartbeat"\nwatchdog = "{SPACE}Control.Watchdog"'
     settings = Settings.read(loop_toml(folder, f"opc.tcp://127.0.0.1:{port}", speed=SPEED, nodes=watched))
-    nodes, server = replace(settings.nodes, **changed.pop("nodes", {})), replace(settings.server, connect_s=2.0)
+    nodes = replace(settings.nodes, **changed.pop("nodes", {}))
+    server = replace(settings.server, connect_s=2.0, **changed.pop("server", {}))
     hold = changed.pop("hold", Hold(recover_after=RECOVER))
     return RunningLoop(replace(settings, nodes=nodes, server=server, hold=hold, **changed))
 
@@ -124,6 +127,12 @@ def wire(plant: Plant) -> Iterator[Wire]:
     made.close()
 
 
+def show(capsys: pytest.CaptureFixture[str], name: str, until_hold: int, until_auto: int, reason: str) -> None:
+    """A row of the table of faults."""
+    with capsys.disabled():
+        print(f"\n{name:28} HOLD after {until_hold:2} periods, AUTO {until_auto:3} after its end: {reason}")
+
+
 def in_flight(found: list[Scan]) -> set[float]:
     """The MVs of the last scans before each HOLD."""
     mv = 1 + 2  # behind sp and pv
@@ -181,8 +190,7 @@ def test_a_fault_holds_and_is_recovered_from(
     besides = {"server frozen": in_flight(found)}.get(name, {START} if name in ANEW else set())
     legal(found, plant, since, besides)
     assert n <= len(found) <= n + 3  # every scan is in the journal
-    with capsys.disabled():
-        print(f"\n{name:28} HOLD after {until_hold:2} periods, AUTO {until_auto:3} after its end: {reason}")
+    show(capsys, name, until_hold, until_auto, reason)
     assert until_hold <= 5
     assert until_auto <= (RECONNECTED if name in CUT else CONNECTED)
 
@@ -268,6 +276,58 @@ def test_the_plants_own_operator_sets_mode_and_set_point(plant: Plant, wire: Wir
     assert within(20, lambda: any("refused: set point C_A 1.7" in line for line in running.told))
     assert running.commands[-1].sp.tolist() == [0.9]
     running.end()
+
+
+@pytest.fixture
+def strict(tmp_path: Path) -> Iterator[Plant]:
+    """A plant whose server takes only clients that it trusts: the loop is one of them."""
+    folder = tmp_path / "strict"
+    folder.mkdir()
+    make(tmp_path / "loop.der", tmp_path / "loop.pem")
+    trusted = folder / "server" / "trusted"
+    trusted.mkdir(parents=True)
+    shutil.copy(tmp_path / "loop.der", trusted)
+    made = Plant(folder, CASE, SPEED, "--only-trusted")
+    made.start()
+    yield made
+    made.end()
+
+
+def test_a_loop_whose_certificate_is_rejected_holds_until_it_is_trusted_again(
+    strict: Plant, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The server is started anew with a trust list that lacks the loop's certificate, and then with one that has it."""
+    trusted, own = strict.folder / "server" / "trusted" / "loop.der", tmp_path / "loop.der"
+    secured = {"security": "Basic256Sha256", "certificate": own, "private_key": tmp_path / "loop.pem"}
+    since = len(strict.actuator())
+    running = begun(tmp_path, strict.port, server=secured)
+    assert running.ask(lambda loop: loop.set_sp([0.93]), "set point") == ""
+    running.becomes(Mode.AUTO, 120, scans=8)
+    strict.end()
+    until_hold = running.becomes(Mode.HOLD, 10)
+    trusted.unlink()
+    strict.start()
+    rejected = f"let the server trust {own}"
+    assert within(60, lambda: rejected in running.commands[-1].reason), running.told
+    running.becomes(Mode.HOLD, scans=10)
+    reason = running.commands[-1].reason
+    held = {tuple(c.mv.tolist()) for c in running.commands[-8:]}
+    asked = {row["asked"][0] for row in strict.actuator()[-3:]}
+    strict.end()
+    shutil.copy(own, trusted)
+    strict.start()
+    until_auto = running.becomes(Mode.AUTO, 60)
+    running.becomes(Mode.AUTO, scans=5)
+    n = len(running.commands)
+    running.end()
+    found = running.scans()
+    assert len(held) == 1
+    assert asked == {START}  # the server's own start: nobody has written there
+    legal(found, strict, since, {START})
+    assert n <= len(found) <= n + 3
+    show(capsys, "certificate rejected", until_hold, until_auto, reason)
+    assert until_hold <= 5
+    assert until_auto <= RECONNECTED
 
 
 def told(running: RunningLoop, words: str) -> list[str]:
@@ -365,18 +425,40 @@ def test_a_plant_is_handed_back_and_asked_for_again(plant: Plant, wire: Wire, tm
     running.end()
 
 
-def test_a_servers_clock_may_be_an_hour_off_and_may_be_set(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+def test_a_servers_clock_may_be_an_hour_off_and_may_be_set(
+    plant: Plant, wire: Wire, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Ages are judged by how source times advance: an offset is none, and a clock that is set costs a few scans."""
     write(plant, "Faults.Clock", -3600.0)
+    before = len(plant.actuator())
+    assert within(20, lambda: len(plant.actuator()) > before + 1)  # the last command of the loop before has arrived
+    since = len(plant.actuator())
     try:
         running = begun(tmp_path, wire.port)
-        running.becomes(Mode.AUTO, scans=30)
+        assert running.ask(lambda loop: loop.set_sp([0.93]), "set point") == ""
+        running.becomes(Mode.AUTO, 120, scans=30)
         assert {c.mode for c in running.commands[10:]} == {Mode.AUTO}
-        for offset in (3600.0, 0.0):
+        for offset, name in ((3600.0, "clock set 2 h ahead"), (0.0, "clock set 1 h back")):
+            at = len(running.commands)
             write(plant, "Faults.Clock", offset)
-            before = len(running.commands)
-            assert within(20, lambda: len(running.commands) > before + 12)  # noqa: B023
+            assert within(20, lambda: len(running.commands) > at + 12)  # noqa: B023
             running.becomes(Mode.AUTO, scans=20)
+            modes = [c.mode for c in running.commands[at:]]
+            assert set(modes) <= {Mode.AUTO, Mode.HOLD}
+            if Mode.HOLD not in modes:
+                with capsys.disabled():
+                    print(f"\n{name:28} no HOLD")
+                continue
+            until_hold = modes.index(Mode.HOLD)
+            held = len(modes) - modes[::-1].index(Mode.HOLD) - until_hold
+            show(capsys, name, until_hold, held, running.commands[at + until_hold].reason)
+            assert until_hold <= 5
+            assert held <= CONNECTED
+        assert Mode.HOLD in modes  # of the clock that was set back
+        n = len(running.commands)
         running.end()
+        found = running.scans()
+        legal(found, plant, since, set())
+        assert n <= len(found) <= n + 3
     finally:
         write(plant, "Faults.Clock", 0.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,9 @@ from processes import within
 
 from serving import Controller, EndpointError
 from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.link import Link, Reading, node_id
+from serving.opcua.link import LateError, Link, node_id
 from serving.opcua.settings import Nodes, Server
+from serving.opcua.values import Reading
 
 pytest_plugins = ["small_laws"]
 GOOD, REFUSED, MISMATCH = 0, ua.StatusCodes.BadNotWritable, ua.StatusCodes.BadTypeMismatch
@@ -30,7 +30,8 @@ class MadeUpLink:
         self.held: dict[str, Any] = {LEASE: ""}
         self.refuses: dict[str, int] = {}
         self.silent, self.opened, self.reads = False, 0, 0
-        self.client = SimpleNamespace(uaclient=SimpleNamespace(protocol=object()))
+        self.fails = ""  # why readings do
+        self.gone, self.on_gone = "", lambda: None
 
     async def resolved(self, nodes: Sequence[str], _: float) -> list[ua.NodeId]:
         return [node_id(n, []) for n in nodes]
@@ -38,7 +39,9 @@ class MadeUpLink:
     async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
         self.reads += 1
         if self.silent:
-            raise EndpointError("it does not answer")
+            raise LateError("it does not answer")
+        if self.fails:
+            raise EndpointError(self.fails)
         names = [n.to_string() for n in nodes]
         return [
             Reading(1.0, 0, None, self.kinds.get(n, ua.VariantType.Double), "", self.held.get(n, "")) for n in names
@@ -68,14 +71,21 @@ class MadeUpLink:
 class Scanning:
     """An endpoint on that server, scanned by hand."""
 
-    def __init__(self, controller: Controller, link: MadeUpLink) -> None:
+    def __init__(
+        self, controller: Controller, link: MadeUpLink, max_age_s: float = 5.0, rewrite_s: float = 0.0
+    ) -> None:
         m = controller.manifest
         nodes = {g: {s.name: f"ns=2;s={g}.{s.name}" for s in m.signals(g)} for g in ("pv", "mv", "dv")}
-        server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
+        server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, rewrite_s=rewrite_s)
         self.told: list[str] = []
         self.link = link
         self.endpoint = OpcUaEndpoint(
-            m, server, Nodes(**nodes, heartbeat=BEAT, lease=LEASE), max_age_s=5.0, speed=25.0, tell=self.told.append
+            m,
+            server,
+            Nodes(**nodes, heartbeat=BEAT, lease=LEASE),
+            max_age_s=max_age_s,
+            speed=25.0,
+            tell=self.told.append,
         )
         self.endpoint.start()
 
@@ -101,7 +111,7 @@ class Scanning:
 def link(monkeypatch: pytest.MonkeyPatch) -> MadeUpLink:
     made = MadeUpLink()
 
-    async def opened(_: Server) -> MadeUpLink:
+    async def opened(_: Server, __: float) -> MadeUpLink:
         made.opened += 1
         return made
 
@@ -159,6 +169,27 @@ def test_a_lease_that_is_refused_is_lost_and_nothing_more_is_written(scanning: S
     assert link.held[mv] == 1.0
 
 
+def test_a_lease_that_another_loop_took_is_told_also_while_the_mv_rests(
+    controller: Controller, link: MadeUpLink
+) -> None:
+    """An MV that stands is not sent for a long time, and the other loop moves it meanwhile."""
+    scanning = Scanning(controller, link, rewrite_s=1e9)
+    try:
+        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+        for _ in range(5):
+            assert scanning.scan() == ""
+        mv = next(name for name in link.held if "mv." in name)
+        link.held[mv], link.held[LEASE] = "as the other one has it", "other:1:a 1e6 1"
+        assert scanning.becomes("the plant is controlled by other:1:a")
+        assert link.held[LEASE] == "other:1:a 1e6 1"
+        assert link.held[mv] == "as the other one has it"
+        link.held[LEASE] = ""  # it has given it back
+        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+        assert link.held[mv] == 1.0
+    finally:
+        scanning.endpoint.close()
+
+
 def test_a_connection_that_is_lost_by_silence_is_told_once_and_so_is_the_next_one(
     scanning: Scanning, link: MadeUpLink
 ) -> None:
@@ -170,3 +201,37 @@ def test_a_connection_that_is_lost_by_silence_is_told_once_and_so_is_the_next_on
         assert scanning.becomes("")
     connected = "connected to opc.tcp://127.0.0.1:1"
     assert scanning.told == [connected, "it does not answer", connected, "it does not answer", connected]
+
+
+def test_a_reading_that_fails_is_a_fault_however_young_the_one_before_may_be(
+    controller: Controller, link: MadeUpLink
+) -> None:
+    """An answer that is late is judged by its age; one that says that nothing was read is not."""
+    scanning = Scanning(controller, link, max_age_s=1e9)
+    try:
+        assert scanning.becomes("")
+        endpoint = scanning.endpoint
+        link.silent = True
+        scanning.scan()
+        assert within(20, lambda: endpoint.trouble == "it does not answer")
+        assert endpoint.read().fault == ""
+        link.silent, link.fails = False, "BadTooManyOperations"
+        assert within(20, lambda: endpoint.trouble == "BadTooManyOperations")
+        with pytest.raises(EndpointError, match="BadTooManyOperations"):
+            endpoint.read()
+        link.fails = ""
+        assert scanning.becomes("")
+    finally:
+        scanning.endpoint.close()
+
+
+def test_a_connection_that_the_server_has_ended_is_made_anew_at_once(scanning: Scanning, link: MadeUpLink) -> None:
+    """Between two scans, and not after three that failed."""
+    opened, reads = link.opened, link.reads
+    link.gone = "BadSessionNotActivated"
+    link.on_gone()
+    assert within(20, lambda: "opc.tcp://127.0.0.1:1: BadSessionNotActivated" in scanning.told)
+    link.gone = ""
+    assert within(20, lambda: link.opened > opened)
+    assert scanning.becomes("")
+    assert link.reads > reads

@@ -11,7 +11,8 @@ import pytest
 from asyncua import ua
 
 from serving import Controller, ControlLoop, EndpointError, LoopError, Mode, VirtualClock
-from serving.opcua.endpoint import OpcUaEndpoint, Values
+from serving.opcua.endpoint import OpcUaEndpoint
+from serving.opcua.sampling import Values
 from serving.opcua.settings import HandBack, Nodes, Server
 
 pytest_plugins = ["small_laws"]

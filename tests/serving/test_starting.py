@@ -20,7 +20,7 @@ from processes import within as in_time
 from serving import Controller, Mode, Sample, VirtualClock
 from serving.journal import JournalReader
 from serving.loop import Command, within
-from serving.opcua.endpoint import Values
+from serving.opcua.sampling import Values
 from serving.opcua.settings import Nodes, Server
 from serving.station import station
 from serving.station.lease import Lease

@@ -1,0 +1,97 @@
+"""What a server has answered, as the values of a scan: judged by quality, age, watchdog and heartbeat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from serving.manifest import Manifest
+from serving.opcua.ages import Ages
+from serving.opcua.plan import Plan
+from serving.opcua.settings import Nodes, Server
+from serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Values:
+    """What one reading brought. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
+
+    arrived_s: float  # on the endpoint's clock
+    pv: Array  # shape: (n_pv,)
+    mv: Array  # shape: (n_mv,)
+    dv: Array  # shape: (n_dv,)
+    age_s: float
+    fault: str
+    quality: tuple[int, ...]
+    asked_sp: Mapping[str, float] = field(default_factory=dict)
+    asked_mode: str = ""
+    starts: int = 0  # how often the server has started anew since the endpoint did
+
+
+class Sampling:
+    """Makes values of answers, by what the settings believe of a server."""
+
+    def __init__(self, manifest: Manifest, server: Server, nodes: Nodes) -> None:
+        self.manifest, self.server, self.nodes = manifest, server, nodes
+        self._watched = (float("nan"), 0)  # what the watchdog showed last, and for how many scans it has stood
+
+    def valued(
+        self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, unbeaten: str, starts: int
+    ) -> Values:
+        """The answers as values, with the first thing that is wrong with them.
+
+        They arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not reach the server, which has
+        started anew ``starts`` times.
+        """
+        fault, found = "", dict[str, float]()
+        for (name, point, judged), answer in zip(plan.points, answers, strict=False):
+            usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
+            # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
+            # is a read-back, which says where the MV stands also while a PV is bad.
+            told = usable or (judged and not name.startswith("MV "))
+            found[name] = point.scale * answer.number + point.offset if told else np.nan
+            if fault or not judged:
+                continue
+            if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
+                fault = f"{name}: {answer.words}"
+            elif answer.text:
+                fault = f"{name}: {answer.text}"
+        judge = self.server.source_time == "judge"
+        timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
+        m = self.manifest
+        asked_sp = {s.name: found[f"SP {s.name}"] for s in m.sp if np.isfinite(found.get(f"SP {s.name}", np.nan))}
+        mode = ""
+        if self.nodes.mode is not None:
+            wanted = found["mode"]
+            mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
+        if self.nodes.watchdog and not fault:
+            fault = self.dead(found["watchdog"])
+        fault = fault or unbeaten
+        n = len(m.pv) + len(m.mv) + len(plan.dv_names)
+        return Values(
+            arrived_s,
+            np.array([found[f"PV {s.name}"] for s in m.pv]),
+            np.array([found[f"MV {s.name}"] for s in m.mv]),
+            np.array([found.get(f"DV {s.name}", 0.0) for s in m.dv]),
+            max(timed, default=0.0),
+            fault,
+            tuple(a.status for a in answers[:n]),
+            asked_sp,
+            mode,
+            starts,
+        )
+
+    def dead(self, watchdog: float) -> str:
+        """Why the server's side counts as dead; empty while its watchdog moves."""
+        last, scans = self._watched
+        moves = watchdog != last and not np.isnan(watchdog)  # one that is gone has stopped, too
+        self._watched = (watchdog, 0 if moves else scans + 1)
+        if self._watched[1] < self.nodes.watchdog_scans:
+            return ""
+        return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"

@@ -1,0 +1,86 @@
+"""What would stop a loop on its own machine, before it is connected: its parts are made, and let go."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from serving.controller import Controller
+from serving.errors import LoopError, LoopwrightError
+from serving.file_lock import LockTakenError, locked
+from serving.journal.file import lock_of, opened
+from serving.page.address import listening, require_usable
+from serving.station.lease import Lease
+from serving.station.making import control_loop
+from serving.station.settings import Settings
+from serving.words import first_line
+
+
+@dataclass
+class Rehearsal:
+    """A line for each part. ``wrong`` would stop the loop, ``notes`` a person should know."""
+
+    wrong: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def tried(self, make: Callable[[], object]) -> None:
+        """Make a part, and say why it cannot be made."""
+        try:
+            make()
+        except (LoopwrightError, OSError) as error:
+            self.wrong.append(first_line(error))
+
+
+def rehearsed(settings: Settings, controller: Controller) -> Rehearsal:
+    """Make what ``loop run`` makes; the plant, the journal and a loop that runs already are left as they are."""
+    found, page = Rehearsal(), settings.served()
+    found.tried(lambda: control_loop(settings, controller))
+    owner = _owner(settings.journal.file)
+    if owner:
+        found.notes.append(
+            f"this loop runs already (process {owner}); its MVs, its journal and its page's address are its own"
+        )
+    else:
+        found.tried(lambda: _require_free(settings))
+        found.tried(lambda: _require_journal(settings.journal.file))
+        if page is not None:
+            found.tried(lambda: listening(page).close())
+    if page is not None:
+        found.tried(page.token)
+        found.tried(lambda: require_usable(page))
+    return found
+
+
+def _owner(journal: Path) -> str:
+    """The process of the loop that writes a journal now; empty: none does."""
+    lock = lock_of(journal)
+    if not lock.is_file():
+        return ""
+    try:
+        os.close(locked(lock))
+    except LockTakenError as error:
+        return error.owner
+    except (LoopError, OSError):
+        return ""
+    return ""
+
+
+def _require_free(settings: Settings) -> None:
+    """LoopError where another loop writes one of the MVs."""
+    Lease(settings.server.endpoint, [p.node for p in settings.nodes.points("mv").values()]).release()
+
+
+def _require_journal(journal: Path) -> None:
+    """LoopError where the file is no journal, or none can be written there."""
+    if journal.exists():
+        with closing(opened(journal, write=False)):
+            pass
+    folder = journal.resolve().parent
+    if not folder.is_dir():
+        raise LoopError(f"{journal} cannot be written: there is no folder {folder}; make it, or name another file")
+    for path in (folder, journal, lock_of(journal)):
+        if path.exists() and not os.access(path, os.W_OK):
+            raise LoopError(f"{journal} cannot be written: this user may not write {path}")
