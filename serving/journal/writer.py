@@ -191,10 +191,11 @@ class Journal:
             # block have no gap.
             run = rows[0][1]
             rows = next(list(same) for _, same in groupby(rows, key=itemgetter(1)))
+            times = [row[2] for row in rows]  # not in order where the clock was set
             with self._base:
                 self._base.execute(
                     "insert into block values (?, ?, ?, ?, ?, ?)",
-                    (rows[0][0], rows[-1][0], run, rows[0][2], rows[-1][2], packed(rows)),
+                    (rows[0][0], rows[-1][0], run, min(times), max(times), packed(rows)),
                 )
                 self._base.execute("delete from scan where run = ? and id <= ?", (run, rows[-1][0]))
                 shorten_scans(self._base, self.max_bytes)

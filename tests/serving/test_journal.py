@@ -7,6 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -262,6 +263,28 @@ def test_runs_that_alternate_lose_nothing_when_they_are_packed(tmp_path: Path, c
     assert all(np.array_equal(a.numbers, b.numbers, equal_nan=True) for a, (_, _, b) in zip(given, found, strict=True))
     assert len(list(reader.scans(after_id=100))) == len(given) - 100
     reader.close()
+
+
+def test_a_reader_holds_one_block_at_a_time(tmp_path: Path, controller: Controller) -> None:
+    path = tmp_path / "loop.journal"
+    journal = Journal(path)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    for scan in scans(FRESH + 30 * BLOCK):
+        journal.scan(scan)
+    journal.close()
+    base = sqlite3.connect(path)
+    (whole,) = base.execute("select sum(length(data)) from block").fetchone()
+    base.close()
+    reader = JournalReader(path)
+    found = reader.scans()
+    tracemalloc.start()
+    for _ in range(3 * BLOCK):
+        next(found)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    found.close()
+    reader.close()
+    assert most < whole
 
 
 def test_what_is_no_journal_is_named(tmp_path: Path) -> None:
