@@ -375,6 +375,17 @@ def test_what_a_full_disk_costs_is_said_and_no_run_is_lost(
     reader.close()
 
 
+@pytest.mark.parametrize(("fsync", "synchronous"), [("crash", 1), ("power loss", 2)])
+def test_each_write_waits_for_the_disk_where_a_power_loss_must_cost_nothing(
+    tmp_path: Path, fsync: Any, synchronous: int
+) -> None:
+    """SQLite syncs its log at each commit with ``synchronous`` 2 (full), and only at checkpoints with 1 (normal)."""
+    journal = Journal(tmp_path / "loop.journal", fsync=fsync)
+    assert journal._base.execute("pragma synchronous").fetchone() == (synchronous,)
+    assert journal._base.execute("pragma journal_mode").fetchone() == ("wal",)
+    journal.close()
+
+
 def test_a_write_that_hangs_makes_nothing_grow(
     tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
