@@ -122,7 +122,7 @@ def scans(n: int, folder: Path) -> None:
     )  # fmt: skip
 
     def observe(sample: Sample | None, command: Command) -> None:
-        recorder.scan(loop, sample, command, ())
+        recorder.scan(loop, sample, command)
         if command.scan % max(n // 100, 1) == 0:
             watched.look()
         if journal.behind > 20_000:  # as a plant gives a loop time, so does this

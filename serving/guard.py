@@ -26,7 +26,8 @@ class Sample:
     ``mv_applied`` is the MV that the plant really received over the last period, read back; None
     where it cannot be read now: a loop that lost its plant goes on from the next one. ``age_s`` is
     the time since the PVs were measured. ``fault`` says why the endpoint does not trust its own
-    sample; empty: it does.
+    sample; empty: it does. ``quality`` is for the journal and the page: an OPC UA status for each PV,
+    then each MV, then each measured disturbance that is read; empty: the endpoint has none.
     """
 
     pv: Array  # shape: (n_pv,)
@@ -34,6 +35,7 @@ class Sample:
     dv: Array = field(default_factory=lambda: np.zeros(0))  # shape: (n_dv,)
     age_s: float = 0.0
     fault: str = ""
+    quality: tuple[int, ...] = ()
 
 
 class Guard(Protocol):

@@ -60,7 +60,10 @@ class JournalReader:
     def scans(
         self, after_id: int = 0, begin_s: float = -1e300, end_s: float = 1e300
     ) -> Iterator[tuple[int, int, Scan]]:
-        """(id, run, scan) of the scans after an id and within times, in order."""
+        """(id, run, scan) of the scans after an id and within times, in the order in which they were written.
+
+        Their times follow that order unless the clock was set meanwhile.
+        """
         with closing(self._base.cursor()) as cursor:
             cursor.execute("begin")  # one state of the file: rows are packed meanwhile
             try:
@@ -68,7 +71,7 @@ class JournalReader:
                     "select data, run, first from block where last > ? and end >= ? and begin <= ? order by first",
                     (after_id, begin_s, end_s),
                 )
-                for data, run, first in cursor.fetchall():
+                for data, run, first in cursor:  # one by one: all blocks together may be gigabytes
                     for i, scan in enumerate(unpacked(data)):
                         if first + i > after_id and begin_s <= scan.time_s <= end_s:
                             yield first + i, run, scan
@@ -77,14 +80,14 @@ class JournalReader:
                     "where id > ? and time between ? and ? order by id",
                     (after_id, begin_s, end_s),
                 )
-                for id_, run, time_s, mode, numbers, quality, reason in cursor.fetchall():
+                for id_, run, time_s, mode, numbers, quality, reason in cursor:
                     values = tuple(np.frombuffer(numbers).tolist())
                     yield id_, run, Scan(time_s, mode, values, tuple(json.loads(quality or "[]")), reason or "")
             finally:
                 cursor.execute("rollback")
 
     def tables(self, begin_s: float, end_s: float) -> Iterator[tuple[int, Array, list[str]]]:
-        """(run, times and numbers (scans, 1 + columns), modes) of the scans within times, in order, in pieces."""
+        """(run, times and numbers (scans, 1 + columns), modes) of the scans within times, in pieces, in that order."""
         with closing(self._base.cursor()) as cursor:
             cursor.execute("begin")
             try:

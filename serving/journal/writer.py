@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import queue
 import sqlite3
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import astuple
-from itertools import groupby, islice
+from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +22,7 @@ from serving.journal.entries import Event, Scan, columns
 from serving.journal.file import opened, sole_writer
 from serving.journal.packing import packed
 from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
+from serving.journal.waiting import Item, Waiting
 from serving.manifest import Manifest
 from serving.words import named
 
@@ -30,6 +30,8 @@ FLUSH_S = 0.25  # so much is lost at most when the process dies
 BLOCK = 600  # scans that are packed together
 FRESH = 1200  # the last scans, a row each
 WAITING = 200_000  # scans and events that wait in memory while the disk takes none
+TOGETHER = 2_000  # are written at most in one transaction
+STALL_S = 10.0  # a write that takes longer is told
 
 
 class Journal:
@@ -38,8 +40,9 @@ class Journal:
     The file is in WAL mode: a process that dies, whatever it was doing, leaves a whole file without its last
     ``FLUSH_S`` at most. With ``fsync`` "power loss" each write waits for the disk. Older scans are packed, and beyond
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
-    takes nothing, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are ``lost``, scans
-    before events; what a run is stays. Once the journal writes again, an alarm in it says how many they were.
+    takes nothing, or does not answer, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are
+    ``lost``, scans before events; what a run is stays. That is told once, and once the journal writes again, an alarm
+    in it says how many they were.
 
     Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
@@ -53,10 +56,11 @@ class Journal:
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.path, self.max_bytes, self.tell = path, max_mb * 1e6, tell
-        self.trouble, self.lost = "", 0
+        self.trouble = ""
         self._fsync = fsync
         self._most_events = self._events = most_events(self.max_bytes)  # written since the last look at how many
-        self._queue = queue.SimpleQueue[Any]()
+        self._queue, self._taken = Waiting(), list[Item]()
+        self._writing_s: float | None = None  # since when, on a monotonic clock
         self._base = opened(path, write=True, fsync=fsync)
         try:
             self._lock = sole_writer(path)
@@ -64,14 +68,18 @@ class Journal:
             self._base.close()
             raise
         self._closing = threading.Event()
-        self._waiting: list[Any] = []
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
     @property
     def behind(self) -> int:
         """How many scans and events wait to be written."""
-        return len(self._waiting) + self._queue.qsize()
+        return len(self._queue)
+
+    @property
+    def lost(self) -> int:
+        """How many scans and events were given up."""
+        return self._queue.lost
 
     def begin(self, manifest: Manifest, sha256: str, time_s: float, speed: float = 1.0) -> None:
         """What follows is of this controller, on a plant that is ``speed`` times as fast as the clock."""
@@ -79,44 +87,53 @@ class Journal:
         signals = {name: [s.to_dict() for s in m.signals(name)] for name in ("sp", "pv", "mv", "dv")}
         texts = (json.dumps(columns(m)), json.dumps(signals))
         row = (time_s, f"{m.law} for {m.case}", sha256, m.period_s, speed, *texts)
-        self._queue.put(("run", row))
+        self._put("run", row)
 
     def scan(self, scan: Scan) -> None:
         """Write a scan down."""
-        self._queue.put(("scan", scan))
+        self._put("scan", scan)
 
     def event(self, event: Event) -> None:
         """Write an event down."""
-        self._queue.put(("event", event))
+        self._put("event", event)
 
     def keep(self, name: str, value: str) -> None:
         """Keep a text under a name, for the next run of the loop."""
-        self._queue.put(("learnt", (name, value)))
+        self._put("learnt", (name, value))
 
     def close(self) -> None:
         """Write what waits and end."""
         self._closing.set()
-        self._queue.put(None)
+        self._queue.wake()
         self._thread.join()
         self._base.close()
         os.close(self._lock)
+
+    def _put(self, kind: str, row: Any) -> None:
+        if self._queue.put((kind, row), WAITING):
+            self.tell(f"the journal has {WAITING} scans and events that wait: from now on the oldest are lost")
+        since = self._writing_s
+        if since is not None and not self.trouble and time.monotonic() - since > STALL_S:
+            self.trouble = f"the disk has not answered for {STALL_S:g} s"
+            self.tell(f"the journal cannot be written: {self.trouble}")
 
     # ------------------------------------------------------------------ the writer
     def _run(self) -> None:
         run = told = 0  # of what is lost, as much as stands in the journal
         while True:
             self._take()
-            if not self._waiting and self._closing.is_set():
+            if not self._taken and self._closing.is_set():
                 return
+            self._writing_s = time.monotonic()
             try:
                 run = self._write(run)
+                self._queue.written()
                 lost, told = self.lost - told, self.lost
-                if self.trouble:
+                if self.trouble or lost:
                     self.tell("the journal writes again" + (LOSS.format(lost) if lost else ""))
-                self.trouble, self._waiting = "", _loss(lost) if lost else []
-                if self._waiting:
+                self.trouble, self._taken = "", _loss(lost) if lost else []
+                if self._taken:
                     run = self._write(run)
-                    self._waiting.clear()
                 self._pack()
                 self._rotate()
             except Exception as error:
@@ -127,34 +144,21 @@ class Journal:
                 self.trouble = named(error)
                 if self._closing.is_set():
                     return
-                self._drop()
-
-    def _drop(self) -> None:
-        """Give up the oldest of what waits beyond ``WAITING``: scans, then events. Runs stay: scans need them."""
-        for kind in ("scan", "event"):
-            surplus = len(self._waiting) - WAITING
-            if surplus > 0:
-                old = list(islice((i for i, (k, _) in enumerate(self._waiting) if k == kind), surplus))
-                gone = set(old)
-                self._waiting = [item for i, item in enumerate(self._waiting) if i not in gone]
-                self.lost += len(old)
+                self._queue.give_back(WAITING)
+            finally:
+                self._writing_s = None
 
     def _take(self) -> None:
-        """Wait for something to write, then gather for ``FLUSH_S``."""
-        if not self._waiting and not self._closing.is_set():
-            first = self._queue.get()
-            if first is not None:
-                self._waiting.append(first)
-        self._closing.wait(FLUSH_S)
-        with suppress(queue.Empty):
-            while True:
-                item = self._queue.get_nowait()
-                if item is not None:
-                    self._waiting.append(item)
+        """Wait for something to write, then gather for ``FLUSH_S``, unless enough waits already."""
+        if not self._closing.is_set():
+            self._queue.wait()
+        if self.trouble or len(self._queue) < TOGETHER:
+            self._closing.wait(FLUSH_S)
+        self._taken = self._queue.take(TOGETHER)
 
     def _write(self, run: int) -> int:
         with self._base:
-            for kind, item in self._waiting:
+            for kind, item in self._taken:
                 if kind == "run":
                     cursor = self._base.execute(
                         "insert into run (began, controller, sha256, period_s, speed, columns, signals) "
@@ -191,10 +195,11 @@ class Journal:
             # block have no gap.
             run = rows[0][1]
             rows = next(list(same) for _, same in groupby(rows, key=itemgetter(1)))
+            times = [row[2] for row in rows]  # not in order where the clock was set
             with self._base:
                 self._base.execute(
                     "insert into block values (?, ?, ?, ?, ?, ?)",
-                    (rows[0][0], rows[-1][0], run, rows[0][2], rows[-1][2], packed(rows)),
+                    (rows[0][0], rows[-1][0], run, min(times), max(times), packed(rows)),
                 )
                 self._base.execute("delete from scan where run = ? and id <= ?", (run, rows[-1][0]))
                 shorten_scans(self._base, self.max_bytes)

@@ -149,7 +149,7 @@ class OpcUaEndpoint:
         # An MV of long ago, or from before a write that failed, is none that the plant has now; an old PV may come with
         # a young MV.
         mv = values.mv if self._told and now - values.arrived_s <= self.max_age_s else None
-        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault)
+        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault, values.quality)
 
     def write(self, mv: Array) -> None:
         """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection.

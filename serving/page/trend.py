@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from serving.journal import JournalReader
 
 Array: TypeAlias = NDArray[np.float64]
+Piece: TypeAlias = tuple[Array, dict[str, Array], list[str]]  # times, columns, modes
 
 GAP = 5  # periods without a scan: a gap in the line
 MOST_POINTS = 2_000
@@ -123,9 +124,10 @@ def _graver(one: str, other: str) -> str:
 def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> dict[str, Any]:
     """What is drawn from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode, thinned alike.
 
-    The mode is empty from the last scan before a gap to the first one after it.
+    The mode is empty from the last scan before a gap to the first one after it. Times ascend: where the clock was set
+    back, what came before and after it lies one over the other.
     """
-    thinned, whole, count = Thinned(begin_s, end_s, points), list[tuple[Array, dict[str, Array]]](), 0
+    thinned, whole, count = Thinned(begin_s, end_s, points), list[Piece](), 0
     modes = Modes(begin_s, thinned.bin_s, points)
     runs: dict[int, dict[str, Any]] = {}
     longest = float(GAP)
@@ -133,14 +135,22 @@ def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> d
         if not runs:  # of the same state of the file as the scans: another controller may take over meanwhile
             runs = {r["id"]: r for r in reader.runs()}
             longest = GAP * max(r["period_s"] / r["speed"] for r in runs.values())
+        order = np.argsort(numbers[:, 0], kind="stable")
+        numbers, mode = numbers[order], [mode[i] for i in order]
         times = numbers[:, 0]
         columns = {name: numbers[:, i + 1] for i, name in enumerate(runs[run]["columns"])}
         thinned.add(times, columns)
         count += len(times)
         if count <= 2 * points:
-            whole.append((times, columns))
+            whole.append((times, columns, mode))
         modes.add(times, mode, longest)
-    times, columns = _joined(whole) if count <= 2 * points else thinned.rows()
+    if count <= 2 * points:
+        times, columns, mode = _joined(whole)
+        modes = Modes(begin_s, thinned.bin_s, points)
+        if len(times):
+            modes.add(times, mode, longest)
+    else:
+        times, columns = thinned.rows()
     times, columns = _with_gaps(times, columns, max(longest, 2.5 * thinned.bin_s if count > 2 * points else 0.0))
     return {
         "time": times.tolist(),
@@ -149,14 +159,17 @@ def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> d
     }
 
 
-def _joined(pieces: list[tuple[Array, dict[str, Array]]]) -> tuple[Array, dict[str, Array]]:
-    """Pieces one after the other; a column that a piece lacks is NaN there."""
-    names = list(dict.fromkeys(name for _, columns in pieces for name in columns))
-    times = np.concatenate([t for t, _ in pieces]) if pieces else np.zeros(0)
+def _joined(pieces: list[Piece]) -> Piece:
+    """Pieces as one, by time; a column that a piece lacks is NaN there."""
+    names = list(dict.fromkeys(name for _, columns, _ in pieces for name in columns))
+    times = np.concatenate([t for t, _, _ in pieces]) if pieces else np.zeros(0)
+    order = np.argsort(times, kind="stable")
     joined = {
-        name: np.concatenate([columns.get(name, np.full(len(t), np.nan)) for t, columns in pieces]) for name in names
+        name: np.concatenate([columns.get(name, np.full(len(t), np.nan)) for t, columns, _ in pieces])[order]
+        for name in names
     }
-    return times, joined
+    modes = [mode for _, _, of in pieces for mode in of]
+    return times[order], joined, [modes[i] for i in order]
 
 
 def _with_gaps(times: Array, columns: dict[str, Array], longest_s: float) -> tuple[Array, dict[str, Array]]:

@@ -101,8 +101,10 @@ def _ask(options: argparse.Namespace) -> int:
         value = {"file": str(options.controller.absolute()), "trial": options.trial}
     request = {"do": do, "value": value, "who": options.who, "reason": options.reason}
     print(ask(settings.journal.file, request)["done"])
-    if do in {"swap", "back"}:
+    if do == "swap":
         print(f"once it has the plant: {options.loop} still names the old file; a restart brings that one")
+    elif do == "back":
+        print(f"a restart brings the controller that {options.loop} names; see that it is the one put back")
     return 0
 
 
@@ -212,7 +214,7 @@ def _run(options: argparse.Namespace) -> int:
 def _left(manifest: Manifest, last: Command) -> str:
     """What the plant is left with."""
     if not last.writes:
-        return f"ended in {last.mode}: nothing was written by this loop"
+        return f"ended in {last.mode}: this loop does not write, and the plant keeps what others set"
     stay = ", ".join(f"{s.name} at {v:.5g} {s.unit}" for s, v in zip(manifest.mv, last.mv.tolist(), strict=True))
     return f"ended in {last.mode}: the plant keeps {stay}, and this loop moves it no more"
 

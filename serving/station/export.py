@@ -28,7 +28,8 @@ def export(journal: Path, out: Path) -> int:
     of rows whose MV acted before their PVs would take what the controller made of a PV for what moved it.
     A value whose quality was not good is an empty cell: nobody measured it. One of uncertain quality counts where the
     loop used it, as ``server.uncertain`` says.
-    Times are the plant's: where its time runs faster than the clock's, so do they, and runs follow each other.
+    Times are the plant's: where its time runs faster than the clock's, so do they, and runs follow each other. Where
+    the clock was set back, the next scan follows the one before it by a period, and the later ones go on from there.
     """
     reader = JournalReader(journal)
     draft = out.with_name(out.name + ".draft")
@@ -47,10 +48,14 @@ def export(journal: Path, out: Path) -> int:
                 speed, period = found[run]["speed"], found[run]["period_s"]
                 if run != of:
                     of, began = run, max(found[run]["began"], last + period)
-                last = began + (scan.time_s - found[run]["began"]) * speed
+                now = began + (scan.time_s - found[run]["began"]) * speed
+                if waiting is not None and now <= last:
+                    began += last + period - now
+                    now = last + period
+                last = now
                 row = _Row(run, last, _believed(scan, runs[run]), scan.mode)
                 if waiting is not None:
-                    table.writerow(waiting.cells(names, row if last - waiting.time_s < LATE * period else None))
+                    table.writerow(waiting.cells(names, row if now - waiting.time_s < LATE * period else None))
                 waiting = row
                 count += 1
             if waiting is not None:

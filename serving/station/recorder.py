@@ -66,9 +66,10 @@ class Recorder:
         said = f"acknowledged: {what}" if kind == "acknowledged" else what
         self._say(f"{who}: {said}" + (f" ({reason})" if reason else ""))
 
-    def scan(self, loop: ControlLoop, sample: Sample | None, command: Command, quality: tuple[int, ...]) -> None:
+    def scan(self, loop: ControlLoop, sample: Sample | None, command: Command) -> None:
         """Write a scan down, and the fault or the new controller that came with it."""
         numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
+        quality = () if sample is None else sample.quality
         self.journal.scan(Scan(time.time(), command.mode.value, numbers, quality, command.reason))
         # A reason whose numbers change, such as an age, is the same fault.
         if command.reason != self._fault and kind_of(command.reason) != kind_of(self._fault):

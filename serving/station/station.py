@@ -26,7 +26,6 @@ from serving.opcua import certificates
 from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.sampling import Values
 from serving.opcua.settings import Server
-from serving.opcua.values import words
 from serving.page.process import PageProcess
 from serving.station.beginning import begun_at, near, usable
 from serving.station.control import Answer, Control
@@ -250,13 +249,12 @@ class Station:
     def _observe(self, sample: Sample | None, command: Command) -> None:
         """Write the scan down, and show it."""
         assert self.loop is not None
-        values = self.endpoint.values
         self._moved(self.loop)
         self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
         self.last, self.stepped = (sample, command, time.time()), self.recorder.controller
         if not np.isnan(command.mv).any():
             self._left_at = command.mv
-        self.recorder.scan(self.loop, sample, command, () if sample is None or values is None else values.quality)
+        self.recorder.scan(self.loop, sample, command)
         self.watching.seen(self.stepped, self.last)
         for seen in self._watchers:
             seen(sample, command)
@@ -319,11 +317,6 @@ class Station:
             raise LoopError(f"{entry.acknowledged.who} has acknowledged it already")
         self.recorder.note("acknowledged", request.who, entry.event.what, request.reason, about=entry.id)
         return {"done": f"acknowledged: {entry.event.what}"}
-
-    def quality(self) -> list[str]:
-        """The quality of each PV, MV and DV, by OPC UA's own names."""
-        values = self.endpoint.values
-        return [] if values is None else [words(status) for status in values.quality]
 
     def _connection(self, what: str) -> None:
         up = what.startswith("connected")

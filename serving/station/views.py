@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from serving.controller import Controller
 from serving.journal import columns
+from serving.opcua.link import words
 from serving.trust import signer
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def state(station: Station) -> View:
         "beside": _plain(command.successor_mv),
         "dv": _plain(None if sample is None else sample.dv),
         "info": _plain(command.info if station.stepped is loop.controller else None),  # of the names in ``about``
-        "quality": station.quality(),
+        "quality": [] if sample is None else [words(status) for status in sample.quality],
         "sha256": loop.controller.sha256,
         "successor": _successor(station),
         "replaced": None if loop.replaced is None else _named(loop.replaced),

@@ -87,7 +87,7 @@ def test_a_shadow_writes_nothing_but_its_heartbeat(
     assert main(["loop", "run", "--scans", "15"]) == 0
     said = capsys.readouterr().out
     assert "(law T_j" in said
-    assert "ended in SHADOW: nothing was written by this loop" in said
+    assert "ended in SHADOW: this loop does not write, and the plant keeps what others set" in said
     assert len({row["asked"][0] for row in plant.actuator()[before:]}) == 1
 
 

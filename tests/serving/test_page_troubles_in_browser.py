@@ -8,7 +8,7 @@ import pytest
 from chromium import CHROMIUM
 from fake_loop import BEGIN, THIRDS, FakeLoop
 
-from serving.journal import Event
+from serving.journal import Event, Scan
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
@@ -125,6 +125,17 @@ def test_each_alarm_that_is_over_is_shown_as_over(page: Page, loop: FakeLoop) ->
 def test_the_trend_is_asked_for_in_the_loops_time(page: Page, loop: FakeLoop) -> None:
     # The loop's scans lie at BEGIN, and this machine's clock elsewhere.
     expect(page.locator("[data-chart]").first).to_have_attribute("data-rows", str(loop.scans))
+
+
+def test_the_trend_goes_on_when_the_loops_clock_is_set_back(page: Page, loop: FakeLoop) -> None:
+    """To 60 s: the trend ends at the loop's own time again, with the scans from before and after."""
+    chart = page.locator("[data-chart]").first
+    expect(chart).to_have_attribute("data-rows", str(loop.scans))
+    loop.state |= {"time": BEGIN + 60, "reason": "the clock is set"}
+    expect(page.locator("#reason")).to_contain_text("the clock is set")
+    for k in range(5):
+        loop.writer.scan(Scan(BEGIN + 49.5 + k, "AUTO", (0.5,) * loop.columns))
+    expect(chart).to_have_attribute("data-rows", str(61 + 5))
 
 
 def test_the_page_follows_the_systems_light_until_the_operator_chooses(page: Page) -> None:

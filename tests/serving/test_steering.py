@@ -111,7 +111,10 @@ def test_a_controller_is_tried_takes_over_and_is_put_back(
     assert loopwright(capsys, "swap", "incad.onnx", "--trial", "1000")[0] == 0
     assert within(10, lambda: json.loads(loopwright(capsys, "state")[1])["beside"] is not None)
     assert loopwright(capsys, "swap", "--keep")[0] == 0
-    assert loopwright(capsys, "swap", "--back", "--trial", "3")[0] == 0
+    status, said = loopwright(capsys, "swap", "--back", "--trial", "3")
+    assert status == 0
+    assert "still names the old file" not in said
+    assert "a restart brings the controller that loop.toml names" in said
     assert within(20, lambda: law() == "pid")
     assert loop.station.watching.monitor.trouble == ""
     loop.station.end()

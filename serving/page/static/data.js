@@ -42,6 +42,8 @@ export class Data {
 
   // Scans that came in; true once the trend should be loaded anew.
   append({ time, columns }, oldest) {
+    const setBack = time.at(-1) < this.time.at(-1) - this.longest;
+    if (setBack) this.forget(time[0]);
     const last = this.time.length ? this.time[this.time.length - 1] : -Infinity;
     const first = time.findIndex((t) => t > last);
     if (first < 0) return false;
@@ -60,7 +62,17 @@ export class Data {
       this.time.splice(0, gone);
       for (const values of Object.values(this.columns)) values.splice(0, gone);
     }
-    return this.live > MOST_LIVE;
+    return setBack || this.live > MOST_LIVE;
+  }
+
+  // The loop's clock was set back: what it showed from then on lies in no past. The trend has it again in time.
+  forget(from) {
+    const kept = this.time.findIndex((t) => t >= from);
+    if (kept < 0) return;
+    this.time.length = kept;
+    for (const values of Object.values(this.columns)) values.length = kept;
+    this.modes = this.modes.filter(([t]) => t < from);
+    this.to = from;
   }
 
   // Nothing came in for a while: no line is drawn over it, and the mode before it ends.
