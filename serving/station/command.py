@@ -21,6 +21,7 @@ from serving.loop import Command, Mode
 from serving.manifest import Manifest
 from serving.station.control import ask
 from serving.station.export import export, tag_table
+from serving.station.happened import happened, journal_of, lines, write_csv
 from serving.station.requests import TRIAL
 from serving.station.settings import Settings
 from serving.station.template import template
@@ -45,6 +46,14 @@ def options(parser: argparse.ArgumentParser) -> None:
     out = commands.add_parser("export", help="write a journal's scans as a CSV that `loopwright new` reads")
     out.add_argument("file", metavar="JOURNAL", type=Path, help="the journal's file, also of a loop that runs")
     out.add_argument("--out", metavar="FILE", type=Path, help="where it goes (JOURNAL.csv)")
+    out.add_argument("--replace", action="store_true", help="write over an earlier export")
+    events = commands.add_parser("events", help="list what a journal says happened: when, who, what, and why")
+    events.add_argument(
+        "file", metavar="FILE", type=Path, nargs="?", default=SETTINGS, help="loop.toml or a journal (%(default)s)"
+    )
+    events.add_argument("--since", metavar="TIME", default="", help="from then on, as 2026-03-01T14:30 (UTC)")
+    events.add_argument("--last", metavar="N", type=int, help="the last N only")
+    events.add_argument("--csv", action="store_true", help="as CSV, for other tools")
 
 
 def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -70,7 +79,7 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 
 def run(options: argparse.Namespace) -> int:
     """Do what was asked for; the exit status."""
-    does = {"init": _init, "check": _check, "run": _run, "export": _export, "state": _state}
+    does = {"init": _init, "check": _check, "run": _run, "export": _export, "events": _events, "state": _state}
     return does.get(options.action, _ask)(options)
 
 
@@ -238,14 +247,26 @@ class _Lines:
 
 def _export(options: argparse.Namespace) -> int:
     out = options.out or options.file.with_suffix(".csv")
-    rows = export(options.file, out)
     tags = out.with_name(f"{out.stem}-tags.csv")
+    for file in (out, tags):
+        if file.exists() and not options.replace:  # params.yaml may name it as the data of a controller
+            raise LoopError(f"{file} is there already; name another file by --out, or write over it with --replace")
+    rows = export(options.file, out)
     tag_table(options.file, tags)
     print(f"{rows} scans: {out}, its tags: {tags}")
     with closing(JournalReader(options.file)) as reader:
         period_s = reader.runs()[-1]["period_s"]
     # Without the period `new` would choose one, and a controller of another period could not be swapped in.
     print(f"next: `loopwright new NAME {out} --tags {tags} --period {period_s:g}` makes a record of it")
+    return 0
+
+
+def _events(options: argparse.Namespace) -> int:
+    events = happened(journal_of(options.file), options.since, options.last)
+    if options.csv:
+        write_csv(events, sys.stdout)
+    else:
+        print("\n".join(lines(events) or ["nothing has happened there"]))
     return 0
 
 

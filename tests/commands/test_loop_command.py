@@ -77,6 +77,11 @@ def test_the_way_from_a_controller_to_training_data(
     assert table["T.PV"].between(200, 600).all()
     times = pd.to_datetime(table["time"])
     assert times.is_monotonic_increasing
+    before_text = Path("loop.csv").read_text()
+    assert main(["loop", "export", "loop.journal"]) == 2
+    assert "loop.csv is there already; name another file by --out, or write over it" in capsys.readouterr().err
+    assert Path("loop.csv").read_text() == before_text
+    assert main(["loop", "export", "loop.journal", "--replace"]) == 0
 
 
 def test_a_shadow_writes_nothing_but_its_heartbeat(
