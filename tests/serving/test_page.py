@@ -88,6 +88,7 @@ def test_a_trend_that_is_none_is_refused(browser: Browser, query: str) -> None:
 
 
 def test_metrics_and_health(browser: Browser, loop: FakeLoop) -> None:
+    loop.state["verdicts"].append({"name": "time in HOLD", "level": "not known yet"})
     status, headers, body = browser.get("/metrics")
     assert status == 200
     assert headers["Content-Type"].startswith("text/plain; version=0.0.4")
@@ -95,6 +96,7 @@ def test_metrics_and_health(browser: Browser, loop: FakeLoop) -> None:
     assert 'loopwright_mode{mode="AUTO"} 1.0' in lines
     assert "loopwright_missed_total 1.0" in lines
     assert 'loopwright_verdict{name="residual"} 1.0' in lines
+    assert 'loopwright_verdict{name="time in HOLD"} -1.0' in lines
     assert 'loopwright_monitor{name="saturated_share"} 0.25' in lines
     families = [line.split()[2] for line in lines if line.startswith("# TYPE")]
     assert len(families) == len(set(families))
