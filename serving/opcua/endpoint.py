@@ -143,7 +143,12 @@ class OpcUaEndpoint:
         # An MV of long ago, or from before a write that failed, is none that the plant has now; an old PV may come with
         # a young MV.
         mv = values.mv if self._told and now - values.arrived_s <= self.max_age_s else None
-        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault)
+        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault, self._late(values, now))
+
+    def _late(self, values: Values, now: float) -> str:
+        """The signals that are too old, where others are not."""
+        late = [name for name, age in values.ages.items() if now - values.arrived_s + age > self.max_age_s]
+        return ", ".join(late) if len(late) == 1 or len(late) < len(values.ages) else ""
 
     def write(self, mv: Array) -> None:
         """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection.

@@ -17,6 +17,8 @@ from serving.opcua.settings import Nodes, Server
 
 Array: TypeAlias = NDArray[np.float64]
 
+NO_NUMBERS = ("nan", "inf", "-inf")
+
 
 @dataclass(frozen=True, slots=True)
 class Values:
@@ -31,6 +33,7 @@ class Values:
     quality: tuple[int, ...]
     asked_sp: Mapping[str, float] = field(default_factory=dict)
     asked_mode: str = ""
+    ages: Mapping[str, float] = field(default_factory=dict)  # [s] of each measured value, by name
     starts: int = 0  # how often the server has started anew since the endpoint did
 
 
@@ -57,7 +60,7 @@ class Judge:
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
                 fault = f"{name}: {answer.words}"
             elif answer.text:
-                fault = f"{name}: {answer.text}"
+                fault = f"{name}: {_given(name, answer.text)}"
         judge = self.server.source_time == "judge"
         timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
         m = self.manifest
@@ -80,6 +83,7 @@ class Judge:
             tuple(a.status for a in answers[:n]),
             asked_sp,
             mode,
+            {plan.points[i][0]: age for i, age in zip(plan.timed, timed, strict=True)},
             starts,
         )
 
@@ -91,3 +95,9 @@ class Judge:
         if self._watched[1] < self.nodes.watchdog_scans:
             return ""
         return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"
+
+
+def _given(name: str, text: str) -> str:
+    """What a value is instead of a number; of NaN and infinity also who gives it."""
+    by = "read-back" if name.startswith("MV ") else "sensor"
+    return f"{text}: the {by} gives no number" if text in NO_NUMBERS else text

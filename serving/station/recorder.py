@@ -22,6 +22,7 @@ from serving.manifest import Manifest
 
 Array: TypeAlias = NDArray[np.float64]
 
+AGE = re.compile(r"is \S+ s old; allowed are (\S+) s")
 NUMBER = re.compile(r"(?<!\w)[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w)")
 
 
@@ -73,7 +74,7 @@ class Recorder:
         # A reason whose numbers change, such as an age, is the same fault.
         if command.reason != self._fault and kind_of(command.reason) != kind_of(self._fault):
             before, self._fault = self._fault, command.reason
-            what = command.reason or f"over: {before}"
+            what = lasting(command.reason or f"over: {before}")
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.reason))
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
@@ -91,6 +92,11 @@ class Recorder:
 def kind_of(reason: str) -> str:
     """A reason without its numbers."""
     return NUMBER.sub("#", reason)
+
+
+def lasting(reason: str) -> str:
+    """A reason for as long as it lasts: an age grows meanwhile."""
+    return AGE.sub(r"is older than \1 s", reason)
 
 
 def named(controller: Controller) -> str:
