@@ -18,6 +18,10 @@ from serving.opcua.settings import Nodes, Server
 Array: TypeAlias = NDArray[np.float64]
 
 NO_NUMBERS = ("nan", "inf", "-inf")
+SLOW = (
+    "the plant's watchdog moves, but not within {} scans: the plant runs at another speed than `speed` in loop.toml "
+    "says, or `nodes.watchdog_scans` is too small"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +47,7 @@ class Judge:
     def __init__(self, manifest: Manifest, server: Server, nodes: Nodes) -> None:
         self.manifest, self.server, self.nodes = manifest, server, nodes
         self._watched = float("nan"), 0  # the watchdog, and for how many readings it has stood there
+        self._dead, self._slow = "", False  # why the plant counts as dead; whether its watchdog has moved since
 
     def values(
         self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, *, unbeaten: str, starts: int
@@ -88,13 +93,22 @@ class Judge:
         )
 
     def dead(self, watchdog: float) -> str:
-        """Why the server's side counts as dead; empty while its watchdog moves."""
+        """Why the server's side counts as dead; empty while its watchdog moves.
+
+        One that has stood is believed once it moves twice within ``watchdog_scans``: a slow one would else make a fault
+        of each of its values.
+        """
         last, scans = self._watched
-        moves = watchdog != last and not np.isnan(watchdog)  # one that is gone has stopped, too
-        self._watched = (watchdog, 0 if moves else scans + 1)
-        if self._watched[1] < self.nodes.watchdog_scans:
-            return ""
-        return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"
+        most = self.nodes.watchdog_scans
+        if watchdog != last and not np.isnan(watchdog):  # one that is gone has stopped, too
+            self._watched = watchdog, 0
+            self._dead, self._slow = ("", False) if scans < most else (self._dead, bool(self._dead))
+            return self._dead
+        self._watched = watchdog, scans + 1
+        if scans + 1 >= most:
+            stands = f"the plant's watchdog has stood at {watchdog:g} for {scans + 1} scans"
+            self._dead = SLOW.format(most) if self._slow else stands
+        return self._dead
 
 
 def _given(name: str, text: str) -> str:

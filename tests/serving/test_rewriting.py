@@ -78,5 +78,9 @@ def test_a_time_that_is_none_is_refused() -> None:
 def test_a_watchdog_that_is_gone_has_stopped(controller: Controller) -> None:
     made = endpoint(controller, 2.0, Clock())
     judge = Judge(made.manifest, made.server, replace(made.nodes, watchdog="ns=2;s=W", watchdog_scans=3))
-    assert [bool(judge.dead(value)) for value in (1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 4.0)] == [False] * 5 + [True, False]
+    assert [bool(judge.dead(value)) for value in (1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 4.0, 5.0)] == [False] * 5 + [
+        True,
+        True,
+        False,
+    ]
     assert [bool(judge.dead(math.nan)) for _ in range(4)] == [False, False, True, True]
