@@ -9,16 +9,20 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import fields
+from math import isnan
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from serving.errors import LoopError
 from serving.guard import Sample
 from serving.journal import JournalReader
 from serving.loop import Command, Mode
-from serving.manifest import Manifest
+from serving.manifest import Manifest, Signal
 from serving.station.control import ask
 from serving.station.export import export, tag_table
 from serving.station.happened import happened, journal_of, lines, write_csv
@@ -142,11 +146,18 @@ def _init(options: argparse.Namespace) -> int:
         path = options.file.absolute().relative_to(folder)
     except ValueError:
         path = options.file.absolute()
-    make(folder / "loop-certificate.der", folder / "loop-key.pem")
+    files = folder / "loop-certificate.der", folder / "loop-key.pem"
+    before = [file.read_bytes() if file.is_file() else b"" for file in files]
+    make(*files)
+    kept = before == [file.read_bytes() for file in files]
     options.out.write_text(
         template(controller, path, options.endpoint, f"{options.out.stem}.journal"), encoding="utf-8"
     )
-    print(f"written: {options.out}, and beside it loop-certificate.der (for the server to trust) and loop-key.pem")
+    pair = "loop-certificate.der (for the server to trust) and loop-key.pem"
+    if kept:
+        print(f"written: {options.out}; it uses {pair}, which were there already")
+    else:
+        print(f"written: {options.out}, and beside it {pair}")
     print(f"next: put the plant's node ids in, then `loopwright loop check {options.out}`")
     return 0
 
@@ -229,6 +240,7 @@ class _Lines:
     def __init__(self, manifest: Manifest, tell: Callable[[str], None]) -> None:
         self.manifest, self.tell, self.every = manifest, tell, max(1, round(60 / manifest.period_s))
         self.last: tuple[str, tuple[float, ...], str] | None = None
+        self.known = False  # whether the plant has shown itself: before, set points are none that anybody named
 
     def show(self, sample: Sample | None, command: Command) -> None:
         """Tell the scan if it is one of those."""
@@ -236,13 +248,19 @@ class _Lines:
         if now == self.last and command.scan % self.every:
             return
         self.last, m = now, self.manifest
-        parts = [f"SP {s.name} {v:.5g}" for s, v in zip(m.sp, command.sp.tolist(), strict=True)]
+        self.known = self.known or not command.reason
+        parts = [f"SP {s.name} {v:.5g}" for s, v in zip(m.sp, command.sp.tolist(), strict=True) if self.known]
         if sample is not None:
-            parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in zip(m.pv, sample.pv.tolist(), strict=True)]
-        parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in zip(m.mv, command.mv.tolist(), strict=True)]
+            parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.pv, sample.pv)]
+        parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.mv, command.mv)]
         if not command.writes and command.law_mv is not None:
             parts += [f"(law {s.name} {v:.5g})" for s, v in zip(m.mv, command.law_mv.tolist(), strict=True)]
         self.tell(f"{command.mode:<6}  {'  '.join(parts)}  {command.reason}".rstrip())
+
+
+def _known(signals: Sequence[Signal], values: NDArray[np.float64]) -> list[tuple[Signal, float]]:
+    """The signals whose value is known, which is no NaN."""
+    return [(s, v) for s, v in zip(signals, values.tolist(), strict=True) if not isnan(v)]
 
 
 def _export(options: argparse.Namespace) -> int:

@@ -88,7 +88,6 @@ def test_a_trend_that_is_none_is_refused(browser: Browser, query: str) -> None:
 
 
 def test_metrics_and_health(browser: Browser, loop: FakeLoop) -> None:
-    loop.state["verdicts"].append({"name": "time in HOLD", "level": "not known yet"})
     status, headers, body = browser.get("/metrics")
     assert status == 200
     assert headers["Content-Type"].startswith("text/plain; version=0.0.4")
@@ -199,6 +198,21 @@ def test_a_page_that_died_is_started_again_and_ends_with_its_loop(loop: FakeLoop
     finally:
         page.close()
     assert within(10, lambda: not _answers(browser))
+
+
+def test_a_page_that_ends_by_the_signal_that_ends_its_loop_is_not_started_again(loop: FakeLoop) -> None:
+    """SIGTERM to the whole process group reaches both; the loop says that it is about to end."""
+    told: list[str] = []
+    page, browser = opened(loop, told)
+    try:
+        page.leaving = True
+        os.kill(page._process.pid, signal.SIGTERM)
+        page._thread.join(10)
+        assert not page._thread.is_alive()
+    finally:
+        page.close()
+    assert told == []
+    assert not _answers(browser)
 
 
 def _answers(browser: Browser) -> bool:
