@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -60,30 +60,38 @@ def fitted(controller: Controller, loop: Manifest) -> Controller:
 
 def require_fits(own: Manifest, loop: Manifest) -> None:
     """LoopError where a controller of ``own`` cannot take over in a loop that reads ``loop``; see ``fitted``."""
+    differ = [*_basics(own, loop), *_steered(own, loop), *_measured(own, loop)]
+    if differ:
+        plants = f"the new controller (made for {own.case}) does not fit this loop (made for {loop.case})"
+        raise LoopError(f"{plants}: {'; '.join(differ)}")
+
+
+def _basics(own: Manifest, loop: Manifest) -> Iterator[str]:
     if own.period_s != loop.period_s:
-        raise LoopError(f"the new controller has a period of {own.period_s:g} s; the loop runs at {loop.period_s:g} s")
+        yield f"its period is {own.period_s:g} s, the loop's is {loop.period_s:g} s"
     if "dv" in own.inputs and "dv" not in loop.inputs:
-        raise LoopError(
-            "the new controller uses measured disturbances, which this loop does not judge; restart with it"
-        )
+        yield "it uses measured disturbances, which this loop does not judge; restart with it"
+
+
+def _steered(own: Manifest, loop: Manifest) -> Iterator[str]:
+    """Set points and MVs, which must be the same."""
     for name, words, ranged in (("sp", "set points", False), ("mv", "MVs", True)):
         ours, its = loop.signals(name), own.signals(name)
         if [_what(s, ranged) for s in ours] != [_what(s, ranged) for s in its]:
             same = "name, unit, range and order" if ranged else "name, unit and order"
-            raise LoopError(
-                f"the new controller's {words} are {_shown(its)}; the loop's are {_shown(ours)}, and both must be the "
-                f"same in {same}"
-            )
+            yield f"its {words} are {_shown(its)}, the loop's are {_shown(ours)}, and both must be the same in {same}"
+
+
+def _measured(own: Manifest, loop: Manifest) -> Iterator[str]:
+    """PVs and measured disturbances, of which it may leave some out."""
     controlled = len(loop.sp)
     for name, words, first in (("pv", "PVs", controlled), ("dv", "measured disturbances", 0)):
         ours, its = loop.signals(name), own.signals(name)
         known = [_what(s) for s in ours]
         if [_what(s) for s in its[:first]] != known[:first] or not {_what(s) for s in its} <= set(known):
             order = ", and must begin with those that are controlled, in the same order" if first else ""
-            raise LoopError(
-                f"the new controller's {words} are {_shown(its)}; the loop's are {_shown(ours)}: it may leave some of "
-                f"them out, but have no others{order}"
-            )
+            may = f"it may leave some of them out, but have no others{order}"
+            yield f"its {words} are {_shown(its)}, the loop's are {_shown(ours)}: {may}"
 
 
 def _seen_as(own: Manifest, loop: Manifest) -> Manifest:

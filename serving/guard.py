@@ -25,9 +25,10 @@ class Sample:
 
     ``mv_applied`` is the MV that the plant really received over the last period, read back; None
     where it cannot be read now: a loop that lost its plant goes on from the next one. ``age_s`` is
-    the time since the PVs were measured. ``fault`` says why the endpoint does not trust its own
-    sample; empty: it does. ``quality`` is for the journal and the page: an OPC UA status for each PV,
-    then each MV, then each measured disturbance that is read; empty: the endpoint has none.
+    the time since the PVs were measured; ``late`` names those whose own age it is, where that is not all of them.
+    ``fault`` says why the endpoint does not trust its own sample; empty: it does. ``quality`` is for the journal and
+    the page: an OPC UA status for each PV, then each MV, then each measured disturbance that is read; empty: the
+    endpoint has none.
     """
 
     pv: Array  # shape: (n_pv,)
@@ -36,6 +37,7 @@ class Sample:
     age_s: float = 0.0
     fault: str = ""
     quality: tuple[int, ...] = ()
+    late: str = ""
 
 
 class Guard(Protocol):
@@ -162,7 +164,8 @@ class Fresh:
         if not _is_age(sample.age_s):
             return f"the sample's age is {sample.age_s!r}; it must be a finite number of seconds, 0 or more"
         if sample.age_s > self.max_age_s:
-            return f"the sample is {sample.age_s:.3g} s old; allowed are {self.max_age_s:.3g} s"
+            of = f" of {sample.late}" if sample.late else ""
+            return f"the sample{of} is {sample.age_s:.3g} s old; allowed are {self.max_age_s:.3g} s"
         return None
 
 

@@ -46,7 +46,8 @@ class FakeLoop:
         self.state = {
             "time": BEGIN, "scan": 100, "alive": True, "mode": "AUTO", "reason": "", "missed": 1, "faults": 2,
             "sp": [0.5] * len(m.sp), "pv": [0.4, None], "mv": None, "journal": "", "sha256": controller.sha256,
-            "verdicts": [{"name": "residual", "level": "watch"}], "numbers": {"saturated_share": 0.25},
+            "verdicts": [{"name": "residual", "level": "watch"}, {"name": "time in HOLD", "level": "not known yet"}],
+            "numbers": {"saturated_share": 0.25},
         }  # fmt: skip
         self.control = Control(self.journal, self.answer)
 

@@ -14,7 +14,7 @@ COMMANDS = {
     "check": "read every section of params.yaml and list its mistakes",
     "results": "show the figures of every controller, and where to look",
     "simulate": "close the loop of a controller file over its plant",
-    "loop": "run a controller on a plant over OPC UA: init, check, run, export",
+    "loop": "run a controller on a plant over OPC UA: init, check, run, export, events",
     "plant": "serve a simulated plant over OPC UA, to try a loop on",
     "playground": "try a plant and two of its controllers by hand in a browser",
     "stress": "close the loops of a controller file over many plants drawn at random",

@@ -32,3 +32,8 @@ class Share(Remembers):
     def learnt(self) -> bool:
         """Whether it has seen enough."""
         return self.count >= self.learn
+
+    @property
+    def done(self) -> float:
+        """How much of that it has seen, from 0 to 1."""
+        return min(self.count / self.learn, 1.0)

@@ -3,7 +3,7 @@
 | verdict | held against |
 |---|---|
 | saturated, at a rate limit, outside the domain | twice the share of the learning time, at least .2 (domain: .1) |
-| in HOLD | .02 |
+| time in HOLD | .02 |
 | MV at its end beside an error above a tenth of the range | two settling times |
 | MV that turns round | four of five moves, of a twentieth of its range |
 | swing | regularity 1, with errors beyond LOUD times the learning time's at rest (before that: a tenth of the range) |
@@ -225,13 +225,18 @@ def _shares(m: Monitor) -> list[Verdict]:
     found = []
     for name, share, least, words in rows:
         if not share.learnt:
-            found.append(unknown(name, "still measured"))
+            found.append(unknown(name, f"still measured: {share.done:.0%} done"))
             continue
         limit = max(2 * share.first, least)
         level: Level = "watch" if share.value > limit else "as validated"
         found.append(Verdict(name, level, f"{share.value:.1%} {words}", share.value, limit))
-    level = "watch" if m.hold.value > MOST_HOLD and m.hold.learnt else "as validated"
-    found.append(Verdict("HOLD", level, f"{m.hold.value:.1%} of the time the loop holds", m.hold.value, MOST_HOLD))
+    name = "time in HOLD"  # not "HOLD": beside events of the mode it would read as one
+    if not m.hold.learnt:
+        found.append(unknown(name, f"still measured: {m.hold.done:.0%} done"))
+    else:
+        level = "watch" if m.hold.value > MOST_HOLD else "as validated"
+        text = f"{m.hold.value:.1%} of the time the loop holds"
+        found.append(Verdict(name, level, text, m.hold.value, MOST_HOLD))
     return found
 
 

@@ -149,7 +149,13 @@ class OpcUaEndpoint:
         # An MV of long ago, or from before a write that failed, is none that the plant has now; an old PV may come with
         # a young MV.
         mv = values.mv if self._told and now - values.arrived_s <= self.max_age_s else None
-        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault, values.quality)
+        late = self._late(values, now)
+        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault, values.quality, late)
+
+    def _late(self, values: Values, now: float) -> str:
+        """The signals that are too old, where others are not."""
+        late = [name for name, age in values.ages.items() if now - values.arrived_s + age > self.max_age_s]
+        return ", ".join(late) if len(late) == 1 or len(late) < len(values.ages) else ""
 
     def write(self, mv: Array) -> None:
         """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection.
@@ -316,7 +322,7 @@ class OpcUaEndpoint:
                 silent = 0
                 self._slowest_s = max(self.clock() - now, FADES * self._slowest_s)
                 self.values = self._sampling.valued(
-                    plan, answers, ages, self.clock(), self._heartbeat.trouble, self.starts
+                    plan, answers, ages, self.clock(), unbeaten=self._heartbeat.trouble, starts=self.starts
                 )
                 self.trouble, self._missed, self._shown = "", "", self.connections
             else:

@@ -1,4 +1,4 @@
-"""What a server has answered, as the values of a scan: judged by quality, age, watchdog and heartbeat."""
+"""What the answers of one reading say: values in engineering units, and the first thing that is wrong with them."""
 
 from __future__ import annotations
 
@@ -17,6 +17,12 @@ from serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading
 
 Array: TypeAlias = NDArray[np.float64]
 
+NO_NUMBERS = ("nan", "inf", "-inf")
+SLOW = (
+    "the plant's watchdog moves, but not within {} scans: the plant runs at another speed than `speed` in loop.toml "
+    "says, or `nodes.watchdog_scans` is too small"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Values:
@@ -31,24 +37,22 @@ class Values:
     quality: tuple[int, ...]
     asked_sp: Mapping[str, float] = field(default_factory=dict)
     asked_mode: str = ""
+    ages: Mapping[str, float] = field(default_factory=dict)  # [s] of each measured value, by name
     starts: int = 0  # how often the server has started anew since the endpoint did
 
 
 class Sampling:
-    """Makes values of answers, by what the settings believe of a server."""
+    """Makes values of answers. It remembers the plant's watchdog from reading to reading."""
 
     def __init__(self, manifest: Manifest, server: Server, nodes: Nodes) -> None:
         self.manifest, self.server, self.nodes = manifest, server, nodes
-        self._watched = (float("nan"), 0)  # what the watchdog showed last, and for how many scans it has stood
+        self._watched = float("nan"), 0  # the watchdog, and for how many readings it has stood there
+        self._dead, self._slow = "", False  # why the plant counts as dead; whether its watchdog has moved since
 
     def valued(
-        self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, unbeaten: str, starts: int
+        self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, *, unbeaten: str, starts: int
     ) -> Values:
-        """The answers as values, with the first thing that is wrong with them.
-
-        They arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not reach the server, which has
-        started anew ``starts`` times.
-        """
+        """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
         fault, found = "", dict[str, float]()
         for (name, point, judged), answer in zip(plan.points, answers, strict=False):
             usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
@@ -61,7 +65,7 @@ class Sampling:
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
                 fault = f"{name}: {answer.words}"
             elif answer.text:
-                fault = f"{name}: {answer.text}"
+                fault = f"{name}: {_given(name, answer.text)}"
         judge = self.server.source_time == "judge"
         timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
         m = self.manifest
@@ -84,14 +88,30 @@ class Sampling:
             tuple(a.status for a in answers[:n]),
             asked_sp,
             mode,
+            {plan.points[i][0]: age for i, age in zip(plan.timed, timed, strict=True)},
             starts,
         )
 
     def dead(self, watchdog: float) -> str:
-        """Why the server's side counts as dead; empty while its watchdog moves."""
+        """Why the server's side counts as dead; empty while its watchdog moves.
+
+        One that has stood is believed once it moves twice within ``watchdog_scans``: a slow one would else make a fault
+        of each of its values.
+        """
         last, scans = self._watched
-        moves = watchdog != last and not np.isnan(watchdog)  # one that is gone has stopped, too
-        self._watched = (watchdog, 0 if moves else scans + 1)
-        if self._watched[1] < self.nodes.watchdog_scans:
-            return ""
-        return f"the plant's watchdog has stood at {watchdog:g} for {self._watched[1]} scans"
+        most = self.nodes.watchdog_scans
+        if watchdog != last and not np.isnan(watchdog):  # one that is gone has stopped, too
+            self._watched = watchdog, 0
+            self._dead, self._slow = ("", False) if scans < most else (self._dead, bool(self._dead))
+            return self._dead
+        self._watched = watchdog, scans + 1
+        if scans + 1 >= most:
+            stands = f"the plant's watchdog has stood at {watchdog:g} for {scans + 1} scans"
+            self._dead = SLOW.format(most) if self._slow else stands
+        return self._dead
+
+
+def _given(name: str, text: str) -> str:
+    """What a value is instead of a number; of NaN and infinity also who gives it."""
+    by = "read-back" if name.startswith("MV ") else "sensor"
+    return f"{text}: the {by} gives no number" if text in NO_NUMBERS else text

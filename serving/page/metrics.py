@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 MODES = ("SHADOW", "MANUAL", "AUTO", "HOLD")
-LEVELS = ("as validated", "watch", "retrain")
+LEVELS = {"not known yet": -1, "as validated": 0, "watch": 1, "retrain": 2}
 GROUPS = (
     ("setpoint", "sp", "sp", "Set point, in the signal's unit."),
     ("process_variable", "pv", "pv", "Process variable, in the signal's unit."),
@@ -53,10 +53,10 @@ def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tu
     yield "info", "gauge", "What the law tells of itself.", [({"name": name}, v) for name, v in infos]
     numbers = state.get("numbers") or {}
     yield "monitor", "gauge", "What the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
-    levels = [
-        ({"name": v["name"]}, LEVELS.index(v["level"])) for v in state.get("verdicts") or [] if v["level"] in LEVELS
-    ]
-    yield "verdict", "gauge", "Is the controller still right? 0 as validated, 1 watch, 2 retrain.", levels
+    verdicts = state.get("verdicts") or []
+    levels = [({"name": v["name"]}, LEVELS[v["level"]]) for v in verdicts if v["level"] in LEVELS]
+    words = "Is the controller still right? 0 as validated, 1 watch, 2 retrain, -1 not known yet."
+    yield "verdict", "gauge", words, levels
 
 
 def _labels(labels: Mapping[str, Any]) -> str:

@@ -17,6 +17,7 @@ from serving.page.settings import Page
 
 START_S = 20.0
 FIRST_PAUSE_S, LAST_PAUSE_S = 1.0, 60.0
+LEAVING_S = 0.5  # in which a loop that a signal to its whole group reaches knows that it ends
 
 
 class PageProcess:
@@ -39,6 +40,7 @@ class PageProcess:
             "token": self.token,
         }
         self._closed = threading.Event()
+        self.leaving = False  # the loop is about to end: a page that ends now is not started again
         self.url = ""
         self._process = self._started()
         self._thread = threading.Thread(target=self._keep, name="page", daemon=True)
@@ -90,7 +92,7 @@ class PageProcess:
                     said = _read(line).get("line")
                     if said:
                         self._tell(str(said))
-            if self._closed.is_set():
+            if self._closed.wait(LEAVING_S) or self.leaving:
                 return
             self._tell(f"the page has ended ({process.returncode}); it is started again")
             while not self._closed.wait(pause):

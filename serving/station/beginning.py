@@ -1,13 +1,19 @@
-"""Where a loop begins: on the plant as it is, as far as the first values tell."""
+"""Where a loop begins: on the plant as it is, as far as the first values tell, and after whom."""
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing, suppress
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from serving.controller import Controller
+from serving.errors import LoopError
 from serving.guard import implausible
+from serving.journal import JournalReader
 from serving.manifest import Signal
 from serving.opcua.sampling import Values
 
@@ -33,6 +39,17 @@ def begun_at(mv: Array, signals: tuple[Signal, ...]) -> list[float] | None:
     if implausible(signals, mv.tolist()):
         return None
     return [_allowed(v, s) for v, s in zip(mv.tolist(), signals, strict=True)]
+
+
+def another_before(journal: Path, controller: Controller) -> str:
+    """That the last loop of a journal ended with another controller, in one line; else empty."""
+    runs: list[dict[str, object]] = []
+    with suppress(LoopError, sqlite3.Error), closing(JournalReader(journal)) as reader:
+        runs = reader.runs()
+    if not runs or runs[-1]["sha256"] == controller.sha256:
+        return ""
+    last = f"{runs[-1]['controller']} ({str(runs[-1]['sha256'])[:12]})"
+    return f"begins with {controller.path.name} ({controller.sha256[:12]}); the journal's last controller was {last}"
 
 
 def _allowed(value: float, signal: Signal) -> float:

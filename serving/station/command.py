@@ -9,18 +9,23 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import fields
+from math import isnan
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from serving.errors import LoopError
 from serving.guard import Sample
 from serving.journal import JournalReader
 from serving.loop import Command, Mode
-from serving.manifest import Manifest
+from serving.manifest import Manifest, Signal
 from serving.station.control import ask
 from serving.station.export import export, tag_table
+from serving.station.happened import happened, journal_of, lines, write_csv
 from serving.station.requests import TRIAL
 from serving.station.settings import Settings
 from serving.station.template import template
@@ -45,6 +50,14 @@ def options(parser: argparse.ArgumentParser) -> None:
     out = commands.add_parser("export", help="write a journal's scans as a CSV that `loopwright new` reads")
     out.add_argument("file", metavar="JOURNAL", type=Path, help="the journal's file, also of a loop that runs")
     out.add_argument("--out", metavar="FILE", type=Path, help="where it goes (JOURNAL.csv)")
+    out.add_argument("--replace", action="store_true", help="write over an earlier export")
+    events = commands.add_parser("events", help="list what a journal says happened: when, who, what, and why")
+    events.add_argument(
+        "file", metavar="FILE", type=Path, nargs="?", default=SETTINGS, help="loop.toml or a journal (%(default)s)"
+    )
+    events.add_argument("--since", metavar="TIME", default="", help="from then on, as 2026-03-01T14:30 (UTC)")
+    events.add_argument("--last", metavar="N", type=int, help="the last N only")
+    events.add_argument("--csv", action="store_true", help="as CSV, for other tools")
 
 
 def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -70,7 +83,7 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 
 def run(options: argparse.Namespace) -> int:
     """Do what was asked for; the exit status."""
-    does = {"init": _init, "check": _check, "run": _run, "export": _export, "state": _state}
+    does = {"init": _init, "check": _check, "run": _run, "export": _export, "events": _events, "state": _state}
     return does.get(options.action, _ask)(options)
 
 
@@ -135,11 +148,18 @@ def _init(options: argparse.Namespace) -> int:
         path = options.file.absolute().relative_to(folder)
     except ValueError:
         path = options.file.absolute()
-    make(folder / "loop-certificate.der", folder / "loop-key.pem")
+    files = folder / "loop-certificate.der", folder / "loop-key.pem"
+    before = [file.read_bytes() if file.is_file() else b"" for file in files]
+    make(*files)
+    kept = before == [file.read_bytes() for file in files]
     options.out.write_text(
         template(controller, path, options.endpoint, f"{options.out.stem}.journal"), encoding="utf-8"
     )
-    print(f"written: {options.out}, and beside it loop-certificate.der (for the server to trust) and loop-key.pem")
+    pair = "loop-certificate.der (for the server to trust) and loop-key.pem"
+    if kept:
+        print(f"written: {options.out}; it uses {pair}, which were there already")
+    else:
+        print(f"written: {options.out}, and beside it {pair}")
     print(f"next: put the plant's node ids in, then `loopwright loop check {options.out}`")
     return 0
 
@@ -225,6 +245,7 @@ class _Lines:
     def __init__(self, manifest: Manifest, tell: Callable[[str], None]) -> None:
         self.manifest, self.tell, self.every = manifest, tell, max(1, round(60 / manifest.period_s))
         self.last: tuple[str, tuple[float, ...], str] | None = None
+        self.known = False  # whether the plant has shown itself: before, set points are none that anybody named
 
     def show(self, sample: Sample | None, command: Command) -> None:
         """Tell the scan if it is one of those."""
@@ -232,25 +253,43 @@ class _Lines:
         if now == self.last and command.scan % self.every:
             return
         self.last, m = now, self.manifest
-        parts = [f"SP {s.name} {v:.5g}" for s, v in zip(m.sp, command.sp.tolist(), strict=True)]
+        self.known = self.known or not command.reason
+        parts = [f"SP {s.name} {v:.5g}" for s, v in zip(m.sp, command.sp.tolist(), strict=True) if self.known]
         if sample is not None:
-            parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in zip(m.pv, sample.pv.tolist(), strict=True)]
-        parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in zip(m.mv, command.mv.tolist(), strict=True)]
+            parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.pv, sample.pv)]
+        parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.mv, command.mv)]
         if not command.writes and command.law_mv is not None:
             parts += [f"(law {s.name} {v:.5g})" for s, v in zip(m.mv, command.law_mv.tolist(), strict=True)]
         self.tell(f"{command.mode:<6}  {'  '.join(parts)}  {command.reason}".rstrip())
 
 
+def _known(signals: Sequence[Signal], values: NDArray[np.float64]) -> list[tuple[Signal, float]]:
+    """The signals whose value is known, which is no NaN."""
+    return [(s, v) for s, v in zip(signals, values.tolist(), strict=True) if not isnan(v)]
+
+
 def _export(options: argparse.Namespace) -> int:
     out = options.out or options.file.with_suffix(".csv")
-    rows = export(options.file, out)
     tags = out.with_name(f"{out.stem}-tags.csv")
+    for file in (out, tags):
+        if file.exists() and not options.replace:  # params.yaml may name it as the data of a controller
+            raise LoopError(f"{file} is there already; name another file by --out, or write over it with --replace")
+    rows = export(options.file, out)
     tag_table(options.file, tags)
     print(f"{rows} scans: {out}, its tags: {tags}")
     with closing(JournalReader(options.file)) as reader:
         period_s = reader.runs()[-1]["period_s"]
     # Without the period `new` would choose one, and a controller of another period could not be swapped in.
     print(f"next: `loopwright new NAME {out} --tags {tags} --period {period_s:g}` makes a record of it")
+    return 0
+
+
+def _events(options: argparse.Namespace) -> int:
+    events = happened(journal_of(options.file), options.since, options.last)
+    if options.csv:
+        write_csv(events, sys.stdout)
+    else:
+        print("\n".join(lines(events) or ["nothing has happened there"]))
     return 0
 
 

@@ -22,6 +22,7 @@ from serving.manifest import Manifest
 
 Array: TypeAlias = NDArray[np.float64]
 
+AGE = re.compile(r"is \S+ s old; allowed are (\S+) s")
 NUMBER = re.compile(r"(?<!\w)[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w)")
 
 
@@ -31,7 +32,7 @@ class Recorder:
     def __init__(self, journal: Journal, say: Callable[[str], None], speed: float = 1.0) -> None:
         self.journal, self._say, self._speed = journal, say, speed
         self._controller: Controller | None = None
-        self._fault, self._trial = "", ""
+        self._fault, self._trial, self._mode = "", "", ""
 
     @property
     def controller(self) -> Controller:
@@ -62,6 +63,8 @@ class Recorder:
         about: int = 0,
     ) -> None:
         """Write an event down, and say it."""
+        if kind == "change" and what.startswith("mode "):  # "mode AUTO" or "mode SHADOW -> AUTO"
+            self._mode = what.rpartition(" ")[2]
         self.journal.event(Event(time.time(), kind, who, what, reason, alarm, raised, about))
         said = f"acknowledged: {what}" if kind == "acknowledged" else what
         self._say(f"{who}: {said}" + (f" ({reason})" if reason else ""))
@@ -74,12 +77,19 @@ class Recorder:
         # A reason whose numbers change, such as an age, is the same fault.
         if command.reason != self._fault and kind_of(command.reason) != kind_of(self._fault):
             before, self._fault = self._fault, command.reason
-            what = command.reason or f"over: {before}"
+            what = lasting(command.reason or f"over: {before}")
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.reason))
+        self._changed(command)
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
             self.begin(loop.controller)
         self._tried(loop)
+
+    def _changed(self, command: Command) -> None:
+        """Say that the mode is another one though nobody asked for it: HOLD by a fault, and the way back."""
+        if self._mode and command.mode.value != self._mode:
+            self.note("change", "loop", f"mode {self._mode} -> {command.mode.value}", lasting(command.reason))
+        self._mode = command.mode.value
 
     def _tried(self, loop: ControlLoop) -> None:
         """Say once why a trial began anew."""
@@ -92,6 +102,11 @@ class Recorder:
 def kind_of(reason: str) -> str:
     """A reason without its numbers."""
     return NUMBER.sub("#", reason)
+
+
+def lasting(reason: str) -> str:
+    """A reason for as long as it lasts: an age grows meanwhile."""
+    return AGE.sub(r"is older than \1 s", reason)
 
 
 def named(controller: Controller) -> str:

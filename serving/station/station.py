@@ -27,7 +27,7 @@ from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.sampling import Values
 from serving.opcua.settings import Server
 from serving.page.process import PageProcess
-from serving.station.beginning import begun_at, near, usable
+from serving.station.beginning import another_before, begun_at, near, usable
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
 from serving.station.making import control_loop
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = NDArray[np.float64]
 
-POLL_S = 0.05
+POLL_S, SILENCE_S = 0.05, 1.0  # between two looks for the first values, and until it is said that there are none
 LONGEST_ANSWER_S = 5.0
 
 
@@ -95,6 +95,7 @@ class Station:
         self._left_at: Array | None = None  # shape: (n_mv,), the last command that was known
         self.stepped: Controller | None = None  # the controller of that scan
         self.scans = self.faults = self.missed = 0
+        self._blind = False  # begun without a value of the plant, and none since
         self.warnings: list[str] = []
         self.ended = False
         self.page: PageProcess | None = None
@@ -123,6 +124,8 @@ class Station:
     def end(self) -> None:
         """Stop after the present scan."""
         self.ended = True
+        if self.page is not None:
+            self.page.leaving = True  # whoever ends the loop may have ended its page, too
 
     def run(self, n: int | None = None) -> RunReport:
         """Connect, and scan until ``end`` or for ``n`` scans."""
@@ -141,10 +144,14 @@ class Station:
             if self.ended:
                 self.recorder.note("change", "loop", "ended before the first scan: nothing was written")
                 return RunReport(0, 0, 0, 0.0)
+            self._blind = first is None
             pv = None if first is None else first.pv[: len(m.sp)]
             mv = None if first is None else begun_at(first.mv, m.mv)
             self.loop = control_loop(s, self.controller, self.endpoint, sp=near(pv, m.sp), mv=mv, clock=self.clock)
+            before = another_before(s.journal.file, self.controller)
             self.recorder.begin(self.controller)
+            if before:
+                self.recorder.note("swap", "loop.toml", before)
             signed = signer(self.controller)
             by = "" if signed is None else f"; {self.controller.path.name} is signed by {signed.words}"
             self.recorder.note("change", "loop.toml", f"started in {s.start}{by}")
@@ -182,6 +189,8 @@ class Station:
             if self.settings.start == "SHADOW" and waited >= limit:
                 return None
             time.sleep(POLL_S)
+            if waited < SILENCE_S <= waited + POLL_S:
+                self.tell("the plant gives no values yet: the loop goes on trying; Ctrl-C ends it")
             waited += POLL_S
         return self.endpoint.values if usable(self.endpoint.values) else None
 
@@ -189,6 +198,7 @@ class Station:
         """Changes that were asked for, here or on the plant's side."""
         assert self.loop is not None
         self.missed = k - self.scans
+        self._at_last(self.loop)
         # Before the first scan nobody knows where the MV stands.
         while self.scans and not self.changes.empty():
             change = self.changes.get()
@@ -206,6 +216,15 @@ class Station:
         if values is not None and self.scans:
             self._plant_side(self.loop, values)
         self._let_go(self.loop)
+
+    def _at_last(self, loop: ControlLoop) -> None:
+        """A shadow that began without the plant begins at its PVs once it sees them, unless a set point was named."""
+        values, sp = self.endpoint.values, self.manifest.sp
+        if self._blind and values is not None and usable(values):
+            self._blind = False
+            if loop.sp.tolist() == near(None, sp):
+                loop.set_sp(near(values.pv[: len(sp)], sp))
+                self.recorder.note("change", "loop", f"set point {_shown(loop.sp, sp)}", "where the plant stands")
 
     def _let_go(self, loop: ControlLoop) -> None:
         """Write nothing while another loop has the lock of a node, whoever asks for it."""

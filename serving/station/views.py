@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from serving.controller import Controller
 from serving.journal import columns
-from serving.opcua.link import words
+from serving.opcua.values import words
 from serving.trust import signer
 
 if TYPE_CHECKING:

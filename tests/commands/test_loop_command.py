@@ -78,6 +78,11 @@ def test_the_way_from_a_controller_to_training_data(
     assert table["T.PV"].between(200, 600).all()
     times = pd.to_datetime(table["time"])
     assert times.is_monotonic_increasing
+    before_text = Path("loop.csv").read_text()
+    assert main(["loop", "export", "loop.journal"]) == 2
+    assert "loop.csv is there already; name another file by --out, or write over it" in capsys.readouterr().err
+    assert Path("loop.csv").read_text() == before_text
+    assert main(["loop", "export", "loop.journal", "--replace"]) == 0
 
 
 def test_a_shadow_writes_nothing_but_its_heartbeat(
@@ -319,9 +324,16 @@ def test_what_is_there_is_not_written_over(settings: Path, capsys: pytest.Captur
     assert "nowhere.journal is not here" in capsys.readouterr().err
 
 
-def test_a_journal_is_named_after_its_loop(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_journal_is_named_after_its_loop_and_a_second_one_uses_the_same_key(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["loop", "init", str(PID), "--out", "reactor.toml"]) == 0
+    assert "written: reactor.toml, and beside it loop-certificate.der" in capsys.readouterr().out
+    key = Path("loop-key.pem").read_bytes()
+    assert main(["loop", "init", str(PID), "--out", "second.toml"]) == 0
+    assert "written: second.toml; it uses loop-certificate.der (for the server to trust)" in capsys.readouterr().out
+    assert Path("loop-key.pem").read_bytes() == key
     assert Settings.read(Path("reactor.toml")).journal.file.name == "reactor.journal"
 
 

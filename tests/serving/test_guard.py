@@ -24,6 +24,7 @@ from serving import (
     Signal,
     default_guards,
 )
+from serving.station.recorder import lasting
 
 PV = (Signal("level", "m", 0.0, 2.0), Signal("T", "K", 250.0, 400.0))
 MANIFEST = Manifest(
@@ -104,6 +105,9 @@ def test_frozen_needs_that_many_equal_samples() -> None:
 def test_fresh() -> None:
     assert Fresh(0.5).check(sample(age_s=0.5), ()) is None
     assert Fresh(0.5).check(sample(age_s=0.6), ()) == "the sample is 0.6 s old; allowed are 0.5 s"
+    late = replace(sample(age_s=0.6), late="PV T")
+    assert Fresh(0.5).check(late, ()) == "the sample of PV T is 0.6 s old; allowed are 0.5 s"
+    assert lasting(str(Fresh(0.5).check(late, ()))) == "the sample of PV T is older than 0.5 s"
     assert Fresh(0.5).check(sample(age_s=math.nan), ()) is not None
 
 

@@ -296,6 +296,24 @@ def test_nothing_that_a_loop_gives_raises_and_its_memory_is_bounded() -> None:
     json.dumps(monitor.numbers(), allow_nan=False)
 
 
+def test_a_loop_that_has_held_for_a_while_is_not_judged_by_its_first_scans() -> None:
+    """How much of its time a loop holds is known after 20 settling times; a start is no measure of it."""
+    monitor = Monitor(manifest(), started_s=0.0)
+    measured = monitor.hold.learn
+
+    def verdict() -> Any:
+        return next(v for v in monitor.verdicts() if v.name == "time in HOLD")
+
+    for k in range(measured):
+        assert (verdict().level, verdict().value) == ("not known yet", None)
+        assert verdict().text.startswith("still measured")
+        monitor.observe(float(k), None, command(k, Mode.HOLD if k < measured // 4 else Mode.AUTO))
+    assert (verdict().level, verdict().value) == ("watch", pytest.approx(0.25, abs=0.01))
+    for k in range(measured, 20 * measured):
+        monitor.observe(float(k), None, command(k))
+    assert verdict().level == "as validated"
+
+
 def test_a_monitor_that_starts_again_goes_on_where_it_was() -> None:
     one = Monitor(manifest(), started_s=0.0)
     loop(one, 9_000, seed=0)

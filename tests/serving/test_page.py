@@ -95,6 +95,7 @@ def test_metrics_and_health(browser: Browser, loop: FakeLoop) -> None:
     assert 'loopwright_mode{mode="AUTO"} 1.0' in lines
     assert "loopwright_missed_total 1.0" in lines
     assert 'loopwright_verdict{name="residual"} 1.0' in lines
+    assert 'loopwright_verdict{name="time in HOLD"} -1.0' in lines
     assert 'loopwright_monitor{name="saturated_share"} 0.25' in lines
     families = [line.split()[2] for line in lines if line.startswith("# TYPE")]
     assert len(families) == len(set(families))
@@ -197,6 +198,21 @@ def test_a_page_that_died_is_started_again_and_ends_with_its_loop(loop: FakeLoop
     finally:
         page.close()
     assert within(10, lambda: not _answers(browser))
+
+
+def test_a_page_that_ends_by_the_signal_that_ends_its_loop_is_not_started_again(loop: FakeLoop) -> None:
+    """SIGTERM to the whole process group reaches both; the loop says that it is about to end."""
+    told: list[str] = []
+    page, browser = opened(loop, told)
+    try:
+        page.leaving = True
+        os.kill(page._process.pid, signal.SIGTERM)
+        page._thread.join(10)
+        assert not page._thread.is_alive()
+    finally:
+        page.close()
+    assert told == []
+    assert not _answers(browser)
 
 
 def _answers(browser: Browser) -> bool:

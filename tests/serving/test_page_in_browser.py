@@ -141,9 +141,13 @@ def test_an_operator_takes_a_loop_from_the_shadow_through_a_fault_to_another_con
     alarm = page.locator("#alarm-list .alarm", has_text="BadSensorFailure").first
     expect(alarm).to_have_attribute("data-level", "active")
     expect(page).to_have_title(re.compile(r"^\(\d+\) "))
+    events = page.locator("#events")
+    expect(events).to_contain_text("mode AUTO -> HOLD (PV T: BadSensorFailure)")
     picture(page, "page_hold")
     spoil(plant, "PV.T", "")
     expect(mode).to_have_text("AUTO")
+    expect(events).to_contain_text("mode HOLD -> AUTO")
+    assert events.locator("li").first.evaluate("e => e.querySelector('.what').offsetWidth / e.offsetWidth") > 0.95
     expect(alarm).to_have_attribute("data-level", "past-unseen")
     alarm.locator("button").click()
     confirm(page, why="the sensor was cleaned")
@@ -158,7 +162,7 @@ def test_an_operator_takes_a_loop_from_the_shadow_through_a_fault_to_another_con
     picture(page, "page_trial")
     expect(page.locator("#title")).to_have_text("inverse_dob for thiosulfate_cstr")
     expect(page.locator("#put-back")).to_be_visible()
-    expect(page.locator("#events")).to_contain_text("has the plant, after pid")
+    expect(events).to_contain_text("has the plant, after pid")
     assert any("anna: mode SHADOW -> AUTO" in event for event in loop.events())
 
 

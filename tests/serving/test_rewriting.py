@@ -78,5 +78,9 @@ def test_a_time_that_is_none_is_refused() -> None:
 def test_a_watchdog_that_is_gone_has_stopped(controller: Controller) -> None:
     of = endpoint(controller, 2.0, Clock())
     made = Sampling(of.manifest, of.server, replace(of.nodes, watchdog="ns=2;s=W", watchdog_scans=3))
-    assert [bool(made.dead(value)) for value in (1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 4.0)] == [False] * 5 + [True, False]
+    assert [bool(made.dead(value)) for value in (1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 4.0, 5.0)] == [False] * 5 + [
+        True,
+        True,
+        False,
+    ]
     assert [bool(made.dead(math.nan)) for _ in range(4)] == [False, False, True, True]

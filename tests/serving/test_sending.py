@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -76,6 +77,22 @@ def scan(loop: ControlLoop, plant: Plant) -> str:
     loop.run(1, observe=lambda _, command: reasons.append(command.reason))
     plant.sends()
     return reasons[0]
+
+
+def test_a_sample_tells_which_signal_is_old(plant: Plant) -> None:
+    """None where all are, for then it is the connection or the server; the age is that of the oldest."""
+    for ages, late in (
+        ({"PV level": 0.0, "PV T": 0.9}, ""),
+        ({"PV level": 0.0, "PV T": 15.0}, "PV T"),
+        ({"PV level": 2.0, "PV T": 15.0}, ""),
+        ({"PV level": 2.0, "PV T": 15.0, "DV inflow": 0.0}, "PV level, PV T"),
+        ({"PV level": 2.0}, "PV level"),
+        ({}, ""),
+    ):
+        assert plant.endpoint.values is not None
+        plant.endpoint.values = replace(plant.endpoint.values, ages=ages, age_s=max(ages.values(), default=0.0))
+        sample = plant.endpoint.read()
+        assert (sample.late, sample.age_s) == (late, max(ages.values(), default=0.0))
 
 
 def test_an_mv_that_a_slow_answer_holds_up_is_not_lost(loop: ControlLoop, plant: Plant) -> None:

@@ -23,6 +23,8 @@ from serving.loop import Command, within
 from serving.opcua.sampling import Values
 from serving.opcua.settings import Nodes, Server
 from serving.station import station
+from serving.station.beginning import another_before
+from serving.station.command import _Lines
 from serving.station.lease import Lease
 from serving.station.settings import Hold, JournalSettings, Settings
 from serving.station.station import Station
@@ -69,7 +71,7 @@ def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..
         server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
         made = Station(
             Settings(
-                PID,
+                changed.pop("controller", PID),
                 server,
                 Nodes(**NODES),
                 start=start,  # type: ignore[arg-type]
@@ -154,6 +156,52 @@ def test_a_shadow_without_first_values_takes_no_middle_for_the_mv(
     made.run(8)
     assert shown[:5] == [(Mode.SHADOW, None)] * 5
     assert plant.written == [310.0] * 3
+
+
+@pytest.mark.parametrize("named", [None, 0.7])
+def test_a_shadow_that_began_without_the_plant_begins_where_the_plant_stands(
+    named: float | None, make_station: Callable[..., tuple[Station, Any]]
+) -> None:
+    """At the PV, as it does with first values; a set point that somebody named stays. No number is shown before."""
+    made, plant = make_station("SHADOW")
+    plant.shows(math.nan, "PV T: Bad")
+    said: list[str] = []
+    made.tell = said.append
+    lines = _Lines(made.manifest, said.append)
+
+    def seen(sample: Sample | None, command: Command) -> None:
+        lines.show(sample, command)
+        assert made.loop is not None
+        if made.scans == 2 and named is not None:
+            made.loop.set_sp([named])
+        if made.scans == 3:
+            plant.shows(310.0)
+
+    made.watch(seen)
+    made.run(6)
+    assert said[0] == "the plant gives no values yet: the loop goes on trying; Ctrl-C ends it"
+    assert said[1] == "SHADOW  C_A 0.9 mol/l  PV T: Bad"
+    assert said[-1].startswith(f"SHADOW  SP C_A {named or 0.9:g}  C_A 0.9 mol/l  T 330 K  T_j 310 K")
+    assert not any("nan" in line for line in said)
+    assert ("loop: set point C_A 0.9 mol/l" in events(made)) == (named is None)
+
+
+def test_a_restart_with_another_controller_than_the_journals_last_one_is_told(
+    make_station: Callable[..., tuple[Station, Any]],
+) -> None:
+    for _ in range(2):
+        made, _ = make_station("SHADOW")
+        made.run(2)
+        assert not any("begins with" in line for line in events(made))
+    last = made.journal.path
+    other = Controller(PID.with_name("inverse_dob.onnx"))
+    words = another_before(last, other)
+    assert words.startswith(
+        f"begins with inverse_dob.onnx ({other.sha256[:12]}); the journal's last controller was pid"
+    )
+    made, _ = make_station("SHADOW", controller=other.path)
+    made.run(2)
+    assert f"loop.toml: {words}" in events(made)
 
 
 def test_a_set_point_of_the_plants_side_outside_its_range_takes_no_other_one_with_it(

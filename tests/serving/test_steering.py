@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import getpass
 import json
 import math
 import re
@@ -192,7 +193,13 @@ def test_an_alarm_is_acknowledged_once(loop: RunningLoop, plant: Plant, capsys: 
     spoil(plant, "PV.T", "bad")
     assert within(20, lambda: any("PV T: BadSensorFailure" in event for event in loop.events()))
     spoil(plant, "PV.T", "")
-    assert within(20, lambda: loop.events()[-1] == "fault loop: over: PV T: BadSensorFailure")
+    assert within(20, lambda: "fault loop: over: PV T: BadSensorFailure" in loop.events())
+    assert within(20, lambda: loop.events()[-1] == "change loop: mode HOLD -> AUTO")
+    assert [e for e in loop.events() if e.startswith("change ") and "mode" in e] == [
+        f"change {getpass.getuser()}: mode SHADOW -> AUTO",
+        "change loop: mode AUTO -> HOLD",
+        "change loop: mode HOLD -> AUTO",
+    ]
     journal = loop.settings.journal.file
     with closing(JournalReader(journal)) as reader:
         (alarm,) = [e for e in reader.entries() if e.event.raised]

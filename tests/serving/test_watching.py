@@ -125,10 +125,10 @@ def test_an_alarm_is_written_down_within_one_look_whatever_the_clock_does(
         watching.seen(controller, scan_of(controller, k, time_s))
 
     scan(0, 1e9)
-    verdicts = [Verdict("HOLD", "watch", "the loop holds")]
+    verdicts = [Verdict("time in HOLD", "watch", "the loop holds")]
     monkeypatch.setattr(type(watching.monitor), "verdicts", lambda self: verdicts)
     scan(1, 1e9 + set_by_s + m.period_s)
-    assert notes == ["HOLD: watch: the loop holds"]
+    assert notes == ["time in HOLD: watch: the loop holds"]
     for k in range(2, 11):
         scan(k, 1e9 + set_by_s + k * m.period_s)
     assert len(notes) == 1
