@@ -15,6 +15,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 from processes import within
@@ -133,10 +134,18 @@ class Wire:
                     threading.Thread(target=self._pass, args=(a, b), daemon=True).start()
 
     def _pass(self, source: socket.socket, to: socket.socket) -> None:
+        came = Queue[tuple[float, bytes]]()  # each with when it is due, so that none is kept longer for those before it
+        threading.Thread(target=self._deliver, args=(came, source, to), daemon=True).start()
         with suppress(OSError):
             while data := source.recv(65_536):
-                if self.delay_s:
-                    time.sleep(self.delay_s)
+                came.put((time.monotonic() + self.delay_s, data))
+        came.put((0.0, b""))
+
+    def _deliver(self, came: Queue[tuple[float, bytes]], source: socket.socket, to: socket.socket) -> None:
+        with suppress(OSError):
+            while (next_one := came.get())[1]:
+                due, data = next_one
+                time.sleep(max(due - time.monotonic(), 0.0))
                 if self.cut:
                     return
                 to.sendall(data)

@@ -72,16 +72,30 @@ class Servers:
 
 @contextmanager
 def servers() -> Iterator[tuple[Servers, dict[str, str]]]:
-    """PostgreSQL, S3, MLflow, a scheduler and two workers; and the environment variables of one who uses them."""
+    """PostgreSQL, S3, MLflow, a scheduler and a worker; and the environment variables of one who uses them."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="loopwright-servers-")))
         folder.chmod(0o755)  # PostgreSQL may run as another user
         made = Servers(folder)
         stack.callback(made.end)
-        s3 = _s3(made)
+        scheduler, s3 = _begun_scheduler(made), _begun_s3(made)  # which import for seconds, as the others go on
         database = _postgres(made)
-        scheduler = _cluster(made)
-        yield made, {**KEYS, "AWS_ENDPOINT_URL": s3, "MLFLOW_TRACKING_URI": _mlflow(made, database, s3), **scheduler}
+        mlflow = _begun_mlflow(made, database, f"http://127.0.0.1:{s3}")
+        made.wait("scheduler", scheduler)
+        _worker(made, scheduler)
+        made.wait("s3", s3)
+        for bucket in BUCKETS:
+            requests.put(f"http://127.0.0.1:{s3}/{bucket}", timeout=20).raise_for_status()
+        made.wait("mlflow", mlflow)
+        yield (
+            made,
+            {
+                **KEYS,
+                "AWS_ENDPOINT_URL": f"http://127.0.0.1:{s3}",
+                "MLFLOW_TRACKING_URI": f"http://127.0.0.1:{mlflow}",
+                "DASK_SCHEDULER_ADDRESS": f"tcp://127.0.0.1:{scheduler}",
+            },
+        )
 
 
 def free_port() -> int:
@@ -124,36 +138,34 @@ def _postgres(made: Servers) -> str:
     return f"postgresql://mlflow@127.0.0.1:{port}/postgres"
 
 
-def _s3(made: Servers) -> str:
+def _begun_s3(made: Servers) -> int:
     port = free_port()
     made.start("s3", sys.executable, "-m", "moto.server", "--host", "127.0.0.1", "--port", port)
-    made.wait("s3", port)
-    at = f"http://127.0.0.1:{port}"
-    for bucket in BUCKETS:
-        requests.put(f"{at}/{bucket}", timeout=20).raise_for_status()
-    return at
+    return port
 
 
-def _mlflow(made: Servers, database: str, s3: str) -> str:
+def _begun_mlflow(made: Servers, database: str, s3: str) -> int:
     port = free_port()
     places = ("--backend-store-uri", database, "--artifacts-destination", "s3://mlflow/artifacts")
     at = ("--host", "127.0.0.1", "--port", port, "--workers", "1")
     off = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     env = {**KEYS, "MLFLOW_S3_ENDPOINT_URL": s3, **off}
     made.start("mlflow", sys.executable, "-m", "mlflow", "server", *places, *at, env=env)
-    made.wait("mlflow", port)
-    return f"http://127.0.0.1:{port}"
+    return port
 
 
-def _cluster(made: Servers) -> dict[str, str]:
-    """A scheduler and two workers of one thread, which have the sources and none of the files of a run."""
+DASK = (sys.executable, "-m", "dask")
+# The sources, and none of the files of a run.
+OF_DASK = {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__DAEMON": "True"}
+
+
+def _begun_scheduler(made: Servers) -> int:
     port = free_port()
-    env = {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__DAEMON": "True"}
-    dask, quiet = (sys.executable, "-m", "dask"), ("--no-dashboard",)
-    made.start("scheduler", *dask, "scheduler", "--host", "127.0.0.1", "--port", port, *quiet, env=env)
-    made.wait("scheduler", port)
-    address = f"tcp://127.0.0.1:{port}"
-    for number in range(2):
-        options = ("--nthreads", "1", "--memory-limit", "0", "--preload", "pipeline.engine.preload", *quiet)
-        made.start(f"worker{number}", *dask, "worker", address, *options, env=env)
-    return {"DASK_SCHEDULER_ADDRESS": address}
+    made.start("scheduler", *DASK, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard", env=OF_DASK)
+    return port
+
+
+def _worker(made: Servers, scheduler: int) -> None:
+    """A worker of one thread. One: each loads its libraries for 8 s of a core."""
+    options = ("--nthreads", "1", "--memory-limit", "0", "--preload", "pipeline.engine.preload", "--no-dashboard")
+    made.start("worker", *DASK, "worker", f"tcp://127.0.0.1:{scheduler}", *options, env=OF_DASK)

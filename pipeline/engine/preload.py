@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 # What stages import late and for long, the longest last; one that is missing or broken costs time alone.
 LIBRARIES = (
-    *("onnxruntime", "casadi", "jinja2", "pandas", "pyarrow.parquet", "matplotlib.figure", "onnx", "onnx_ir"),
-    *("sklearn.linear_model", "torch", "torch._dynamo", "torch.export._trace"),
+    *("onnxruntime", "casadi", "scipy.signal", "jinja2", "pandas", "pyarrow.parquet", "matplotlib.figure"),
+    *("onnx", "onnx_ir", "sklearn.linear_model", "torch", "torch._dynamo", "torch.export._trace"),
     *("torch.onnx._internal.exporter._compat", "onnxscript.optimizer", "onnxscript.function_libs.torch_lib.ops"),
 )
 IDLE_S = 0.05  # until a worker that has a task looks again whether it may go on importing

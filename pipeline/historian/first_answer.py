@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_toeplitz, solve_triangular, toeplitz
-from scipy.signal import fftconvolve, lfilter
 
 from pipeline.metrics import Array
 
@@ -47,6 +46,8 @@ def first_answer(y: Array, u: Array, run: NDArray[np.int64]) -> FirstAnswer | No
     back. Where the z_l before a move have the other sign than the answer, they are feedback, and the answer begins
     after the move.
     """
+    from scipy.signal import fftconvolve, lfilter
+
     n = min(len(y), MOST)
     du, dy = np.diff(u[:n], prepend=u[:1]), np.diff(y[:n], append=y[n - 1 : n])
     inside = run[1:n] == run[: n - 1]

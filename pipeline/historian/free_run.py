@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from pipeline.historian.linear import Linear, answer_of, fitted
 from pipeline.metrics import Array
@@ -70,6 +69,8 @@ def _differ(one: Linear, other: Linear) -> bool:
 
 def free_run(model: Linear, u: Sequence[Array], run: NDArray[np.int64]) -> Array:
     """Answer (n,) of the model to the inputs alone from rest at the start of each run (n,); NaN until lags are full."""
+    from scipy.signal import lfilter  # half a second to load, here and elsewhere in this room, for who screens alone
+
     back = model.blocks[-1][1]
     out = np.full(len(run), np.nan)
     edges = np.r_[0, np.flatnonzero(np.diff(run)) + 1, len(run)]

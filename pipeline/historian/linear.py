@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from pipeline.metrics import Array
 
@@ -64,6 +63,8 @@ class Linear:
 
     def step_response(self, i: int, length: int = 600) -> Array:
         """Answer of y to a unit step of input ``i`` at k = 0, (length,)."""
+        from scipy.signal import lfilter
+
         drive = np.zeros(length)
         for (first, last), b in zip(self.blocks, self.b[i], strict=True):
             for lag in range(first, last):

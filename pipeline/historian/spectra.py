@@ -8,7 +8,6 @@ from itertools import combinations_with_replacement, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import csd
 
 from pipeline.metrics import Array
 
@@ -59,6 +58,8 @@ def spectra(u: Array, y: Array, run: NDArray[np.int64], settling: Sequence[int])
 
     ``settling`` [rows] of the answer to each input. None where too few segments fit for the coherences.
     """
+    from scipy.signal import csd
+
     n, m = min(len(u), MOST), u.shape[1]
     length = int(np.clip(SETTLINGS * max(settling), SHORTEST, LONGEST))
     edges = np.r_[0, np.flatnonzero(np.diff(run[:n])) + 1, n]

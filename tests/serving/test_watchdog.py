@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from serving import Controller
-from serving.opcua.settings import Nodes, Server
 from serving.opcua.sampling import Sampling
+from serving.opcua.settings import Nodes, Server
 from serving.station.recorder import kind_of
 
 pytest_plugins = ["small_laws"]

@@ -1,0 +1,63 @@
+"""What a plant asks of its loop: modes, set points, types of values, and who has it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from asyncua import ua
+from plant_servers import SPACE, Plant, Wire
+from processes import within
+from served_plant import MODE, RECOVER, begun, read, served, wired, write  # noqa: F401
+
+from serving import Mode
+from serving.opcua.settings import HandBack
+from serving.station.settings import Hold
+
+
+def test_an_mv_node_of_another_type_is_written_in_that_type(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    """The server refuses, the loop holds and asks for the types anew, and goes on by itself."""
+    running = begun(tmp_path, wire.port)
+    running.becomes(Mode.AUTO, scans=8)
+    for kind in ("int", ""):
+        before = len(running.commands)
+        write(plant, "Faults.MV.T_j", kind)
+        assert within(20, lambda: any("BadTypeMismatch" in c.reason for c in running.commands[before:]))  # noqa: B023
+        running.becomes(Mode.AUTO, scans=8)
+        asked = [row["asked"][0] for row in plant.actuator()[-3:]]
+        assert all((value == round(value)) is (kind == "int") for value in asked)
+    running.end()
+
+
+def test_the_plants_own_operator_sets_mode_and_set_point(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    write(plant, "Control.Mode", 1, ua.VariantType.Int32)  # from before; no wish of now
+    running = begun(tmp_path, wire.port, start="SHADOW", nodes={"mode": MODE, "sp": {"C_A": f"{SPACE}SP.C_A"}})
+    running.becomes(Mode.SHADOW, scans=6)
+    write(plant, "Control.Mode", 0, ua.VariantType.Int32)
+    running.becomes(Mode.MANUAL)
+    write(plant, "Control.Mode", 1, ua.VariantType.Int32)
+    running.becomes(Mode.AUTO)
+    write(plant, "SP.C_A", 0.9)
+    assert within(20, lambda: running.commands[-1].sp.tolist() == [0.9])
+    write(plant, "SP.C_A", 1.7)
+    assert within(20, lambda: any("refused: set point C_A 1.7" in line for line in running.told))
+    assert running.commands[-1].sp.tolist() == [0.9]
+    running.end()
+
+
+def test_a_plant_is_handed_back_and_asked_for_again(plant: Plant, wire: Wire, tmp_path: Path) -> None:
+    running = begun(
+        tmp_path,
+        wire.port,
+        nodes={"hand_back": HandBack(f"{SPACE}Control.Owner", 0)},
+        hold=Hold(recover_after=RECOVER, max_s=1.0, then="hand back"),
+    )
+    running.becomes(Mode.AUTO, scans=5)
+    write(plant, "Faults.PV.T", "bad")
+    running.becomes(Mode.SHADOW)
+    assert read(plant, "Control.Owner") == 0
+    write(plant, "Faults.PV.T", "")
+    running.becomes(Mode.SHADOW, scans=10)  # who has the plant now decides
+    write(plant, "Control.Owner", 1, ua.VariantType.Int32)
+    assert running.ask(lambda loop: loop.set_mode(Mode.AUTO), "mode AUTO") == ""
+    running.becomes(Mode.AUTO, scans=5)
+    running.end()
