@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import os
 import signal
 from collections.abc import Callable
@@ -33,6 +34,9 @@ from pipeline.plants.equations import EquationPlant
 from pipeline.plants.signals import Signals
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import simulate_batch
+
+# What is imported stays: looking through it for garbage again and again takes a tenth of all CPU time.
+gc.disable()
 
 # The same examples on each run, however slow the machine is.
 hypothesis.settings.register_profile("same", derandomize=True, deadline=None, database=None)
@@ -101,16 +105,18 @@ LawFactory = Callable[..., ControlLaw]
 
 
 # By their time, those of 13 s and more. Taken first, so that with several workers none is waited for alone at the end.
-# The one that waits longest, for a plant on a clock of its own, begins when mypy beside the tests is done.
+# Those that mostly wait, for a plant on a clock of its own or for a browser, lie between those that compute: while one
+# waits the others have the cores. They begin when mypy beside the tests is done.
 LONG_FILES = (
     *("test_pipeline.py", "test_laws_contract.py", "test_real_servers.py", "test_plant_faults.py", "test_new.py"),
-    *("test_playground_in_browser.py", "test_screen_by_dvc.py", "test_screen.py", "test_export_to_controller.py"),
-    *("test_benchmark_of_monitor.py", "test_journal.py", "test_page_in_browser.py", "test_release.py"),
-    *("test_identified_part.py", "test_tracking.py", "test_page_for_everybody_in_browser.py"),
-    *("test_page_troubles_in_browser.py", "test_cluster_stages.py", "test_cluster.py"),
-    *("test_laws_that_are_refused.py", "test_manual_builds.py", "test_report.py", "test_predictive.py"),
-    *("test_signed_registry.py", "test_loop_certificates.py", "test_repeatable.py", "test_browser_host.py"),
-    *("test_steering.py", "test_fmu_memory.py", "test_page_attacks.py", "test_fuzzy_laws.py"),
+    *("test_plant_outages.py", "test_playground_in_browser.py", "test_screen_by_dvc.py", "test_plant_wishes.py"),
+    *("test_screen.py", "test_journal.py", "test_export_to_controller.py", "test_page_in_browser.py"),
+    *("test_benchmark_of_monitor.py", "test_page_for_everybody_in_browser.py", "test_release.py"),
+    *("test_identified_part.py", "test_page_troubles_in_browser.py", "test_tracking.py", "test_cluster_stages.py"),
+    *("test_cluster.py", "test_two_loops.py", "test_laws_that_are_refused.py", "test_another_stack.py"),
+    *("test_manual_builds.py", "test_report.py", "test_predictive.py", "test_signed_registry.py"),
+    *("test_loop_certificates.py", "test_repeatable.py", "test_browser_host.py", "test_steering.py"),
+    *("test_fmu_memory.py", "test_page_attacks.py", "test_fuzzy_laws.py"),
 )
 
 
@@ -118,6 +124,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The long files first; xdist must be told to keep the order (``--no-loadscope-reorder``)."""
     rank = {name: i for i, name in enumerate(LONG_FILES)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+
+
+def pytest_collection_finish() -> None:
+    """All modules are imported: from here on garbage is looked for, and not among them."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

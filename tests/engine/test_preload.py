@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -34,14 +35,17 @@ class Idle:
 @pytest.mark.parametrize("busy", ["executing", "ready", "long_running"])
 def test_imports_go_on_while_nothing_else_is_to_be_done(monkeypatch: pytest.MonkeyPatch, busy: str) -> None:
     imported: list[str] = []
+    collecting: list[bool] = []
 
     def steps() -> Any:
         for name in "abc":
             imported.append(name)
+            collecting.append(gc.isenabled())
             yield name
 
     monkeypatch.setattr(preload, "loading", steps)
     monkeypatch.setattr(preload, "listen", lambda: None)
+    before = gc.get_freeze_count()
     worker = Idle()
     setting = threading.Thread(target=preload.dask_setup, args=(worker,))  # in the main one it would take over Ctrl-C
     setting.start()
@@ -50,6 +54,7 @@ def test_imports_go_on_while_nothing_else_is_to_be_done(monkeypatch: pytest.Monk
     for _ in range(2):  # may it go on, and a step
         worker.waiting.popleft()()
     assert imported == ["a"]
+    assert gc.isenabled()
     getattr(worker.state, busy).add("a task")
     for _ in range(10):
         worker.waiting.popleft()()
@@ -58,6 +63,9 @@ def test_imports_go_on_while_nothing_else_is_to_be_done(monkeypatch: pytest.Monk
     while worker.waiting:
         worker.waiting.popleft()()
     assert imported == ["a", "b", "c"]
+    assert collecting == [False] * 3
+    assert gc.isenabled()
+    assert gc.get_freeze_count() > before
 
 
 def test_a_worker_that_ends_meanwhile_complains_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
