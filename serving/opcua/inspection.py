@@ -15,6 +15,7 @@ from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
 from serving.opcua.link import Link
 from serving.opcua.plan import Plan
+from serving.opcua.sampling import NO_NUMBERS
 from serving.opcua.settings import Nodes, Point, Server
 from serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
 from serving.words import first_line
@@ -25,7 +26,10 @@ MAY = {True: "yes", False: "no", None: "?"}
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """One node. ``wrong`` says what would stop the loop, ``note`` what a person should know; empty: nothing."""
+    """One node. ``wrong`` says what would stop the loop, ``note`` what a person should know; empty: nothing.
+
+    ``passing``: what is wrong may pass by itself, as a sensor's bad quality does.
+    """
 
     signal: str
     node: str
@@ -38,6 +42,17 @@ class Found:
     writable: str = "-"
     wrong: str = ""
     note: str = ""
+    passing: bool = False
+
+
+def lasting(manifest: Manifest, server: Server, nodes: Nodes, margin: float, *, writes: bool) -> list[str]:
+    """A line for all that would stop the loop and does not pass by itself; ``writes``: whether it is to write at once.
+
+    Raises EndpointError where the server cannot be asked now, LoopError where the settings do not fit.
+    """
+    rows = inspected(manifest, server, nodes, margin)
+    wrong = [row for row in rows if row.wrong and not row.passing]
+    return [f"{row.signal}: {row.wrong}" for row in wrong if writes or not row.signal.endswith(", written")]
 
 
 def inspected(manifest: Manifest, server: Server, nodes: Nodes, margin: float) -> list[Found]:
@@ -158,28 +173,29 @@ async def _one(
     number = point.scale * reading.number + point.offset
     age = "-" if reading.source_s is None else f"{time.time() - reading.source_s:.3g} s"
     signal = _signal(manifest, name)
-    wrong = ""
+    wrong, passing = "", False
     if reading.quality == BAD or (reading.quality == UNCERTAIN and server.uncertain == "fault"):
-        wrong = _bad(reading, node)
+        wrong, passing = _bad(reading, node), words(reading.status) != "BadNodeIdUnknown"
     elif reading.text:
-        wrong = f"it holds {reading.text}"
+        wrong, passing = f"it holds {reading.text}", reading.text in NO_NUMBERS
     elif name.endswith(", written") and reading.kind not in {*FLOATS, *INTEGERS, ua.VariantType.Boolean}:
         wrong = f"its type {kind} holds no number"
     elif name.endswith(", written") and writable is False:
         wrong = "it may not be written by this user"
     elif signal is not None:
-        wrong = _refused(name, signal, number, margin)
+        wrong, passing = _refused(name, signal, number, margin), True
     unit, limits = await _properties(link, server, at)
     note = ""
     if signal is not None:
         outside = "" if wrong or reading.text else _outside(signal, number)
-        wrong = wrong or other_unit(unit, point, signal)
+        misfit = other_unit(unit, point, signal)
+        wrong, passing = (misfit, False) if misfit else (wrong, passing)
         note = "; ".join(filter(None, (outside, _other_range(limits, point, signal))))
     quality = "Good" if reading.quality == GOOD else words(reading.status)
     if not judged:
         wrong, note = "", "; ".join(filter(None, (wrong, note)))
     shown = "-" if reading.text else f"{number:.6g}"
-    return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note)
+    return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note, passing)
 
 
 def _signal(manifest: Manifest, name: str) -> Signal | None:

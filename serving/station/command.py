@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import fields
 from math import isnan
 from pathlib import Path
@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.errors import LoopError
+from serving.errors import EndpointError, LoopError
 from serving.guard import Sample
 from serving.journal import JournalReader
 from serving.loop import Command, Mode
@@ -176,7 +176,7 @@ def _check(options: argparse.Namespace) -> int:
     for line in here.wrong:
         print(f"would stop the loop: {line}", file=sys.stderr)
     rows = inspected(manifest, settings.server, settings.nodes, settings.guards.margin)
-    names = [f.name for f in fields(Found) if f.name not in {"wrong", "note"}]
+    names = [f.name for f in fields(Found) if f.name not in {"wrong", "note", "passing"}]
     table = [names, *([getattr(row, name) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
     for cells in table:
@@ -211,6 +211,11 @@ def _warnings(settings: Settings) -> list[str]:
 def _run(options: argparse.Namespace) -> int:
     settings = Settings.read(options.file)
     _quiet()
+    misfits = _misfits(settings)
+    for line in misfits:
+        print(f"would stop the loop: {line}", file=sys.stderr)
+    if misfits:
+        return 2
     from serving.station.station import Station
 
     def tell(line: str) -> None:
@@ -229,6 +234,17 @@ def _run(options: argparse.Namespace) -> int:
     station.tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
     station.tell(f"journal: {settings.journal.file}")
     return 0
+
+
+def _misfits(settings: Settings) -> list[str]:
+    """What of ``loop check`` is wrong for good: another unit, a node that is not there. None while nobody answers."""
+    from serving.opcua.inspection import lasting
+
+    manifest = Controller(settings.controller, settings.sha256 or None, settings.trusted).manifest
+    writes = settings.start != "SHADOW"
+    with suppress(EndpointError):
+        return lasting(manifest, settings.server, settings.nodes, settings.guards.margin, writes=writes)
+    return []
 
 
 def _left(manifest: Manifest, last: Command) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from plant_servers import Plant, RunningLoop
+from plant_servers import Plant, RunningLoop, spoil
 from processes import within
 
 from pipeline.__main__ import main
@@ -123,6 +123,40 @@ def test_check_refuses_another_unit_unless_it_is_explained(
     assert "would stop the loop: PV T: the server says the unit is K, loop.toml says degC" in capsys.readouterr().err
     changed(settings, 'unit = "degC"', 'unit = "K"')
     assert main(["loop", "check"]) == 0
+
+
+@pytest.mark.parametrize("start", ["SHADOW", "AUTO"])
+def test_run_refuses_what_check_finds_wrong_for_good(
+    settings: Path, plant: Plant, start: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another unit, a node that is not there; a node that may not be written stops only a loop that is to write."""
+    text = settings.read_text().replace('start = "SHADOW"', f'start = "{start}"')
+    t_at, mv_at = '"nsu=urn:loopwright:plant;s=PV.T"', 'node = "nsu=urn:loopwright:plant;s=MV.T_j"'
+    before = len(plant.actuator())
+    for old, new, words in (
+        (f"T = {t_at}", f'T = {{ node = {t_at}, unit = "degC" }}', "PV T: the server says the unit is K"),
+        ("s=PV.T", "s=PV.TT", "PV T: its quality is BadNodeIdUnknown; the server has no node"),
+        *[(mv_at, mv_at.replace("s=MV", "s=RB"), "MV T_j, written: it may not be written by this user")]
+        * (start == "AUTO"),
+    ):
+        assert old in text
+        settings.write_text(text.replace(old, new, 1))
+        assert main(["loop", "run", "--scans", "3"]) == 2
+        said = capsys.readouterr()
+        assert said.err.startswith(f"would stop the loop: {words}")
+        assert said.out == ""
+    assert not Path("loop.journal").exists()
+    assert len({row["asked"][0] for row in plant.actuator()[before:]}) <= 1
+
+
+def test_run_begins_while_a_sensor_is_bad(settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]) -> None:
+    """It may come back at any time."""
+    spoil(plant, "PV.T", "bad")
+    try:
+        assert main(["loop", "run", "--scans", "3"]) == 0
+    finally:
+        spoil(plant, "PV.T", "")
+    assert "BadSensorFailure" in capsys.readouterr().out
 
 
 HALF = 'hand_back = { node = "nsu=urn:loopwright:plant;s=Control.Owner", value = 0.5 }'
