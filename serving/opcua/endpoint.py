@@ -344,7 +344,9 @@ class OpcUaEndpoint:
             rows = [plan.hand_back()] if isinstance(last, str) else plan.variants(last)
         except EndpointError as error:
             self._failed(first_line(error))
-            return
+            if handing:
+                return
+            raise  # with the next connection all types are asked for anew
         if plan.lease is not None:
             try:
                 await self.lease.take(link, plan.lease, self.answer_s)

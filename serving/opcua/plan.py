@@ -61,7 +61,7 @@ class Plan:
         kinds = [r.kind for r in await link.read(ids[len(texts) :], timeout_s)]
         names = [*(f"MV {n}" for n in plan.mv_names), *extra]
         for name, kind in zip(names, kinds, strict=True):
-            if kind is None:
+            if kind in {None, ua.VariantType.Null}:  # the node is not there now, or holds nothing yet
                 raise EndpointError(f"{name}: the server gives no value, so its type is not known")
         typed = [(i, k) for i, k in zip(ids[len(texts) :], kinds, strict=True) if k is not None]
         plan.written, rest = typed[: len(plan.mv_points)], typed[len(plan.mv_points) :]

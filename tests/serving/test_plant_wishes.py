@@ -49,7 +49,7 @@ def test_a_plant_is_handed_back_and_asked_for_again(plant: Plant, wire: Wire, tm
         tmp_path,
         wire.port,
         nodes={"hand_back": HandBack(f"{SPACE}Control.Owner", 0)},
-        hold=Hold(recover_after=RECOVER, max_s=1.0, then="hand back"),
+        hold=Hold(recover_after=RECOVER, max_s=10.0, then="hand back"),
     )
     running.becomes(Mode.AUTO, scans=5)
     write(plant, "Faults.PV.T", "bad")

@@ -15,10 +15,11 @@ from asyncua import ua
 from serving import Controller, EndpointError, Sample, VirtualClock
 from serving.journal import JournalReader
 from serving.opcua.ages import Ages
-from serving.opcua.endpoint import OpcUaEndpoint, Values
-from serving.opcua.link import Reading
+from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.plan import Plan
+from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import Nodes, Server
+from serving.opcua.values import Reading
 from serving.station import station
 from serving.station.export import export
 from serving.station.lease import Lease
@@ -100,9 +101,9 @@ def valued(uncertain: Any, *readings: Reading) -> Values:
     manifest = Controller(PID).manifest
     nodes = Nodes(**NODES)
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, uncertain=uncertain)
-    endpoint = OpcUaEndpoint(manifest, server, nodes, max_age_s=1.0, clock=lambda: 100.0)
     plan = Plan(nodes, manifest)
-    return endpoint._valued(plan, list(readings), Ages(len(plan.timed)))
+    ages = Ages(len(plan.timed))
+    return Sampling(manifest, server, nodes).valued(plan, list(readings), ages, 100.0, unbeaten="", starts=0)
 
 
 def reading(number: float, status: int = GOOD) -> Reading:
