@@ -120,3 +120,23 @@ def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
         assert {row["asked"][0] for row in rows} == {moved}
         assert told(running, f"the MV stands at T_j {moved:g} K, not at T_j ")
     running.end()
+
+
+def test_a_node_that_is_gone_while_the_connection_is_made_anew_is_found_again(
+    plant: Plant, wire: Wire, tmp_path: Path
+) -> None:
+    """The server then tells no type of it; the loop asks again until there is one."""
+    running = begun(tmp_path, wire.port)
+    try:
+        running.becomes(Mode.AUTO, 120, scans=5)
+        write(plant, "Faults.MV.T_j", "deleted")
+        running.becomes(Mode.HOLD)
+        cut(plant, wire)
+        assert within(20, lambda: "does not answer" in running.commands[-1].reason)
+        mend(plant, wire)
+        assert within(30, lambda: "so its type is not known" in running.commands[-1].reason)
+        write(plant, "Faults.MV.T_j", "")
+        running.becomes(Mode.AUTO, 60, scans=5)
+    finally:
+        write(plant, "Faults.MV.T_j", "")
+        running.end()
