@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 
 END_BYTES = 16  # drawn at random: no program writes them by chance
+NO_TEXT = b"\xff"  # begins the end: a byte of UTF-8 never has this value, so no text has to wait for what follows it
 
 
 @contextlib.contextmanager
@@ -17,7 +18,7 @@ def outlet(stopped: threading.Event) -> Iterator[int]:
     Once ``stopped``, no more comes out: workers that are ended while they start complain of what they did not get, at
     a time of their own, and the last line of a stopped run is to be the one that says how to go on.
     """
-    real, (source, into), end = os.dup(2), os.pipe(), os.urandom(END_BYTES)
+    real, (source, into), end = os.dup(2), os.pipe(), NO_TEXT + os.urandom(END_BYTES)
     os.dup2(into, 2)
     passing = threading.Thread(target=_pass_on, args=(source, real, stopped, end), daemon=True)
     passing.start()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from select import select
 
 PROGRAM = """
 import subprocess, sys, threading
@@ -58,3 +59,27 @@ def test_a_byte_of_zero_ends_nothing() -> None:
     many = MANY.replace("0123456789", "abc\\\\0")
     done = subprocess.run([sys.executable, "-c", many], capture_output=True, timeout=60)
     assert done.stderr == b"abc\0" * 50_000
+
+
+TORN = """
+import os, threading
+from pipeline.engine.outlet import outlet
+os.urandom = lambda n: b"\\n" * n
+with outlet(stopped := threading.Event()):
+    os.write(2, b"before\\n")
+    while os.read(0, 1) != b"!":
+        pass
+    stopped.set()
+"""
+
+
+def test_a_line_waits_for_no_other() -> None:
+    """However the mark of the end was drawn: a line that looks like its beginning came before the run was stopped."""
+    command = [sys.executable, "-c", TORN]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        assert running.stdin is not None
+        assert running.stderr is not None
+        heard = select([running.stderr], [], [], 60)[0] and os.read(running.stderr.fileno(), 100)
+        running.stdin.write(b"!")
+        running.stdin.close()
+        assert (heard, running.stderr.read()) == (b"before\n", b"")
