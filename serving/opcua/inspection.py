@@ -93,6 +93,9 @@ def _certificates(link: Link, server: Server) -> list[Found]:
     if server.security == "None" or server.certificate is None:
         return []
     rows = [Found("certificate of this loop", "-", note=f"valid until {valid_until(server.certificate)}")]
+    if server.user_certificate is not None:
+        note = f"valid until {valid_until(server.user_certificate)}"
+        rows.append(Found("certificate of the user", "-", note=note))
     own = link.server_certificate()
     if own:
         rows.append(Found("certificate of the server", "-", note=f"valid until {last_day(own)}"))

@@ -14,7 +14,7 @@ from asyncua import Client, ua
 from asyncua.crypto import security_policies
 
 from serving.errors import EndpointError, LoopError
-from serving.opcua.certificates import APPLICATION, require_valid
+from serving.opcua.certificates import APPLICATION, identity, require_valid
 from serving.opcua.settings import Server
 from serving.opcua.values import EPOCH, Reading, reading, words
 from serving.words import named
@@ -84,7 +84,7 @@ class Link:
         except Exception as error:
             link.abort()
             reason = _reason(error)
-            hint = "" if "User" in reason or "Identity" in reason else link._hint()
+            hint = link._user_hint() if "User" in reason or "Identity" in reason else link._hint()
             raise EndpointError(f"{server.endpoint} refuses: {reason}{hint}") from None
         except BaseException:
             link.abort()
@@ -97,6 +97,11 @@ class Link:
             return ""
         pinned = "" if self.server.server_certificate is None else ", and see that server_certificate is its own"
         return f"; let the server trust {self.server.certificate}{pinned}"
+
+    def _user_hint(self) -> str:
+        """What to look at where a server does not know its user."""
+        user = self.server.user_certificate
+        return "" if user is None else f"; let the server trust {user} as a user's"
 
     def server_certificate(self) -> bytes:
         """The server's own certificate; empty without security."""
@@ -116,6 +121,9 @@ class Link:
         if server.user:
             client.set_user(server.user)
             client.set_password(server.password())
+        if server.user_certificate is not None:
+            assert server.user_key is not None
+            client.user_certificate, client.user_private_key = identity(server.user_certificate, server.user_key)
         self._asked_s = asyncio.get_running_loop().time()
         await client.connect()
         self._securing = False

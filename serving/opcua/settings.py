@@ -112,11 +112,12 @@ class Server:
     """How to reach a server, and what to believe of it.
 
     ``security`` is signed and encrypted by ``certificate`` and ``private_key``; the policy None is refused unless
-    ``insecure``. ``server_certificate`` pins the server's own. The password comes from the environment variable
-    ``password_env`` or from ``password_file``. ``uncertain`` says whether a value of uncertain quality is used.
-    ``source_time`` says whether a value whose source time stands still grows old: ``ignore`` it for a server that
-    stamps a value only when it changes. An MV that has not changed is written again after ``rewrite_s`` [s]; 0: at
-    every scan.
+    ``insecure``. ``server_certificate`` pins the server's own. The loop logs on as ``user``, whose password comes from
+    the environment variable ``password_env`` or from ``password_file``, or by a certificate of a user's own,
+    ``user_certificate`` with ``user_key``, or as nobody. ``uncertain`` says whether a value of uncertain quality is
+    used. ``source_time`` says whether a value whose source time stands still grows old: ``ignore`` it for a server
+    that stamps a value only when it changes. An MV that has not changed is written again after ``rewrite_s`` [s]; 0:
+    at every scan.
     """
 
     endpoint: str
@@ -128,6 +129,8 @@ class Server:
     user: str = ""
     password_env: str = ""
     password_file: Path | None = None
+    user_certificate: Path | None = None
+    user_key: Path | None = None
     connect_s: float = 5.0
     uncertain: Literal["fault", "use"] = "fault"
     source_time: Literal["judge", "ignore"] = "judge"
@@ -151,6 +154,12 @@ class Server:
             raise LoopError("give password_env or password_file, not both")
         if self.user and not (self.password_env or self.password_file is not None):
             raise LoopError("user needs a password: name an environment variable (password_env) or a file")
+        if (self.user_certificate is None) != (self.user_key is None):
+            raise LoopError("a user's certificate needs its key: give both user_certificate and user_key")
+        if self.user_certificate is not None and self.user:
+            raise LoopError("give user or user_certificate, not both: a session has one user")
+        if self.user_certificate is not None and self.security == "None":
+            raise LoopError("user_certificate needs a connection that is signed and encrypted; security is None")
         if not (isfinite(self.connect_s) and self.connect_s > 0):
             raise LoopError(f"connect_s is {self.connect_s}; it must be above zero")
         if not (isfinite(self.rewrite_s) and self.rewrite_s >= 0):

@@ -163,6 +163,8 @@ class Settings:
             private_key=_under(at, s.private_key),
             server_certificate=_under(at, s.server_certificate),
             password_file=_under(at, s.password_file),
+            user_certificate=_under(at, s.user_certificate),
+            user_key=_under(at, s.user_key),
         )
         journal = replace(found.journal, file=at / found.journal.file)
         page = found.page

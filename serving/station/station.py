@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
-from datetime import datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -22,10 +21,9 @@ from serving.guard import Sample
 from serving.journal import Journal, JournalReader
 from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
-from serving.opcua import certificates
+from serving.opcua.certificates import expiries
 from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.sampling import Values
-from serving.opcua.settings import Server
 from serving.page.process import PageProcess
 from serving.station.beginning import another_before, begun_at, near, usable
 from serving.station.control import Answer, Control
@@ -68,7 +66,7 @@ class Station:
         self.settings, self.said = settings, Said(tell)
         self.tell = tell = self.said.say
         self.trusted = self._public_keys()
-        self.certificate_ends = _certificate_ends(settings.server)
+        self.certificates = expiries(settings.server)
         self.controller = TrustedController(settings.controller, settings.sha256 or None, self.trusted)
         m = self.manifest
         age = settings.max_age_s(m.period_s)
@@ -110,8 +108,7 @@ class Station:
     def ending(self) -> list[str]:
         """A line for what the loop runs by and that ends soon: its controller's signature, its certificate."""
         lines = ending(self.controller if self.loop is None else self.loop.controller)
-        words = "" if self.certificate_ends is None else certificates.ending(self.certificate_ends)
-        return [*lines, words] if words else lines
+        return [*lines, *filter(None, (certificate.words() for certificate in self.certificates))]
 
     def ask(self, change: Change) -> None:
         """Have a change carried out before the next scan; from any thread."""
@@ -340,15 +337,6 @@ class Station:
     def _connection(self, what: str) -> None:
         up = what.startswith("connected")
         self.recorder.note("connection", "opcua", what, alarm="connection", raised=not up)
-
-
-def _certificate_ends(server: Server) -> datetime | None:
-    """When this loop's certificate ends; None where it has none. A file that is none is told when the loop connects."""
-    if server.security == "None" or server.certificate is None:
-        return None
-    with suppress(LoopError):
-        return certificates.until(server.certificate)
-    return None
 
 
 def _shown(values: Array, signals: tuple[Signal, ...]) -> str:

@@ -33,6 +33,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         '# server_certificate = "server.der"  # pins the server: no other one is spoken to',
         '# user = "loopwright"',
         '# password_env = "LOOP_PASSWORD"  # the environment variable that holds it; or password_file',
+        '# user_certificate = "user.der"  # in place of user and password; its key in user_key = "user-key.pem"',
         '# uncertain = "use"  # values of uncertain quality; without it they are a fault',
         "# rewrite_s = 10  # [s] after which an MV that has not changed is written again; without it at every scan",
         '# source_time = "ignore"  # for a server that stamps a value only when it changes',

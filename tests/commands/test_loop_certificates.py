@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from plant_servers import Plant, RunningLoop
 from processes import within
 
 from pipeline.__main__ import main
 from serving import LoopError
-from serving.opcua.certificates import ending, make, valid_until
+from serving.opcua.certificates import Expiry, make, valid_until
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
 
@@ -99,9 +100,43 @@ def test_a_certificate_that_has_ended_is_named(settings: Path, capsys: pytest.Ca
 
 def test_a_certificate_that_ends_soon_is_told_while_the_loop_runs() -> None:
     end = datetime(2027, 3, 1, tzinfo=UTC)
-    assert ending(end, end - timedelta(days=31)) == ""
-    assert ending(end, end - timedelta(days=29)).startswith("the loop's certificate ends on 2027-03-01; ")
-    assert ending(end, end + timedelta(days=1)).startswith("the loop's certificate ended on 2027-03-01; ")
+    own = Expiry("loop", end)
+    assert own.words(end - timedelta(days=31)) == ""
+    assert own.words(end - timedelta(days=29)).startswith("the loop's certificate ends on 2027-03-01; ")
+    assert own.words(end + timedelta(days=1)).startswith("the loop's certificate ended on 2027-03-01; ")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("", "give both user_certificate and user_key"),
+        ('user_key = "loop-key.pem"\nuser = "anna"\npassword_env = "X"', "a session has one user"),
+        ('user_key = "none.pem"', "none.pem cannot be read: No such file"),
+        ('user_key = "loop-certificate.der"', "loop-certificate.der is no private key"),
+        ('user_key = "another-key.pem"', "another-key.pem is not the key of"),
+        ('user_key = "locked-key.pem"', "locked-key.pem is locked by a pass phrase"),
+        ('user_key = "curve-key.pem"', "curve-key.pem is no RSA key"),
+    ],
+)
+def test_a_user_whose_certificate_is_of_no_use_is_one_line(
+    settings: Path, capsys: pytest.CaptureFixture[str], given: str, words: str
+) -> None:
+    folder = settings.parent
+    make(folder / "another.der", folder / "another-key.pem")
+    own = serialization.load_pem_private_key((folder / "loop-key.pem").read_bytes(), None)
+    curve = ec.generate_private_key(ec.SECP256R1())
+    locked = serialization.BestAvailableEncryption(b"a secret")
+    for name, key, lock in (
+        ("locked-key.pem", own, locked), ("curve-key.pem", curve, serialization.NoEncryption()),
+    ):  # fmt: skip
+        form = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8)
+        (folder / name).write_bytes(key.private_bytes(*form, lock))
+    text = settings.read_text().replace("[server]", f'[server]\nuser_certificate = "loop-certificate.der"\n{given}')
+    settings.write_text(text)
+    status, said_now = said(capsys)
+    assert status == 2
+    assert said_now.count("\n") == 1
+    assert words in said_now
 
 
 def expired(certificate: Path, key: Path) -> None:

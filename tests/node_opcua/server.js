@@ -11,10 +11,12 @@ const NAMESPACE = "urn:loopwright:plant";
 
 async function main() {
   const certificates = new OPCUACertificateManager({ rootFolder: `${folder}/pki`, automaticallyAcceptUnknownCertificate: true });
+  const users = new OPCUACertificateManager({ rootFolder: `${folder}/users` }); // those in trusted/certs
   const server = new OPCUAServer({
     port: Number(port),
     hostname: "127.0.0.1",
     serverCertificateManager: certificates,
+    userCertificateManager: users,
     securityPolicies: [SecurityPolicy.Basic256Sha256],
     securityModes: [MessageSecurityMode.SignAndEncrypt],
     defaultSecureTokenLifetime: lifetime ? Number(lifetime) : undefined,

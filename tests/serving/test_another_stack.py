@@ -25,7 +25,7 @@ from processes import within
 from pipeline.__main__ import main
 from serving import Mode
 from serving.journal import JournalReader
-from serving.opcua.certificates import APPLICATION
+from serving.opcua.certificates import APPLICATION, make, valid_until
 from serving.station.control import ask
 
 HERE = Path(__file__).parents[1] / "node_opcua"
@@ -142,6 +142,35 @@ def test_a_wrong_password_is_one_line(
     assert said.count("\n") == 1
     assert "refuses" in said
     assert "a guess" not in said
+
+
+def test_a_user_logs_on_by_a_certificate_once_the_server_trusts_it(
+    settings: Path, server: NodeServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    user, key = server.folder / "user.der", server.folder / "user-key.pem"
+    make(user, key)
+    text = settings.read_text()
+    for line in ('user = "loopwright"', 'password_env = "LOOP_PASSWORD"'):
+        assert f"\n{line}" in text
+        text = text.replace(f"\n{line}", f"\n# {line}")
+    by_certificate = server.folder / "by-certificate.toml"
+    by_certificate.write_text(
+        text.replace("[server]", '[server]\nuser_certificate = "user.der"\nuser_key = "user-key.pem"')
+    )
+    capsys.readouterr()
+    assert main(["loop", "check", str(by_certificate)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"let the server trust {user}" in said
+    users = server.folder / "users"
+    (rejected,) = (users / "rejected").iterdir()
+    rejected.rename(users / "trusted" / "certs" / rejected.name)  # as its operator would
+    server.end()  # it looks there as it starts
+    server.start()
+    assert main(["loop", "check", str(by_certificate)]) == 0
+    said = capsys.readouterr().out
+    assert "nothing would stop the loop" in said
+    assert f"certificate of the user: valid until {valid_until(user)}" in said
 
 
 def test_a_loop_from_the_shadow_through_a_fault_and_a_killed_server(settings: Path, server: NodeServer) -> None:
