@@ -11,8 +11,8 @@ export DO_NOT_TRACK := 1
 # Python keeps what it has compiled: else each process of the tests compiles all sources again, 10 s for some.
 unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
-# Tests of loops, servers and browsers wait as much as they compute: one worker more than there are cores.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
+# Beside a worker for each core two more, for tests of loops, servers and browsers, which mostly wait: tests/scheduling.py.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 2)')
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run test check quick docs coverage registry bench release clean

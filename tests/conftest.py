@@ -18,6 +18,12 @@ import numpy as np
 import pytest
 import reversible_cstr_parts
 import torch
+from scheduling import (  # noqa: F401  hooks of pytest
+    pytest_collection_modifyitems,
+    pytest_configure,
+    pytest_configure_node,
+    pytest_xdist_make_scheduler,
+)
 from shipped import required
 from threadpoolctl import threadpool_limits
 
@@ -102,28 +108,6 @@ AT_REST: dict[str, tuple[float, float, float]] = {"thiosulfate_cstr": (0.1, 0.66
 HORIZON = 3
 
 LawFactory = Callable[..., ControlLaw]
-
-
-# By their time, those of 13 s and more. Taken first, so that with several workers none is waited for alone at the end.
-# Those that mostly wait, for a plant on a clock of its own or for a browser, lie between those that compute: while one
-# waits the others have the cores. They begin when mypy beside the tests is done.
-LONG_FILES = (
-    *("test_pipeline.py", "test_laws_contract.py", "test_real_servers.py", "test_plant_faults.py", "test_new.py"),
-    *("test_plant_outages.py", "test_playground_in_browser.py", "test_screen_by_dvc.py", "test_plant_wishes.py"),
-    *("test_screen.py", "test_journal.py", "test_export_to_controller.py", "test_page_in_browser.py"),
-    *("test_benchmark_of_monitor.py", "test_page_for_everybody_in_browser.py", "test_release.py"),
-    *("test_identified_part.py", "test_page_troubles_in_browser.py", "test_tracking.py", "test_cluster_stages.py"),
-    *("test_cluster.py", "test_two_loops.py", "test_laws_that_are_refused.py", "test_another_stack.py"),
-    *("test_manual_builds.py", "test_report.py", "test_predictive.py", "test_signed_registry.py"),
-    *("test_loop_certificates.py", "test_repeatable.py", "test_browser_host.py", "test_steering.py"),
-    *("test_fmu_memory.py", "test_page_attacks.py", "test_fuzzy_laws.py"),
-)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The long files first; xdist must be told to keep the order (``--no-loadscope-reorder``)."""
-    rank = {name: i for i, name in enumerate(LONG_FILES)}
-    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 
 
 def pytest_collection_finish() -> None:

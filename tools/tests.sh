@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# tests.sh ARGUMENT...: mypy and pytest side by side. mypy computes on one core for 40 s, and tests wait now and then.
+# tests.sh ARGUMENT...: mypy and pytest side by side. mypy computes on one core for 40 s, behind tests that keep time.
 # Fails if either does; what mypy finds is printed when it ends.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 said=$(mktemp)
 (
-  mypy > "$said" 2>&1 &
+  nice mypy > "$said" 2>&1 &
   trap "kill $! 2> /dev/null" TERM
   wait $! || { status=$?; cat "$said" >&2; exit "$status"; }
 ) &
