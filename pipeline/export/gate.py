@@ -93,7 +93,11 @@ def export(
 
 
 def parity_gate(
-    law: ControlLaw, controller: Controller, *, steps: int = GATE_STEPS, drive: Callable[[Array], Array] | None = None
+    law: ControlLaw,
+    controller: Controller,
+    *,
+    steps: int | None = None,
+    drive: Callable[[Array], Array] | None = None,
 ) -> float:
     """Largest difference between the law and its controller over a closed loop in MV and state, relative.
 
@@ -101,13 +105,14 @@ def parity_gate(
     without a plant. With ``drive`` both sides have the plant's process variables and the MV that it received, so
     that a loop that rings does not amplify rounding.
 
-    Relative to each entry's largest value over the loop; 1e-13 of the largest number anywhere is
-    allowed beside it, because an output that ought to be zero is rounding alone. For MV and state
+    ``steps`` are GATE_STEPS unless given. Relative to each entry's largest value over the loop; 1e-13 of the largest
+    number anywhere is allowed beside it, because an output that ought to be zero is rounding alone. For MV and state
     "anywhere" means among themselves: a large entry of info excuses nothing there.
 
     Raises ExportError where it exceeds 1e-9, where an entry of info differs by more than 1e-6 of its
     largest value, and where either side has no number to give.
     """
+    steps = GATE_STEPS if steps is None else steps
     signals, rng = law.signals, np.random.default_rng(0)
     courses = (_course(signals.sp, rng, 1 / 40), _course(signals.pv, rng), _course(signals.dv, rng))
     mv = np.array([s.middle for s in signals.mv])

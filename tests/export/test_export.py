@@ -12,9 +12,11 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from conftest import STEPS_OF_GATE
 from torch import Tensor
 
 from pipeline.errors import ExportError
+from pipeline.export import gate
 from pipeline.export.controller_file import with_evidence
 from pipeline.export.gate import GATE_TOLERANCE, export, parity_gate
 from pipeline.export.graph import law_graph
@@ -26,6 +28,11 @@ from serving.digest import TRAILER_BYTES, file_digest
 pytest_plugins = ["small_laws"]
 MakeFormula = Callable[..., ControlLaw]
 ONE = Signal("x", "-", -1e6, 1e6)
+
+
+@pytest.fixture(autouse=True)
+def whole_gate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "GATE_STEPS", STEPS_OF_GATE)
 
 
 def loop_signals(**changed: Any) -> Signals:
