@@ -101,12 +101,19 @@ def sessions(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return asked
 
 
-@pytest.fixture
-def server(tmp_path: Path, opens: list[Any], sessions: list[float]) -> Iterator[ShortServer]:
-    made = ShortServer(tmp_path)
+@pytest.fixture(scope="module")
+def started(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ShortServer]:
+    """One for all tests: its address space takes a second to make."""
+    made = ShortServer(tmp_path_factory.mktemp("server"))
     made.start()
     yield made
     made.end()
+
+
+@pytest.fixture
+def server(started: ShortServer, opens: list[Any], sessions: list[float]) -> ShortServer:
+    """Counted from here on."""
+    return started
 
 
 def settings(folder: Path, server: ShortServer, period_s: float) -> Settings:
