@@ -20,7 +20,13 @@ NICE = 10  # of the workers that compute: a core that somebody else wants has th
 KEEP_TIME = (
     *("test_plant_faults.py", "test_playground_in_browser.py", "test_plant_outages.py", "test_page_in_browser.py"),
     *("test_page_troubles_in_browser.py", "test_kept_sessions.py", "test_page_for_everybody_in_browser.py"),
-    *("test_journal.py", "test_another_stack.py", "test_loop_command.py", "test_plant_wishes.py"),
+    *(
+        "test_journal_kills.py",
+        "test_journal.py",
+        "test_another_stack.py",
+        "test_loop_command.py",
+        "test_plant_wishes.py",
+    ),
     *("test_page_attacks.py", "test_loop_certificates.py", "test_browser_host.py", "test_two_loops.py"),
     *("test_steering.py", "test_page_signers_in_browser.py", "test_page.py", "test_sending.py"),
     *("test_playground_of_a_made_plant_in_browser.py", "test_signed_steering.py", "test_quality.py"),

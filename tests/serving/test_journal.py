@@ -1,9 +1,8 @@
-"""A journal holds what happened, whole, whatever happens to its process."""
+"""A journal holds what happened, whole; see test_journal_kills.py for what happens to its process."""
 
 from __future__ import annotations
 
 import os
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -177,47 +176,6 @@ def test_runs_go_with_their_last_scan(tmp_path: Path, controller: Controller) ->
     assert 1 not in runs
     assert 6 in runs
     reader.close()
-
-
-WRITER = """
-import sys, time
-from pathlib import Path
-from serving import Manifest
-from serving.journal import Journal, Scan
-journal = Journal(Path(sys.argv[1]))
-journal.begin(Manifest.from_json(sys.argv[2]), "", time.time())
-k = 0
-while True:
-    journal.scan(Scan(time.time(), "AUTO", (float(k),) * 9))
-    k += 1
-    print(time.time(), flush=True)
-    time.sleep(0.001)
-"""
-
-
-def test_a_killed_process_loses_at_most_its_last_second(tmp_path: Path, controller: Controller) -> None:
-    """Fifty times, in the middle of writing, packing and rotating."""
-    path, rng, before = tmp_path / "loop.journal", np.random.default_rng(0), 0
-    for _ in range(50):
-        process = subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(path), controller.manifest.to_json()], stdout=subprocess.PIPE, text=True
-        )
-        assert process.stdout is not None
-        said = [process.stdout.readline() for _ in range(int(rng.integers(50, 500)))]
-        os.kill(process.pid, signal.SIGKILL)
-        said += process.stdout.readlines()
-        process.wait()
-        process.stdout.close()
-        base = sqlite3.connect(path)
-        assert base.execute("pragma integrity_check").fetchone() == ("ok",)
-        base.close()
-        reader = JournalReader(path)
-        found = list(reader.scans(after_id=before))
-        reader.close()
-        assert [i for i, _, _ in found] == list(range(before + 1, before + 1 + len(found)))
-        before += len(found)
-        times = [float(line) for line in said if line.endswith("\n")]
-        assert times[-1] - (found[-1][2].time_s if found else times[0]) < 1.0
 
 
 def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path: Path, controller: Controller) -> None:
