@@ -27,7 +27,7 @@ _log = logging.getLogger("serving.loop")
 class RunReport:
     """Counts of a run: scans, periods missed because the machine was late, scans with a fault.
 
-    An exception in ``observe``, ``until`` or the warm-up does not affect the MV and is no fault.
+    An exception in ``observe``, ``until``, ``stop`` or the warm-up does not affect the MV and is no fault.
     ``errors`` counts these exceptions; ``first_errors`` has the first one of each.
     """
 
@@ -67,6 +67,7 @@ def run_on_grid(
     until: Callable[[Command], bool] | None,
     before: Callable[[int], None] | None,
     observe: Callable[[Sample | None, Command], None] | None,
+    stop: Callable[[], bool] | None = None,
 ) -> RunReport:
     """See ``ControlLoop.run``."""
     period = loop.controller.manifest.period_s
@@ -83,6 +84,8 @@ def run_on_grid(
             reason = f"the clock failed: {named(error)}"
             spare = MonotonicClock()
             spare.sleep_until(spare.now() + period)
+        if stop is not None and failures.call("stop", _true, stop):
+            break
         if gap:
             k, missed, late = k + gap, missed + gap, late - gap * period
             if n is not None and k >= n:
@@ -146,5 +149,5 @@ def _trace(call: str) -> None:
         _log.debug("the endpoint's %s failed", call, exc_info=True)
 
 
-def _true(until: Callable[[Command], bool], command: Command) -> bool:
-    return bool(until(command))
+def _true(asked: Callable[..., bool], *arguments: object) -> bool:
+    return bool(asked(*arguments))

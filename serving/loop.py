@@ -319,8 +319,9 @@ class ControlLoop:
         until: Callable[[Command], bool] | None = None,
         before: Callable[[int], None] | None = None,
         observe: Callable[[Sample | None, Command], None] | None = None,
+        stop: Callable[[], bool] | None = None,
     ) -> RunReport:
-        """Scan once a period for ``n`` periods, or until ``until`` returns True.
+        """Scan once a period for ``n`` periods, or until ``until`` returns True after a scan, or ``stop`` before one.
 
         Deadlines are t0 + k period, so lateness does not add up to drift. A period that has passed
         completely is skipped and counted. ``before(k)`` is called before the scan at grid place k
@@ -333,9 +334,9 @@ class ControlLoop:
         - ``before``: a fault, because the set points may be wrong. The held MV is written.
         - ``clock``: a fault, because the law's period is not known. The held MV is written, and the
           machine's clock measures the next period.
-        - ``observe``, ``until``, the warm-up: no fault, because the MV is already written or does
-          not depend on them. The run continues; an ``until`` that raises counts as False. The
-          report counts and names these exceptions, and the first of each is logged at once.
+        - ``observe``, ``until``, ``stop``, the warm-up: no fault, because the MV is already written
+          or does not depend on them. The run continues; an ``until`` or ``stop`` that raises counts
+          as False. The report counts and names these exceptions, and the first of each is logged at once.
 
         Raises
         ------
@@ -346,4 +347,4 @@ class ControlLoop:
         """
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")
-        return run_on_grid(self, self.endpoint, n, until=until, before=before, observe=observe)
+        return run_on_grid(self, self.endpoint, n, until=until, before=before, observe=observe, stop=stop)

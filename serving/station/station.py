@@ -119,8 +119,9 @@ class Station:
         self._watchers.append(seen)
 
     def end(self) -> None:
-        """Stop after the present scan."""
+        """Stop before the next scan, without waiting for it; from any thread, and from the handler of a signal."""
         self.ended = True
+        self.clock.end()
         if self.page is not None:
             self.page.leaving = True  # whoever ends the loop may have ended its page, too
 
@@ -152,7 +153,7 @@ class Station:
             signed = signer(self.controller)
             by = "" if signed is None else f"; {self.controller.path.name} is signed by {signed.words}"
             self.recorder.note("change", "loop.toml", f"started in {s.start}{by}")
-            report = self.loop.run(n, before=self._before, observe=self._observe, until=lambda _: self.ended)
+            report = self.loop.run(n, before=self._before, observe=self._observe, stop=lambda: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
 

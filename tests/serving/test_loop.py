@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -443,7 +444,7 @@ def test_a_law_or_guard_that_raises_without_a_text_is_still_a_fault(
 
 
 @pytest.mark.parametrize("error", RAISED, ids=lambda e: type(e).__name__)
-@pytest.mark.parametrize("where", ["observe", "until", "warm"])
+@pytest.mark.parametrize("where", ["observe", "until", "stop", "warm"])
 def test_whatever_raises_beside_the_plant_moves_nothing_and_is_reported(
     make_loop: Callable[..., ControlLoop], monkeypatch: Any, caplog: Any, where: str, error: Exception
 ) -> None:
@@ -497,7 +498,7 @@ def test_a_clock_that_fails_holds_and_the_machines_own_measures_the_period(
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit])
-@pytest.mark.parametrize("where", ["read", "write", "before", "observe", "until"])
+@pytest.mark.parametrize("where", ["read", "write", "before", "observe", "until", "stop"])
 def test_a_person_can_still_end_the_run(make_loop: Callable[..., ControlLoop], where: str, stop: Any) -> None:
     def raised(*_: Any) -> Any:
         raise stop
@@ -711,6 +712,14 @@ def test_run_ends_when_told(make_loop: Callable[..., ControlLoop]) -> None:
     assert places == list(range(8))
 
 
+def test_a_run_that_is_stopped_between_two_scans_makes_no_other_one(make_loop: Callable[..., ControlLoop]) -> None:
+    tank, clock, places = Tank(), VirtualClock(), list[int]()
+    loop, before = make_loop(tank, clock=clock), len(tank.written)
+    report = loop.run(before=places.append, stop=lambda: clock.now() > 2.5 * PERIOD)
+    assert (report.scans, places, len(tank.written) - before) == (3, [0, 1, 2], 3)
+    assert loop.run(stop=lambda: True).scans == 0
+
+
 def test_the_law_is_warmed_just_before_each_deadline(make_loop: Callable[..., ControlLoop], monkeypatch: Any) -> None:
     clock = VirtualClock(100.0)
     loop = make_loop(Tank(), clock=clock, warm_lead_s=1e-3)
@@ -727,3 +736,12 @@ def test_the_machines_clock_keeps_its_word() -> None:
         clock.sleep_until(until)
         assert clock.now() >= until
         clock.sleep_until(until - 10)  # long ago: at once
+
+
+def test_a_sleep_of_an_hour_ends_when_the_clock_is_ended() -> None:
+    clock = MonotonicClock()
+    asleep = threading.Thread(target=lambda: clock.sleep_until(clock.now() + 3600), daemon=True)
+    asleep.start()
+    clock.end()
+    asleep.join(60)
+    assert not asleep.is_alive()

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from processes import within as in_time
 
-from serving import Controller, Mode, Sample, VirtualClock
+from serving import Controller, Mode, MonotonicClock, Sample, VirtualClock
 from serving.journal import JournalReader
 from serving.loop import Command, within
 from serving.opcua.sampling import Values
@@ -104,6 +104,21 @@ def test_a_loop_that_is_ended_while_it_waits_for_a_pv_writes_nothing(
     assert not thread.is_alive()
     assert (plant.written, made.scans) == ([], 0)
     assert events(made) == ["loop: ended before the first scan: nothing was written"]
+
+
+def test_a_loop_that_is_ended_between_two_scans_does_not_wait_for_the_next(
+    make_station: Callable[..., tuple[Station, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(station, "MonotonicClock", lambda _: MonotonicClock(1e-3))  # half a second in 500
+    made, plant = make_station("AUTO")
+    thread = threading.Thread(target=made.run)
+    thread.start()
+    assert in_time(20, lambda: made.last is not None)
+    made.end()
+    thread.join(60)
+    assert not thread.is_alive()
+    assert (len(plant.written), made.scans) == (1, 1)
+    assert events(made)[-1] == "loop: ended"
 
 
 @pytest.mark.parametrize("start", ["AUTO", "MANUAL"])
