@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from pathlib import Path
 from queue import Queue
-from typing import Any
+from typing import Any, ClassVar
 
 from processes import within
 
@@ -158,6 +158,8 @@ class Wire:
 class RunningLoop:
     """A station in a thread, as a loop.toml or its settings say, with what it did."""
 
+    begun: ClassVar[list[RunningLoop]] = []  # that may run still
+
     def __init__(self, settings: Path | Settings) -> None:
         self.settings = Settings.read(settings) if isinstance(settings, Path) else settings
         self.told: list[str] = []
@@ -166,6 +168,7 @@ class RunningLoop:
         self.station.watch(self._seen)
         self.thread = threading.Thread(target=self.station.run, daemon=True)
         self.thread.start()
+        self.begun.append(self)
         assert within(30, lambda: self.station.scans > 2), self.told
 
     def _seen(self, _: Sample | None, command: Command) -> None:
@@ -202,6 +205,12 @@ class RunningLoop:
         self.station.end()
         self.thread.join(20)
         assert not self.thread.is_alive()
+
+    @classmethod
+    def end_all(cls) -> None:
+        """Those, too, whose test failed: they would write to the plant of the next one."""
+        while cls.begun:
+            cls.begun.pop().end()
 
 
 def spoil(plant: Plant, tag: str, fault: str) -> None:

@@ -47,6 +47,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
 def wired(plant: Plant) -> Iterator[Wire]:
     made = Wire(plant.port)
     yield made
+    RunningLoop.end_all()
     made.close()
 
 

@@ -32,6 +32,7 @@ FRESH = 1200  # the last scans, a row each
 WAITING = 200_000  # scans and events that wait in memory while the disk takes none
 TOGETHER = 2_000  # are written at most in one transaction
 STALL_S = 10.0  # a write that takes longer is told
+CLOSE_S = 30.0  # without a scan written, after which an end waits no longer
 
 
 class Journal:
@@ -102,10 +103,16 @@ class Journal:
         self._put("learnt", (name, value))
 
     def close(self) -> None:
-        """Write what waits and end."""
+        """Write what waits and end. A disk that does not answer for ``CLOSE_S`` is waited for no longer, and told."""
         self._closing.set()
         self._queue.wake()
-        self._thread.join()
+        waiting = None
+        while self._thread.is_alive() and waiting != self.behind:
+            waiting = self.behind
+            self._thread.join(CLOSE_S)
+        if self._thread.is_alive():  # which has the file open still
+            self.tell(f"the journal cannot be written: the last {waiting} scans and events are lost")
+            return
         self._base.close()
         os.close(self._lock)
 

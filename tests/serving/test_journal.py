@@ -380,6 +380,23 @@ def test_a_write_that_hangs_makes_nothing_grow(
     reader.close()
 
 
+def test_a_disk_that_hangs_for_good_is_not_waited_for(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "CLOSE_S", 0.05)
+    told, answers = list[str](), threading.Event()
+    journal = Journal(tmp_path / "loop.journal", tell=told.append)
+    write = journal._write
+    monkeypatch.setattr(journal, "_write", lambda run: write(run) if answers.wait(60) else 0)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    journal.scan(scans(1)[0])
+    journal.close()
+    assert told == ["the journal cannot be written: the last 2 scans and events are lost"]
+    answers.set()
+    journal._thread.join(60)
+    journal.close()
+
+
 def test_an_alarm_that_is_over_stays_over() -> None:
     """One that became worse before it ended: the first event is kept for whoever has not seen it, with its end."""
     given = [("gain", True, 0), ("gain", True, 0), ("", False, 2), ("gain", False, 0), *[("", False, 0)] * 3000]
