@@ -32,7 +32,7 @@ def parse(cls: type[T], values: Any, where: str, error: type[Exception]) -> T:
     """
     if not isinstance(values, Mapping):
         raise error(f"{where} is {values!r}; it must be a mapping")
-    hints = _hints(cls)
+    hints = _hints(cls)  # type: ignore[arg-type]
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     for key in values:
         if key not in fields:
