@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -31,7 +32,7 @@ def parse(cls: type[T], values: Any, where: str, error: type[Exception]) -> T:
     """
     if not isinstance(values, Mapping):
         raise error(f"{where} is {values!r}; it must be a mapping")
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)  # type: ignore[arg-type]
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     for key in values:
         if key not in fields:
@@ -45,6 +46,12 @@ def parse(cls: type[T], values: Any, where: str, error: type[Exception]) -> T:
         return cls(**read)
     except (ValueError, TypeError, LoopwrightError) as refused:
         raise error(f"{where}: {refused}") from None
+
+
+@functools.cache
+def _hints(cls: type) -> Mapping[str, Any]:
+    """The types of a dataclass's fields; read once, because each annotation is compiled for it."""
+    return typing.get_type_hints(cls)
 
 
 def _convert(hint: Any, value: Any, where: str, error: type[Exception]) -> Any:

@@ -19,8 +19,8 @@ from pipeline.evaluation.case import Case
 from pipeline.evaluation.stress.draws import Drawing
 from pipeline.evaluation.stress.loops import Outcome, Stress, figures_of, opened
 from pipeline.evaluation.stress.summary import Summary
-from pipeline.pictures.drawing import save
 from pipeline.pictures.numbers import number
+from pipeline.pictures.png import save
 from pipeline.pictures.stress_pictures import loop_canvas
 from pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
 from serving.manifest import Manifest

@@ -1,11 +1,9 @@
-"""Shared parts of all pictures: size, style, colours, labels, axes, legends, and the file that is written."""
+"""Shared parts of all pictures: size, style, colours, labels, axes, legends."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFo
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import Array
 from pipeline.evaluation.metric import NO_UNIT
-from pipeline.files import write_bytes
 from serving.manifest import Signal
 
 BASELINE_COLOUR = "#7f7f7f"
@@ -178,33 +175,36 @@ def fit_labels(canvas: Canvas, titles: Iterable[Text] = ()) -> None:
     A label beside a panel breaks before its unit; then the letters become smaller; at last the middle is left out.
     """
     lay_out(canvas)
-    for axes in canvas.axes:
-        _fit(axes.yaxis.label, axes, upright=True)
-        _fit(axes.xaxis.label, axes)
-    for title in titles:
-        if title.axes is not None:
-            _fit(title, title.axes)
+    fits = [_fit(axes.yaxis.label, axes, upright=True) for axes in canvas.axes]
+    fits += [_fit(axes.xaxis.label, axes) for axes in canvas.axes]
+    fits += [_fit(title, title.axes) for title in titles if title.axes is not None]
+    if all(fits):
+        canvas.set_layout_engine(None)  # nothing changed: the panels keep their places
 
 
-def _fit(text: Any, axes: Any, upright: bool = False) -> None:
+def _fit(text: Any, axes: Any, upright: bool = False) -> bool:
+    """Whether the text was short enough as it was."""
     side = "height" if upright else "width"
     room = getattr(axes.get_window_extent(), side) + LABEL_GAP
 
     def excess() -> float:
         return float(getattr(text.get_window_extent(), side)) / room
 
-    if upright and excess() > 1 and "\n" not in text.get_text():
+    if excess() <= 1:
+        return True
+    if upright and "\n" not in text.get_text():
         text.set_text(text.get_text().replace(" [", "\n["))
     if excess() > 1:
         text.set_fontsize(max(LEAST_FONT, text.get_fontsize() / excess()))
     words = text.get_text()
     if "$" in words:  # a formula cannot be cut
-        return
+        return False
     name, end, unit = words.partition("\n")
     for kept in range(len(name) - 1, LEAST_LETTERS - 1, -1):
         if excess() <= 1:
-            return
+            break
         text.set_text(f"{name[: kept // 2]}…{name[len(name) - (kept - kept // 2) :]}{end}{unit}")
+    return False
 
 
 def covers(legend: Legend, axes: Axes) -> bool:
@@ -241,10 +241,3 @@ def clear_legend(axes: Axes, **options: Any) -> Legend:
     top = low + (high - low) / max(1.0 - taken, 0.2)
     axes.set_ylim(axes.get_ylim()[0], float(to_scale.inverted().transform(np.array([top]))[0]))
     return legend
-
-
-def save(canvas: Canvas, path: Path) -> None:
-    """Write the PNG whole or not at all; without date and version inside, so that equal data give equal files."""
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=100, facecolor="white", metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())

@@ -14,10 +14,11 @@ from pipeline.errors import ReportError
 from pipeline.evaluation.case import Figure
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.model_evidence import candidates, identified_part
-from pipeline.pictures.drawing import STYLE, CasePicture, Draw, save
+from pipeline.pictures.drawing import STYLE, CasePicture, Draw
 from pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
 from pipeline.pictures.loop_pictures import disturbance_picture, info_picture, loops_picture, overview_picture
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
+from pipeline.pictures.png import save
 from pipeline.pictures.replay_pictures import replay_picture
 from pipeline.pictures.words import scenario_name
 from pipeline.simulation.scenario import NOISE_SUFFIX

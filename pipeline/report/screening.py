@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from pathlib import Path
 
 from matplotlib.figure import Figure as Canvas
@@ -13,6 +12,7 @@ from pipeline.historian.reason import Reason
 from pipeline.historian.screening import Screened
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.excitation_pictures import inputs, verdict
+from pipeline.pictures.png import png
 from pipeline.pictures.screening_pictures import details, readings, times_of, trends
 from pipeline.report.templating import render
 
@@ -46,6 +46,4 @@ def write_page(path: Path, found: Screened, test: StepTest | None) -> None:
 
 
 def _inline(canvas: Canvas) -> str:
-    buffer = io.BytesIO()
-    canvas.savefig(buffer, format="png", dpi=100, facecolor="white", metadata={"Software": None})
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return "data:image/png;base64," + base64.b64encode(png(canvas)).decode()

@@ -13,8 +13,8 @@ from pipeline.evaluation.stress.faults import KINDS, MOST_SPAN, MOST_ZERO, STROK
 from pipeline.evaluation.stress.loops import Outcome, Stress
 from pipeline.evaluation.stress.summary import QUANTILES, Summary, table
 from pipeline.files import draft_of
-from pipeline.pictures.drawing import save
 from pipeline.pictures.numbers import number
+from pipeline.pictures.png import save
 from pipeline.pictures.stress_pictures import growth_canvas, loop_canvas, spread_canvas
 from pipeline.report.templating import render, write_pages
 from serving.manifest import Signal

@@ -7,6 +7,7 @@ import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import cache
 from pathlib import Path
 from urllib.request import url2pathname
 
@@ -102,9 +103,15 @@ def _migrate(uri: str) -> None:
     with closing(sqlite3.connect(_database(uri))) as connection:
         connection.execute("PRAGMA schema_version")
     engine = database.create_sqlalchemy_engine_with_retry(uri)
-    if database._get_schema_version(engine) not in {None, database._get_latest_schema_revision()}:
+    if database._get_schema_version(engine) not in {None, _newest()}:
         database._upgrade_db(engine)
     engine.dispose()
+
+
+@cache
+def _newest() -> str:
+    """The schema of this mlflow, read once: alembic imports each of its 68 steps for it."""
+    return str(database._get_latest_schema_revision())
 
 
 def _database(uri: str) -> Path:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from dirty_plant import TAGS, Clean, cells, clean, write
+from undrawn import draw_nothing
 
 from pipeline.__main__ import main
 from pipeline.cases import all_cases
@@ -30,8 +31,15 @@ ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI
 Tell = Callable[[], pytest.CaptureFixture[str]]
 
 
+@pytest.fixture
+def drawn() -> None:
+    """Asked for by a test that looks at the page's pictures, or gives them data that are hard to draw."""
+
+
 @pytest.fixture(autouse=True)
-def _repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _repository(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "drawn" not in request.fixturenames:
+        draw_nothing(monkeypatch)
     monkeypatch.chdir(tmp_path)
     Path("params.yaml").write_text("cases:\n  taken: {}\n")
 
@@ -41,13 +49,16 @@ def files() -> set[str]:
 
 
 def read_back(name: str) -> tuple[PlantParams, Record]:
-    """What params.yaml has of the plant, and the record that its stage makes of the files."""
-    screen(name)
+    """What params.yaml has of the plant, and the record that its stage makes of the files, without its page."""
+    with pytest.MonkeyPatch.context() as undrawn:
+        draw_nothing(undrawn)
+        screen(name)
     params = PlantParams.read(name)
     pv, dv, mv = (tuple(Signal(s.name, s.unit, s.low, s.high) for s in g) for g in (params.pv, params.dv, params.mv))
     return params, Record.read(params.data, Signals(params.period_s, pv, pv, dv, mv))
 
 
+@pytest.mark.usefixtures("drawn")
 def test_an_export_becomes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
     data = clean()
     path = write(Path("x.csv"), cells(data))
@@ -69,11 +80,12 @@ def test_an_export_becomes_a_plant(capsys: pytest.CaptureFixture[str]) -> None:
     assert "https://" not in page
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_same_export_gives_the_same_bytes() -> None:
     write(Path("x.csv"), cells(clean()))
     for name in ("plant_a", "plant_b"):
         assert main(["new", name, "x.csv", *ROLES]) == 0
-        screen(name)
+        read_back(name)
     assert sha256(screened_record("plant_a")) == sha256(screened_record("plant_b"))
     pages = [Path(f"data/{n}/screening.html").read_text().replace(n, "") for n in ("plant_a", "plant_b")]
     assert pages[0] == pages[1]
@@ -200,6 +212,7 @@ def test_a_step_test_is_no_faster_than_the_valve_may_move(capsys: pytest.Capture
     np.testing.assert_allclose(np.diff(at), 60 * (ramp + hold)[:-1], rtol=1e-3)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_few_rows_are_said_where_the_plant_is_added_and_too_few_refused(capsys: pytest.CaptureFixture[str]) -> None:
     write(Path("x.csv"), cells(clean(300)))
     assert main(["new", "tank", "x.csv", *ROLES]) == 0
@@ -224,6 +237,7 @@ def quick(n: int) -> Clean:
     return data.with_(mv=30.0 + 30.0 * (np.arange(n) // 4 % 2))
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_constant_mv_gets_a_step_test_and_no_section(capsys: pytest.CaptureFixture[str]) -> None:
     data = clean()
     write(Path("x.csv"), cells(data.with_(mv=np.full(len(data.mv), 40.0))))
@@ -259,6 +273,7 @@ def test_data_that_carry_no_model_are_refused_unless_asked_for(capsys: pytest.Ca
     assert "already" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_verdict_is_on_the_page_and_in_json(capsys: pytest.CaptureFixture[str]) -> None:
     write(Path("x.csv"), cells(clean(2500)))
     assert main(["new", "tank", "x.csv", *ROLES]) == 0
@@ -431,6 +446,7 @@ def test_times_are_positive(option: str, value: str, capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_example_of_the_repository(capsys: pytest.CaptureFixture[str]) -> None:
     """The simulated export with its dirt: every fault is named, the record is good."""
     script = ROOT / "examples" / "own_plant" / "make_export.py"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from undrawn import draw_nothing
 
 from pipeline.__main__ import main
 
@@ -79,7 +80,10 @@ def test_a_controller_of_no_case_is_refused(
     assert "the controller is for 'ph_neutralization', which is no case here" in capsys.readouterr().err
 
 
-def test_a_report_takes_the_place_of_another_one_alone(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_takes_the_place_of_another_one_alone(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw_nothing(monkeypatch)
     Path("taken").write_text("mine")
     assert main(["stress", str(PH), "--plants", "2", "--out", "taken"]) == 2
     assert capsys.readouterr().err == "loopwright stress: taken is no folder; name one by --out\n"

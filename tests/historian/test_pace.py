@@ -11,6 +11,7 @@ import pytest
 import yaml
 from dirty_plant import clean, screen_of, write
 from scipy.signal import lfilter
+from undrawn import draw_nothing
 
 from pipeline.__main__ import main
 from pipeline.config.exports import ExportParams, screened_record
@@ -179,6 +180,7 @@ def test_new_says_the_period_and_the_stage_makes_the_same_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    draw_nothing(monkeypatch)
     Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
     y, u = slow(3, 15_000)
     y = 55 + y + noise(3, len(y), 0.2)

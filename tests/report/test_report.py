@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from made_up_case import CASE
+from undrawn import draw_nothing
 
 from pipeline.cases import CASES
 from pipeline.errors import ReportError
@@ -280,6 +281,7 @@ def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
     shutil.copytree(root, own)
     (own / "params.yaml").write_text(yaml.safe_dump(params))
     monkeypatch.chdir(own)
+    draw_nothing(monkeypatch)
     report(CASE)
     assert "has no nmpc figures of scenario 'ua' as it is now; run `loopwright bounds" in capsys.readouterr().err
     folder = own / "artifacts" / CASE

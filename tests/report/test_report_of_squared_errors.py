@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from made_up_case import BATCH, PH, Miniature
 from rich.console import Console
+from undrawn import draw_nothing
 
 from pipeline.cases import CASES
 from pipeline.cases.batch_reactor.case import CALMED
@@ -256,8 +257,9 @@ def test_claims_of_the_reactor_follow_the_measurement(tmp_path):
     assert "the paper's 11,121" in said
 
 
-def test_a_persons_own_data_get_no_reasons_of_the_papers(batch, tmp_path):
+def test_a_persons_own_data_get_no_reasons_of_the_papers(batch, tmp_path, monkeypatch):
     evidence = load(batch, BATCH, own_data=True)
+    draw_nothing(monkeypatch)
     made_up.report(evidence, tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "full heating" not in text

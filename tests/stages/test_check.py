@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,20 @@ from pipeline.stages import check
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def params(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """The repository's own params.yaml in a folder of its own, which ``checked`` writes anew."""
-    shutil.copytree(ROOT / "pipeline" / "cases", tmp_path / "pipeline" / "cases")
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def whole() -> dict[str, Any]:
+    """The repository's own params.yaml, read once: it is long."""
     tree: dict[str, Any] = yaml.safe_load((ROOT / "params.yaml").read_text())
     return tree
+
+
+@pytest.fixture
+def params(whole: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The same in a folder of its own, which ``checked`` writes anew."""
+    (tmp_path / "pipeline").mkdir()
+    (tmp_path / "pipeline" / "cases").symlink_to(ROOT / "pipeline" / "cases")  # which nothing here changes
+    monkeypatch.chdir(tmp_path)
+    return deepcopy(whole)
 
 
 def checked(tree: dict[str, Any]) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from own_cases import controllers_of_a_lag
 from rich.console import Console
+from undrawn import draw_nothing
 
 from pipeline.cases.own_plant import OwnCase
 from pipeline.errors import LawError, ModelError, ParamsError, PlantError, RecordError
@@ -25,9 +26,15 @@ from pipeline.tracking.gate import Gate
 GIVEN = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
 
 
-@pytest.fixture
-def plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no picture is drawn: the words of the reports are looked at."""
     monkeypatch.chdir(tmp_path)
+    draw_nothing(monkeypatch)
+
+
+@pytest.fixture
+def plant(_in_a_folder_of_its_own: None) -> None:
     controllers_of_a_lag({"pid": GIVEN})
 
 
@@ -89,10 +96,7 @@ def pages() -> tuple[str, str]:
     return Path("artifacts/it/report.md").read_text(), terminal.getvalue()
 
 
-def test_a_pid_that_locks_up_need_not_be_beaten_and_the_report_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_pid_that_locks_up_need_not_be_beaten_and_the_report_says_so() -> None:
     controllers_of_a_lag({"pid": GIVEN | {"kc": -2.0}, "other": GIVEN})
     found = designed_and_validated("pid", "other")
     assert re.search(
@@ -105,10 +109,7 @@ def test_a_pid_that_locks_up_need_not_be_beaten_and_the_report_says_so(
     assert f"**There is no PID to beat**, because {found.gate.no_baseline}. " in pages()[0]
 
 
-def test_without_a_pid_another_law_passes_and_with_one_it_must_win(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_without_a_pid_another_law_passes_and_with_one_it_must_win(monkeypatch: pytest.MonkeyPatch) -> None:
     controllers_of_a_lag({"pid": GIVEN, "other": GIVEN | {"kc": 0.05}})  # slower, so worse
     found = designed_and_validated("pid", "other")
     assert found.gate.no_baseline == ""
@@ -130,7 +131,6 @@ def test_without_a_pid_another_law_passes_and_with_one_it_must_win(
     assert re.search(r"pid \* .* 1\.0+ × PID", terminal), terminal
 
     # Nor a PID: what noise can hide counts as 1.
-    monkeypatch.chdir(tmp_path)
     controllers_of_a_lag({"other": GIVEN})
     report("it")
     found = Validation.read(Path("artifacts/it/validation.json"))
@@ -142,10 +142,7 @@ def test_without_a_pid_another_law_passes_and_with_one_it_must_win(
     assert "× noise floor" in terminal
 
 
-def test_without_any_law_the_report_shows_the_model_and_the_reasons(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_without_any_law_the_report_shows_the_model_and_the_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
     controllers_of_a_lag({"pid": GIVEN, "other": GIVEN})
 
     def refuses(*_: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pandas as pd
 import pytest
 import yaml
 from dirty_plant import cells, clean, write
+from undrawn import draw_nothing
 
 from pipeline.__main__ import main
 from pipeline.cases.own_entries import entries_of
@@ -34,15 +36,32 @@ NEW, RECORD = Path("data/tank"), screened_record("tank")
 Edit = Callable[[dict[str, Any]], None]
 
 
+@pytest.fixture(scope="module")
+def added(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plant that `new` added; each test has a copy, so that it is added once."""
+    path = tmp_path_factory.mktemp("added")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(path)
+        draw_nothing(patch)
+        for package in ("pipeline", "serving"):  # the list of files looks for them below the root
+            Path(package).symlink_to(ROOT / package)
+        Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
+        write(Path("x.csv"), cells(clean(1500)))
+        assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    return path
+
+
+@pytest.fixture
+def drawn() -> None:
+    """Asked for by a test that looks at the page's pictures."""
+
+
 @pytest.fixture(autouse=True)
-def _tank(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plant that `new` added."""
+def _tank(request: pytest.FixtureRequest, added: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(added, tmp_path, symlinks=True, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    for package in ("pipeline", "serving"):  # the list of files looks for them below the root
-        Path(package).symlink_to(ROOT / package)
-    Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
-    write(Path("x.csv"), cells(clean(1500)))
-    assert main(["new", "tank", "x.csv", *ROLES]) == 0
+    if "drawn" not in request.fixturenames:
+        draw_nothing(monkeypatch)
 
 
 def edited(edit: Edit) -> None:
@@ -94,6 +113,7 @@ def test_the_budget_of_the_search_is_written_and_is_its_default() -> None:
     assert search.minutes == MINUTES
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_stage_makes_the_record_that_new_judged(capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     screen("tank")
@@ -105,7 +125,7 @@ def test_the_stage_makes_the_record_that_new_judged(capsys: pytest.CaptureFixtur
     )
     metrics = json.loads(RECORD.with_name("metrics.json").read_text())
     assert metrics["files"] == [{"file": "x.csv", "sha256": sha256(Path("x.csv"))}]
-    assert RECORD.with_name("screening.html").exists()
+    assert RECORD.with_name("screening.html").read_text().count('src="data:image/png;base64,iVBOR') == 4
     before = RECORD.read_bytes()
     screen("tank")
     assert RECORD.read_bytes() == before

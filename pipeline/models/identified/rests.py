@@ -43,10 +43,13 @@ def hidden_rest(model: Dynamics, y: Array, v: Array, start: Array) -> Array:
     if n_y == model.n_x:
         return x
     eye = np.eye(model.n_x - n_y)
+    inverse = np.linalg.pinv(eye - model.a[None, n_y:, n_y:], rcond=1e-3)
     for _ in range(8):
         gap = (model.advance(x, v) - x)[:, n_y:]
-        slope = np.broadcast_to(model.slopes(x, v)[0], (len(x), model.n_x, model.n_x))[:, n_y:, n_y:]
-        step = np.einsum("nij,nj->ni", np.linalg.pinv(eye - slope, rcond=1e-3), gap)
+        if model.n_hidden:  # else the slope is the same everywhere
+            slope = np.broadcast_to(model.slopes(x, v)[0], (len(x), model.n_x, model.n_x))[:, n_y:, n_y:]
+            inverse = np.linalg.pinv(eye - slope, rcond=1e-3)
+        step = np.einsum("nij,nj->ni", np.broadcast_to(inverse, (len(x), *eye.shape)), gap)
         x[:, n_y:] += np.clip(step, -2, 2)
     return x
 

@@ -31,17 +31,18 @@ class Equations:
     def solve(self, damping: float, start_damping: float) -> tuple[Array, list[Array]]:
         """The step of the parameters (P,) and of each initial state (n_x,).
 
-        (H + mu I) is reduced by the initial states, of which each touches its own stretch only.
+        (H + mu I) is reduced by the initial states, of which each touches its own stretch only. The sums are finite,
+        see ``sensitivity_sums``: looking at each again takes as long as solving.
         """
         h, g = self.h + damping * np.eye(len(self.h)), self.g.copy()
         solved = []
         for cross, own, right in self.of_starts:
-            factor = linalg.cho_factor(own + start_damping * np.eye(len(own)))
-            back, mean = linalg.cho_solve(factor, cross.T), linalg.cho_solve(factor, right)
+            factor = linalg.cho_factor(own + start_damping * np.eye(len(own)), check_finite=False)
+            back, mean = (linalg.cho_solve(factor, of, check_finite=False) for of in (cross.T, right))
             solved.append((back, mean))
             h = h - cross @ back
             g = g - cross @ mean
-        step = linalg.solve(h, g, assume_a="pos") if len(g) else g
+        step = linalg.solve(h, g, assume_a="pos", check_finite=False) if len(g) else g
         return step, [mean - back @ step for back, mean in solved]
 
 

@@ -1,0 +1,29 @@
+"""The file of a picture."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+from matplotlib.figure import Figure as Canvas
+
+from pipeline.files import write_bytes
+from pipeline.pictures.drawing import lay_out
+
+DPI = 100.0  # MLflow shows pictures in their own size
+
+
+def png(canvas: Canvas) -> bytes:
+    """The picture as a PNG; without date and version inside, so that equal data give equal files."""
+    canvas.dpi = DPI
+    # Matplotlib draws a canvas with a layout twice, the first time only to find it.
+    lay_out(canvas)
+    canvas.set_layout_engine(None)
+    buffer = io.BytesIO()
+    canvas.savefig(buffer, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def save(canvas: Canvas, path: Path) -> None:
+    """Write the PNG whole or not at all."""
+    write_bytes(path, png(canvas))
