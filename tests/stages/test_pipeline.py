@@ -23,6 +23,8 @@ from reduced import reduced
 ROOT = Path(__file__).parents[2]
 CASE = "thiosulfate_cstr"
 PID = f"{CASE}-pid"
+# All but the reports and the registry, which follow whatever comes out and take as long as all others.
+LAWS = (f"validate@{CASE}-inc", f"validate@{PID}")
 ENVIRONMENT = {
     **os.environ,
     "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
@@ -131,9 +133,7 @@ def test_a_second_run_does_nothing(copy: Copy) -> None:
 
 def test_another_number_reruns_its_own_design_and_validation_only(copy: Copy) -> None:
     copy.edit(("controllers", PID, "lambda_s"), 2.0)
-    ran = copy.repro()
-    assert {f"design@{PID}", f"validate@{PID}"} <= ran
-    assert ran <= {"code", f"design@{PID}", f"validate@{PID}", f"report@{CASE}", "overview", "publish"}
+    assert copy.repro(*LAWS) == {"code", f"design@{PID}", f"validate@{PID}"}
     # Back again: DVC's cache has it, nothing is computed twice.
     copy.edit(("controllers", PID, "lambda_s"), 1.5)
     assert not {s for s in copy.repro(f"validate@{PID}") if s.startswith(("excite", "fit", "design"))}
@@ -158,10 +158,10 @@ def test_a_run_killed_in_the_middle_loses_nothing(copy: Copy) -> None:
             break
     process.stdout.close()
     process.wait()
-    ran = copy.repro()
+    ran = copy.repro(*LAWS)
     assert {f"fit@{CASE}-linearized", f"design@{PID}"} <= ran
     assert not {s for s in ran if s.startswith("excite") or s.endswith(("-inverse", "-inc"))}
-    assert "up to date" in copy.run("dvc", "status")
+    assert "up to date" in copy.run("dvc", "status", "--with-deps", *LAWS)
     assert (copy.path / "artifacts" / CASE / "inc.onnx").read_bytes() == before
 
 
