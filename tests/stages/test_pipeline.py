@@ -172,7 +172,7 @@ def test_ctrl_c_leaves_one_line_and_no_process_and_a_run_goes_on(copy: Copy, who
     copy.edit(("controllers", PID, "lambda_s"), 3.0 + whole_group)
     mark = f"{os.getpid()}-{whole_group}"
     bare = {**ENVIRONMENT, "PATH": "/usr/bin:/bin", "MARK": mark}
-    command, pipe = [sys.executable, "-m", "pipeline", "run", CASE], subprocess.PIPE
+    command, pipe = [sys.executable, "-m", "pipeline", "run", PID], subprocess.PIPE
     process = subprocess.Popen(
         command, cwd=copy.path, env=bare, text=True, stdout=pipe, stderr=subprocess.STDOUT, start_new_session=True
     )
@@ -180,17 +180,18 @@ def test_ctrl_c_leaves_one_line_and_no_process_and_a_run_goes_on(copy: Copy, who
     said = []
     for line in process.stdout:
         said.append(line)
-        if line.startswith("stage 1 of 3: design"):
+        if line.startswith("stage 1 of 2: design"):
             (os.killpg if whole_group else os.kill)(process.pid, signal.SIGINT)
     assert process.wait() == 130, said
     process.stdout.close()
-    assert said[-1] == f"stopped; finished stages are kept, `loopwright run {CASE}` goes on from there\n", said
-    assert said[-2].startswith("stage 1 of 3: design"), said
+    assert said[-1] == f"stopped; finished stages are kept, `loopwright run {PID}` goes on from there\n", said
+    assert said[-2].startswith("stage 1 of 2: design"), said
     assert within(10, lambda: not _marked(f"MARK={mark}".encode()))
     if whole_group:  # the other one would show the same again
         rest, code = copy.warm(f"PATH={bare['PATH']} {shlex.join(command)}")
         assert code == 0, rest
-        assert "stage 1 of 3: design" in rest
+        assert "stage 1 of 2: design" in rest
+        assert "stage 2 of 2: validate" in rest
 
 
 def _marked(variable: bytes) -> list[str]:
