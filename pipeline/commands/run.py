@@ -58,12 +58,13 @@ def _run(options: argparse.Namespace) -> int:
         rest = f"; params.yaml has {len(wrong)} mistakes, `loopwright check` lists them" if wrong[1:] else ""
         raise ParamsError(f"{wrong[0]}{rest}")
     # The list of files that each stage runs comes first: what has changed shows only after it.
-    # DVC alone would not make it anew for a data file that has grown, and in a dry run it would change dvc.lock.
-    # Unforced it would put the list back that the same sources had before the file grew.
+    # DVC alone would not make it anew for a data file that has grown. It is told that this list is the stage's output:
+    # it would run the stage once more, or put the list back that the same sources had before the file grew.
+    # In a dry run it is not told, because that changes dvc.lock.
     list_files()
     if not options.dry:
         try:
-            ask("repro", "--quiet", "--force", "code", finish=True)
+            ask("commit", "--quiet", "--force", "code", finish=True)
         except PipelineError as error:
             raise PipelineError(
                 f"the list of the files that each stage runs could not be made, so no stage ran ({error}); "

@@ -30,7 +30,10 @@ LIBRARIES = (
 IDLE_S = 0.05  # until a worker that has a task looks again whether it may go on importing
 PROFILING = ("profile", "profile-cycle")
 # The ends of the pipeline that no worker runs.
-APART = ("pipeline.__main__", "pipeline.commands", "pipeline.tracking", "pipeline.stages.publish")
+APART = (
+    *("pipeline.__main__", "pipeline.commands", "pipeline.tracking", "pipeline.stages.publish", "pipeline.playground"),
+    *("pipeline.hosts", "pipeline.simulation.opcua_server"),
+)
 
 
 def dask_setup(worker: Worker) -> None:

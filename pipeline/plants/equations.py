@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
-from scipy import optimize
 
 from pipeline.errors import PlantError
 from pipeline.plants.linearization import Linearization
@@ -207,6 +206,8 @@ class EquationPlant(Simulator):
 
     def steady_states(self, mv: float) -> list[Array]:
         """All steady states at one MV, the smallest controlled variable first."""
+        from scipy import optimize  # a quarter of a second to load, for whoever needs a plant's signals alone
+
         cvs, _, mvs = self.steady_curve
         found = []
         for i in np.nonzero(np.diff(np.sign(mvs - mv)))[0]:
@@ -216,6 +217,8 @@ class EquationPlant(Simulator):
 
     def turning_points(self) -> list[tuple[Array, float]]:
         """(x, mv) where two steady states meet: extrema of the steady MV over the CV, smallest CV first."""
+        from scipy import optimize
+
         cvs, _, mvs = self.steady_curve
 
         def singular(cv: float) -> float:

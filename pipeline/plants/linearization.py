@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from pipeline.plants.simulator import Array
 
@@ -33,6 +32,8 @@ class Linearization:
 
     def sampled(self, period_s: float) -> tuple[Array, Array]:
         """Zero-order-hold discretization (Phi, Gamma): x(k+1) = Phi x(k) + Gamma mv(k)."""
+        from scipy import linalg  # loads for long, and most who import this room linearize nothing
+
         n, m = self.b.shape
         block = np.zeros((n + m, n + m))
         block[:n, :n], block[:n, n:] = self.a, self.b
@@ -44,6 +45,8 @@ class Linearization:
 
         The exact one-step inverse puts a closed-loop eigenvalue on each of them.
         """
+        from scipy import linalg
+
         phi, gamma = self.sampled(period_s)
         n = phi.shape[0]
         pencil = np.zeros((n + 1, n + 1))

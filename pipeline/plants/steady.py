@@ -7,7 +7,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy import optimize
 
 from pipeline.plants.simulator import Array
 from serving.manifest import Signal
@@ -103,6 +102,8 @@ class SteadyStates:
         return None
 
     def _robust(self, z: Array, cv: float) -> Array | None:
+        from scipy import optimize  # a quarter of a second to load, for whoever needs a plant's signals alone
+
         def balance(v: Array) -> Any:
             return self.balance(v, cv)
 

@@ -60,15 +60,19 @@ NO_FILE = "not there"  # in place of a digest; the stage says so
 
 
 def code() -> None:
-    """Write work/code: one file for each stage of each case, one for each of those at the end."""
+    """Write work/code: one file for each stage of each case, one for each of those at the end; no other stays there."""
+    made = {DATA}
     for stage, case in (*((stage, "") for stage in LAST), *product(STAGES, all_cases())):
         if stage == "screen" and not is_exported(case):
             continue
-        write_json(WORK / "code" / f"{stage}{case and '-' + case}.json", listing(Path.cwd(), stage, case))
+        made.add(file := WORK / "code" / f"{stage}{case and '-' + case}.json")
+        write_json(file, listing(Path.cwd(), stage, case))
     # For the engine, which sends a stage's files to a worker: no stage depends on this list.
     simulators = {p.as_posix() for case in all_cases().values() for p in case.reads}  # the list of cases loads them all
     records = {name: [PlantParams.read(name).data.as_posix()] for name in sections("plants")}
     write_json(DATA, {EVERY: sorted(simulators), **records})
+    for left in set((WORK / "code").glob("*.json")) - made:  # of a case or an export that is no more
+        left.unlink()
 
 
 def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:

@@ -9,7 +9,6 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 
 from pipeline.plants.linearization import Linearization
 from pipeline.plants.simulator import Array
@@ -148,6 +147,8 @@ def searched(order: int, seed: int = 0, neighbours: int = 400) -> tuple[float, .
             best, least, width = trial, cost, min(1.5 * width, 0.5)
         else:
             width = max(0.95 * width, 1e-3)
+    from scipy.optimize import minimize  # loads for long, for whoever only reads what a law's parameters are
+
     polished = minimize(itae, best, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-12, "maxiter": 2_000})
     return tuple(round(float(v), DECIMALS) for v in polished.x)
 

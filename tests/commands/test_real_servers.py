@@ -6,7 +6,8 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,13 @@ from servers import ROOT, Servers, servers
 CASE = "thiosulfate_cstr"
 KEPT = {f"{CASE}-{name}" for name in ("operating_point", "linearized", "pid")}
 OFF = {"DVC_NO_ANALYTICS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "1", "PYTHONUNBUFFERED": "1"}
+# `loopwright` with one line of arguments after another, in a process that loads MLflow once.
+PROMPT = """
+import sys
+from pipeline.__main__ import main
+for line in sys.stdin:
+    print("ended with", main(line.split()), file=sys.stderr, flush=True)
+"""
 GIT = ("git", "-c", "user.name=test", "-c", "user.email=test@localhost", "-c", "commit.gpgsign=false")
 
 
@@ -25,12 +33,15 @@ class Person:
     def __init__(self, clone: Path, variables: dict[str, str]) -> None:
         self.clone, self.variables = clone, variables
 
-    def asks(self, *command: object) -> subprocess.CompletedProcess[str]:
+    @property
+    def environment(self) -> dict[str, str]:
         own = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         without = {k: v for k, v in os.environ.items() if not k.startswith(("AWS_", "MLFLOW_", "DASK_"))}
-        env = {**without, **OFF, **self.variables, "PATH": own, "PYTHONPATH": str(self.clone)}
+        return {**without, **OFF, **self.variables, "PATH": own, "PYTHONPATH": str(self.clone)}
+
+    def asks(self, *command: object) -> subprocess.CompletedProcess[str]:
         words = [str(word) for word in command]
-        return subprocess.run(words, cwd=self.clone, env=env, capture_output=True, text=True, timeout=900)
+        return subprocess.run(words, cwd=self.clone, env=self.environment, capture_output=True, text=True, timeout=900)
 
     def does(self, *command: object) -> str:
         done = self.asks(*command)
@@ -49,6 +60,28 @@ class Person:
         assert done.returncode in (1, 2), done.stdout + done.stderr
         (line,) = done.stderr.splitlines()
         return line
+
+    @contextmanager
+    def prompt(self) -> Iterator[Callable[[str], str]]:
+        """A function: what `loopwright` says, in one line, of arguments with which it cannot."""
+        command, pipe = [sys.executable, "-c", PROMPT], subprocess.PIPE
+        with subprocess.Popen(
+            command, cwd=self.clone, env=self.environment, text=True, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe
+        ) as process:
+            assert process.stdin is not None
+            assert process.stderr is not None
+            asked, said = process.stdin, process.stderr
+
+            def mistake(words: str) -> str:
+                asked.write(f"{words}\n")
+                asked.flush()
+                line, end = said.readline(), said.readline()
+                assert end == "ended with 2\n", line + end
+                return line
+
+            yield mistake
+            asked.close()
+            assert said.read() == ""
 
 
 def small_copy(folder: Path) -> None:
@@ -109,15 +142,16 @@ def test_a_run_on_real_servers_reaches_a_second_clone(around: tuple[Servers, dic
     assert contents(second.clone / "work") == made
 
     # The servers go away one by one: each time one line says which, and nothing is left half-written.
-    for gone, words in (
-        ("s3", "the store of files behind the server"),
-        ("postgres", "was answered by error 503; is its server running, and the database behind it?"),
-        ("mlflow", "is its server running"),
-    ):
-        running.stop(gone)
-        line = second.mistake("pipeline", "registry", "fetch", CASE, "again")
-        assert words in line, line
-        assert not (second.clone / "again").exists()
+    with second.prompt() as mistake:
+        for gone, words in (
+            ("s3", "the store of files behind the server"),
+            ("postgres", "was answered by error 503; is its server running, and the database behind it?"),
+            ("mlflow", "is its server running"),
+        ):
+            running.stop(gone)
+            line = mistake(f"registry fetch {CASE} again")
+            assert words in line, line
+            assert not (second.clone / "again").exists()
     running.stop("scheduler")
     line = first.mistake("pipeline.engine.start", "design", f"{CASE}-pid")
     assert variables["DASK_SCHEDULER_ADDRESS"] in line

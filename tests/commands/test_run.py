@@ -56,6 +56,22 @@ def test_a_dry_run_leaves_the_stages_to_a_run(
     assert capsys.readouterr().out == "nothing has changed; everything is up to date\n"
 
 
+def test_dvc_is_told_of_the_list_of_files_and_does_not_make_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def dvc(*arguments: str, finish: bool = False) -> str:
+        done.append(" ".join(arguments) + " to its end" * finish)
+        return "{}"
+
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(run, "mistakes", list)
+    monkeypatch.setattr(run, "list_files", lambda: done.append("listed"))
+    monkeypatch.setattr(run, "ask", dvc)
+    monkeypatch.setattr(run, "show_results", lambda *_, **__: None)
+    assert main(["run"]) == 0
+    assert done == ["listed", "commit --quiet --force code to its end", "status --json"]
+
+
 def test_a_first_step_that_fails_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +38,12 @@ def built(fmi: int, folder: Path, extra: tuple[str, ...] = ()) -> Path:
     return driver
 
 
+@pytest.fixture(scope="module")
+def driver_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
+    """The driver of a version of FMI, compiled once for all tests."""
+    return cache(lambda fmi: built(fmi, tmp_path_factory.mktemp("driver")))
+
+
 def steps_of(of: str, to: Path) -> int:
     """Write the kit's steps as fmu_driver.c reads them; how many."""
     controller = controller_of(of)
@@ -66,8 +74,10 @@ def played(
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-def test_the_fmu_neither_leaks_nor_reads_beyond_its_memory(fmi: int, tmp_path: Path) -> None:
-    driver = built(fmi, tmp_path)
+def test_the_fmu_neither_leaks_nor_reads_beyond_its_memory(
+    fmi: int, driver_of: Callable[[int], Path], tmp_path: Path
+) -> None:
+    driver = driver_of(fmi)
     for of in ("thiosulfate_cstr/pid", "jacketed_batch_reactor/fuzzy_feedforward_observer"):
         done = played(driver, of, fmi, tmp_path)
         assert done.returncode == 0, done.stderr
@@ -76,13 +86,13 @@ def test_the_fmu_neither_leaks_nor_reads_beyond_its_memory(fmi: int, tmp_path: P
 
 def test_a_leak_of_the_fmu_would_be_found(tmp_path: Path) -> None:
     """The same with an instance that is never freed."""
-    driver = built(3, tmp_path, ("-DLEAK",))
+    driver = built(3, tmp_path, ("-DLEAK", "-O0"))
     done = played(driver, "thiosulfate_cstr/pid", 3, tmp_path)
     assert done.returncode != 0
     assert "LeakSanitizer: detected memory leaks" in done.stderr
 
 
-def test_a_program_with_decimal_commas_can_load_the_fmu(tmp_path: Path) -> None:
+def test_a_program_with_decimal_commas_can_load_the_fmu(driver_of: Callable[[int], Path], tmp_path: Path) -> None:
     """The manifest's numbers have points, and strtod obeys the locale of the program around it."""
     (tmp_path / "comma").write_text('comment_char %\nescape_char /\nLC_NUMERIC\ndecimal_point ","\nthousands_sep ""\n'
                                     "grouping -1\nEND LC_NUMERIC\n")  # fmt: skip
@@ -90,5 +100,5 @@ def test_a_program_with_decimal_commas_can_load_the_fmu(tmp_path: Path) -> None:
     words = ["localedef", "-c", "-i", str(tmp_path / "comma"), str(tmp_path / "locales" / "comma")]
     subprocess.run(words, capture_output=True)  # it warns of the other categories; the driver needs this one
     environment = {"LOCPATH": str(tmp_path / "locales"), "DRIVER_LOCALE": "comma"}
-    done = played(built(3, tmp_path), "thiosulfate_cstr/pid", 3, tmp_path, environment)
+    done = played(driver_of(3), "thiosulfate_cstr/pid", 3, tmp_path, environment)
     assert done.returncode == 0, done.stderr

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from pipeline.cases import CASES
-from pipeline.stages.code import APART, CARRIERS, LAST, PACKAGES, STAGES, graph, listing, modules
+from pipeline.stages.code import APART, CARRIERS, LAST, PACKAGES, STAGES, code, graph, listing, modules
 
 ROOT = Path(__file__).parents[2]
 DVC = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
@@ -75,6 +75,19 @@ def test_nothing_is_missing_but_what_is_named_as_apart(stage: str, case: str) ->
 def test_a_stage_has_the_files_that_it_runs(stage: str, case: str, path: str, runs: bool) -> None:
     assert (ROOT / path).is_file()
     assert (path in listing(ROOT, stage, case)) is runs
+
+
+def test_the_list_of_a_case_that_is_no_more_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever runs the stage finds what DVC finds, which empties the folder before."""
+    (tmp_path / "params.yaml").write_text("cases: {}\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pipeline.stages.code.listing", lambda *_: {})
+    code()
+    made = {file.name for file in Path("work/code").iterdir()}
+    assert {"data.json", "overview.json", "publish.json", "fit-batch_reactor.json"} <= made
+    Path("work/code/fit-tank.json").write_text("{}")
+    code()
+    assert {file.name for file in Path("work/code").iterdir()} == made
 
 
 def test_an_edit_shows_in_the_stages_that_run_it_alone(tmp_path: Path) -> None:

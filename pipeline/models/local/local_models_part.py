@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from scipy import optimize
 
 from pipeline.errors import ModelError
 from pipeline.metrics import fit_percent
@@ -130,6 +129,8 @@ def operating_cv(plant: EquationPlant, point: Mapping[str, float]) -> float:
             f"plant {plant.name!r} has {len(at)} steady states with {name} = {value:g} over its set point's range; "
             "an operating point needs exactly one"
         )
+    from scipy import optimize  # loads for long, for whoever only reads what a model's parameters are
+
     return float(optimize.brentq(miss, cvs[at[0]], cvs[at[0] + 1], xtol=1e-14))
 
 
