@@ -68,8 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _loaded(name: str) -> ModuleType:
     """The module of a command. What it imports stays: looking through it for garbage took a sixth of the time."""
     module = f"pipeline.commands.{name}"
-    if module in sys.modules:  # whoever calls main again is no command: frozen each time, their garbage would pile up
-        return sys.modules[module]
+    if (found := sys.modules.get(module)) is not None:  # frozen at each call, a caller's garbage would pile up
+        return found
     looking = gc.isenabled()
     gc.disable()
     try:

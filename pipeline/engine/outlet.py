@@ -33,15 +33,17 @@ def outlet(stopped: threading.Event) -> Iterator[int]:
 
 
 def _pass_on(source: int, to: int, stopped: threading.Event, end: bytes) -> None:
-    kept, over = b"", False
+    kept, over, within = b"", False, False  # within a line
     while not over:  # who writes on may have written behind the end already
         text, found, _ = (kept + os.read(source, 65_536)).partition(end)
         over = bool(found)
         begun = 0 if over else _begun(text, end)
         text, kept = text[: len(text) - begun], text[len(text) - begun :]
-        if not stopped.is_set():
-            with contextlib.suppress(OSError):  # nobody reads any more; unread here, it would stop those who write
-                os.write(to, text)
+        if stopped.is_set():  # print writes a line and its end one after the other, and the stop may fall between them
+            text = b"\n" * within
+        within = not text.endswith(b"\n") if text else within
+        with contextlib.suppress(OSError):  # nobody reads any more; unread here, it would stop those who write
+            os.write(to, text)
 
 
 def _begun(text: bytes, end: bytes) -> int:

@@ -66,20 +66,31 @@ import os, threading
 from pipeline.engine.outlet import outlet
 os.urandom = lambda n: b"\\n" * n
 with outlet(stopped := threading.Event()):
-    os.write(2, b"before\\n")
+    os.write(2, {text!r})
     while os.read(0, 1) != b"!":
         pass
     stopped.set()
+    os.write(2, b"\\nmore\\n")
 """
 
 
-def test_a_line_waits_for_no_other() -> None:
-    """However the mark of the end was drawn: a line that looks like its beginning came before the run was stopped."""
-    command = [sys.executable, "-c", TORN]
+def stopped_behind(text: bytes) -> tuple[bytes, bytes]:
+    """What comes out of a text before the run is stopped behind it, and after that."""
+    command = [sys.executable, "-c", TORN.format(text=text)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as running:
         assert running.stdin is not None
         assert running.stderr is not None
         heard = select([running.stderr], [], [], 60)[0] and os.read(running.stderr.fileno(), 100)
         running.stdin.write(b"!")
         running.stdin.close()
-        assert (heard, running.stderr.read()) == (b"before\n", b"")
+        return heard or b"", running.stderr.read()
+
+
+def test_a_line_waits_for_no_other() -> None:
+    """However the mark of the end was drawn: a line that looks like its beginning came before the run was stopped."""
+    assert stopped_behind(b"before\n") == (b"before\n", b"")
+
+
+def test_a_line_that_a_stop_cuts_ends_there() -> None:
+    """What is said next begins a line of its own."""
+    assert stopped_behind(b"before") == (b"before", b"\n")

@@ -286,6 +286,7 @@ def test_what_is_read_by_keyboard_stays_while_scans_come_in(page: Page, loop: Fa
         loop.add(1)
         expect(chart).to_have_attribute("data-rows", str(rows + 1))
 
+    scans()  # something is drawn that can be read
     said = list[str]()
     for _ in range(4):
         page.keyboard.press(",")

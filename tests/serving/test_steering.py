@@ -173,6 +173,8 @@ def test_a_controller_that_reads_fewer_pvs_takes_over(
     assert within(20, lambda: state()["mode"] == "AUTO")
     assert loopwright(capsys, "swap", "--back", "--trial", "2")[0] == 0
     assert within(20, lambda: state()["sha256"] == loop.station.controller.sha256)
+    before = loop.station.scans
+    assert within(20, lambda: loop.station.scans > before + 2)  # by the one that is back
     loop.end()
     assert loopwright(capsys, "export", str(loop.settings.journal.file))[0] == 0
     with (tmp_path / "loop.csv").open(newline="") as text:

@@ -81,7 +81,7 @@ def test_the_second_loop_holds_until_the_first_is_gone(
         before = len(plant.actuator())
         assert within(20, lambda: len(plant.actuator()) > before + 10)
         assert not second.station.endpoint.lease.held
-        assert mode(first)[0] is Mode.AUTO
+        assert within(20, lambda: mode(first)[0] is Mode.AUTO)  # a busy machine may hold it for a moment
         first.end()
         assert within(30, lambda: second.station.endpoint.lease.held and mode(second)[0] is Mode.AUTO)
         ask(second.settings.journal.file, {"do": "mode", "value": "SHADOW", "who": "anna"})
