@@ -147,7 +147,8 @@ def _answers(
             if task is not None and not task.wanted():
                 raise PipelineError("nobody waits for this any more")
             place = places[future.key]
-            if future.status != "finished":
+            # Not by its status: a result may have come a moment before the worker that kept it was lost.
+            if not isinstance(ended, bytes):
                 # Of a piece that was given up with the connection Dask has the error alone.
                 raise lost(ended if isinstance(ended, Exception) else ended[1], f"piece {place + 1} of {len(work)}")
             failed, result, changes = pickle.loads(ended)

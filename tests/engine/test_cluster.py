@@ -8,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.request import urlopen
 
@@ -90,6 +92,17 @@ def test_the_error_of_a_piece_is_raised_here(address: str) -> None:
     with pytest.raises(PipelineError) as error:
         parallel_map(refuse, range(4), "refusals")
     assert str(error.value) == "the valve is stuck"
+
+
+def test_a_result_counts_whose_worker_was_lost_a_moment_later(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    completed = distributed.as_completed
+
+    def late(futures: Any, **how: Any) -> Iterator[tuple[Any, Any]]:
+        for future, ended in completed(futures, **how):
+            yield SimpleNamespace(key=future.key, status="pending"), ended
+
+    monkeypatch.setattr(distributed, "as_completed", late)
+    assert parallel_map(process_of, range(3), "processes")
 
 
 def test_a_worker_that_is_killed_costs_its_piece_alone(address: str, tmp_path: Path) -> None:
