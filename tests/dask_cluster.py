@@ -53,10 +53,10 @@ class Cluster:
 
 @pytest.fixture(scope="module", name="cluster")
 def two_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """A scheduler with two workers, one of them without the preload."""
+    """A scheduler with two workers, one of them without a preload; ``test_preload.py`` tests what it imports ahead."""
     made = Cluster(tmp_path_factory.mktemp("cluster"))
     try:
-        made.worker("--preload", "pipeline.engine.preload")
+        made.worker("--preload", "quick_preload")
         made.worker()
         yield made
     finally:
