@@ -11,8 +11,8 @@ export DO_NOT_TRACK := 1
 # Python keeps what it has compiled: else each process of the tests compiles all sources again, 10 s for some.
 unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
-# Beside a worker for each core two more, for tests of loops, servers and browsers, which mostly wait: tests/scheduling.py.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 2)')
+# More than there are cores: tests of loops, servers and browsers mostly wait, see tests/scheduling.py. Each takes 1.2 GB.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 3)')
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run test check quick docs coverage registry bench release clean
@@ -33,12 +33,12 @@ test: quick ## formatting, lint, types, import rules, tests
 	@bash tools/tests.sh -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 check: quick ## the static part of make test
+	lint-imports
 	mypy
 
 quick: $(STAMP) # what takes seconds
 	ruff format --check .
 	ruff check .
-	lint-imports
 
 docs: $(STAMP) ## build the manual into build/docs, under a minute
 	@$(BIN)/python -c "import furo, myst_parser" 2> /dev/null || \

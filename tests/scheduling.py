@@ -1,8 +1,9 @@
 """Which worker runs which test file, so that all cores are busy and none that keeps time is late.
 
 Files in KEEP_TIME run plants on a clock, browsers or servers that are asked in time: they mostly wait, and fail where
-they are not served when they need it. The others compute. So there are two kinds of workers: at most as many as there
-are cores compute, at a low priority; the rest keep time at the usual one, and compute when no such file is left.
+they are not served when they need it. The others compute. So there are two kinds of workers. Some compute, at a low
+priority: one more than there are cores, since now and then one of them waits for processes. The others, two where there
+are enough, keep time at the usual priority, and compute when no such file is left.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import pytest
 from xdist.scheduler import LoadFileScheduling
 from xdist.workermanage import WorkerController
 
+KEEPERS = 2
 NICE = 10  # of the workers that compute: a core that somebody else wants has them a tenth of its time
 
 # By their time, the longest first, so that none is waited for alone at the end.
@@ -68,9 +70,9 @@ class TwoKinds(LoadFileScheduling):
 
 
 def computes(node: WorkerController) -> bool:
-    """Whether a worker is one of those that compute: as many as there are cores, and all but one at most."""
+    """Whether a worker is one of those that compute: all but KEEPERS, of three and less all but one."""
     n = node.workerinput["workercount"]
-    return int(node.gateway.id.removeprefix("gw")) % n < min(n - 1, os.cpu_count() or 1)
+    return int(node.gateway.id.removeprefix("gw")) % n < n - min(KEEPERS, (n + 1) // 2)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import scheduling
 from scheduling import KEEP_TIME, RANK, TwoKinds, computes
 
 
@@ -42,26 +41,24 @@ def scheduler(files: list[str], nodes: list[Any]) -> TwoKinds:
     return made
 
 
-@pytest.mark.parametrize(("workers", "computing"), [(1, 0), (2, 1), (4, 2), (10, 2)])
-def test_as_many_compute_as_there_are_cores(workers: int, computing: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scheduling.os, "cpu_count", lambda: 2)
+@pytest.mark.parametrize(("workers", "computing"), [(1, 0), (2, 1), (3, 1), (5, 3), (10, 8)])
+def test_two_keep_time_where_there_are_enough(workers: int, computing: int) -> None:
     assert [computes(node(i, workers)) for i in range(workers)] == [i < computing for i in range(workers)]
     assert computes(node(workers, workers)) == (computing > 0)  # which takes the place of the first, after a crash
 
 
-def test_files_that_keep_time_go_to_the_workers_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scheduling.os, "cpu_count", lambda: 2)
-    timed = sorted(KEEP_TIME)[:3]
+def test_files_that_keep_time_go_to_the_workers_for_them() -> None:
+    timed = sorted(KEEP_TIME)[:5]
     files = [*timed, "test_a.py", "test_b.py", "test_c.py"]
-    nodes = [node(i, 3) for i in range(3)]
+    nodes = [node(i, 4) for i in range(4)]
     made = scheduler(files, nodes)
     for _ in range(6):
         for each in nodes:
             if made.workqueue and not each.shutting_down:
                 made._assign_work_unit(each)
     given = [[files[i] for i in each.given] for each in nodes]
-    assert given == [["test_a.py", "test_c.py"], ["test_b.py"], timed]
-    assert [each.shutting_down for each in nodes] == [True, True, False]
+    assert given == [["test_a.py", "test_c.py"], ["test_b.py"], timed[::2], timed[1::2]]
+    assert [each.shutting_down for each in nodes] == [True, True, False, False]
 
 
 def test_every_file_that_is_named_is_there() -> None:

@@ -25,8 +25,8 @@ from serving.opcua.settings import Server as ServerSettings
 from serving.station.settings import Hold, Settings
 
 SPACE = "urn:loopwright:plant"
-GRANTED_S = 1.0  # of a session and of a channel
-PERIOD_S = 2.5  # of the loop, by the machine's clock
+GRANTED_S = 2.0  # of a session and of a channel, which are renewed half a second before: a busy machine needs some
+PERIOD_S = 3.0  # of the loop, by the machine's clock
 
 
 class ShortServer:
@@ -138,15 +138,15 @@ def test_a_session_outlives_periods_that_are_longer_than_it(
     assert [(c.mode, c.reason) for c in running.commands[:3]] == [(Mode.AUTO, "")] * 3
     assert running.station.endpoint.connections == 1
     assert sessions == [60.0]
-    assert opens.count(ua.SecurityTokenRequestType.Renew) >= 4
+    assert opens.count(ua.SecurityTokenRequestType.Renew) >= 2
 
 
 def test_a_channel_is_renewed_under_a_loop_that_speaks_all_the_time(
     server: ShortServer, opens: list[ua.SecurityTokenRequestType], tmp_path: Path
 ) -> None:
-    patient = settings(tmp_path, server, 0.05)
+    patient = settings(tmp_path, server, 0.1)
     running = RunningLoop(replace(patient, guards=replace(patient.guards, max_age_s=5.0)))
-    assert within(60, lambda: opens.count(ua.SecurityTokenRequestType.Renew) >= 4)
+    assert within(60, lambda: opens.count(ua.SecurityTokenRequestType.Renew) >= 3)
     n = running.station.scans
     assert within(20, lambda: running.station.scans > n + 10)
     running.end()

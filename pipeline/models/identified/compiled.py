@@ -100,7 +100,9 @@ def propagate(
     of_w2 = of_b1 + n_h
     slope, ahead = np.empty((n_x, n_x)), np.empty((n_x, width))
     for k in range(len(z)):
-        jac[k] = s[:n_y]
+        for i in range(n_y):
+            for c in range(width):
+                jac[k, i, c] = s[i, c]
         for i in range(n_x):
             for j in range(n_x):
                 total = a[i, j]
@@ -108,25 +110,27 @@ def propagate(
                     total += w2[i, h] * (1 - t[k, h] * t[k, h]) * w1[h, j]
                 slope[i, j] = total * keep if j < n_y else total
         for i in range(n_x):
-            row = ahead[i]
-            row[:] = 0.0
+            for c in range(width):
+                ahead[i, c] = 0.0
             for j in range(n_x):
-                factor, other = slope[i, j], s[j]
+                factor = slope[i, j]
                 for c in range(width):
-                    row[c] += factor * other[c]
+                    ahead[i, c] += factor * s[j, c]
             if parameters:
                 for j in range(n_x):
-                    row[i * n_x + j] += z[k, j]
+                    ahead[i, i * n_x + j] += z[k, j]
                 for j in range(n_v):
-                    row[of_b + i * n_v + j] += z[k, n_x + j]
-                row[of_c + i] += 1.0
+                    ahead[i, of_b + i * n_v + j] += z[k, n_x + j]
+                ahead[i, of_c + i] += 1.0
                 for h in range(n_h):
                     through = w2[i, h] * (1 - t[k, h] * t[k, h])
                     for j in range(n_z):
-                        row[of_w1 + h * n_z + j] += through * z[k, j]
-                    row[of_b1 + h] += through
-                    row[of_w2 + i * n_h + h] += t[k, h]
-        s[:] = ahead
+                        ahead[i, of_w1 + h * n_z + j] += through * z[k, j]
+                    ahead[i, of_b1 + h] += through
+                    ahead[i, of_w2 + i * n_h + h] += t[k, h]
+        for i in range(n_x):
+            for c in range(width):
+                s[i, c] = ahead[i, c]
 
 
 @compiled
