@@ -144,11 +144,11 @@ def test_a_session_outlives_periods_that_are_longer_than_it(
 def test_a_channel_is_renewed_under_a_loop_that_speaks_all_the_time(
     server: ShortServer, opens: list[ua.SecurityTokenRequestType], tmp_path: Path
 ) -> None:
-    patient = settings(tmp_path, server, 0.1)
+    patient = settings(tmp_path, server, 0.4)  # whose readings have the time that a busy machine takes
     running = RunningLoop(replace(patient, guards=replace(patient.guards, max_age_s=5.0)))
     assert within(60, lambda: opens.count(ua.SecurityTokenRequestType.Renew) >= 3)
     n = running.station.scans
-    assert within(20, lambda: running.station.scans > n + 10)
+    assert within(20, lambda: running.station.scans > n + 5)
     running.end()
     assert running.station.endpoint.connections == 1
 
