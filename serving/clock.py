@@ -42,7 +42,10 @@ class MonotonicClock:
             pass
 
     def end(self) -> None:
-        """Let every sleep return, also one that has begun; from any thread, and from the handler of a signal."""
+        """Let every sleep return, also one that has begun; from any thread, and from the handler of a signal.
+
+        A run on this clock needs a ``stop`` that is true from then on: without one it would scan without waiting.
+        """
         self.ended = True
 
 

@@ -84,8 +84,7 @@ def expiries(server: Server) -> list[Expiry]:
 
 def identity(certificate: Path, key: Path) -> tuple[x509.Certificate, PrivateKeyTypes]:
     """A user's certificate and its private key (DER or PEM, RSA). LoopError where they are not such or no pair."""
-    require_valid(certificate, ASK)
-    found, private = _read(certificate), _key(key)
+    found, private = require_valid(certificate, ASK), _key(key)
     if not isinstance(private, RSAPrivateKey):
         raise LoopError(f"{key} is no RSA key, and OPC UA's policies sign with RSA")
     if private.public_key() != found.public_key():
@@ -101,14 +100,15 @@ def last_day(der: bytes) -> str:
         return "a day that cannot be read"
 
 
-def require_valid(certificate: Path, cure: str = RENEWAL) -> None:
-    """LoopError for a file that is no certificate, and for one whose time is over or has not come."""
+def require_valid(certificate: Path, cure: str = RENEWAL) -> x509.Certificate:
+    """A certificate. LoopError for a file that is none, and for one whose time is over or has not come."""
     found, now = _read(certificate), datetime.now(UTC)
     if now > found.not_valid_after_utc:
-        raise LoopError(f"{certificate} was valid until {valid_until(certificate)}; {cure}")
+        raise LoopError(f"{certificate} was valid until {found.not_valid_after_utc:%Y-%m-%d}; {cure}")
     if now < found.not_valid_before_utc:
         first = f"{found.not_valid_before_utc:%Y-%m-%d}"
         raise LoopError(f"{certificate} is valid from {first} on; is this machine's clock right?")
+    return found
 
 
 def _read(certificate: Path) -> x509.Certificate:
