@@ -14,15 +14,15 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from chromium import CHROMIUM, launched
 from kits import DAMAGES, EMBED, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None:
-    pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
+    pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 if not (EMBED / "browser" / "node_modules").is_dir():
     pytest.skip("onnxruntime-web is missing (npm ci in examples/embed/browser)", allow_module_level=True)
 
-from playwright.sync_api import Page, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Page, expect
 
 PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
 expect.set_options(timeout=30_000)
@@ -40,15 +40,13 @@ def page() -> Iterator[Page]:
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     said: list[str] = []
-    with sync_playwright() as p:
-        browser = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with launched() as browser:
         made = browser.new_page()
         made.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
         made.on("pageerror", lambda error: said.append(str(error)))
         made.goto(f"http://127.0.0.1:{server.server_port}/browser/")
         expect(made.locator("body")).to_have_attribute("data-ready", "yes")
         yield made
-        browser.close()
     server.shutdown()
     server.server_close()
     thread.join()

@@ -27,7 +27,7 @@ from pipeline.simulation.scenario import Scenario
 from serving import Controller, ControlLoop, Mode, Sample, Signal
 
 if CHROMIUM is None:
-    pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
+    pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 if not kept().exists():
     pytest.skip("onnxruntime-web is not here (python -m pipeline.playground.web_runtime)", allow_module_level=True)
 

@@ -19,7 +19,7 @@ from serving.journal import Event
 from serving.monitor.verdict import when
 
 if CHROMIUM is None:
-    pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
+    pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 
 from playwright.sync_api import Browser, CDPSession, Page, Request, expect
 

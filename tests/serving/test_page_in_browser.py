@@ -12,17 +12,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from chromium import CHROMIUM, launched
 from PIL import Image
 from plant_servers import Plant, RunningLoop, spoil
 from processes import within
 
 from pipeline.__main__ import main
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None:
-    pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
+    pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 
-from playwright.sync_api import Browser, Page, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Browser, Page, expect
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr"
 PICTURES = os.environ.get("LOOPWRIGHT_PICTURES")
@@ -61,11 +61,9 @@ def loop(plant: Plant, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run
 
 @pytest.fixture(scope="module")
 def browser(loop: RunningLoop) -> Iterator[Browser]:
-    with sync_playwright() as p:
-        # Containers have no user namespaces; the page is our own.
-        made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    """After the loop, which is begun by an event loop of its own; the browser keeps one running."""
+    with launched() as made:
         yield made
-        made.close()
 
 
 @pytest.fixture

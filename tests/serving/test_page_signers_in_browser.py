@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Iterator
 
 import pytest
+from chromium import CHROMIUM, launched
 from plant_servers import RunningLoop
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 if CHROMIUM is None:
-    pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
+    pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 
-from playwright.sync_api import Page, expect, sync_playwright  # noqa: E402
+from playwright.sync_api import Page, expect
 
 pytest_plugins = ["signed_files", "signed_loop"]
 
@@ -21,13 +20,10 @@ pytest_plugins = ["signed_files", "signed_loop"]
 @pytest.fixture
 def card_page(trusting_loop: RunningLoop) -> Iterator[Page]:
     assert trusting_loop.station.page is not None
-    with sync_playwright() as p:
-        # Containers have no user namespaces; the page is our own.
-        browser = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with launched() as browser:
         made = browser.new_page()
         made.goto(trusting_loop.station.page.url)
         yield made
-        browser.close()
 
 
 def test_the_card_shows_who_signed_and_offers_what_is_trusted(card_page: Page) -> None:

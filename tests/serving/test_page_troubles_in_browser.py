@@ -11,7 +11,7 @@ from fake_loop import BEGIN, THIRDS, FakeLoop
 from serving.journal import Event, Scan
 
 if CHROMIUM is None:
-    pytest.skip("no chromium is installed (apt install chromium)", allow_module_level=True)
+    pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 
 from playwright.sync_api import Page, Route, expect
 
