@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -16,10 +12,10 @@ import onnx_ir as ir
 import torch
 from onnx_ir.passes import common as passes
 from onnxscript import optimizer
-from torch.onnx._internal.exporter._registration import ONNXRegistry
 
 from pipeline.errors import ExportError
 from pipeline.export.operators import check_operators
+from pipeline.export.torch_exporter import nothing_twice, quiet
 from pipeline.laws.base import ControlLaw
 from serving.graph_audit import MAX_IR
 from serving.manifest import INPUTS
@@ -76,7 +72,7 @@ class _Traced:
     @classmethod
     def of(cls, law: ControlLaw) -> Self:
         example = example_inputs(law)
-        with _quiet():
+        with quiet():
             program = torch.export.export(law, example, strict=False)
         constants = {name: t.numpy() for name, t in program.constants.items() if isinstance(t, torch.Tensor)}
         values = b"".join(f"{n} {t.dtype} {t.shape}".encode() + t.tobytes() for n, t in sorted(constants.items()))
@@ -90,7 +86,7 @@ def _translated(traced: _Traced) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     Most of an export's time goes here, so laws of other seeds share it. The buffers are those of
     the law that came first.
     """
-    with _quiet(), _operators_kept():
+    with quiet(), nothing_twice():
         program = torch.onnx.export(
             traced.program, dynamo=True, external_data=False, verbose=False, optimize=False, opset_version=OPSET
         )
@@ -208,36 +204,3 @@ def _cause(error: Exception) -> str:
     while inner.__cause__ is not None:
         inner = inner.__cause__
     return (str(inner).strip().splitlines() or [type(inner).__name__])[0]
-
-
-_operators = cache(ONNXRegistry.from_torchlib)
-
-
-@contextmanager
-def _operators_kept() -> Iterator[None]:
-    """Have torch make its table of operators once a process: it reads the table only, and makes it anew in 0.4 s."""
-    method = vars(ONNXRegistry)["from_torchlib"]
-    ONNXRegistry.from_torchlib = staticmethod(_operators)  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        ONNXRegistry.from_torchlib = method  # type: ignore[method-assign]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Hold back what the exporter says of torchvision and of its own deprecated calls.
-
-    And what it notes of the place in the sources of each operation: nobody reads it, and it is a third of the tracing.
-    """
-    log = logging.getLogger("torch.onnx._internal.exporter._registration")
-    level, without_places = log.level, torch.fx.config.do_not_emit_stack_traces
-    log.setLevel(logging.ERROR)
-    torch.fx.config.do_not_emit_stack_traces = True
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*", category=FutureWarning)
-            yield
-    finally:
-        log.setLevel(level)
-        torch.fx.config.do_not_emit_stack_traces = without_places
