@@ -89,11 +89,20 @@ class Member(Item):
 class Pool(Item):
     """What is computed together for all its members that are needed: the price depends on them."""
 
-    __slots__ = ("members",)
+    __slots__ = ("_known", "members")
 
     def __init__(self) -> None:
         super().__init__(())
         self.members: list[Member] = []  # that are needed
+        self._known: dict[frozenset[int], tuple[float, list[Item]]] = {}
+
+    def settled(self) -> tuple[float, list[Item]]:
+        """What ``settle`` says; the search comes back to the same members again and again."""
+        members = frozenset(map(id, self.members))
+        found = self._known.get(members)
+        if found is None:
+            found = self._known[members] = self.settle()
+        return found
 
     def settle(self) -> tuple[float, list[Item]]:
         """Price and uses for the present members."""
@@ -146,9 +155,11 @@ class Account:
     def _settled(self, pool: Pool) -> tuple[list[Item], list[Item]]:
         """Price a pool anew; what it uses now and did not, and what it used and does not."""
         price, uses = pool.price, pool.uses
-        pool.price, pool.uses = pool.settle()
+        pool.price, pool.uses = pool.settled()
         if not pool.count:
             return [], []
         self.total += pool.price - price
+        if uses is pool.uses:
+            return [], []
         before, after = set(map(id, uses)), set(map(id, pool.uses))
         return [u for u in pool.uses if id(u) not in before], [u for u in uses if id(u) not in after]
