@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -356,6 +357,7 @@ def test_a_settling_time_is_that_of_the_tests_without_noise() -> None:
     assert settle_scans(manifest()) == 100
 
 
+@cache
 def learnt() -> Any:
     """What a monitor keeps whose charts have learnt."""
     monitor = Monitor(manifest(), started_s=0.0)
@@ -363,7 +365,6 @@ def learnt() -> Any:
     return json.loads(json.dumps(monitor.state()))
 
 
-LEARNT = learnt()
 ANOTHER: list[tuple[str, Any]] = [
     ("law", "another"), ("law", None), ("settle", 1), ("settle", None), ("started_s", "now"), ("started_s", math.nan),
     ("started_s", 1e15), ("parts", []), ("parts", None), ("parts rest theta", [[0.0]]), ("parts foresight", None),
@@ -384,7 +385,7 @@ ANOTHER: list[tuple[str, Any]] = [
 @pytest.mark.parametrize(("place", "kept"), ANOTHER, ids=[f"{i} {place}" for i, (place, _) in enumerate(ANOTHER)])
 def test_what_another_controller_learnt_or_nobody_is_refused(place: str, kept: Any) -> None:
     *way, last = (int(step) if step.isdigit() else step for step in place.split())
-    state = json.loads(json.dumps(LEARNT))
+    state = json.loads(json.dumps(learnt()))
     at = state
     for step in way:
         at = at[step]
@@ -426,8 +427,8 @@ TREES = st.recursive(
 @given(TREES)
 def test_a_memory_that_is_any_tree_is_refused(tree: Any) -> None:
     answers_well(tree)
-    answers_well({**LEARNT, "parts": tree})
-    answers_well({**LEARNT, "parts": {**LEARNT["parts"], "spread": tree}})
+    answers_well({**learnt(), "parts": tree})
+    answers_well({**learnt(), "parts": {**learnt()["parts"], "spread": tree}})
 
 
 def forged(tree: Any, data: st.DataObject) -> Any:
@@ -448,14 +449,14 @@ def forged(tree: Any, data: st.DataObject) -> Any:
 @settings(max_examples=150)
 @given(st.data())
 def test_a_forged_memory_is_refused_or_does_no_harm(data: st.DataObject) -> None:
-    state = LEARNT
+    state = learnt()
     for _ in range(data.draw(st.integers(1, 3))):
         state = forged(state, data)
     answers_well(state)
 
 
 def test_a_monitor_that_fails_says_so_and_never_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    monitor = Monitor.restored(manifest(), LEARNT)
+    monitor = Monitor.restored(manifest(), learnt())
     monkeypatch.setattr(monitor, "plight", None)
     monkeypatch.setattr(monitor, "saturated", None)
     (said,) = monitor.verdicts()
