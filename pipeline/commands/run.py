@@ -16,6 +16,7 @@ from typing import Any
 from pipeline.config.params import entries, sections, sections_of
 from pipeline.engine.dvc import affected, ask, environment
 from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
+from pipeline.engine.start import STAGES as KINDS
 from pipeline.errors import ParamsError, PipelineError, nearest
 from pipeline.report.results import show_results, without_controller
 from pipeline.stages.check import mistakes
@@ -121,7 +122,8 @@ def repro(targets: Sequence[str], changed: Iterable[str], expected: Sequence[str
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         command = [sys.executable, "-m", "pipeline.engine.with_cluster", *lanes]
-        with subprocess.Popen(command, env=environment(), preexec_fn=begin) as process:
+        kinds = ",".join(dict.fromkeys(stage.partition("@")[0] for stage in expected))
+        with subprocess.Popen(command, env={**environment(), KINDS: kinds}, preexec_fn=begin) as process:
             running.append(process)
             if asked:
                 process.terminate()
