@@ -25,6 +25,8 @@ PRELOAD = ["pipeline.engine.preload"]
 # Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
 CONFIG = {
     "distributed.scheduler.worker-ttl": None,
+    # Nobody reads what it samples a hundred times a second, also where no work is done; see ``preload.unwatched``.
+    "distributed.worker.profile.enabled": False,
     "distributed.admin.large-graph-warning-threshold": "1GB",  # a stage's files are its arguments
     "logging.distributed": "critical",
     "logging.tornado": "critical",
