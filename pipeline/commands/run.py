@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.params import entries, sections, sections_of
-from pipeline.engine.dvc import affected, ask, environment
+from pipeline.engine.dvc import affected, ask, ask_in_turn, environment
 from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
+from pipeline.engine.start import STAGES as KINDS
 from pipeline.errors import ParamsError, PipelineError, nearest
 from pipeline.report.results import show_results, without_controller
 from pipeline.stages.check import mistakes
@@ -71,8 +72,8 @@ def _run(options: argparse.Namespace) -> int:
                 f"mend that and run again: results are kept. Python is {sys.executable}; `make setup` gives one with "
                 "all packages"
             ) from None
-    found = status(targets)
-    expected = affected(found, targets) if found else []
+    found, graph = status(targets)
+    expected = affected(graph, found, targets)
     changed = {stage: found[stage] for stage in sorted(found, key=(*expected, *found).index)}  # as they run
     print("\n".join(plan(changed, len(expected))), flush=True)
     if options.dry:
@@ -121,7 +122,8 @@ def repro(targets: Sequence[str], changed: Iterable[str], expected: Sequence[str
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         command = [sys.executable, "-m", "pipeline.engine.with_cluster", *lanes]
-        with subprocess.Popen(command, env=environment(), preexec_fn=begin) as process:
+        kinds = ",".join(dict.fromkeys(stage.partition("@")[0] for stage in expected))
+        with subprocess.Popen(command, env={**environment(), KINDS: kinds}, preexec_fn=begin) as process:
             running.append(process)
             if asked:
                 process.terminate()
@@ -170,11 +172,15 @@ def stages_of(name: str) -> list[str]:
     )
 
 
-def status(targets: Iterable[str]) -> Mapping[str, list[str]]:
-    """Stage -> why it runs, of the stages whose own files or parameters have changed (``dvc status``)."""
+def status(targets: Iterable[str]) -> tuple[Mapping[str, list[str]], str]:
+    """Stage -> why it runs, of the stages whose own files or parameters have changed; the graph of all stages.
+
+    These are what ``dvc status`` and ``dvc dag --dot`` say.
+    """
     upstream = [] if not targets else ["--with-deps"]
-    tree = json.loads(ask("status", "--json", *upstream, *targets) or "{}")
-    return {stage: reasons(entries) for stage, entries in tree.items() if stage != "code"}
+    said, graph = ask_in_turn(["status", "--json", *upstream, *targets], ["dag", "--dot"])
+    tree = json.loads(said or "{}")
+    return {stage: reasons(entries) for stage, entries in tree.items() if stage != "code"}, graph
 
 
 def reasons(entries: Iterable[Mapping[str, Mapping[str, Any]] | str]) -> list[str]:

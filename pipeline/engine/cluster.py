@@ -25,6 +25,8 @@ PRELOAD = ["pipeline.engine.preload"]
 # Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
 CONFIG = {
     "distributed.scheduler.worker-ttl": None,
+    # Nobody reads what it samples a hundred times a second, also where no work is done; see ``preload.unwatched``.
+    "distributed.worker.profile.enabled": False,
     "distributed.admin.large-graph-warning-threshold": "1GB",  # a stage's files are its arguments
     "logging.distributed": "critical",
     "logging.tornado": "critical",
@@ -32,10 +34,11 @@ CONFIG = {
 
 
 @contextlib.contextmanager
-def local_cluster(workers: int | None = None, say: Callable[[str], object] = lambda _: None) -> Iterator[str]:
+def local_cluster(workers: int | None = None, say: Callable[[str], object] | None = None) -> Iterator[str]:
     """Workers of one thread on this machine (None: ``usual_workers``) until the block ends; its scheduler's address.
 
-    ``say`` is told where a browser shows the work, where the package bokeh, which draws it, is installed.
+    ``say`` is told where a browser shows the work, where the package bokeh, which draws it, is installed. Without
+    ``say`` nobody would know: nothing is drawn then, because that takes half a second to load.
 
     The address stands in the environment meanwhile, where whatever is started looks for it. The workers come in their
     own time: work that comes before them waits.
@@ -47,13 +50,14 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] = lam
     dask.config.set(CONFIG)
     from distributed import LocalCluster
 
+    dashboard = None if say is None else _dashboard()
     with tempfile.TemporaryDirectory(prefix="loopwright-workers-", ignore_cleanup_errors=True) as folder:
         cluster = LocalCluster(
             n_workers=0,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=_dashboard(),
+            dashboard_address=dashboard,
             memory_limit=0,
             local_directory=folder,
             preload=PRELOAD,
@@ -62,7 +66,7 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] = lam
         try:
             os.environ[ADDRESS] = cluster.scheduler_address
             cluster.scale(wanted)
-            if _dashboard():
+            if say is not None and dashboard is not None:
                 say(f"the work at a glance, in a browser: {cluster.dashboard_link}")
             yield cluster.scheduler_address
         finally:

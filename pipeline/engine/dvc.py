@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
@@ -14,6 +15,18 @@ from pipeline.errors import PipelineError
 
 COMMAND = (sys.executable, "-m", "dvc")
 DEPENDENCY = re.compile(r'"([^"]+)" -> "([^"]+)";')  # of a line of `dvc dag --dot`
+MARK = "\x1e"  # the ASCII record separator
+# One command of DVC after another, a mark after each: loading DVC takes longer than most of them. What it loads stays:
+# no garbage is looked for.
+IN_TURN = """
+import gc, json, sys
+gc.disable()
+from dvc.cli import main
+for command in json.loads(sys.argv[1]):
+    if code := main(command):
+        sys.exit(code)
+    print(sys.argv[2], end="", flush=True)
+"""
 OF_DVC = ("ERROR:", "WARNING:", "Stage '", "Running stage '", "> ")  # beginnings of its own lines
 
 
@@ -32,15 +45,30 @@ def ask(*arguments: str, finish: bool = False) -> str:
 
     A Ctrl-C ends DVC at once; with ``finish`` DVC ends its work first, because it writes dvc.lock.
     """
+    code, out, err = _done([*COMMAND, *arguments], finish)
+    if code:
+        raise PipelineError(f"dvc {arguments[0]} failed: {_reason(err or out)}")
+    return out
+
+
+def ask_in_turn(*commands: Sequence[str]) -> list[str]:
+    """What ``dvc ARGUMENT...`` prints for each of some commands, as ``ask`` of each; DVC is loaded once."""
+    code, out, err = _done([sys.executable, "-c", IN_TURN, json.dumps(commands), MARK])
+    *found, rest = out.split(MARK)
+    if code:
+        raise PipelineError(f"dvc {commands[len(found)][0]} failed: {_reason(err or rest)}")
+    return found
+
+
+def _done(command: Sequence[str], finish: bool = False) -> tuple[int, str, str]:
+    """(exit status, standard output, standard error) of a command."""
     own, pipe = os.getpid(), subprocess.PIPE
 
     def begin() -> None:
         end_with_parent(own)
         hear_no_interrupt()
 
-    with subprocess.Popen(
-        [*COMMAND, *arguments], env=environment(), stdout=pipe, stderr=pipe, text=True, preexec_fn=begin
-    ) as process:
+    with subprocess.Popen(command, env=environment(), stdout=pipe, stderr=pipe, text=True, preexec_fn=begin) as process:
         try:
             out, err = process.communicate()
         except KeyboardInterrupt:
@@ -49,14 +77,15 @@ def ask(*arguments: str, finish: bool = False) -> str:
             else:
                 process.kill()
             raise
-    if process.returncode:
-        raise PipelineError(f"dvc {arguments[0]} failed: {_reason(err or out)}")
-    return out
+    return process.returncode, out, err
 
 
-def affected(changed: Iterable[str], targets: Iterable[str] = ()) -> list[str]:
-    """The stages ``changed`` and all that depend on them, of those that ``targets`` (none: everything) need."""
-    edges = DEPENDENCY.findall(ask("dag", "--dot"))
+def affected(graph: str, changed: Iterable[str], targets: Iterable[str] = ()) -> list[str]:
+    """The stages ``changed`` and all that depend on them, of those that ``targets`` (none: everything) need.
+
+    ``graph`` is what ``dvc dag --dot`` prints.
+    """
+    edges = DEPENDENCY.findall(graph)
     after, before = dict[str, list[str]](), dict[str, list[str]]()
     for earlier, later in edges:
         after.setdefault(earlier, []).append(later)

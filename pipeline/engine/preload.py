@@ -1,7 +1,8 @@
 """What a worker loads while nothing waits: ``dask worker ADDRESS --nthreads 1 --preload pipeline.engine.preload``.
 
 torch, casadi, pandas and the like take a stage longer to import than most take to work. A worker begins with them as it
-starts and goes on whenever it is idle, so that a task waits for one of them at most.
+starts and goes on whenever it is idle, so that a task waits for one of them at most. A worker of this machine's own
+cluster, which is told in STAGES what comes, imports no more than that needs.
 """
 
 from __future__ import annotations
@@ -9,14 +10,16 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
+import os
 import pkgutil
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from pipeline.engine.fingerprint import fingerprint
 from pipeline.engine.spoken import listen
+from pipeline.engine.start import STAGES
 
 if TYPE_CHECKING:
     from distributed import Worker
@@ -27,6 +30,13 @@ LIBRARIES = (
     *("onnx", "onnx_ir", "sklearn.linear_model", "torch", "torch._dynamo", "torch.export._trace"),
     *("torch.onnx._internal.exporter._compat", "onnxscript.optimizer", "onnxscript.function_libs.torch_lib.ops"),
 )
+# Of these, what stages of some kinds import. Those of a kind that is not named may need all; those without any run on
+# no worker. Models need nothing of the exporter and of scipy's signals, which take half of the time.
+OF_KIND = {
+    "excite": ("casadi", "pandas", "pyarrow.parquet"),
+    "fit": ("casadi", "pandas", "pyarrow.parquet", "matplotlib.figure", "torch"),
+    **dict.fromkeys(("code", "screen", "report", "overview", "publish"), ()),
+}
 IDLE_S = 0.05  # until a worker that has a task looks again whether it may go on importing
 PROFILING = ("profile", "profile-cycle")
 # The ends of the pipeline that no worker runs.
@@ -87,15 +97,25 @@ def load() -> None:
 
 def loading() -> Iterator[str]:
     """Import the libraries and all sources that a task may need, a step each; their names."""
-    for name in LIBRARIES:
+    kinds = [kind for kind in os.environ.get(STAGES, "").split(",") if kind]
+    for name in _needed(kinds) if kinds and OF_KIND.keys() >= set(kinds) else _everything():
+        # A broken source is the error of the task that needs it: a worker that did not start would be waited for.
         with contextlib.suppress(Exception):
             importlib.import_module(name)
         yield name
+
+
+def _needed(kinds: Sequence[str]) -> Iterator[str]:
+    """The libraries of some kinds of stages, in the usual order, and the stages themselves."""
+    needed = {name for kind in kinds for name in OF_KIND[kind]}
+    yield from (name for name in LIBRARIES if name in needed)
+    yield from (f"pipeline.stages.{kind}" for kind in kinds if OF_KIND[kind])
+
+
+def _everything() -> Iterator[str]:
+    yield from LIBRARIES
     import pipeline
 
     for module in pkgutil.walk_packages(pipeline.__path__, "pipeline.", onerror=lambda _: None):
         if not module.name.startswith(APART):
-            # A broken source is the error of the task that needs it: a worker that did not start would be waited for.
-            with contextlib.suppress(Exception):
-                importlib.import_module(module.name)
             yield module.name

@@ -23,6 +23,8 @@ from pathlib import Path
 
 # Set for the commands under pipeline.engine.with_cluster: the door of a run, which is open as long as the run goes on.
 DOOR = "LOOPWRIGHT_RUN"
+# Set for the workers of a cluster of this machine: kinds of stages, with commas, that it is for. Unset: any may come.
+STAGES = "LOOPWRIGHT_STAGES"
 # New objects before garbage is looked for. A stage imports for a second and ends soon: at Python's 700 a sixth of its
 # time goes into looking through libraries that stay.
 NEW_OBJECTS = 200_000
@@ -91,6 +93,7 @@ def run(arguments: list[str]) -> int | str | None:
         at = address()
         if at is not None:
             return run_on(at, arguments, files)
+        os.environ[STAGES] = arguments[0]
         with local_cluster() as own:
             return run_on(own, arguments, files)
     except PipelineError as error:

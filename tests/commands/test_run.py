@@ -41,18 +41,19 @@ def test_a_stage_that_never_ran_is_not_said_to_be_deleted(how: str) -> None:
 def test_a_dry_run_leaves_the_stages_to_a_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """DVC is asked for its status alone: a stage that it runs would change dvc.lock."""
-    asked: list[tuple[str, ...]] = []
+    """DVC is asked for its status and its graph alone: a stage that it runs would change dvc.lock."""
+    asked: list[list[str]] = []
 
-    def dvc(*arguments: str) -> str:
-        asked.append(arguments)
-        return '{"code": ["changed command"]}'
+    def dvc(*commands: list[str]) -> list[str]:
+        asked.extend(commands)
+        return ['{"code": ["changed command"]}', ""]
 
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(run, "ask", dvc)
+    monkeypatch.setattr(run, "ask", None)
+    monkeypatch.setattr(run, "ask_in_turn", dvc)
     monkeypatch.setattr(run, "list_files", lambda: None)
     assert main(["run", "--dry"]) == 0
-    assert asked == [("status", "--json")]
+    assert asked == [["status", "--json"], ["dag", "--dot"]]
     assert capsys.readouterr().out == "nothing has changed; everything is up to date\n"
 
 
@@ -61,15 +62,20 @@ def test_dvc_is_told_of_the_list_of_files_and_does_not_make_it_again(monkeypatch
 
     def dvc(*arguments: str, finish: bool = False) -> str:
         done.append(" ".join(arguments) + " to its end" * finish)
-        return "{}"
+        return ""
+
+    def in_turn(*commands: list[str]) -> list[str]:
+        done.extend(" ".join(command) for command in commands)
+        return ["{}", ""]
 
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(run, "mistakes", list)
     monkeypatch.setattr(run, "list_files", lambda: done.append("listed"))
     monkeypatch.setattr(run, "ask", dvc)
+    monkeypatch.setattr(run, "ask_in_turn", in_turn)
     monkeypatch.setattr(run, "show_results", lambda *_, **__: None)
     assert main(["run"]) == 0
-    assert done == ["listed", "commit --quiet --force code to its end", "status --json"]
+    assert done == ["listed", "commit --quiet --force code to its end", "status --json", "dag --dot"]
 
 
 def test_a_first_step_that_fails_says_what_to_do(
@@ -105,7 +111,8 @@ def test_a_case_without_any_controller_ends_with_a_status_of_its_own(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run, "mistakes", list)
     monkeypatch.setattr(run, "list_files", lambda: None)
-    monkeypatch.setattr(run, "ask", lambda *_, **__: "{}")
+    monkeypatch.setattr(run, "ask", lambda *_, **__: "")
+    monkeypatch.setattr(run, "ask_in_turn", lambda *_: ["{}", ""])
     monkeypatch.setattr(run, "stages_of", lambda name: [f"report@{name}"])
     shown: list[str | None] = []
     monkeypatch.setattr(run, "show_results", lambda _, case: shown.append(case))
@@ -127,7 +134,7 @@ def test_a_part_runs_where_no_report_was_made_yet(
     monkeypatch.setattr(run, "mistakes", list)
     monkeypatch.setattr(run, "list_files", lambda: None)
     monkeypatch.setattr(run, "ask", lambda *_, **__: "")
-    monkeypatch.setattr(run, "status", lambda _: {})
+    monkeypatch.setattr(run, "status", lambda _: ({}, ""))
     assert main(["run", "ph_neutralization-nnarx"]) == 0
     assert "`loopwright run CASE` makes the report" in capsys.readouterr().out
 

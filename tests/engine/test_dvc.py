@@ -65,9 +65,17 @@ def test_a_failure_is_the_line_that_says_why(said: str, reason: str, monkeypatch
     assert str(error.value) == f"dvc repro failed: {reason}"
 
 
-def test_what_depends_on_a_change_is_affected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dvc, "ask", lambda *_: DOT)
-    assert dvc.affected(["design@a-pid"]) == ["design@a-pid", "overview", "report@a", "validate@a-pid"]
-    assert dvc.affected(["fit@a-one", "fit@b-one"], ["design@a-inc", "report@b"]) == [
+def test_commands_in_turn_say_what_each_of_them_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the one that fails is named, by the real DVC."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DVC_NO_ANALYTICS", "1")
+    assert dvc.ask_in_turn(["init", "--no-scm", "--quiet"], ["root"]) == ["", ".\n"]
+    with pytest.raises(PipelineError, match=r"^dvc repro failed: ERROR: .*dvc\.yaml"):
+        dvc.ask_in_turn(["root"], ["repro", "fit"], ["root"])
+
+
+def test_what_depends_on_a_change_is_affected() -> None:
+    assert dvc.affected(DOT, ["design@a-pid"]) == ["design@a-pid", "overview", "report@a", "validate@a-pid"]
+    assert dvc.affected(DOT, ["fit@a-one", "fit@b-one"], ["design@a-inc", "report@b"]) == [
         *("design@a-inc", "fit@a-one", "fit@b-one", "report@b"),
     ]

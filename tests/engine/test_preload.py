@@ -6,12 +6,17 @@ import gc
 import threading
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import yaml
 
 from pipeline.engine import preload
+from pipeline.engine.start import STAGES
+
+ROOT = Path(__file__).parents[2]
 
 
 class Idle:
@@ -86,3 +91,35 @@ def test_what_is_missing_or_broken_stops_no_import(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(preload, "LIBRARIES", ("not_a_library_at_all", "json"))
     monkeypatch.setattr(preload.pkgutil, "walk_packages", lambda *_, **__: [SimpleNamespace(name="pipeline.not_there")])
     assert list(preload.loading()) == ["not_a_library_at_all", "json", "pipeline.not_there"]
+
+
+def imported(monkeypatch: pytest.MonkeyPatch, stages: str | None) -> list[str]:
+    """The names that a worker would import which is told of ``stages``; none is imported."""
+    monkeypatch.setattr(preload, "importlib", SimpleNamespace(import_module=lambda _: None))
+    monkeypatch.delenv(STAGES, raising=False)
+    if stages is not None:
+        monkeypatch.setenv(STAGES, stages)
+    return list(preload.loading())
+
+
+@pytest.mark.parametrize("stages", [None, "", "fit,design", "validate", "bounds"])
+def test_a_worker_for_anything_imports_everything(monkeypatch: pytest.MonkeyPatch, stages: str | None) -> None:
+    names = imported(monkeypatch, stages)
+    assert names[: len(preload.LIBRARIES)] == list(preload.LIBRARIES)
+    assert {"pipeline.stages.design", "pipeline.models.static.fuzzy_means", "pipeline.laws.pid.pid"} <= set(names)
+
+
+def test_a_worker_for_models_alone_imports_no_exporter(monkeypatch: pytest.MonkeyPatch) -> None:
+    libraries = ["casadi", "pandas", "pyarrow.parquet", "matplotlib.figure", "torch"]
+    assert imported(monkeypatch, "screen,fit,overview") == [*libraries, "pipeline.stages.fit"]
+    assert imported(monkeypatch, "excite") == [*libraries[:3], "pipeline.stages.excite"]
+    assert imported(monkeypatch, "screen") == []
+
+
+def test_every_stage_that_needs_a_worker_is_known_to_need_something() -> None:
+    """A kind without libraries runs where it was started, by dvc.yaml."""
+    stages = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
+    on_workers = {kind for kind, stage in stages.items() if "meta" in stage.get("do", stage)}
+    assert {kind for kind, names in preload.OF_KIND.items() if names} <= on_workers
+    assert {kind for kind, names in preload.OF_KIND.items() if not names} <= set(stages) - on_workers
+    assert {name for names in preload.OF_KIND.values() for name in names} <= set(preload.LIBRARIES)
