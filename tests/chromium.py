@@ -17,8 +17,9 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 @contextmanager
 def launched() -> Iterator[Browser]:
     """The browser until the block ends."""
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import expect, sync_playwright
 
+    expect.set_options(timeout=30_000)  # a busy machine takes its time
     with sync_playwright() as p:
         # Containers have no user namespaces; the pages are our own.
         made = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

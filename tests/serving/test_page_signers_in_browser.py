@@ -16,6 +16,7 @@ if CHROMIUM is None:
 from playwright.sync_api import Page, expect, sync_playwright  # noqa: E402
 
 pytest_plugins = ["signed_files", "signed_loop"]
+expect.set_options(timeout=30_000)
 
 
 @pytest.fixture
