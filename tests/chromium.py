@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,6 +36,7 @@ def come_in(browser: Browser, served: tuple[FakeLoop, str, str], **how: object) 
     made.set_default_timeout(20_000)
     made.goto(served[1])
     expect(made.locator("#alarm-list .alarm").first).to_be_visible()
+    expect(made.locator("[data-chart]").first).to_have_attribute("data-rows", re.compile("[1-9]"))
     made.evaluate("token => sessionStorage.setItem('token', token)", served[2])
     made.evaluate("sessionStorage.setItem('who', 'anna')")
     return made
