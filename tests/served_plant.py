@@ -49,8 +49,6 @@ def wired(plant: Plant) -> Iterator[Wire]:
     yield made
     RunningLoop.end_all()
     made.close()
-    for tag in ("PV.T", "MV.T_j"):
-        write(plant, f"Faults.{tag}", "")  # of a test that failed
 
 
 def write(plant: Plant, tag: str, value: Any, kind: ua.VariantType | None = None) -> None:

@@ -105,30 +105,33 @@ def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
             running.ask(lambda loop: loop.set_mode(Mode.AUTO), "mode AUTO")
         return len(running.since(0, Mode.AUTO)) >= 8 and running.commands[-1].mode is Mode.AUTO
 
-    assert within(120, in_auto)
-    for begin in (Mode.HOLD, Mode.MANUAL):
-        if begin is Mode.MANUAL:
-            assert running.ask(lambda loop: loop.set_mode(Mode.MANUAL), "mode MANUAL") == ""
-            running.becomes(Mode.MANUAL, scans=3)
-        cut(plant, wire)
-        assert within(20, lambda: "does not answer" in running.commands[-1].reason)
-        running.becomes(begin, scans=6)
-        assert running.station.loop is not None
-        (left,) = running.station.loop.mv.tolist()
-        moved = round(left) + (61.0 if left < START else -61.0)  # more than an actuator may differ from its command
-        write(plant, "MV.T_j", moved)
-        write(plant, "Faults.PV.T", spoilt)
-        n = len(running.commands)
-        since = len(plant.actuator())
-        mend(plant, wire)
-        assert within(30, lambda: running.commands[-1].mv.tolist() == [moved]), (moved, running.told)  # noqa: B023
-        assert within(20, lambda: len(running.commands) > n + 20)  # noqa: B023
+    try:
+        assert within(120, in_auto)
+        for begin in (Mode.HOLD, Mode.MANUAL):
+            if begin is Mode.MANUAL:
+                assert running.ask(lambda loop: loop.set_mode(Mode.MANUAL), "mode MANUAL") == ""
+                running.becomes(Mode.MANUAL, scans=3)
+            cut(plant, wire)
+            assert within(20, lambda: "does not answer" in running.commands[-1].reason)
+            running.becomes(begin, scans=6)
+            assert running.station.loop is not None
+            (left,) = running.station.loop.mv.tolist()
+            moved = round(left) + (61.0 if left < START else -61.0)  # more than an actuator may differ from its command
+            write(plant, "MV.T_j", moved)
+            write(plant, "Faults.PV.T", spoilt)
+            n = len(running.commands)
+            since = len(plant.actuator())
+            mend(plant, wire)
+            assert within(30, lambda: running.commands[-1].mv.tolist() == [moved]), (moved, running.told)  # noqa: B023
+            assert within(20, lambda: len(running.commands) > n + 20)  # noqa: B023
+            write(plant, "Faults.PV.T", "")
+            running.becomes(begin, scans=5)
+            assert within(20, lambda: len(plant.actuator()) > since + 12)  # noqa: B023
+            rows = plant.actuator()[since + 1 :]
+            assert {row["asked"][0] for row in rows} == {moved}
+            assert told(running, f"the MV stands at T_j {moved:g} K, not at T_j ")
+    finally:
         write(plant, "Faults.PV.T", "")
-        running.becomes(begin, scans=5)
-        assert within(20, lambda: len(plant.actuator()) > since + 12)  # noqa: B023
-        rows = plant.actuator()[since + 1 :]
-        assert {row["asked"][0] for row in rows} == {moved}
-        assert told(running, f"the MV stands at T_j {moved:g} K, not at T_j ")
     running.end()
 
 
