@@ -15,13 +15,14 @@ from serving.signing.keys import PrivateKey
 from serving.signing.sign import sign
 
 ARTIFACTS = Path(__file__).parents[1] / "artifacts" / "thiosulfate_cstr"
+SPEED = 2.5  # periods of .2 s
 SIGNERS = {"pid": "anna", "inverse_dob": "anna", "incad": "bob", "incadec": None}
 
 
 @pytest.fixture(scope="module")
 def trusting(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The loop.toml of a loop that trusts anna, beside controllers of anna, of bob and of nobody."""
-    plant = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", 5.0, "--noise")
+    plant = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", SPEED, "--noise")
     plant.start()
     folder = tmp_path_factory.mktemp("loop")
     for law, name in SIGNERS.items():
@@ -33,7 +34,7 @@ def trusting(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[P
     path = folder / "loop.toml"
     assert main(["loop", "init", str(folder / "pid.onnx"), "--endpoint", plant.endpoint, "--out", str(path)]) == 0
     text = path.read_text().replace('# trusted = ["maker.pub"]', 'trusted = ["anna.pub"]')
-    text = re.sub("sha256 = .*", "speed = 5.0", text).replace('page = "127.0.0.1:8080"', 'page = "127.0.0.1:0"')
+    text = re.sub("sha256 = .*", f"speed = {SPEED}", text).replace('page = "127.0.0.1:8080"', 'page = "127.0.0.1:0"')
     path.write_text(re.sub("max_age_s = .*", "max_age_s = 5", text))  # this machine has other work beside it
     yield path
     plant.end()

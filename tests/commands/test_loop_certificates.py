@@ -58,11 +58,11 @@ def test_a_server_that_does_not_trust_the_loop_and_then_does(
     settings.write_text(text.replace("[server]", "[server]\nconnect_s = 2.0", 1))
     loop = RunningLoop(settings)
     try:
-        assert any("let the server trust" in line for line in loop.told)
+        assert within(20, lambda: any("let the server trust" in line for line in loop.told))
         plant.end()
         shutil.copy(settings.parent / "loop-certificate.der", plant.folder / "server" / "trusted")
         plant.start()
-        assert within(30, lambda: loop.station.endpoint.connections == 1)
+        assert within(30, lambda: loop.station.endpoint.connections > 0)
         status, words = said(capsys)
         assert status == 0
         assert (

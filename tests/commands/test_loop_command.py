@@ -75,7 +75,8 @@ def test_the_way_from_a_controller_to_training_data(
     table = pd.read_csv("loop.csv")
     assert list(table.columns) == ["time", "C_A.PV", "T.PV", "T_j.OP", "C_A.SP", "MODE"]
     assert set(table["MODE"]) <= {"AUTO", "HOLD"}
-    assert table["T.PV"].between(200, 600).all()
+    assert table.loc[table["MODE"] == "AUTO", "T.PV"].between(200, 600).all()  # in HOLD there may be none
+    assert table["T.PV"].notna().any()
     times = pd.to_datetime(table["time"])
     assert times.is_monotonic_increasing
     before_text = Path("loop.csv").read_text()
@@ -153,7 +154,7 @@ def test_run_begins_while_a_sensor_is_bad(settings: Path, plant: Plant, capsys: 
     """It may come back at any time."""
     spoil(plant, "PV.T", "bad")
     try:
-        assert main(["loop", "run", "--scans", "3"]) == 0
+        assert main(["loop", "run", "--scans", "20"]) == 0
     finally:
         spoil(plant, "PV.T", "")
     assert "BadSensorFailure" in capsys.readouterr().out

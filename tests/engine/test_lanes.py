@@ -120,6 +120,6 @@ def test_dvc_ends_by_itself_where_its_stage_is_ended(
     assert within(30, lambda: pid.exists() and bool(pid.read_text()))
     process.send_signal(signal.SIGTERM)
     os.kill(int(pid.read_text()), signal.SIGTERM)  # as the shutting door does
-    out, err = process.communicate(timeout=10)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM
     assert (out.splitlines(), err) == (["ran waits", "stage 1 of 1: fit x"], "")

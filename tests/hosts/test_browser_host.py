@@ -81,7 +81,7 @@ def test_the_browser_does_not_pass_a_damaged_kit(page: Page, damage: str, tmp_pa
 
 def test_the_browser_s_loop_scans_once_a_period(page: Page) -> None:
     page.set_input_files("#files", [str(kit_of(PID) / f"pid{suffix}") for suffix in (".onnx", ".json")])
-    page.fill("#period", "0.03")
+    page.fill("#period", "0.1")
     page.click("#control")
     expect(page.locator("#control")).to_be_enabled()
     rows = [line.split() for line in (page.locator("#said").text_content() or "").splitlines()]
@@ -89,7 +89,7 @@ def test_the_browser_s_loop_scans_once_a_period(page: Page) -> None:
     assert places == sorted(set(places))  # a busy machine leaves some out, also at the start
     assert places[0] >= 0
     assert len(places) > 1
-    assert all(0 <= float(row[1]) < 30 for row in rows)
+    assert all(0 <= float(row[1]) < 100 for row in rows)
     assert {row[4] for row in rows} == {"AUTO"}
 
 

@@ -26,7 +26,6 @@ from pipeline.__main__ import main
 from serving import Mode
 from serving.journal import JournalReader
 from serving.opcua.certificates import APPLICATION, make, valid_until
-from serving.station.control import ask
 
 HERE = Path(__file__).parents[1] / "node_opcua"
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
@@ -35,7 +34,9 @@ if NODE is None or not (HERE / "node_modules").is_dir():
     pytest.skip("node or its packages are missing (npm ci in tests/node_opcua)", allow_module_level=True)
 
 LIFETIME_MS = 2_500  # of a secure channel: the shortest that node-opcua grants
-PERIOD_MS = 100  # as fast as the loop's: 0.5 s, five times as fast as the clock
+PERIOD_MS = 100
+SPEED = 2.5  # of the loops: periods of .2 s
+PATIENT_SPEED = 0.4  # periods of 1.25 s: a busy machine loses no connection to a loop that waits .8 of it for an answer
 
 
 class NodeServer:
@@ -100,17 +101,17 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeServer]:
 
 @pytest.fixture
 def settings(server: NodeServer, monkeypatch: pytest.MonkeyPatch) -> Path:
-    return settings_of(server, monkeypatch)
+    return settings_of(server, monkeypatch, SPEED)
 
 
-def settings_of(server: NodeServer, monkeypatch: pytest.MonkeyPatch) -> Path:
+def settings_of(server: NodeServer, monkeypatch: pytest.MonkeyPatch, speed: float) -> Path:
     monkeypatch.setenv("LOOP_PASSWORD", "a secret")
     path = server.folder / "loop.toml"
     path.unlink(missing_ok=True)
     assert main(["loop", "init", str(PID), "--endpoint", server.endpoint, "--out", str(path)]) == 0
     text = path.read_text()
     for old, new in (
-        ('page = "127.0.0.1:8080"', "speed = 5.0"),
+        ('page = "127.0.0.1:8080"', f"speed = {speed}"),
         ('# user = "loopwright"', 'user = "loopwright"'),
         ('# password_env = "LOOP_PASSWORD"', 'password_env = "LOOP_PASSWORD"'),
         ("s=Control.Heartbeat", "s=Heartbeat"),
@@ -182,8 +183,8 @@ def test_a_loop_from_the_shadow_through_a_fault_and_a_killed_server(settings: Pa
 
     try:
         assert len({row["asked"] for row in server.rows()}) == 1  # a shadow writes nothing
-        assert ask(journal, {"do": "mode", "value": "AUTO", "who": "anna"})["done"] == "mode SHADOW -> AUTO"
-        assert ask(journal, {"do": "sp", "value": {"C_A": 0.55}, "who": "anna"})
+        assert loop.does("mode", "AUTO").startswith("mode SHADOW -> AUTO")
+        assert loop.does("sp", {"C_A": 0.55})
         assert within(20, lambda: len({row["asked"] for row in server.rows()[-30:]}) > 5)
         for row in server.rows():
             assert row["type"] == "Float"
@@ -216,14 +217,15 @@ def test_a_channel_that_lasts_some_seconds_is_renewed_under_the_loop(
     """This server forgets a token after five quarters of its lifetime, and takes nothing more under it."""
     server = NodeServer(tmp_path, str(LIFETIME_MS))
     server.start()
-    loop = RunningLoop(settings_of(server, monkeypatch))
+    loop = RunningLoop(settings_of(server, monkeypatch, PATIENT_SPEED))
     try:
         link = loop.station.endpoint._link
         assert link is not None
         assert link.client.secure_channel_timeout == LIFETIME_MS
-        assert ask(loop.settings.journal.file, {"do": "mode", "value": "AUTO", "who": "anna"})
+        assert loop.does("mode", "AUTO")
         lifetimes = 3
-        assert within(60, lambda: len(loop.commands) > lifetimes * LIFETIME_MS / PERIOD_MS)
+        period_ms = 1000 * loop.station.manifest.period_s / PATIENT_SPEED
+        assert within(60, lambda: len(loop.commands) > lifetimes * LIFETIME_MS / period_ms)
         assert loop.station.endpoint.connections == 1
         n = len(server.rows())
         assert within(20, lambda: len({row["asked"] for row in server.rows()[n:]}) > 2)  # it is written, too

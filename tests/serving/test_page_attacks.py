@@ -10,6 +10,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from http.client import HTTPException
 from pathlib import Path
 
 import pytest
@@ -246,7 +247,14 @@ def test_who_takes_his_time_is_cut_off(loop: FakeLoop, monkeypatch: pytest.Monke
         for i, wire in enumerate(open_ones):
             with wire:
                 assert ends(wire), i
-        assert browser.get("/healthz")[0] == 200
+        assert within(20, lambda: healthy(browser))
+
+
+def healthy(browser: Browser) -> bool:
+    """Whether the page answers; a busy machine may take too long even for a whole request."""
+    with suppress(OSError, HTTPException):
+        return browser.get("/healthz")[0] == 200
+    return False
 
 
 def test_many_connections_keep_nobody_out(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,7 +340,7 @@ def test_as_many_pages_as_are_allowed_are_sent_news(loop: FakeLoop, monkeypatch:
 
 
 def test_who_never_reads_holds_little_and_is_cut_off(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "STALLED_S", 0.5)
+    monkeypatch.setattr(patience, "STALLED_S", 1.5)  # the second one is seen before it is cut off
     with serving_here(loop) as (app, browser, server):
         deaf = connected(browser.port, raw(browser.port, "token", LIVE, body=b""), room=4_096)
         assert within(10, lambda: len(app.live._pages) == 1)

@@ -15,6 +15,7 @@ if CHROMIUM is None:
 from playwright.sync_api import Page, expect
 
 pytest_plugins = ["signed_files", "signed_loop"]
+expect.set_options(timeout=30_000)
 
 
 @pytest.fixture

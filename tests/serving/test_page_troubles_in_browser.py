@@ -167,10 +167,11 @@ def test_an_alarm_that_was_raised_while_the_stream_was_broken_is_shown(page: Pag
 
 def test_an_answer_that_is_no_stream_is_not_the_last_word(page: Page) -> None:
     refused: list[Route] = []
+    seen = False  # what the page says meanwhile
 
     def proxy(route: Route) -> None:
         refused.append(route)
-        if len(refused) < 3:
+        if len(refused) < 3 or not seen:
             route.fulfill(status=502, content_type="text/html", body="<h1>Bad gateway</h1>")
         else:
             route.continue_()
@@ -178,6 +179,7 @@ def test_an_answer_that_is_no_stream_is_not_the_last_word(page: Page) -> None:
     page.route("**/api/live", proxy)
     page.reload()
     expect(page.locator("#banner")).to_contain_text("what you see is old")
+    seen = True
     expect(page.locator("#banner")).to_be_hidden(timeout=20_000)
     expect(page.locator("body")).not_to_have_class("old")
-    assert len(refused) == 3
+    assert len(refused) >= 3

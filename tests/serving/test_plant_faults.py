@@ -9,12 +9,13 @@ from __future__ import annotations
 import re
 import shutil
 import signal
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from itertools import groupby, pairwise
 from pathlib import Path
 
 import pytest
-from plant_servers import CASE, Plant, Wire
+from plant_servers import CASE, Plant, RunningLoop, Wire
 from processes import within
 from served_plant import PERIOD_S, SPEED, begun, cut, mend, read, served, wired, write  # noqa: F401
 
@@ -77,25 +78,32 @@ def in_flight(found: list[Scan]) -> set[float]:
     return {found[j].numbers[mv] for i in falls for j in (i - 2, i - 1)}
 
 
+def stands(running: RunningLoop) -> bool:
+    """Whether the MV does while the loop holds. None is written where nothing reads back one that was lost."""
+    last = running.commands[-8:]
+    return all(c.mode is Mode.HOLD for c in last) and len({tuple(c.mv.tolist()) for c in last if c.writes}) <= 1
+
+
 def legal(found: list[Scan], plant: Plant, since: int, besides: set[float]) -> None:
     """What the MV node held since then, period by period: in range, and changed by nothing but fresh commands.
 
-    A value that is new there was commanded within the last periods. While the loop holds, the node stands still. What
+    A value that is new there was commanded within the last scans. While the loop holds, the node stands still. What
     a server itself may do ``besides``: show START in a node that it made anew, or carry out, when it wakes up, what had
     reached it before it froze.
     """
     mv = 1 + 2  # behind sp and pv
-    commands = [(s.time_s, s.numbers[mv]) for s in found]
+    times, values = [s.time_s for s in found], [s.numbers[mv] for s in found]
     rows = plant.actuator()[since - 1 :]
     for before, row in pairwise(rows):
         (asked,) = row["asked"]
         assert 0 <= asked <= 500
-        fresh = {v for t, v in commands if row["time"] - 6 * PERIOD_S <= t <= row["time"] + PERIOD_S}
+        now = bisect_right(times, row["time"])
+        fresh = set(values[max(0, now - 6) : now + 1])
         assert asked in {before["asked"][0], *fresh, *besides}, (row, fresh)
     for mode, group in groupby(found, key=lambda s: s.mode):
-        times = [s.time_s for s in group][6:]  # what was on its way has arrived, or never will
-        if mode == "HOLD" and times:
-            stood = {row["asked"][0] for row in rows if times[0] <= row["time"] <= times[-1]} - besides
+        within_it = [s.time_s for s in group][6:]  # what was on its way has arrived, or never will
+        if mode == "HOLD" and within_it:
+            stood = {row["asked"][0] for row in rows if within_it[0] <= row["time"] <= within_it[-1]} - besides
             assert not stood or max(stood) - min(stood) <= SAME * 500, stood
 
 
@@ -110,40 +118,55 @@ def test_a_fault_holds_and_is_recovered_from(
     running = begun(tmp_path, wire.port)
     assert running.ask(lambda loop: loop.set_sp([0.93]), "set point") == ""
     running.becomes(Mode.AUTO, scans=8)
+    begun_at = len(running.commands)
     begin(plant, wire)
     until_hold = running.becomes(Mode.HOLD, 10)
     reason = running.commands[-1].reason
+
+    def named() -> bool:
+        """A busy machine may be the reason of the first scans."""
+        return any(words in c.reason for c in running.commands[begun_at:] if c.mode is Mode.HOLD)
+
+    assert within(20, named), {c.reason for c in running.commands[begun_at:]}
     running.becomes(Mode.HOLD, scans=10)
-    reasons = {c.reason for c in running.commands if c.mode is Mode.HOLD}
-    held = {tuple(c.mv.tolist()) for c in running.commands[-8:] if c.writes}
+    assert within(20, lambda: stands(running))
     end(plant, wire)
     until_auto = running.becomes(Mode.AUTO, 60)
     running.becomes(Mode.AUTO, scans=5)
-    n = len(running.commands)
     running.end()
     found = running.scans()
-    assert any(words in r for r in reasons), reasons
-    assert len(held) <= 1  # none where nothing reads the MV back that was lost
     besides = {"server frozen": in_flight(found)}.get(name, {START} if name in ANEW else set())
     legal(found, plant, since, besides)
-    assert n <= len(found) <= n + 3  # every scan is in the journal
+    assert len(found) == len(running.commands)  # every scan is in the journal
     show(capsys, name, until_hold, until_auto, reason)
     assert until_hold <= 5
     assert until_auto <= (RECONNECTED if name in CUT else CONNECTED)
+
+
+def held_by_the_watchdog(running: RunningLoop, plant: Plant) -> bool:
+    """Whether a watchdog that stands was the first reason, after three scans; a busy machine may be another one."""
+    running.becomes(Mode.AUTO, 120, scans=8)
+    at = len(running.commands)
+    write(plant, "Faults.Control.Watchdog", "frozen")
+    stood = read(plant, "Control.Watchdog")
+    stands = f"the plant's watchdog has stood at {stood} for "
+    assert within(30, lambda: any(c.reason.startswith(stands) for c in running.commands[at:]))
+    running.becomes(Mode.HOLD, scans=10)
+    first = next(c for c in running.commands[at:] if c.reason)
+    assert first.mode is Mode.HOLD
+    write(plant, "Faults.Control.Watchdog", "")
+    running.becomes(Mode.AUTO, 60)
+    if not first.reason.startswith(stands):
+        return False
+    assert first.reason == f"{stands}3 scans"
+    return True
 
 
 def test_a_plant_whose_watchdog_stands_is_held_within_three_periods(plant: Plant, wire: Wire, tmp_path: Path) -> None:
     """Its values go on, with new source times: nothing else would tell."""
     running = begun(tmp_path, wire.port)
     try:
-        running.becomes(Mode.AUTO, 120, scans=8)
-        write(plant, "Faults.Control.Watchdog", "frozen")
-        stood = read(plant, "Control.Watchdog")
-        reason = f"the plant's watchdog has stood at {stood} for 3 scans"  # the first that is said: not for 4
-        assert within(30, lambda: any(c.reason == reason and c.mode is Mode.HOLD for c in running.commands))
-        running.becomes(Mode.HOLD, scans=10)
-        write(plant, "Faults.Control.Watchdog", "")
-        running.becomes(Mode.AUTO, 60)
+        assert any(held_by_the_watchdog(running, plant) for _ in range(5))
     finally:
         write(plant, "Faults.Control.Watchdog", "")
         running.end()
@@ -182,20 +205,18 @@ def test_a_loop_whose_certificate_is_rejected_holds_until_it_is_trusted_again(
     assert within(60, lambda: rejected in running.commands[-1].reason), running.told
     running.becomes(Mode.HOLD, scans=10)
     reason = running.commands[-1].reason
-    held = {tuple(c.mv.tolist()) for c in running.commands[-8:] if c.writes}
+    assert within(20, lambda: stands(running))
     asked = {row["asked"][0] for row in strict.actuator()[-3:]}
     strict.end()
     shutil.copy(own, trusted)
     strict.start()
     until_auto = running.becomes(Mode.AUTO, 60)
     running.becomes(Mode.AUTO, scans=5)
-    n = len(running.commands)
     running.end()
     found = running.scans()
-    assert len(held) <= 1  # none where nothing reads the MV back that was lost
     assert asked == {START}  # the server's own start: nobody has written there
     legal(found, strict, since, {START})
-    assert n <= len(found) <= n + 3
+    assert len(found) == len(running.commands)
     show(capsys, "certificate rejected", until_hold, until_auto, reason)
     assert until_hold <= 5
     assert until_auto <= RECONNECTED
@@ -205,6 +226,29 @@ def aged_by_a_clock(commands: list[Command]) -> list[str]:
     """Why scans were held whose sample counted as older than any that a busy machine delivers."""
     ages = [(c.reason, re.match(r"the sample(?: of .+)? is (\S+) s old", c.reason)) for c in commands]
     return [reason for reason, age in ages if age and float(age[1]) > 60]
+
+
+def held_by_the_clock(
+    running: RunningLoop, plant: Plant, offset: float, name: str, capsys: pytest.CaptureFixture[str]
+) -> bool:
+    """Set the server's clock: whether that held the loop, and then soon and not for long."""
+    write(plant, "Faults.Clock", offset)
+    at = len(running.commands)
+    assert within(60, lambda: len(running.commands) > at + 12)
+    since = len(running.commands)
+    assert within(60, lambda: len(running.since(since, Mode.AUTO)) >= 20)
+    rows = running.commands[at:]
+    assert {c.mode for c in rows} <= {Mode.AUTO, Mode.HOLD}
+    aged = [i for i, c in enumerate(rows) if aged_by_a_clock([c])]
+    if not aged:
+        with capsys.disabled():
+            print(f"\n{name:28} no HOLD")
+        return False
+    until_hold, held = sum(not c.reason for c in rows[: aged[0]]), aged[-1] - aged[0] + 1
+    show(capsys, name, until_hold, held, rows[aged[0]].reason)
+    assert until_hold <= 5
+    assert held <= CONNECTED
+    return True
 
 
 def test_a_servers_clock_may_be_an_hour_off_and_may_be_set(
@@ -218,31 +262,18 @@ def test_a_servers_clock_may_be_an_hour_off_and_may_be_set(
     try:
         running = begun(tmp_path, wire.port)
         assert running.ask(lambda loop: loop.set_sp([0.93]), "set point") == ""
-        running.becomes(Mode.AUTO, 120, scans=30)
+        assert within(120, lambda: len(running.since(0, Mode.AUTO)) >= 30)
         assert aged_by_a_clock(running.commands[10:]) == []
-        for offset, name in ((3600.0, "clock set 2 h ahead"), (0.0, "clock set 1 h back")):
-            at = len(running.commands)
-            write(plant, "Faults.Clock", offset)
-            asking = len(running.commands) - at  # scans for which the server was asked to: connecting takes some
-            assert within(20, lambda: len(running.commands) > at + asking + 12)  # noqa: B023
-            running.becomes(Mode.AUTO, scans=20)
-            modes = [c.mode for c in running.commands[at:]]
-            assert set(modes) <= {Mode.AUTO, Mode.HOLD}
-            if Mode.HOLD not in modes:
-                with capsys.disabled():
-                    print(f"\n{name:28} no HOLD")
-                continue
-            first = modes.index(Mode.HOLD)
-            held = len(modes) - modes[::-1].index(Mode.HOLD) - first
-            until_hold = max(0, first - asking)
-            show(capsys, name, until_hold, held, running.commands[at + first].reason)
-            assert until_hold <= 5
-            assert held <= CONNECTED
-        assert Mode.HOLD in modes  # of the clock that was set back
-        n = len(running.commands)
+        for _ in range(5):
+            held_by_the_clock(running, plant, 3600.0, "clock set 2 h ahead", capsys)
+            # Not where the loop lost its plant just then: with a new connection it asks anew what the server's time is.
+            if held_by_the_clock(running, plant, 0.0, "clock set 1 h back", capsys):
+                break
+        else:
+            raise AssertionError(running.told)
         running.end()
         found = running.scans()
         legal(found, plant, since, set())
-        assert n <= len(found) <= n + 3
+        assert len(found) == len(running.commands)
     finally:
         write(plant, "Faults.Clock", 0.0)

@@ -16,6 +16,7 @@ from served_plant import MODE, PERIOD_S, SPEED, begun, cut, mend, read, served, 
 from serving import Controller, Mode
 from serving.station.settings import Hold
 
+START = 250.0  # the MV of the plant's start
 LEARNT_WITHIN = 3  # of the loop's own periods: so soon a plant knows that its loop is gone
 
 
@@ -96,29 +97,41 @@ def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
     spoilt: str, plant: Plant, wire: Wire, tmp_path: Path
 ) -> None:
     """HOLD goes on from where the MV stands, also while a PV is bad; MANUAL too."""
-    running = begun(tmp_path, wire.port, hold=Hold(recover_after=60))  # it holds for all that is looked at below
-    running.becomes(Mode.AUTO, 120, scans=8)
-    for begin, moved in ((Mode.HOLD, 311.0), (Mode.MANUAL, 287.0)):
-        if begin is Mode.MANUAL:
-            assert running.ask(lambda loop: loop.set_mode(Mode.MANUAL), "mode MANUAL") == ""
-            running.becomes(Mode.MANUAL, scans=3)
-        cut(plant, wire)
-        assert within(20, lambda: "does not answer" in running.commands[-1].reason)
-        running.becomes(begin, scans=6)
-        assert running.commands[-1].mv[0] != moved
-        write(plant, "MV.T_j", moved)
-        write(plant, "Faults.PV.T", spoilt)
-        n = len(running.commands)
-        since = len(plant.actuator())
-        mend(plant, wire)
-        assert within(30, lambda: running.commands[-1].mv.tolist() == [moved])  # noqa: B023
-        assert within(20, lambda: len(running.commands) > n + 20)  # noqa: B023
+    running = begun(tmp_path, wire.port, hold=Hold(recover_after=0))  # it holds for all that is looked at below
+
+    def in_auto() -> bool:
+        """For some scans; its operator has it go on where a busy machine had it hold."""
+        if running.commands[-1].mode is not Mode.AUTO:
+            running.ask(lambda loop: loop.set_mode(Mode.AUTO), "mode AUTO")
+        return len(running.since(0, Mode.AUTO)) >= 8 and running.commands[-1].mode is Mode.AUTO
+
+    try:
+        assert within(120, in_auto)
+        for begin in (Mode.HOLD, Mode.MANUAL):
+            if begin is Mode.MANUAL:
+                assert running.ask(lambda loop: loop.set_mode(Mode.MANUAL), "mode MANUAL") == ""
+                running.becomes(Mode.MANUAL, scans=3)
+            cut(plant, wire)
+            assert within(20, lambda: "does not answer" in running.commands[-1].reason)
+            running.becomes(begin, scans=6)
+            assert running.station.loop is not None
+            (left,) = running.station.loop.mv.tolist()
+            moved = round(left) + (61.0 if left < START else -61.0)  # more than an actuator may differ from its command
+            write(plant, "MV.T_j", moved)
+            write(plant, "Faults.PV.T", spoilt)
+            n = len(running.commands)
+            since = len(plant.actuator())
+            mend(plant, wire)
+            assert within(30, lambda: running.commands[-1].mv.tolist() == [moved]), (moved, running.told)  # noqa: B023
+            assert within(20, lambda: len(running.commands) > n + 20)  # noqa: B023
+            write(plant, "Faults.PV.T", "")
+            running.becomes(begin, scans=5)
+            assert within(20, lambda: len(plant.actuator()) > since + 12)  # noqa: B023
+            rows = plant.actuator()[since + 1 :]
+            assert {row["asked"][0] for row in rows} == {moved}
+            assert told(running, f"the MV stands at T_j {moved:g} K, not at T_j ")
+    finally:
         write(plant, "Faults.PV.T", "")
-        running.becomes(begin, scans=5)
-        rows = plant.actuator()[since + 1 :]
-        assert len(rows) > 10
-        assert {row["asked"][0] for row in rows} == {moved}
-        assert told(running, f"the MV stands at T_j {moved:g} K, not at T_j ")
     running.end()
 
 

@@ -1,4 +1,7 @@
-"""A loop that runs is steered from its own machine, and a controller is swapped in it."""
+"""A loop that runs is steered from its own machine, and a controller is swapped in it.
+
+A machine that is busy may hold the loop for some scans at any time: what is asked of it holds nonetheless.
+"""
 
 from __future__ import annotations
 
@@ -15,24 +18,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from plant_servers import Plant, RunningLoop, spoil
+from plant_servers import UNKNOWN, Plant, RunningLoop, spoil
 from processes import within
 
 from pipeline.__main__ import main
 from pipeline.export.gate import export
 from pipeline.plants.signals import Signals
-from serving import Controller, LoopError
+from serving import Controller, LoopError, Mode
 from serving.journal import JournalReader
+from serving.journal.reader import Entry
 from serving.page.candidates import candidates
 from serving.station.control import ask
 
 pytest_plugins = ["small_laws"]
 ARTIFACTS = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr"
+SPEED = 2.5  # periods of .2 s
 
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", 5.0, "--noise")
+    made = Plant(tmp_path_factory.mktemp("plant"), "thiosulfate_cstr", SPEED, "--noise")
     made.start()
     yield made
     made.end()
@@ -48,7 +53,7 @@ def loop(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     text = path.read_text()
     assert 'page = "127.0.0.1:8080"' in text
     text = re.sub("max_age_s = .*", "max_age_s = 5", text)  # this machine has other work beside it
-    path.write_text("speed = 5.0\n" + text.replace('page = "', '# page = "'))
+    path.write_text(f"speed = {SPEED}\n" + text.replace('page = "', '# page = "'))
     made = RunningLoop(path)
     yield made
     made.end()
@@ -61,16 +66,44 @@ def loopwright(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, st
     return status, said.out + said.err
 
 
+def done(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """What a change did; asked again while the loop has just lost its plant."""
+    said = ""
+
+    def accepted() -> bool:
+        nonlocal said
+        status, said = loopwright(capsys, *words)
+        assert status == 0 or UNKNOWN in said, said
+        return status == 0
+
+    assert within(20, accepted)
+    return said
+
+
+def state(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    status, said = loopwright(capsys, "state")
+    assert status == 0
+    return json.loads(said)  # type: ignore[no-any-return]
+
+
+def becomes(capsys: pytest.CaptureFixture[str], mode: str) -> bool:
+    return within(20, lambda: state(capsys)["mode"] == mode)
+
+
 def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixture[str]) -> None:
     who = ("--who", "anna", "--reason", "start of the shift")
-    status, said = loopwright(capsys, "state")
-    assert (status, json.loads(said)["mode"]) == (0, "SHADOW")
-    assert loopwright(capsys, "mode", "manual", *who) == (0, "mode SHADOW -> MANUAL\n")
-    assert loopwright(capsys, "mv", "T_j=260", *who)[0] == 0
-    assert loopwright(capsys, "sp", "C_A=0.5", *who)[0] == 0
-    assert loopwright(capsys, "mode", "auto", *who)[0] == 0
-    state = json.loads(loopwright(capsys, "state")[1])
-    assert (state["mode"], state["sp"], state["quality"]) == ("AUTO", {"C_A": 0.5}, ["Good", "Good", "Good"])
+    assert state(capsys)["mode"] == "SHADOW"
+    assert done(capsys, "mode", "manual", *who).startswith("mode SHADOW -> MANUAL")
+    assert becomes(capsys, "MANUAL")
+    done(capsys, "mv", "T_j=260", *who)
+    done(capsys, "sp", "C_A=0.5", *who)
+    done(capsys, "mode", "auto", *who)
+
+    def good() -> bool:
+        now = state(capsys)
+        return (now["mode"], now["sp"], now["quality"]) == ("AUTO", {"C_A": 0.5}, ["Good", "Good", "Good"])
+
+    assert within(20, good)
     for words, refusal in (
         (("mode", "fast"), "mode is 'FAST'; "),
         (("sp", "C_A=2"), "the set point C_A = 2.0 mol/l is outside [0, 1] mol/l"),
@@ -88,10 +121,12 @@ def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixtu
         assert status == 2
         assert refusal in said
         assert said.count("\n") == 1
+    assert within(20, lambda: loop.station.journal.behind == 0)
     events = loop.events()
     assert "change anna: mode SHADOW -> MANUAL" in events
     assert "change anna: MV T_j 250 -> 260 K" in events
-    assert not any("refused" in event for event in events)  # what is refused there never came to the loop
+    refused = [event for event in events if "refused" in event and UNKNOWN not in event]
+    assert refused == []  # what is refused there never came to the loop
 
 
 def test_a_controller_is_tried_takes_over_and_is_put_back(
@@ -100,23 +135,21 @@ def test_a_controller_is_tried_takes_over_and_is_put_back(
     def law() -> str:
         return loop.station.loop.controller.manifest.law if loop.station.loop is not None else ""
 
-    assert loopwright(capsys, "mode", "auto")[0] == 0
-    status, said = loopwright(capsys, "swap", "inverse_dob.onnx", "--trial", "8")
-    assert status == 0
-    assert "loop.toml still names the old file" in said
-    successor = json.loads(loopwright(capsys, "state")[1])["successor"]
+    done(capsys, "mode", "auto")
+    assert "loop.toml still names the old file" in done(capsys, "swap", "inverse_dob.onnx", "--trial", "8")
+    successor = state(capsys)["successor"]
     assert successor is None or successor["law"] == "inverse_dob"
-    assert within(20, lambda: law() == "inverse_dob")
+    assert within(60, lambda: law() == "inverse_dob")  # after good scans in a row
     assert within(10, lambda: loop.station.watching.monitor.manifest.law == "inverse_dob")
     assert loop.station.watching.monitor.trouble == ""
     assert loopwright(capsys, "swap", "incad.onnx", "--trial", "1000")[0] == 0
-    assert within(10, lambda: json.loads(loopwright(capsys, "state")[1])["beside"] is not None)
+    assert within(20, lambda: state(capsys)["beside"] is not None)
     assert loopwright(capsys, "swap", "--keep")[0] == 0
     status, said = loopwright(capsys, "swap", "--back", "--trial", "3")
     assert status == 0
     assert "still names the old file" not in said
     assert "a restart brings the controller that loop.toml names" in said
-    assert within(20, lambda: law() == "pid")
+    assert within(60, lambda: law() == "pid")
     assert loop.station.watching.monitor.trouble == ""
     loop.station.end()
     loop.thread.join(20)
@@ -149,18 +182,13 @@ def test_a_controller_that_reads_fewer_pvs_takes_over(
     c_a = replace(m.pv[0], high=0.99)
     narrow = Signals(m.period_s, m.sp, (c_a,), (), m.mv)
     export(make_formula(level, signals=narrow), tmp_path / "level.onnx", case="thiosulfate_cstr", provenance={})
-    assert loopwright(capsys, "mode", "auto")[0] == 0
+    done(capsys, "mode", "auto")
     assert loopwright(capsys, "swap", "level.onnx", "--trial", "4")[0] == 0
-
-    def state() -> Any:
-        return json.loads(loopwright(capsys, "state")[1])
-
-    assert within(20, lambda: state()["replaced"] is not None)
+    assert within(60, lambda: state(capsys)["replaced"] is not None)
     assert within(10, lambda: loop.station.watching.monitor.manifest.law == "formula")
-    before = loop.station.scans
-    assert within(10, lambda: loop.station.scans > before + 10)
-    now = state()
-    assert (now["mode"], list(now["pv"]), now["reason"]) == ("AUTO", ["C_A", "T"], "")
+    before = len(loop.commands)
+    assert within(60, lambda: len(loop.since(before, Mode.AUTO)) > 10)
+    assert within(20, lambda: list(state(capsys)["pv"] or ()) == ["C_A", "T"])
     assert loop.station.watching.monitor.trouble == ""
     about = ask(loop.settings.journal.file, {"do": "about"})
     assert [(s["name"], s["high"]) for s in about["signals"]["pv"]] == [("C_A", 0.99), ("T", m.pv[1].high)]
@@ -168,13 +196,13 @@ def test_a_controller_that_reads_fewer_pvs_takes_over(
     rows = candidates(tmp_path / about["card"]["file"], None, Path(about["first"]))
     assert [row["file"] for row in rows] == ["incad.onnx", "inverse_dob.onnx", "pid.onnx"]
     spoil(plant, "PV.T", "bad")
-    assert within(20, lambda: "PV T: BadSensorFailure" in state()["reason"])
+    assert within(20, lambda: "PV T: BadSensorFailure" in state(capsys)["reason"])
     spoil(plant, "PV.T", "")
-    assert within(20, lambda: state()["mode"] == "AUTO")
+    assert becomes(capsys, "AUTO")
     assert loopwright(capsys, "swap", "--back", "--trial", "2")[0] == 0
-    assert within(20, lambda: state()["sha256"] == loop.station.controller.sha256)
-    before = loop.station.scans
-    assert within(20, lambda: loop.station.scans > before + 2)  # by the one that is back
+    assert within(60, lambda: state(capsys)["sha256"] == loop.station.controller.sha256)
+    before = len(loop.commands)
+    assert within(60, lambda: len(loop.since(before, Mode.AUTO)) > 2)  # by the one that is back
     loop.end()
     assert loopwright(capsys, "export", str(loop.settings.journal.file))[0] == 0
     with (tmp_path / "loop.csv").open(newline="") as text:
@@ -191,21 +219,30 @@ def test_a_controller_that_reads_fewer_pvs_takes_over(
 
 
 def test_an_alarm_is_acknowledged_once(loop: RunningLoop, plant: Plant, capsys: pytest.CaptureFixture[str]) -> None:
-    assert loopwright(capsys, "mode", "auto")[0] == 0
+    done(capsys, "mode", "auto")
     spoil(plant, "PV.T", "bad")
-    assert within(20, lambda: any("PV T: BadSensorFailure" in event for event in loop.events()))
+    assert within(20, lambda: "fault loop: PV T: BadSensorFailure" in loop.events())
     spoil(plant, "PV.T", "")
-    assert within(20, lambda: "fault loop: over: PV T: BadSensorFailure" in loop.events())
-    assert within(20, lambda: loop.events()[-1] == "change loop: mode HOLD -> AUTO")
-    assert [e for e in loop.events() if e.startswith("change ") and "mode" in e] == [
-        f"change {getpass.getuser()}: mode SHADOW -> AUTO",
-        "change loop: mode AUTO -> HOLD",
-        "change loop: mode HOLD -> AUTO",
-    ]
+
+    def modes() -> list[str]:
+        changes = [e for e in loop.events() if e.startswith("change ") and "mode" in e]
+        return [e for e in changes if UNKNOWN not in e]
+
+    assert within(20, lambda: modes()[-1] == "change loop: mode HOLD -> AUTO")
+    by_whom, *others = modes()
+    assert by_whom == f"change {getpass.getuser()}: mode SHADOW -> AUTO"
+    holds = ["change loop: mode AUTO -> HOLD", "change loop: mode HOLD -> AUTO"]
+    assert others[: len(others) // 2 * 2] == holds * (len(others) // 2)  # the bad sensor's, and those of a busy machine
     journal = loop.settings.journal.file
-    with closing(JournalReader(journal)) as reader:
-        (alarm,) = [e for e in reader.entries() if e.event.raised]
-    assert alarm.over_s is not None
+
+    def alarm_is_over() -> Entry | None:
+        with closing(JournalReader(journal)) as reader:
+            found = [e for e in reader.entries() if e.event.raised and e.event.what == "PV T: BadSensorFailure"]
+        return found[-1] if found[-1].over_s is not None else None  # the oldest of them
+
+    assert within(20, lambda: alarm_is_over() is not None)
+    alarm = alarm_is_over()
+    assert alarm is not None
     assert alarm.acknowledged is None
     request = {"do": "acknowledge", "value": alarm.id, "who": "anna", "reason": "the sensor was cleaned"}
     assert ask(journal, request) == {"done": "acknowledged: PV T: BadSensorFailure"}
