@@ -46,20 +46,20 @@ def test_the_trends_go_through_time_by_keyboard(page: Page, loop: FakeLoop) -> N
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     expect(shown).to_have_text("the last 5 min")
     from_s, to_s = pressed(page, "+")
-    assert to_s - from_s == pytest.approx(150)
+    assert to_s - from_s == pytest.approx(150, rel=0, abs=0.01)
     expect(follow).to_have_text("Live")  # closer, about now
-    assert pressed(page, "ArrowLeft") == pytest.approx((from_s - 30, to_s - 30))
+    assert pressed(page, "ArrowLeft") == pytest.approx((from_s - 30, to_s - 30), rel=0, abs=0.01)
     expect(follow).to_have_text("Paused")
     expect(back).to_be_visible()
     expect(shown).to_contain_text(" to ")
-    assert pressed(page, "Shift+ArrowLeft") == pytest.approx((from_s - 180, to_s - 180))
-    assert pressed(page, "-") == pytest.approx((from_s - 255, to_s - 105))
+    assert pressed(page, "Shift+ArrowLeft") == pytest.approx((from_s - 180, to_s - 180), rel=0, abs=0.01)
+    assert pressed(page, "-") == pytest.approx((from_s - 255, to_s - 105), rel=0, abs=0.01)
     for live in ("End", "Home"):
-        assert pressed(page, live)[1] == pytest.approx(to_s)
+        assert pressed(page, live)[1] == pytest.approx(to_s, rel=0, abs=0.01)
         expect(follow).to_have_text("Live")
         expect(back).to_be_hidden()
         pressed(page, "ArrowLeft")
-    assert pressed(page, "ArrowRight")[1] == pytest.approx(to_s)  # what reaches now is live
+    assert pressed(page, "ArrowRight")[1] == pytest.approx(to_s, rel=0, abs=0.01)  # what reaches now is live
     expect(follow).to_have_text("Live")
     top = page.evaluate("scrollY")
     page.keyboard.press("PageDown")
