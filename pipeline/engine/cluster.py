@@ -22,8 +22,8 @@ WORKERS = "LOOPWRIGHT_WORKERS"  # how many a cluster of this machine has where n
 CONNECT_S = 20.0
 WORKERS_S = 120.0  # for the first worker, whose libraries take some seconds
 PRELOAD = ["pipeline.engine.preload"]
-# What workers have in their environment before they start. They keep memory that is freed: Dask has them give it back to
-# the system at once, and the pages that it then has to clear anew took up to a third of a training's time.
+# What workers have in their environment before they start. They keep memory that is freed: Dask has them give it back
+# to the system at once, and the pages that it then has to clear anew took up to a third of a training's time.
 MEMORY = {
     "MALLOC_MMAP_MAX_": "0",  # large arrays come from the kept memory, too
     "MALLOC_TRIM_THRESHOLD_": str(512 * 1024**2),  # bytes at the end of it that are kept
