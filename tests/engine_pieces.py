@@ -45,6 +45,12 @@ def pages_of(_: int) -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 
+def waking_ms(_: int) -> tuple[float, float]:
+    """How often [ms] this worker looks at its event loop, and at what it takes of the machine."""
+    callbacks = get_worker().periodic_callbacks
+    return callbacks["tick"].callback_time, callbacks["monitor"].callback_time
+
+
 def watched(_: int) -> bool:
     """Whether Dask's profiler looks into the frames of this process's tasks."""
     return "profile" in get_worker().periodic_callbacks

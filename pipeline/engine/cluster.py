@@ -32,6 +32,9 @@ MEMORY = {
 # Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
 CONFIG = {
     **{f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in MEMORY.items()},
+    # Dask looks at itself 50 times a second in every process, which takes 3 % of two cores and interrupts the work.
+    "distributed.admin.tick.interval": "2s",
+    "distributed.admin.system-monitor.interval": "5s",
     "distributed.scheduler.worker-ttl": None,
     "distributed.admin.large-graph-warning-threshold": "1GB",  # a stage's files are its arguments
     "logging.distributed": "critical",
