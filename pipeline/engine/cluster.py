@@ -22,8 +22,19 @@ WORKERS = "LOOPWRIGHT_WORKERS"  # how many a cluster of this machine has where n
 CONNECT_S = 20.0
 WORKERS_S = 120.0  # for the first worker, whose libraries take some seconds
 PRELOAD = ["pipeline.engine.preload"]
+# What workers have in their environment before they start. They keep memory that is freed: Dask has them give it back
+# to the system at once, and the pages that it then has to clear anew took up to a third of a training's time.
+MEMORY = {
+    "MALLOC_MMAP_MAX_": "0",  # large arrays come from the kept memory, too
+    "MALLOC_TRIM_THRESHOLD_": str(512 * 1024**2),  # bytes at the end of it that are kept
+    "MALLOC_ARENA_MAX": "1",  # for all threads: one of them computes
+}
 # Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
 CONFIG = {
+    **{f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in MEMORY.items()},
+    # Dask looks at itself 50 times a second in every process, which takes 3 % of two cores and interrupts the work.
+    "distributed.admin.tick.interval": "2s",
+    "distributed.admin.system-monitor.interval": "5s",
     "distributed.scheduler.worker-ttl": None,
     # Nobody reads what it samples a hundred times a second, also where no work is done; see ``preload.unwatched``.
     "distributed.worker.profile.enabled": False,

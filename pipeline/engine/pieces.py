@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import math
 import pickle
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
@@ -16,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from pipeline.engine.fingerprint import difference, fingerprint
 from pipeline.engine.folder import Files, Folder
@@ -153,8 +154,14 @@ def _opened(_digest: bytes, shared: _Content) -> _Opened:
 
 def alone(function: Callable[[Item], Result], item: Item) -> Result:
     """``function(item)`` on one thread: processes that each start a thread per core only fight over the cores."""
-    with threadpool_limits(1):
+    with _pools(len(sys.modules)).limit(limits=1):
         return function(item)
+
+
+@lru_cache(maxsize=1)
+def _pools(_modules: int) -> ThreadpoolController:
+    """The libraries with threads of their own, found anew where modules were imported: that takes some milliseconds."""
+    return ThreadpoolController()
 
 
 def _as_bytes(error: Exception) -> bytes:

@@ -164,6 +164,25 @@ class EquationPlant(Simulator):
         step.buffer = buffer  # type: ignore[attr-defined]  # evaluate() only borrows it
         return step
 
+    def meter(self) -> Callable[[Array], Array]:
+        """``measure(x) -> pv`` through CasADi's buffers, as ``stepper``."""
+        if self.measures_states:
+            return self.measure
+        buffer: Any
+        evaluate: Any
+        buffer, evaluate = self.measurement.buffer()
+        state, result = np.zeros(self.n_x), np.zeros(self.measurement.numel_out(0))
+        buffer.set_arg(0, state.data)
+        buffer.set_res(0, result.data)
+
+        def measure(x: Array) -> Array:
+            state[:] = x
+            evaluate()
+            return result.copy()
+
+        measure.buffer = buffer  # type: ignore[attr-defined]  # evaluate() only borrows it
+        return measure
+
     # ------------------------------------------------------------------ steady states
     @cached_property
     def _steady(self) -> SteadyStates:

@@ -115,6 +115,10 @@ class Simulator(ABC):
         """``step`` for a loop over many samples."""
         return self.step
 
+    def meter(self) -> Callable[[Array], Array]:
+        """``measure`` for a loop over many samples."""
+        return self.measure
+
     def many(self, n: int, p: Array | None = None) -> AdvanceMany:
         """``step`` of ``n`` runs side by side under its own measured disturbances and p (n_p,), by default its own."""
         dv, known = self.dv_nominal, self.parameters() if p is None else p

@@ -77,12 +77,12 @@ def simulate_closed(
     n, n_mv = test.samples, len(plant.mv_signals)
     parameters = test.parameters(plant)
     deviation = noise_draws(plant, n, noise, np.random.default_rng(seed))
-    advance, dv = plant.stepper(), test.disturbances(plant)
+    advance, measure, dv = plant.stepper(), plant.meter(), test.disturbances(plant)
     x, pv, mv, info = np.empty((n + 1, plant.n_x)), np.empty(deviation.shape), np.empty((n, n_mv)), []
     x[0] = _checked("x0", test.x0, x.shape[1:])
     applied = _checked("mv0", test.mv0, (n_mv,))
     for k in range(n):
-        pv[k] = plant.measure(x[k])
+        pv[k] = measure(x[k])
         move, row = step(test.sp[k], pv[k] + deviation[k], applied)
         applied = mv[k] = _checked("the controller's MV", move, (n_mv,))
         if not np.isfinite(applied).all():

@@ -150,12 +150,12 @@ def _floats(figures: Mapping[str, float]) -> dict[str, float]:
 def _closed_loop(plant: Simulator) -> Callable[[Array], Array]:
     """The plant as the parity gate drives it: one period further with each MV."""
     state, _ = plant.start
-    step, dv, p = plant.stepper(), plant.dv_nominal, plant.parameters()
+    step, measure, dv, p = plant.stepper(), plant.meter(), plant.dv_nominal, plant.parameters()
 
     def drive(mv: Array) -> Array:
         nonlocal state
         state = step(state, mv, dv, p)
-        return plant.measure(state)
+        return measure(state)
 
     return drive
 

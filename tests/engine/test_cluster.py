@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import resource
 import shutil
 import signal
 import subprocess
@@ -17,10 +19,10 @@ from urllib.request import urlopen
 import distributed.client
 import pytest
 from dask_cluster import ROOT, Cluster, joined, two_workers  # noqa: F401
-from engine_pieces import fatal, process_of, refuse, squares, sums_of_squares, watched
+from engine_pieces import fatal, pages_of, process_of, refuse, squares, sums_of_squares, waking_ms, watched
 from processes import within
 
-from pipeline.engine.cluster import ADDRESS, WORKERS, connected, disconnect, local_cluster, usual_workers
+from pipeline.engine.cluster import ADDRESS, MEMORY, WORKERS, connected, disconnect, local_cluster, usual_workers
 from pipeline.engine.fingerprint import fingerprint
 from pipeline.engine.parallel import _answers, parallel_map
 from pipeline.engine.pieces import Task
@@ -185,6 +187,22 @@ def test_a_cluster_of_this_machine_has_the_workers_asked_for_and_ends_with_its_b
         assert os.getpid() not in pids
     assert ADDRESS not in os.environ
     assert within(20, lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another library of C keeps memory in its own way")
+def test_workers_of_this_machine_keep_memory_that_is_freed_and_seldom_look_at_themselves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv(ADDRESS, raising=False)
+    monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])
+    for name in MEMORY:
+        monkeypatch.delenv(name, raising=False)
+    once = 16 * 1024**2 // resource.getpagesize()
+    with local_cluster(1):
+        for pages in parallel_map(pages_of, range(2), "pages"):
+            assert pages < 3 * once  # a hundred times as many where each array is given back
+        for tick, monitor in parallel_map(waking_ms, range(2), "waking"):
+            assert min(tick, monitor) >= 2000  # 20 and 500 by default
 
 
 def test_a_number_of_workers_that_is_none_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,6 +123,14 @@ def test_rk4_is_the_exact_transition(name):
         assert plant.stepper()(x, mv, plant.dv_nominal, plant.parameters()) == pytest.approx(rk4, rel=1e-13)
 
 
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_meter_gives_the_measurement_to_the_last_bit(name):
+    plant = PLANTS[name]()
+    measure, xs = plant.meter(), plant.steady_curve[1][:20]
+    found = [measure(x) for x in xs]  # each in an array of its own
+    assert np.array_equal(np.array(found), np.array([plant.measure(x) for x in xs]))
+
+
 def test_rk4_has_order_four(cstr):
     x, mv = np.array([0.5, 330.0]), np.array([250.0])
 
