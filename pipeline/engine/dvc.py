@@ -56,7 +56,7 @@ def ask_in_turn(*commands: Sequence[str]) -> list[str]:
     code, out, err = _done([sys.executable, "-c", IN_TURN, json.dumps(commands), MARK])
     *found, rest = out.split(MARK)
     if code:
-        raise PipelineError(f"dvc {commands[len(found)][0]} failed: {_reason(err or rest)}")
+        raise PipelineError(f"dvc {commands[min(len(found), len(commands) - 1)][0]} failed: {_reason(err or rest)}")
     return found
 
 

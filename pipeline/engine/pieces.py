@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -154,14 +155,20 @@ def _opened(_digest: bytes, shared: _Content) -> _Opened:
 
 def alone(function: Callable[[Item], Result], item: Item) -> Result:
     """``function(item)`` on one thread: processes that each start a thread per core only fight over the cores."""
-    with _pools(len(sys.modules)).limit(limits=1):
+    with _pools(*_loaded()).limit(limits=1):
         return function(item)
 
 
 @lru_cache(maxsize=1)
-def _pools(_modules: int) -> ThreadpoolController:
-    """The libraries with threads of their own, found anew where modules were imported: that takes some milliseconds."""
+def _pools(_modules: int, _libraries: int) -> ThreadpoolController:
+    """The libraries with threads of their own, found anew where something was loaded: that takes some milliseconds."""
     return ThreadpoolController()
+
+
+def _loaded() -> tuple[int, int]:
+    """How many modules and, on Linux, parts of libraries: CasADi's solvers come without a module."""
+    maps = Path("/proc/self/maps")
+    return len(sys.modules), maps.read_bytes().count(b".so") if maps.exists() else 0
 
 
 def _as_bytes(error: Exception) -> bytes:

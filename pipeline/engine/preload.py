@@ -90,7 +90,7 @@ def unwatched(worker: Worker) -> None:
 
 
 def load() -> None:
-    """Everything at once, for whoever measures what tasks take afterwards: ``Client.run(load)``."""
+    """All of it at once, for whoever measures what tasks take afterwards: ``Client.run(load)``."""
     for _ in loading():
         pass
 

@@ -94,8 +94,11 @@ def run(arguments: list[str]) -> int | str | None:
         if at is not None:
             return run_on(at, arguments, files)
         os.environ[STAGES] = arguments[0]
-        with local_cluster() as own:
-            return run_on(own, arguments, files)
+        try:
+            with local_cluster() as own:
+                return run_on(own, arguments, files)
+        finally:
+            del os.environ[STAGES]
     except PipelineError as error:
         print(f"{' '.join(arguments)}: {error}", file=sys.stderr)
         return FAILED

@@ -189,7 +189,6 @@ def test_a_cluster_of_this_machine_has_the_workers_asked_for_and_ends_with_its_b
     assert within(20, lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another library of C keeps memory in its own way")
 def test_workers_of_this_machine_keep_memory_that_is_freed_and_seldom_look_at_themselves(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -200,7 +199,8 @@ def test_workers_of_this_machine_keep_memory_that_is_freed_and_seldom_look_at_th
     once = 16 * 1024**2 // resource.getpagesize()
     with local_cluster(1):
         for pages in parallel_map(pages_of, range(2), "pages"):
-            assert pages < 3 * once  # a hundred times as many where each array is given back
+            if platform.libc_ver()[0] == "glibc":  # another library of C keeps memory in its own way
+                assert pages < 3 * once  # a hundred times as many where each array is given back
         for tick, monitor in parallel_map(waking_ms, range(2), "waking"):
             assert min(tick, monitor) >= 2000  # 20 and 500 by default
 
