@@ -45,10 +45,7 @@ def nothing_twice() -> Iterator[None]:
 
 
 def _decomposed_if_needed(exported_program: ExportedProgram, registry: ONNXRegistry) -> ExportedProgram:
-    """The program without the operations that ONNX lacks; traced again where it has others than those named here.
-
-    Changes the program that it is given.
-    """
+    """The program without the operations that ONNX lacks; traced again where it has others than those named here."""
     calls = [node for node in exported_program.graph.nodes if node.op == "call_function"]
     replaced = [node for node in calls if node.target in _REPLACED and len(node.args) == 2 and not node.kwargs]
     if not all(node in replaced or _kept(node, registry) for node in calls):
