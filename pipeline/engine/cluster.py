@@ -69,6 +69,8 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] | Non
             processes=True,
             host="127.0.0.1",
             dashboard_address=dashboard,
+            # Its small server of HTTP has any free port even where nothing is drawn.
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
             memory_limit=0,
             local_directory=folder,
             preload=PRELOAD,

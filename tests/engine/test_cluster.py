@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -203,6 +205,17 @@ def test_workers_of_this_machine_keep_memory_that_is_freed_and_seldom_look_at_th
                 assert pages < 3 * once  # a hundred times as many where each array is given back
         for tick, monitor in parallel_map(waking_ms, range(2), "waking"):
             assert min(tick, monitor) >= 2000  # 20 and 500 by default
+
+
+def test_another_program_has_the_port_that_dask_would_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(ADDRESS, raising=False)
+    monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])
+    with socket.socket() as taken:
+        with contextlib.suppress(OSError):  # somebody has it already
+            taken.bind(("127.0.0.1", 8787))
+            taken.listen()
+        with local_cluster(1):  # Dask would warn, and a warning fails a test
+            assert parallel_map(process_of, range(1), "processes") != [os.getpid()]
 
 
 def test_a_number_of_workers_that_is_none_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
