@@ -61,16 +61,15 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] | Non
     dask.config.set(CONFIG)
     from distributed import LocalCluster
 
-    dashboard = None if say is None else _dashboard()
+    drawn = say is not None and _can_draw()
     with tempfile.TemporaryDirectory(prefix="loopwright-workers-", ignore_cleanup_errors=True) as folder:
         cluster = LocalCluster(
             n_workers=0,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=dashboard,
-            # Its small server of HTTP has any free port even where nothing is drawn.
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+            dashboard_address="127.0.0.1:0",  # of its server of HTTP, which it has also where nothing is drawn
+            scheduler_kwargs={"dashboard": drawn},
             memory_limit=0,
             local_directory=folder,
             preload=PRELOAD,
@@ -79,7 +78,7 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] | Non
         try:
             os.environ[ADDRESS] = cluster.scheduler_address
             cluster.scale(wanted)
-            if say is not None and dashboard is not None:
+            if say is not None and drawn:
                 say(f"the work at a glance, in a browser: {cluster.dashboard_link}")
             yield cluster.scheduler_address
         finally:
@@ -172,9 +171,9 @@ def _client(to: str) -> Client:
     return client
 
 
-def _dashboard() -> str | None:
+def _can_draw() -> bool:
     try:
         import bokeh  # noqa: F401
     except ImportError:
-        return None
-    return "127.0.0.1:0"
+        return False
+    return True
