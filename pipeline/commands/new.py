@@ -45,7 +45,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add = parser.add_argument
     add("name", metavar="NAME", help="of the plant: small letters, digits and _")
-    add("files", metavar="FILE", type=Path, nargs="*", help="exports: .csv, .txt, .gz, .parquet")
+    add("files", metavar="FILE", type=Path, nargs="*", help="exports: .csv, .txt, .gz, .parquet, .xlsx")
     add("--anyway", action="store_true", help="add the plant even where the data cannot carry a model")
     add("--replace", action="store_true", help="put the plant in place of an own plant of this name and its entries")
     add("--simulator", metavar="FILE", type=Path, help="a Python class or an FMU, instead of exports")
@@ -64,7 +64,10 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--hold", metavar="S", type=positive("s"), help="longest time that a reading is held or drawn on over")
     add("--without-mode", metavar="MODE", action="append", default=[], help="leave rows of this mode out")
     add("--time", metavar="COLUMN", default="", help="the column of times (default: found by name and content)")
-    add("--time-format", metavar="FORM", default="", help="of the times, as in '%%d/%%m/%%Y %%H:%%M:%%S'")
+    add("--time-format", metavar="FORM", default="",
+        help="of times, as in '%%d/%%m/%%Y %%H:%%M:%%S', or a unit of numbers: ms, s, min, h, d, serial")  # fmt: skip
+    add("--time-zone", metavar="ZONE", default="",
+        help="of dates that state none, as in Europe/Berlin or +01:00")  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 from pipeline.commands.new_widened import Widening
@@ -11,7 +12,7 @@ from pipeline.config.exports import ExportParams
 from pipeline.errors import RecordError
 from pipeline.historian.exported import exported
 from pipeline.historian.guessing import guesses
-from pipeline.historian.reading import read_export, units_of
+from pipeline.historian.reading import read_export, tags_in, units_of
 from pipeline.historian.tags import (
     EXPLAINED,
     ROLES,
@@ -27,7 +28,8 @@ from pipeline.historian.tags import (
 
 def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
     """The tags that a person gave, and where they stand."""
-    given = tuple(parse_tag(text, role) for role in ROLES for text in getattr(options, role))
+    known = cache(lambda: tags_in(options.files))
+    given = tuple(parse_tag(text, role, known) for role in ROLES for text in getattr(options, role))
     if given and options.tags:
         raise RecordError("--tags and options of roles are both given; give one of them")
     # A range in an option was stated; one in a table may be as it was guessed.
@@ -52,6 +54,7 @@ def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
         without_mode=tuple(options.without_mode),
         time=options.time,
         time_format=options.time_format,
+        time_zone=options.time_zone,
         anyway=options.anyway,
     )
 
@@ -59,9 +62,11 @@ def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
 def propose_tags(name: str, options: argparse.Namespace) -> None:
     """Write the table of all tags with guessed roles, for a person to correct, and say so."""
     path = Path(f"{name}-tags.csv")
-    export = read_export(options.files, (), (), options.time, options.time_format)
+    export = read_export(options.files, (), (), options.time, options.time_format, options.time_zone)
     rows = guesses(export, units_of(options.files))
     write_tags(path, rows)
+    for note in export.notes:
+        print(f"  {note.column}: {note.words}")
     roles = {r: [g.tag.tag for g in rows if g.tag.role == r] for r in ROLES}
     print(f"{path}: {len(rows)} tags with guessed roles; nothing else was written")
     for role, tags in roles.items():

@@ -29,7 +29,7 @@ class Widening:
         if tag.role != "mv" or not (below or above) or not self.options.files:
             return tag
         options = self.options
-        export = read_export(options.files, (tag.tag,), (), options.time, options.time_format)
+        export = read_export(options.files, (tag.tag,), (), options.time, options.time_format, options.time_zone)
         seen = seen_range(export.series[tag.tag])
         if seen is None:
             return tag

@@ -37,7 +37,8 @@ class ExportParams:
 
     ``period_s``, ``hold_s``: sampling period of the record and the longest time that a reading is held (None: from the
     data). ``without_mode``: rows of these modes are left out. ``time``, ``time_format``: the column of times and its
-    form ("": found by name and content). ``anyway``: the record is used even where it cannot carry a model.
+    form ("": found by name and content). ``time_zone``: that of dates which state none. ``anyway``: the record is used
+    even where it cannot carry a model.
     """
 
     case: str
@@ -48,6 +49,7 @@ class ExportParams:
     without_mode: tuple[str, ...] = ()
     time: str = ""
     time_format: str = ""
+    time_zone: str = ""
     anyway: bool = False
 
     def __post_init__(self) -> None:

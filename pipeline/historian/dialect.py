@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import codecs
 import csv
-import gzip
 import re
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import RecordError
+from pipeline.historian.file_kinds import head_of
+from pipeline.historian.headers import split_header
+from pipeline.historian.numbers import plain
+from pipeline.historian.table_head import Head, head_of_table, kind_of_cell
 
 SAMPLE_BYTES = 1 << 18
 SAMPLE_LINES = 200
 SEPARATORS = ("\t", ";", "|", ",")  # a comma last: it may be the decimal sign
-NUMBER = re.compile(r"^\s*[+-]?(\d[\d.,]*|[.,]\d+)([eE][+-]?\d+)?\s*$")
 COMMA_DECIMAL = re.compile(r"^\s*[+-]?(\d{1,3}(\.\d{3})+|\d*),\d+([eE][+-]?\d+)?\s*$")
-COMMA_THOUSANDS = re.compile(r"^\s*[+-]?\d{1,3}(,\d{3})+(\.\d+)?\s*$")
 POINT_DECIMAL = re.compile(r"^\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*$")
-LONGEST_UNIT = 14  # characters
+COMMA_THOUSANDS = re.compile(r"^[+-]?\d{1,3}(,\d{3})*(,\d{3}\.\d*|,\d{3},\d{3})$")
+EITHER = re.compile(r"^[+-]?[1-9]\d{0,2}(?P<sign>[.,])\d{3}$")  # 1,234 is 1.234 or 1234
+SMALL = re.compile(r"^[+-]?\d{1,3}$")
+LONGEST_HEADER = 6  # lines of one header, with line breaks in quoted names
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +36,10 @@ class Dialect:
     separator: str
     decimal: str  # "." or ","
     first_line: int  # lines before the first row of values
-    header: tuple[str, ...]
+    header: tuple[str, ...]  # of every column, "column 3" where none is written
     units: tuple[str, ...]  # below the header, "" where none is written
     rows: tuple[tuple[str, ...], ...]  # the first ones
+    unused: frozenset[str]  # columns without a name and a value, as of rows that end with a separator
 
     @property
     def thousands(self) -> str:
@@ -42,34 +47,32 @@ class Dialect:
         return "." if self.decimal == "," else ","
 
 
-def sniff(path: Path) -> Dialect:
+def sniff(path: Path, kind: str = "text") -> Dialect:
     """The dialect of a text file, gzipped or not; RecordError where it holds no table."""
-    raw = _head(path)
+    raw = _head(path, kind)
     if not raw.strip():
         raise RecordError(f"{path}: the file is empty; give an export with a header and rows")
     encoding = encoding_of(raw)
     text = codecs.getincrementaldecoder(encoding)(errors="replace").decode(raw)
-    lines = text.splitlines()
+    lines = re.split(r"\r\n|\n|\r", text)
     lines = lines[: SAMPLE_LINES if len(raw) < SAMPLE_BYTES else min(SAMPLE_LINES, len(lines) - 1)]
+    failures = []
     for separator in SEPARATORS:
-        cells = list(_split(lines, separator))
-        place = _header_line(cells)
-        if place is not None:
+        rows, after = _split(lines, separator)
+        found = head_of_table(rows)
+        if isinstance(found, Head):
             break
+        failures.append(found)
     else:
         if sum(bool(line.strip()) for line in lines) == 1:
             raise RecordError(f"{path}: there is one line and no row below it; export a longer time")
-        raise RecordError(
-            f"{path}: no table was found in the first {len(lines)} lines; a header of names and rows of equal length "
-            "are wanted, separated by comma, semicolon, tab or |"
-        )
-    header, below = cells[place], [c for c in cells[place + 1 :] if any(c)]
-    units: tuple[str, ...] = ("",) * len(header)
-    first = place + 1
-    if len(below) > 1 and _are_units(below[0], below[1]):
-        units, below, first = tuple(u.strip(" []()") for u in below[0]), below[1:], place + 2
-    rows = tuple(tuple(c) for c in below if len(c) == len(header))
-    return Dialect(encoding, separator, _decimal(rows), first, _names(path, header), units, rows)
+        why = next((f for f in failures if f), "a header of names and rows of equal length are wanted, separated by "
+                   "comma, semicolon, tab or |")  # fmt: skip
+        raise RecordError(f"{path}: no table was found in the first {len(lines)} lines; {why}")
+    header = names_of(path, found.header)
+    unused = frozenset(n for i, n in enumerate(header) if not found.header[i] and not any(r[i] for r in found.rows))
+    first = after[found.first - 1]
+    return Dialect(encoding, separator, _decimal(found.rows, separator), first, header, found.units, found.rows, unused)
 
 
 def encoding_of(raw: bytes) -> str:
@@ -87,56 +90,84 @@ def encoding_of(raw: bytes) -> str:
     return "utf-8"
 
 
-def _head(path: Path) -> bytes:
+def names_of(path: Path, header: Sequence[str]) -> tuple[str, ...]:
+    """A name for each column: a quality that stands beside every tag under one name gets its tag's too.
+
+    RecordError where a name stands twice.
+    """
+    names = [" ".join(name.split()) or f"column {i + 1}" for i, name in enumerate(header)]
+    twice = {name for name, times in Counter(names).items() if times > 1}
+    for i, name in enumerate(names):
+        if name in twice and i and split_header(name)[0].lower() in QUALITIES and names[i - 1] not in twice:
+            names[i] = f"{split_header(names[i - 1])[0]} {name}"
+    twice = {name for name, times in Counter(names).items() if times > 1}
+    if twice:
+        first = next(name for name in names if name in twice)
+        pairs = "; where each tag has a column of times, export one for all, or a file a tag" * (
+            split_header(first)[0].lower() in {"time", "timestamp", "date", "datetime", "zeit", "zeitstempel"}
+        )
+        raise RecordError(f"{path}: column {first!r} stands twice in the header; rename or remove one of them{pairs}")
+    return tuple(names)
+
+
+QUALITIES = {
+    "quality",
+    "qual",
+    "status",
+    "stat",
+    "q",
+    "opcquality",
+    "statuscode",
+    "qualität",
+    "good",
+    "isgood",
+    "valid",
+}
+
+
+def _head(path: Path, kind: str) -> bytes:
     try:
-        with gzip.open(path, "rb") if path.suffix.lower() == ".gz" else path.open("rb") as file:
-            return file.read(SAMPLE_BYTES)
+        return head_of(path, kind, SAMPLE_BYTES)
     except FileNotFoundError:
         raise RecordError(f"{path}: no such file; give the path of an export") from None
     except (OSError, EOFError, zlib.error) as error:
         raise RecordError(f"{path} cannot be read: {error}; export the file again") from None
 
 
-def _split(lines: list[str], separator: str) -> Iterator[list[str]]:
-    for line in lines:
+def _split(lines: Sequence[str], separator: str) -> tuple[list[list[str]], list[int]]:
+    """Rows of cells, and the number of lines up to each row's end: a quoted name may hold line breaks."""
+    rows, after, k = list[list[str]](), list[int](), 0
+    while k < len(lines):
+        n = 1
+        while lines[k : k + n] and '"' in lines[k] and "".join(lines[k : k + n]).count('"') % 2:
+            n += 1
+            if n > LONGEST_HEADER or k + n > len(lines):
+                n = 1
+                break
+        text = " ".join(lines[k : k + n]).replace("\0", "")
         try:
-            yield [c.strip() for c in next(csv.reader([line.replace("\0", "")], delimiter=separator), [])]
+            rows.append([c.strip() for c in next(csv.reader([text], delimiter=separator), [])])
         except csv.Error:
-            yield []
+            rows.append([])
+        k += n
+        after.append(k)
+    return rows, after
 
 
-def _header_line(cells: list[list[str]]) -> int | None:
-    """The line that names the columns: the first of those as long as most, and it holds no number."""
-    lengths = Counter(len(c) for c in cells if len(c) > 1)
-    if not lengths:
-        return None
-    length, times = lengths.most_common(1)[0]
-    if times < 0.6 * sum(1 for c in cells if any(c)):
-        return None
-    place = next(i for i, c in enumerate(cells) if len(c) == length)
-    filled = [c for c in cells[place] if c]
-    return place if filled and not any(NUMBER.match(c) for c in filled) and len(cells) > place + 1 else None
+def _decimal(rows: Sequence[Sequence[str]], separator: str) -> str:
+    """The sign that most numbers show.
 
-
-def _are_units(row: list[str], after: list[str]) -> bool:
-    filled = [c for c in row[1:] if c]
-    numbers = sum(bool(NUMBER.match(c)) for c in after)
-    short = all(len(c) <= LONGEST_UNIT and not NUMBER.match(c) for c in filled)
-    return bool(filled) and short and not re.match(r"^\d", row[0]) and numbers > 0
-
-
-def _decimal(rows: tuple[tuple[str, ...], ...]) -> str:
-    """The sign that the numbers show; a cell such as 1,234 alone decides for a decimal comma."""
-    cells = [c for row in rows for c in row if NUMBER.match(c)]
-    comma = sum(bool(COMMA_DECIMAL.match(c)) for c in cells)
-    thousands = sum(bool(COMMA_THOUSANDS.match(c)) for c in cells)
-    point = sum(bool(POINT_DECIMAL.match(c)) for c in cells)
-    return "," if comma > 0 and not (thousands >= comma and point) else "."
-
-
-def _names(path: Path, header: list[str]) -> tuple[str, ...]:
-    names = [name or f"column {i + 1}" for i, name in enumerate(header)]
-    twice = [name for name, times in Counter(names).items() if times > 1]
-    if twice:
-        raise RecordError(f"{path}: column {twice[0]!r} stands twice in the header; rename or remove one of them")
-    return tuple(names)
+    Where all are like 1,234 the comma is between thousands if smaller numbers have none, or if it separates cells.
+    """
+    cells = [[plain(c) for c in column if c and kind_of_cell(c) == "number"] for column in zip(*rows, strict=True)]
+    every = [c for column in cells for c in column]
+    comma = sum(bool(COMMA_DECIMAL.match(c)) and not EITHER.match(c) for c in every)
+    point = sum(bool(POINT_DECIMAL.match(c)) and not EITHER.match(c) for c in every)
+    if comma or point:
+        return "," if comma > point else "."
+    if any(COMMA_THOUSANDS.match(c) for c in every):
+        return "."
+    either = [column for column in cells if any((m := EITHER.match(c)) and m["sign"] == "," for c in column)]
+    if not either or any((m := EITHER.match(c)) and m["sign"] == "." for c in every):
+        return "."
+    return "." if separator == "," or all(any(SMALL.match(c) for c in column) for column in either) else ","

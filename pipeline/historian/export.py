@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,13 @@ class Series:
         return int(np.count_nonzero(new))
 
 
+class Note(NamedTuple):
+    """What was assumed of a column of a file, for a person to confirm."""
+
+    column: str
+    words: str
+
+
 @dataclass(frozen=True, slots=True)
 class Contents:
     """What one file holds of the tags that were asked for, in how many rows, and from when to when [s]."""
@@ -88,6 +95,7 @@ class Export:
     timeless_rows: int  # whose time cannot be read
     zone: str = ""  # that its dates are in, or that it states none; empty where times are no dates
     contents: tuple[Contents, ...] = ()  # of each file
+    notes: tuple[Note, ...] = ()
 
 
 def in_order(series: Series, files: NDArray[np.int64] = NO_CUTS) -> Series:

@@ -33,5 +33,5 @@ def with_units(tags: Sequence[Tag], params: ExportParams) -> tuple[Tag, ...]:
 def screened_export(params: ExportParams, tags: Sequence[Tag]) -> Screened:
     """The files read and screened; ``tags`` have names and units. RecordError as ``read_export`` and ``screened``."""
     values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
-    export = read_export(params.files, values, modes, params.time, params.time_format)
+    export = read_export(params.files, values, modes, params.time, params.time_format, params.time_zone)
     return screened(params.case, export, tags, params.period_s, params.hold_s, params.without_mode)

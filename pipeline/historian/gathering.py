@@ -9,11 +9,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from pipeline.errors import RecordError
 from pipeline.historian.export import Series
 from pipeline.historian.numbers import numbers
-from pipeline.historian.quality import good_quality
+from pipeline.historian.quality import meaning_of
 from pipeline.historian.reason import Reason
 
+MOST_QUALITIES = 1_000  # more are the values of a tag
 GROWTH = 1.1  # of an array that is full: what is spare takes memory too
 
 
@@ -27,8 +29,12 @@ class Gathered:
         self.code: dict[str, Growing] = {}
         self.texts: dict[str, Counter[str]] = {}
         self.names: dict[str, dict[str, int]] = {}
+        self.flag: dict[str, Growing] = {}  # of a tag: index of each reading's quality among the words of its column
+        self.quality: dict[str, str] = {}  # tag -> the column of its quality
+        self.words: dict[str, Counter[str]] = {}  # of each column of quality, in the order of their index
+        self.says: dict[str, str] = {}  # column of quality -> how it was understood
 
-    def add(self, name: str, seconds: Any, column: Any, quality: Any) -> None:
+    def add(self, name: str, seconds: Any, column: Any, quality: Any, quality_column: str = "") -> None:
         """A block of readings of one tag: seconds (m,), its Arrow column, and the column of its quality or None."""
         if name in self.modes:
             known = self.names.setdefault(name, {})
@@ -40,7 +46,7 @@ class Gathered:
             values, codes, texts = numbers(column, self.decimal)
             self.texts.setdefault(name, Counter()).update(texts)
         if quality is not None:
-            codes[~good_quality(quality) & (codes == Reason.GOOD)] = Reason.QUALITY
+            self._add_quality(name, quality, quality_column)
         if not self.wide or name == next(iter(self.value), name):
             self.time.setdefault("" if self.wide else name, Growing(np.float64)).append(seconds)
         self.value.setdefault(name, Growing(np.float64)).append(values)
@@ -48,18 +54,44 @@ class Gathered:
 
     def series(self) -> dict[str, Series]:
         """The series of each tag; nothing may be added afterwards."""
+        code = {name: grown.whole() for name, grown in self.code.items()}
+        good = {}
+        for column, words in self.words.items():
+            meaning = meaning_of(column, words)
+            good[column] = None if meaning.good is None else np.array([w in meaning.good for w in words])
+            self.says[column] = "says nothing of quality, and is not used" if meaning.good is None else meaning.says
+        for name, column in self.quality.items():
+            if (known := good[column]) is not None:
+                bad = ~known[self.flag[name].whole()]
+                code[name][bad & (code[name] == Reason.GOOD)] = Reason.QUALITY
         times = {name: grown.whole() for name, grown in self.time.items()}
         return {
             name: Series(
                 name,
                 times["" if self.wide else name],
                 value.whole(),
-                self.code[name].whole(),
+                code[name],
                 self.texts.get(name, Counter()),
                 tuple(self.names.get(name, ())),
             )
             for name, value in self.value.items()
         }
+
+    def _add_quality(self, name: str, column: Any, header: str) -> None:
+        """Keep the quality (m,) of a block: what it means is known from all of them."""
+        self.quality[name] = header
+        words = self.words.setdefault(header, Counter())
+        place = {word: i for i, word in enumerate(words)}
+        index, cells = _categories(pc.cast(column, pa.string()) if not pa.types.is_dictionary(column.type) else column)
+        cells = [*cells, ""]  # of the index -1, a null
+        own = np.array([place.setdefault(word, len(place)) for word in cells])
+        if len(place) > MOST_QUALITIES:
+            raise RecordError(f"column {header!r} has more than {MOST_QUALITIES} qualities; name it otherwise")
+        for word in place:
+            words.setdefault(word, 0)
+        for i, times in enumerate(np.bincount(np.where(index < 0, len(cells) - 1, index), minlength=len(cells))):
+            words[cells[i]] += int(times)
+        self.flag.setdefault(name, Growing(np.uint16)).append(own[index].astype(np.uint16))
 
 
 class Growing:

@@ -1,29 +1,123 @@
-"""What a header of an export says: the tag, and its unit in brackets."""
+"""What a header of an export says: the tag and its unit in brackets; of the column of times, the unit of time."""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from pipeline.records.record_file import split_column
-
+SQUARE = re.compile(r"^(?P<name>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")  # the last bracket: TIC[1].PV [degC]
 ROUND = re.compile(r"^(?P<name>.*\S)\s*\((?P<unit>[^()]{1,16})\)$")
 # A unit in round brackets, which may hold any words: these, with prefixes and powers, their products and quotients.
 BASES = (
-    "%|°|°C|°F|degC|degF|deg|grd|K|C|F|m|g|t|l|L|s|sec|h|hr|min|d|bar|barg|bara|Pa|psi|psig|A|V|W|VA|var|Wh|J|Hz|N|Nm|mol|"
-    "M|pH|ppm|ppb|rpm|lb|ft|in|gal|gpm|bbl|BTU|S|cP|Ω|Nm3|Sm3|m3|vol|vol%|wt%|pct"
+    "%|°|°C|°F|degC|degF|deg|grd|K|C|F|m|g|t|l|L|s|sec|h|hr|min|d|bar|barg|bara|Pa|psi|psig|A|V|W|VA|var|Wh|J|Hz|N|Nm|"
+    "mol|M|pH|ppm|ppb|rpm|lb|ft|in|gal|gpm|bbl|BTU|S|cP|Ω|Nm3|Sm3|m3|vol|vol%|wt%|pct"
 )
 ONE = rf"[kmµuMGcdh]?(?:{BASES})(?:[²³0-9]|\^-?[0-9])?"
 UNIT = re.compile(rf"^{ONE}(?:[/*·.\s]?{ONE})*$")
+
+SPELLINGS = {
+    "ns": (1e-9, "ns nsec nanosecond nanoseconds nanosekunde nanosekunden"),
+    "us": (1e-6, "us usec µs μs microsecond microseconds mikrosekunde mikrosekunden"),
+    "ms": (1e-3, "ms msec msecs millis millisecond milliseconds millisekunde millisekunden"),
+    "s": (1.0, "s sec secs second seconds sek sekunde sekunden seconde secondes segundo segundos secondi"),
+    "min": (60.0, "min mins minute minutes minuten minuto minutos minuti mn"),
+    "h": (3600.0, "h hr hrs hour hours std stunde stunden heure heures hora horas ore"),
+    "d": (86_400.0, "d day days tag tage jour jours día días dia dias giorni"),
+    "weeks": (604_800.0, "w wk wks week weeks woche wochen"),
+}
+TIME_UNITS = {word: factor for factor, words in SPELLINGS.values() for word in words.split()}  # to seconds
+ALONE = {word for word in TIME_UNITS if len(word) > 3 or word == "sec"} - {"days", "tage"}  # a header by itself
+NO_UNITS = {"", "utc", "gmt", "z", "local", "local time", "lokal", "epoch", "unix", "posix", "unix time", "-"}
+
+NAMES = {
+    "time_s", "time", "timestamp", "datetime", "date", "date time", "date/time", "datetimeutc", "ts", "t", "zeit",
+    "zeitstempel", "datum", "time stamp", "utc", "epoch", "index",
+}  # fmt: skip
+FIRST_WORDS = {
+    "time", "times", "timestamp", "timestamps", "datetime", "date", "ts", "t", "zeit", "zeitstempel", "zeitpunkt",
+    "datum", "utc", "epoch", "unix", "posix", "elapsed", "uhrzeit", "laufzeit", "tiempo", "fecha", "temps",
+    "horodatage", "tempo", "hora", "heure",
+}  # fmt: skip
+LAST_WORDS = {"time", "timestamp", "datetime", "zeit", "zeitstempel", "seconds", "elapsed"}
+VAGUE = {"t", "index", "tempo", "temps", "hora", "heure"}  # may be a temperature, or the number of a row
+DATES = {"date", "datum", "datetime", "timestamp", "fecha", "zeitstempel", "horodatage", "zeitpunkt"}
+BRACKET = re.compile(r"^(?P<name>.*?)\s*[\[({]\s*(?P<unit>[^\[\](){}]*?)\s*[\])}]\s*$")
+TAIL = re.compile(r"^(?P<name>.*?)(?:\s*[_\s./,:-]\s*|\s+in\s+)(?P<unit>[^\W\d_]+)\.?$")
+
+
+@dataclass(frozen=True, slots=True)
+class TimeHeader:
+    """A header read as that of a column of times."""
+
+    factor: float | None  # unit of its numbers to seconds; None where no unit is written
+    unknown: str  # what brackets hold that is no unit of time
+    rank: int  # 0 the exact name of a time, 1 begins with its word, 2 ends with it or may be another thing, 3 no time
+    date: bool  # the name is one of dates
+
+    @property
+    def named(self) -> bool:
+        """Whether the name is one of times."""
+        return self.rank < 3
 
 
 def split_header(column: str) -> tuple[str, str]:
     """(tag, unit) of a header: of ``TIC-7.PV [degC]``, ``TIC-7.PV (°C)``; the unit is empty where none is written.
 
-    Round brackets hold a unit only where they look like one: ``FI-7 (raw)`` is a tag, and ``P-7 (A)`` a pump.
+    The last square bracket holds the unit, unless it is a number, as of ``TIC[1]``. Round brackets hold one only
+    where they look like one: ``FI-7 (raw)`` is a tag, and ``P-7 (A)`` a pump.
     """
-    name, unit = split_column(column)
-    match = None if unit else ROUND.match(name)
+    column = " ".join(column.split())
+    square = SQUARE.match(column)
+    if square is not None:
+        unit = square["unit"].strip()
+        return (column, "") if unit.isdecimal() else (square["name"], unit)
+    match = ROUND.match(column)
     found = match["unit"].strip() if match else ""
     if match is None or not UNIT.match(found) or (len(found) == 1 and found.isupper()):
-        return name, unit
+        return column, ""
     return match["name"], found
+
+
+def tags_of(header: Sequence[str]) -> dict[str, str]:
+    """Column -> its tag without the unit; the whole header where two columns differ in their brackets only."""
+    own = {column: split_header(column)[0] for column in header}
+    times = Counter(own.values())
+    return {column: tag if times[tag] == 1 else column for column, tag in own.items()}
+
+
+def tag_named(text: str, columns: Mapping[str, str]) -> str:
+    """The tag that a person means by a tag, a header, or a header with a unit, of columns and their tags."""
+    if text in columns.values():
+        return text
+    return columns.get(text) or split_header(text)[0]
+
+
+def time_header(column: str) -> TimeHeader:
+    """The header as one of times: ``Time (min)``, ``elapsed [hr]``, ``t_ms``, ``Zeit s``, ``TIME/H``, ``minutes``."""
+    text = " ".join(column.split())
+    whole = text.lower()
+    factor, unknown, name = None, "", text
+    if (match := BRACKET.match(text)) is not None:
+        inner = match["unit"].lower().rstrip(".")
+        name, factor = match["name"], TIME_UNITS.get(inner)
+        unknown = "" if factor is not None or inner in NO_UNITS else match["unit"]
+    if factor is None and not unknown:
+        parts = TAIL.match(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name))
+        if parts is not None and parts["unit"].lower() in TIME_UNITS:
+            name, factor = parts["name"], TIME_UNITS[parts["unit"].lower()]
+        elif name.lower() in ALONE:
+            return TimeHeader(TIME_UNITS[name.lower()], unknown, 2, date=False)
+    words = [w for w in re.split(r"[\W_\d]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if w]
+    lower = name.strip().lower()
+    vague = lower in VAGUE
+    if (lower in NAMES or whole in NAMES) and not vague:
+        rank = 0
+    elif words and words[0] in FIRST_WORDS and not vague and words[0] not in VAGUE:
+        rank = 1
+    elif lower in VAGUE or (words and (words[0] in VAGUE - {"index"} or words[-1] in LAST_WORDS)):
+        rank = 2
+    else:
+        rank = 3
+    return TimeHeader(factor, unknown, rank, bool(words) and bool({words[0], words[-1]} & DATES))

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import RecordError, nearest
-from pipeline.historian.times import NAMES, Clock, clock_of
-from pipeline.records.record_file import split_column
+from pipeline.errors import RecordError
+from pipeline.historian.export import Note
+from pipeline.historian.headers import split_header, tags_of
+from pipeline.historian.quality import QUALITY, is_quality
+from pipeline.historian.table_head import kind_of_cell
+from pipeline.historian.time_column import TimeColumn, time_column_of
 
-TAG_NAMES = {"tag", "tagname", "tag name", "name", "point", "signal", "variable", "item", "pointname", "messstelle"}
-VALUE_NAMES = {"value", "val", "wert", "reading", "measurement", "tagvalue"}
-QUALITY = re.compile(r"^(?P<tag>.*?)[ ._:/-]*\(?(quality|status|qual|stat|opcquality)\)?$", re.IGNORECASE)
-DATE_NAMES, HOUR_NAMES = ("date", "datum", "day"), ("time", "zeit", "uhrzeit", "hour", "time of day")
-HOUR = re.compile(r"^\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?$")
+TAG_NAMES = {
+    "tag", "tagname", "tagid", "name", "point", "pointname", "pointid", "signal", "signalname", "variable", "varname",
+    "variablename", "item", "itemid", "itemname", "nodeid", "node", "sensor", "sensorid", "sensorname", "channel",
+    "channelname", "parameter", "parametername", "metric", "field", "measurand", "series", "id", "key", "object",
+    "messstelle", "messstellenname", "kanal", "bezeichnung", "datenpunkt", "größe", "groesse", "kennung", "messgröße",
+    "étiquette", "repère", "nom", "etiqueta", "punto", "nombre", "señal", "measurement", "desc", "description",
+    "beschreibung", "kks",
+}  # fmt: skip
+VALUE_NAMES = {
+    "value", "val", "wert", "messwert", "reading", "measurement", "tagvalue", "data", "result", "valeur", "valor",
+    "valore", "avg", "average", "mean", "numericvalue", "floatvalue", "doublevalue", "realvalue", "zahlenwert",
+    "istwert", "v", "vvalue", "pointvalue", "numeric", "analogvalue",
+}  # fmt: skip
 LONG_COLUMNS = 8  # more make a wide file
 
 
@@ -25,79 +36,112 @@ class Layout:
     """The columns of one file: ``wide`` has a column a tag, ``long`` the columns tag, time, value and quality."""
 
     kind: str
-    time: str
-    clock: Clock
+    time: TimeColumn
     values: tuple[str, ...]
     quality: Mapping[str, str]  # value column -> its quality's column
+    tags: Mapping[str, str]  # value column -> tag
     tag: str = ""
-    date: str = ""  # the column of the day, where ``time`` holds the hour alone
+    notes: tuple[Note, ...] = ()  # what was assumed
 
 
 def layout_of(
-    path: Path, header: Sequence[str], sample: Mapping[str, Sequence[Any]], time_column: str = "", time_format: str = ""
+    path: Path,
+    header: Sequence[str],
+    sample: Mapping[str, Sequence[Any]],
+    time_column: str = "",
+    time_format: str = "",
+    units: Mapping[str, str] | None = None,
+    spread: Callable[[str], Sequence[Any]] | None = None,
 ) -> Layout:
-    """The layout by the header and the first rows; RecordError where no column is time."""
-    date, time = ("", "") if time_column else _day_and_hour(header, sample)
-    if date:
-        both = [f"{a} {b}" for a, b in zip(sample[date], sample[time], strict=False)]
-        named, clock = "time", Clock("format", format=time_format) if time_format else None
-        clock = clock or clock_of(named, both[:200], f"{path}: columns {date!r} and {time!r}")
-        if clock is None:
-            raise RecordError(
-                f"{path}: {both[0]!r} of the columns {date!r} and {time!r} is no time that can be read; give its form "
-                "with --time-format, for example '%d.%m.%Y %H:%M:%S'"
-            )
-    else:
-        time, clock = _time(path, header, sample, time_column, time_format)
-    others = [h for h in header if h not in {time, date}]
-    lower = {h.strip().lower(): h for h in others}
-    tag = next((lower[n] for n in lower if n in TAG_NAMES), "")
-    value = next((lower[n] for n in lower if n in VALUE_NAMES), "")
-    if tag and value and len(header) <= LONG_COLUMNS:
-        quality = next((h for h in others if QUALITY.match(h) and h not in {tag, value}), "")
-        return Layout("long", time, clock, (value,), {value: quality} if quality else {}, tag, date)
-    qualities = {}
+    """The layout by the header and the first rows; RecordError where no column is time.
+
+    ``units`` stand below the header; ``spread`` gives cells from all over a column, where the first ones do not do.
+    """
+    more = spread or (lambda column: sample.get(column, ()))
+    time = time_column_of(path, header, sample, time_column, time_format, units or {}, more)
+    notes = [Note(time.name, words) for words in (time.left, time.clock.says) if words]
+    others = [h for h in header if h not in time.columns]
+    tag, value = _tag_and_value(others, sample, time)
+    if tag and value:
+        quality = next((h for h in others if h not in {tag, value} and _quality_word(h, sample) is not None), "")
+        qualities = {value: quality} if quality else {}
+        return Layout("long", time, (value,), qualities, tags_of(header), tag, tuple(notes))
+    qualities, whole = {}, ""
     for h in others:
-        match = QUALITY.match(h)
-        if match and match["tag"] and match["tag"] in others:
-            qualities[match["tag"]] = h
-    flags = set(qualities.values())
+        found = _quality_word(h, sample)
+        if found is None:
+            continue
+        own = [o for o in others if o != h and split_header(o)[0] in {found, found.rstrip(" ._:/-")}] if found else []
+        if own:
+            qualities[own[0]] = h
+        elif not found and not whole:
+            whole = h
+    flags = {*qualities.values(), *([whole] if whole else [])}
     values = tuple(h for h in others if h not in flags)
+    if whole:
+        qualities |= {v: whole for v in values if v not in qualities}
+        notes.append(Note(whole, "is the quality of every tag in its row"))
     if not values:
-        raise RecordError(f"{path}: there is no column beside the time {time!r}; export the tags too")
-    return Layout("wide", time, clock, values, qualities, date=date)
+        raise RecordError(f"{path}: there is no column beside the time {time.name!r}; export the tags too")
+    return Layout("wide", time, values, qualities, tags_of(header), notes=tuple(notes))
 
 
-def _day_and_hour(header: Sequence[str], sample: Mapping[str, Sequence[Any]]) -> tuple[str, str]:
-    """The columns of the day and of the hour, where time is written in two; "" twice where it is not."""
-    lower = {h.strip().lower(): h for h in header}
-    date = next((lower[n] for n in DATE_NAMES if n in lower), "")
-    time = next((lower[n] for n in HOUR_NAMES if n in lower), "")
-    if not (date and time and date != time):
+def _quality_word(column: str, sample: Mapping[str, Sequence[Any]]) -> str | None:
+    """The tag in front of a word of quality ("" for the word alone); None where the column is no quality."""
+    match = QUALITY.match(column)
+    if match is None or not is_quality(match["word"], _texts(sample.get(column, ()))):
+        return None
+    return match["tag"].strip()
+
+
+def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], time: TimeColumn) -> tuple[str, str]:
+    """The columns of the tag and of the value where a row is a reading; "" twice where it is not.
+
+    By their names; or by content: a column of words beside one of numbers, where each time has several words.
+    """
+    if len(others) + len(time.columns) > LONG_COLUMNS:
         return "", ""
-    days, hours = ([str(c).strip() for c in sample.get(h, ()) if str(c).strip()] for h in (date, time))
-    split = bool(days and hours) and all(HOUR.match(h) for h in hours) and not any(":" in d for d in days)
-    return (date, time) if split else ("", "")
+    kinds = {h: _kind(sample.get(h, ())) for h in others}
+    flags = {h for h in others if _quality_word(h, sample) is not None}
+    numbers = [h for h in others if kinds[h] in {"number", "empty"} and h not in flags]
+    words = [h for h in others if kinds[h] == "text" and h not in flags]
+    tags = [h for h in others if _plain(h) in TAG_NAMES and h not in flags]
+    values = [h for h in others if _plain(h) in VALUE_NAMES]
+    tag = next((h for h in tags if h in words), next((h for h in tags if _numbered(sample[h], numbers)), ""))
+    value = next((h for h in values if h in numbers and h != tag), next((h for h in values if h != tag), ""))
+    if tag and value:
+        return tag, value
+    if tag in words and len([n for n in numbers if n != tag]) == 1:
+        value = next(n for n in numbers if n != tag)
+        if len(set(_texts(sample[tag]))) > 1:
+            return tag, value
+    if len(numbers) == 1:
+        stamps = [_texts(sample.get(c, ())) for c in time.columns]
+        rows = list(zip(*stamps, strict=False))
+        for h in words:
+            cells = _texts(sample[h])
+            together = set(zip(rows, cells, strict=False))
+            if 1 < len(set(cells)) <= len(cells) // 2 and len(together) > 1.5 * len(set(rows)):
+                return h, numbers[0]
+    return "", ""
 
 
-def _time(
-    path: Path, header: Sequence[str], sample: Mapping[str, Sequence[Any]], named: str, time_format: str
-) -> tuple[str, Clock]:
-    if named:
-        if named not in header:
-            raise RecordError(f"{path}: no column {named!r} for --time{nearest(named, header)}")
-        order = [named]
-    else:
-        order = sorted(header, key=lambda h: split_column(h)[0].strip().lower() not in NAMES)
-    for column in order:
-        if time_format and (named or split_column(column)[0].strip().lower() in NAMES or len(order) == 1):
-            return column, Clock("format", format=time_format)
-        name = "time" if named and split_column(column)[0].lower() not in NAMES else column
-        clock = clock_of(name, sample.get(column, ())[:200], f"{path}: column {column!r}")
-        if clock is not None:
-            return column, clock
-    shown = next((str(sample[c][0]) for c in order if sample.get(c)), "nothing")
-    raise RecordError(
-        f"{path}: no column holds times that can be read ({order[0]!r} begins with {shown!r}); name the column with "
-        "--time, its form with --time-format, for example '%d.%m.%Y %H:%M:%S'"
-    )
+def _numbered(cells: Sequence[Any], numbers: Sequence[str]) -> bool:
+    """Whether the numbers of a column are tags: they come again, and beside them stands one column of values."""
+    texts = _texts(cells)
+    return 1 < len(set(texts)) <= len(texts) // 2 and len(numbers) == 2
+
+
+def _plain(column: str) -> str:
+    """The header in small letters, without its unit, blanks and signs."""
+    return re.sub(r"[\W_]+", "", split_header(column)[0].lower())
+
+
+def _texts(cells: Sequence[Any]) -> list[str]:
+    return ["" if c is None else str(c).strip() for c in cells]
+
+
+def _kind(cells: Sequence[Any]) -> str:
+    """What most cells of a column are: "number", "time", "text", or "empty"."""
+    kinds = [kind_of_cell(t) for t in _texts(cells) if t]
+    return max(set(kinds), key=kinds.count) if kinds else "empty"

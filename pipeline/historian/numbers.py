@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from typing import Any
 
@@ -13,8 +14,27 @@ from numpy.typing import NDArray
 from pipeline.historian.reason import Reason
 from pipeline.metrics import Array
 
-EMPTY = ("", "nan", "null", "none", "na", "n/a", "#n/a", "#nv", "-", "--", "?", "<null>")
+EMPTY = ("", "nan", "null", "none", "na", "n/a", "#n/a", "#nv", "-", "--", "?", "<null>", "1.#qnan", "-1.#ind")
 PLAIN = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+MINUS = (
+    "\u2212\u2010\u2011\u2012\u2013\u2014\ufe58\ufe63\uff0d"  # minus, hyphens and dashes that programs write for one
+)
+UNSEEN = "\u200b\u200e\u200f\u2060\ufeff\u00ad"  # of no width
+BLANKS = " \t\u00a0\u2000-\u200a\u202f\u205f\u3000"
+BETWEEN = rf"[{BLANKS}'’‘ʼ`´]"  # between thousands
+GROUPED = rf"^[+-]?\d{{1,3}}({BETWEEN}\d{{3}})+([.,]\d*)?([eE][+-]?\d+)?$"
+THOUSANDS = {  # by the decimal sign: certain ones, and those of one sign alone, which may be a decimal sign
+    ".": (
+        r"^[+-]?\d{1,3}(,\d{3})*(,\d{3}\.\d*|,\d{3},\d{3})$", r"^[+-]?\d{1,3},\d{3}$",
+        r"^[+-]?\d*,\d+([eE][+-]?\d+)?$",
+    ),
+    ",": (
+        r"^[+-]?\d{1,3}(\.\d{3})*(\.\d{3},\d*|\.\d{3}\.\d{3})$", r"^[+-]?\d{1,3}\.\d{3}$",
+        r"^[+-]?\d*\.\d+([eE][+-]?\d+)?$",
+    ),
+}  # fmt: skip
+OTHER = {".": ",", ",": "."}
+LOOSE = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 
 Codes = NDArray[np.uint8]
 
@@ -28,22 +48,39 @@ def numbers(column: Any, decimal: str = ".") -> tuple[Array, Codes, Counter[str]
         return np.full(len(column), np.nan), np.full(len(column), Reason.EMPTY, np.uint8), Counter()
     if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
         return _of_numbers(column)
+    quick = column
     if decimal == ",":
-        column = _with_points(column)
+        if pc.any(pc.match_substring(column, ".")).as_py():
+            return _of_texts(column, decimal)
+        quick = pc.replace_substring(column, ",", ".")
     try:
         # Empty cells are no reason for the slow way.
-        found = pc.cast(pc.if_else(pc.equal(column, ""), pa.scalar(None, kind), column), pa.float64())
+        found = pc.cast(pc.if_else(pc.equal(quick, ""), pa.scalar(None, kind), quick), pa.float64())
     except pa.ArrowInvalid:
-        return _of_texts(column, "" if decimal == "," else ",")
+        return _of_texts(column, decimal)
     return _of_numbers(found)
 
 
-def _with_points(column: Any) -> Any:
-    """1.234,5 as 1234.5; a number with a decimal point among those with a comma may be either, and becomes a text."""
-    if pc.any(pc.match_substring(column, ".")).as_py():
-        grouped = pc.match_substring_regex(column, r"^\s*[+-]?\d{1,3}(\.\d{3})+(,\d+)?\s*$")
-        column = pc.if_else(grouped, pc.replace_substring(column, ".", ""), pc.replace_substring(column, ".", " . "))
-    return pc.replace_substring(column, ",", ".")
+def plain(text: str) -> str:
+    """The cell with the signs of a plain number: every minus is ``-``, no blanks or apostrophes between thousands."""
+    return str(_plain(pa.array([text]))[0])
+
+
+def loose_number(text: str) -> float | None:
+    """The number that a text shows beside other signs, as ``(5,2)`` or ``< 0.5``; None for none or several."""
+    found = LOOSE.findall(plain(text).replace("- ", "-"))
+    return float(found[0].replace(",", ".")) if len(found) == 1 else None
+
+
+def _plain(column: Any) -> Any:
+    text = pc.replace_substring_regex(column, f"[{UNSEEN}]", "")
+    text = pc.replace_substring_regex(text, f"[{MINUS}]", "-")
+    text = pc.replace_substring(text, "\uff0b", "+")
+    text = pc.replace_substring_regex(text, rf"^[{BLANKS}]+|[{BLANKS}]+$", "")
+    text = pc.replace_substring_regex(text, rf"^([+-])[{BLANKS}]+(\d)", r"\1\2")
+    text = pc.replace_substring_regex(text, r"^(\d[\d.,]*)-$", r"-\1")  # 5.2- as some programs write -5.2
+    grouped = pc.match_substring_regex(text, GROUPED)
+    return pc.if_else(grouped, pc.replace_substring_regex(text, BETWEEN, ""), text)
 
 
 def _of_numbers(column: Any) -> tuple[Array, Codes, Counter[str]]:
@@ -59,18 +96,35 @@ def _of_numbers(column: Any) -> tuple[Array, Codes, Counter[str]]:
     return values, codes, Counter({"inf": int(endless.sum())} if endless.any() else {})
 
 
-def _of_texts(column: Any, thousands: str) -> tuple[Array, Codes, Counter[str]]:
+def _of_texts(column: Any, decimal: str) -> tuple[Array, Codes, Counter[str]]:
     text = pc.fill_null(pc.utf8_trim_whitespace(column), "")
-    if thousands:
-        grouped = pc.match_substring_regex(text, r"^[+-]?\d{1,3}(,\d{3})+(\.\d+)?$")
-        text = pc.if_else(grouped, pc.replace_substring(text, thousands, ""), text)
-    plain = pc.match_substring_regex(text, PLAIN)
-    digits = pc.utf8_ltrim(pc.if_else(plain, text, pa.scalar(None, text.type)), "+")
+    points = _with_points(_plain(text), decimal)
+    plain_ones = pc.match_substring_regex(points, PLAIN)
+    digits = pc.utf8_ltrim(pc.if_else(plain_ones, points, pa.scalar(None, points.type)), "+")
     values = np.array(pc.cast(digits, pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
-    empty = pc.is_in(pc.utf8_lower(text), value_set=pa.array(EMPTY, text.type)).to_numpy(zero_copy_only=False)
+    empty = pc.is_in(pc.utf8_lower(_plain(text)), value_set=pa.array(EMPTY, text.type)).to_numpy(zero_copy_only=False)
     codes = np.full(len(values), Reason.TEXT, np.uint8)
     codes[empty] = Reason.EMPTY
     codes[np.isfinite(values)] = Reason.GOOD
     values[~np.isfinite(values)] = np.nan
     words = text.filter(pa.array(codes == Reason.TEXT))
     return values, codes, Counter({row["values"]: row["counts"] for row in pc.value_counts(words).to_pylist()})
+
+
+def _with_points(text: Any, decimal: str) -> Any:
+    """1.234,5 as 1234.5 where the comma is the decimal sign, 1,234.5 where the point is.
+
+    A number with the other sign is neither, and stays as it is, a text. Where such ones stand beside 1,234 or 1.234,
+    these may be either too.
+    """
+    certain, one_sign, other = THOUSANDS[decimal]
+    groups = pc.match_substring_regex(text, certain)
+    single = pc.match_substring_regex(text, one_sign)
+    strange = pc.and_not(pc.match_substring_regex(text, other), single)
+    if not pc.any(strange).as_py():
+        groups = pc.or_(groups, single)
+    if decimal == ".":
+        return pc.if_else(groups, pc.replace_substring(text, ",", ""), text)
+    own = pc.if_else(groups, pc.replace_substring(text, ".", ""), text)
+    mine = pc.invert(pc.match_substring(own, "."))
+    return pc.if_else(mine, pc.replace_substring(own, ",", "."), pc.binary_join_element_wise(own, pa.scalar(""), "?"))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC as UTC_ZONE
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +19,21 @@ import pyarrow.parquet as pq
 from pipeline.errors import RecordError, nearest
 from pipeline.files import sha256
 from pipeline.historian.dialect import Dialect, sniff
-from pipeline.historian.export import Contents, Export, Series, joined
+from pipeline.historian.export import Contents, Export, Note, Series, joined
+from pipeline.historian.file_kinds import kind_of
 from pipeline.historian.gathering import Gathered
-from pipeline.historian.headers import split_header
+from pipeline.historian.headers import split_header, tag_named, tags_of
 from pipeline.historian.layout import Layout, layout_of
 from pipeline.historian.sent_again import drop_repeated_rows
-from pipeline.historian.times import zone_of
+from pipeline.historian.times import UNSTATED, UTC, zone_of
+from pipeline.historian.workbook import sheet_of, text_of
+from pipeline.historian.zones import LocalClock, zone_named
 
 BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17
+SPREAD = 1_000  # cells of a block
 PARQUET = {".parquet", ".pq"}
+DAY_S, HALF_DAY_S = 86_400.0, 43_200.0
 
 
 @dataclass(slots=True)
@@ -40,6 +47,16 @@ class Opened:
     decimal: str
     blocks: Callable[[Sequence[str]], Iterator[Any]]
     unreadable: Counter[str]  # "rows": lines of another length than the header's
+    notes: tuple[Note, ...] = ()
+
+    def spread(self, column: str) -> list[Any]:
+        """Cells from all over a column."""
+        cells = list[Any]()
+        for block in self.blocks([column]):
+            own = block.column(0)
+            cells += own.take(pa.array(range(0, len(own), max(1, len(own) // SPREAD)))).to_pylist()
+        self.unreadable.clear()
+        return cells
 
 
 def opened(path: Path) -> Opened:
@@ -49,7 +66,10 @@ def opened(path: Path) -> Opened:
     if not path.exists():
         raise RecordError(f"{path}: no such file; give the path of an export")
     try:
-        return _parquet(path) if path.suffix.lower() in PARQUET else _text(path, sniff(path))
+        kind = kind_of(path)
+        if kind == "parquet" or path.suffix.lower() in PARQUET:
+            return _parquet(path)
+        return _workbook(path) if kind == "workbook" else _text(path, sniff(path, kind), kind)
     except (pa.ArrowException, OSError, UnicodeError, LookupError, EOFError) as error:
         raise RecordError(f"{path} cannot be read: {str(error).splitlines()[0]}; export the file again") from None
 
@@ -60,22 +80,28 @@ def read_export(
     modes: Sequence[str] = (),
     time_column: str = "",
     time_format: str = "",
+    time_zone: str = "",
 ) -> Export:
     """The series of ``tags`` and ``modes`` (texts allowed) of all files; of every column where none is named.
 
-    Raises RecordError for a file that cannot be read, a tag that none of them has, time that cannot be read.
+    ``time_zone`` is that of dates that state none. Raises RecordError for a file that cannot be read, a tag that none
+    of them has, time that cannot be read.
     """
     if not paths:
         raise RecordError("no file is named; give one or more exports")
     parts: dict[str, list[Series]] = {}
     files, kinds, zones, totals, contents = [], [], list[str](), Counter[str](), list[Contents]()
-    known: set[str] = set()
-    tags, modes = [bare(t) for t in tags], [bare(t) for t in modes]
-    for path in paths:
-        source = opened(path)
-        layout = layout_of(source.path, source.header, source.sample, time_column, time_format)
-        found, counts = _read(source, layout, set(tags) | set(modes), set(modes))
-        zones.append(zone_of(layout.clock, source.sample[layout.date or layout.time]))
+    known, notes = set[str](), list[Note]()
+    sources = [opened(path) for path in paths]
+    columns = {column: tag for source in sources for column, tag in tags_of(source.header).items()}
+    tags, modes = [tag_named(t, columns) for t in tags], [tag_named(t, columns) for t in modes]
+    for path, source in zip(paths, sources, strict=True):
+        layout = layout_of(path, source.header, source.sample, time_column, time_format, source.units, source.spread)
+        zone = zone_of(layout.time.clock, source.sample[layout.time.columns[0]])
+        clock = LocalClock(time_zone, zone_named(time_zone)) if time_zone and zone == UNSTATED else None
+        found, counts, more = _read(source, layout, set(tags) | set(modes), set(modes), clock)
+        notes += [*source.notes, *layout.notes, *more]
+        zones.append(UTC if clock else zone)
         drop_repeated_rows(found)
         contents.append(_contents(path, found, counts["rows_read"]))
         for name, series in found.items():
@@ -84,7 +110,7 @@ def read_export(
         totals += counts + source.unreadable
         kinds.append(layout.kind)
         files.append((str(path), sha256(path)))
-        known |= set(found) if layout.kind == "long" else set(map(bare, layout.values))
+        known |= set(found) if layout.kind == "long" else {layout.tags[v] for v in layout.values}
     absent = [f"no tag {tag!r}{nearest(tag, known)}" for tag in (*tags, *modes) if tag not in parts]
     if absent:
         raise RecordError(f"{', '.join(map(str, paths))}: {'; '.join(absent)}")
@@ -95,7 +121,13 @@ def read_export(
     zone = zones[0] if len(set(zones)) == 1 else ""  # of files that count differently no date is known
     rows = totals["rows_read"] + totals["rows"]
     unreadable, timeless = totals["rows"], totals["timeless"]
-    return Export(together, tuple(files), layouts, rows, unreadable, timeless, zone, tuple(contents))
+    if unreadable or timeless:
+        words = f"{unreadable} have another number of cells than the header, {timeless} no time that can be read"
+        notes.append(Note(f"{rows} rows of the export", f"{words}: they are left out"))
+    if time_zone and not any(n.column == time_zone for n in notes):
+        raise RecordError(f"--time-zone {time_zone}: no file has dates without a zone of their own; leave it out")
+    own = tuple(dict.fromkeys(notes))
+    return Export(together, tuple(files), layouts, rows, unreadable, timeless, zone, tuple(contents), own)
 
 
 def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
@@ -108,10 +140,25 @@ def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
 
 
 def units_of(paths: Sequence[Path]) -> dict[str, str]:
-    """Column -> the unit that a row below the header or brackets in the header name."""
+    """Tag -> the unit that a row below the header or brackets in the header name."""
     found: dict[str, str] = {}
     for path in paths:
-        found |= {bare(k): v for k, v in opened(path).units.items() if v}
+        source = opened(path)
+        tags = tags_of(source.header)
+        found |= {tags[k]: v for k, v in source.units.items() if v}
+    return found
+
+
+def tags_in(paths: Sequence[Path]) -> set[str]:
+    """Tags that the headers of files name, and of rows that are a reading those of the first ones."""
+    found = set[str]()
+    for source in map(opened, paths):
+        found |= {*tags_of(source.header).values(), *source.header}
+        try:
+            layout = layout_of(source.path, source.header, source.sample, units=source.units, spread=source.spread)
+        except RecordError:  # the same file is refused when it is read
+            continue
+        found |= {str(c).strip() for c in source.sample.get(layout.tag, ())}
     return found
 
 
@@ -121,23 +168,32 @@ def bare(column: str) -> str:
 
 
 # ---------------------------------------------------------------------- one file
-def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> tuple[dict[str, Series], Counter[str]]:
+def _read(
+    source: Opened, layout: Layout, wanted: set[str], modes: set[str], local: LocalClock | None
+) -> tuple[dict[str, Series], Counter[str], list[Note]]:
     gather = Gathered(modes, source.decimal, wide=layout.kind == "wide")
     counts: Counter[str] = Counter()
-    values = {v: bare(v) for v in layout.values if not wanted or {v, bare(v)} & wanted or layout.kind == "long"}
+    values = {
+        v: layout.tags[v] for v in layout.values if not wanted or layout.tags[v] in wanted or layout.kind == "long"
+    }
     qualities = {v: layout.quality[v] for v in values if v in layout.quality}
-    names = [n for n in dict.fromkeys((layout.date, layout.time, layout.tag, *values, *qualities.values())) if n]
+    time, midnights = layout.time, Midnights()
+    names = [n for n in dict.fromkeys((*time.columns, layout.tag, *values, *qualities.values())) if n]
     try:
         for block in source.blocks(names):
             counts["rows_read"] += block.num_rows
-            seconds = layout.clock.seconds(_stamps(block, layout))
+            seconds = time.clock.seconds(_stamps(block, layout))
+            if time.clock.kind == "elapsed" and layout.kind == "wide":
+                seconds = midnights.passed(seconds)
+            seconds = local.utc(seconds) if local else seconds
             timed = np.isfinite(seconds)
             if not timed.all():
                 counts["timeless"] += int(np.count_nonzero(~timed))
                 block, seconds = block.filter(pa.array(timed)), seconds[timed]
             if layout.kind == "wide":
                 for v, name in values.items():
-                    gather.add(name, seconds, block.column(v), block.column(qualities[v]) if v in qualities else None)
+                    own = qualities.get(v, "")
+                    gather.add(name, seconds, block.column(v), block.column(own) if own else None, own)
             else:
                 _long_block(gather, layout, block, seconds, wanted)
     except (pa.ArrowException, OSError, UnicodeError, EOFError) as error:
@@ -146,17 +202,52 @@ def _read(source: Opened, layout: Layout, wanted: set[str], modes: set[str]) -> 
         ) from None
     if counts["rows_read"] and counts["timeless"] == counts["rows_read"]:
         raise RecordError(
-            f"{source.path}: no time of column {layout.time!r} can be read; name the column with --time, its form with "
+            f"{source.path}: no time of column {time.name!r} can be read; name the column with --time, its form with "
             "--time-format"
         )
-    return gather.series(), counts
+    series = gather.series()
+    notes = [Note(column, words) for column, words in gather.says.items() if words]
+    return series, counts, notes + (_of_zone(source.path, local) if local else [])
+
+
+def _of_zone(path: Path, local: LocalClock) -> list[Note]:
+    """What was made of local times; RecordError where some do not exist in their zone."""
+    if local.missing:
+        stamp = datetime.fromtimestamp(local.missing[0], UTC_ZONE).strftime("%Y-%m-%d %H:%M:%S")
+        raise RecordError(
+            f"{path}: {len(local.missing)} times such as {stamp} do not exist in the zone {local.name}, whose clocks "
+            "skip them; where the export keeps winter time all year give its offset, as in --time-zone +01:00"
+        )
+    twice = f"; {local.told} readings of an hour that came twice by their order" if local.told else ""
+    return [Note(local.name, f"is the zone of the export's times, kept as UTC{twice}")]
+
+
+@dataclass(slots=True)
+class Midnights:
+    """Hours of the day without a date, block by block: each fall by more than half a day is a midnight."""
+
+    last_s: float = np.nan
+    days: int = 0
+
+    def passed(self, seconds: Any) -> Any:
+        """Seconds (n,) since the first midnight."""
+        known = np.flatnonzero(np.isfinite(seconds))
+        if not known.size:
+            return seconds
+        own = seconds[known]
+        falls = np.diff(np.r_[own[0] if np.isnan(self.last_s) else self.last_s, own]) < -HALF_DAY_S
+        days = self.days + np.cumsum(falls)
+        self.last_s, self.days = float(own[-1]), int(days[-1])
+        out = seconds.copy()
+        out[known] = own + DAY_S * days
+        return out
 
 
 def _stamps(block: Any, layout: Layout) -> Any:
     """The column of times, put together where day and hour stand apart."""
-    if not layout.date:
-        return block.column(layout.time)
-    parts = [pc.utf8_trim_whitespace(pc.cast(block.column(c), pa.string())) for c in (layout.date, layout.time)]
+    if not layout.time.date:
+        return block.column(layout.time.name)
+    parts = [pc.utf8_trim_whitespace(pc.cast(block.column(c), pa.string())) for c in layout.time.columns]
     return pc.binary_join_element_wise(*parts, " ")
 
 
@@ -167,13 +258,13 @@ def _long_block(gather: Gathered, layout: Layout, block: Any, seconds: Any, want
     tags = tags.combine_chunks() if isinstance(tags, pa.ChunkedArray) else tags
     index = np.asarray(tags.indices.fill_null(-1).to_numpy(zero_copy_only=False))
     (value,) = layout.values
-    quality = layout.quality.get(value)
+    quality = layout.quality.get(value, "")
     for i, name in enumerate(tags.dictionary.to_pylist()):
         name = str(name).strip()
         rows = np.flatnonzero(index == i)
         if rows.size and (not wanted or name in wanted):
             part = block.take(pa.array(rows))
-            gather.add(name, seconds[rows], part.column(value), part.column(quality) if quality else None)
+            gather.add(name, seconds[rows], part.column(value), part.column(quality) if quality else None, quality)
 
 
 # ---------------------------------------------------------------------- formats
@@ -191,7 +282,18 @@ def _parquet(path: Path) -> Opened:
     return Opened(path, header, sample, {n: split_header(n)[1] for n in header}, ".", blocks, Counter())
 
 
-def _text(path: Path, dialect: Dialect) -> Opened:
+def _workbook(path: Path) -> Opened:
+    sheet = sheet_of(path)
+    used = [n for i, n in enumerate(sheet.header) if any(row[i] is not None for row in sheet.rows)]
+    sample = {n: [text_of(row[i]) for row in sheet.rows] for i, n in enumerate(sheet.header)}
+    units = {n: unit or split_header(n)[1] for n, unit in zip(sheet.header, sheet.units, strict=True)}
+    left = f"; the sheets {', '.join(sheet.others)} were not read" if sheet.others else ""
+    notes = (Note(str(path), f"the sheet {sheet.name!r} was read{left}"),) if left else ()
+    return Opened(path, tuple(used), sample, units, ".", sheet.blocks, Counter(), notes)
+
+
+def _text(path: Path, dialect: Dialect, kind: str) -> Opened:
+    used = tuple(n for n in dialect.header if n not in dialect.unused)
     sample = {n: [row[i] for row in dialect.rows] for i, n in enumerate(dialect.header)}
     unreadable: Counter[str] = Counter()
 
@@ -200,7 +302,7 @@ def _text(path: Path, dialect: Dialect) -> Opened:
         return "skip"
 
     def blocks(names: Sequence[str]) -> Iterator[Any]:
-        stream = pa.input_stream(str(path), compression="gzip" if path.suffix.lower() == ".gz" else None)
+        stream = pa.input_stream(str(path), compression="gzip" if kind == "gzip" else None)
         encoding = "utf8" if dialect.encoding in {"utf-8", "utf-8-sig"} else dialect.encoding
         yield from pa_csv.open_csv(
             stream,
@@ -218,4 +320,4 @@ def _text(path: Path, dialect: Dialect) -> Opened:
         )
 
     units = {n: unit or split_header(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
-    return Opened(path, dialect.header, sample, units, dialect.decimal, blocks, unreadable)
+    return Opened(path, used, sample, units, dialect.decimal, blocks, unreadable)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +14,18 @@ from pipeline.historian.cells import MV_CONVERSIONS, outliers, unit_slips, usual
 from pipeline.historian.copies import copied
 from pipeline.historian.dialect import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, Verdict
 from pipeline.historian.missing_codes import sentinels
+from pipeline.historian.numbers import loose_number
 from pipeline.historian.reason import Reason
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
 
 RANGE_SLACK = 0.1  # of a PV's given range: noise at its ends
+ONE_SIDED = "one_sided"  # kind of a finding
+FEW_TEXTS, MANY_TEXTS = 3, 0.01  # texts, and their share of the readings
+LEAST_READINGS, FEW_NEIGHBOURS = 50, 8
+ONE_SIDE, END_SHARE = 0.9, 0.25  # of the texts, or of the readings beside them, at one end; the share that is an end
 MOSTLY = 0.5  # of the readings outside the given range: then the range or its unit is wrong
 
 
@@ -31,6 +38,9 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
         mixed = any(COMMA_DECIMAL.match(t) or POINT_DECIMAL.match(t) for t in series.texts)
         hint = "; decimal points and commas are mixed, write one of them" if mixed else ""
         found.append(Finding("text", tag.tag, f"text where a number belongs: {words}{hint}", True))
+        if side := text_side(series):
+            words = f"its readings that are text stand at the {side} end of what it reads, so that this end is lost"
+            found.append(Finding(ONE_SIDED, tag.tag, words, True))
     if counts.get("quality"):
         found.append(Finding("quality", tag.tag, f"quality is not good in {counts['quality']} readings", True))
     if counts.get("duplicate"):
@@ -38,7 +48,8 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
         found.append(Finding("duplicate", tag.tag, words, True))
     if counts.get("clock"):
         words = (
-            f"{counts['clock']} readings have an ambiguous time: the clock was set back, or zones are mixed; export UTC"
+            f"{counts['clock']} readings have an ambiguous time: the clock was set back, or zones are mixed; export "
+            "UTC, or name the zone with --time-zone"
         )
         found.append(Finding("clock", tag.tag, words, True))
     if tag.role == "pv" and (n := series.flag(_copies(series), Reason.COPY)):
@@ -58,6 +69,45 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
         place = np.flatnonzero(series.good & (series.value != 0.0))  # zero is a closed valve in every unit
         found += _slipped(series, tag, place, *unit_slips(series.value[place], MV_CONVERSIONS))
     return found
+
+
+def text_side(series: Series) -> str:
+    """At which end of its readings a tag's texts stand, "low" or "high"; "" where at neither, or too few are known.
+
+    The numbers that texts show, as (5.2) or < 0.5, lie nearly all outside the other readings; or texts are many, and
+    the readings next to them are nearly all the lowest or the highest ones.
+    """
+    good = series.value[series.good]
+    if good.size < LEAST_READINGS:
+        return ""
+    shown = [(v, n) for t, n in series.texts.items() if (v := loose_number(t)) is not None]
+    total = sum(n for _, n in shown)
+    if total >= FEW_TEXTS and 2 * total >= series.texts.total():
+        low, high = float(good.min()), float(good.max())
+        for side, n in (("low", sum(n for v, n in shown if v <= low)), ("high", sum(n for v, n in shown if v >= high))):
+            if n >= ONE_SIDE * total:
+                return side
+    texts = np.flatnonzero(series.code == Reason.TEXT)
+    if len(texts) < max(FEW_TEXTS, MANY_TEXTS * len(series)):
+        return ""
+    place = np.flatnonzero(series.good)
+    after = np.searchsorted(place, texts)
+    near = np.unique(np.r_[place[after[after < len(place)]], place[after[after > 0] - 1]])
+    if len(near) < FEW_NEIGHBOURS:
+        return ""
+    rank = np.searchsorted(np.sort(good), series.value[near]) / len(good)
+    share = max((np.mean(rank > 1 - END_SHARE), "high"), (np.mean(rank < END_SHARE), "low"))
+    return share[1] if share[0] >= ONE_SIDE else ""
+
+
+def with_texts_of_one_side(verdict: Verdict, findings: Sequence[Finding]) -> Verdict:
+    """The verdict, "doubtful" at best where one end of a tag's readings was refused as text."""
+    tags = [f.tag for f in findings if f.kind == ONE_SIDED]
+    if not tags:
+        return verdict
+    words = f"one end of the readings of {', '.join(tags)} is text where a number belongs: export them as numbers"
+    carries = verdict.carries if verdict.carries == "no" else "doubtful"
+    return replace(verdict, carries=carries, reasons=(*verdict.reasons, words))
 
 
 def _copies(series: Series) -> NDArray[np.bool_]:

@@ -61,6 +61,11 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
     return found
 
 
+def of_notes(export: Export) -> list[Finding]:
+    """What was assumed when the files were read: their times, qualities, sheets."""
+    return [Finding("reading", note.column, note.words) for note in export.notes]
+
+
 def of_files(export: Export, tags: Sequence[Tag]) -> list[Finding]:
     """Tags that one of several files lacks, while no other file has them at its time."""
     found = []

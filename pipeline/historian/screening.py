@@ -24,9 +24,9 @@ from pipeline.historian.linear import Linear
 from pipeline.historian.modes import check_modes
 from pipeline.historian.pace import of_period, pace_of
 from pipeline.historian.pulses import pulses
-from pipeline.historian.readings import clean, reasons_of
+from pipeline.historian.readings import clean, reasons_of, with_texts_of_one_side
 from pipeline.historian.reason import Reason
-from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_series
+from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_notes, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.sampling import Sampling, proposed_period, sampling
 from pipeline.historian.static import explained
@@ -69,7 +69,7 @@ def screened(
     """
     own = {t.tag: export.series[t.tag] for t in tags}
     check_modes(without_modes, tags, own)
-    findings: list[Finding] = [*of_files(export, tags)]
+    findings: list[Finding] = [*of_notes(export), *of_files(export, tags)]
     for tag in tags:
         if tag.role != "mode":
             findings += clean(own[tag.tag], tag)
@@ -126,6 +126,7 @@ def screened(
     counts = np.bincount(code, minlength=len(Reason))
     verdict = with_levels(judged(excerpt, models, moved, len(record), drifts), excerpt, tags)
     verdict = with_rows_out_of_range(verdict, int(counts[Reason.RANGE]), len(code))
+    verdict = with_texts_of_one_side(verdict, findings)
     findings += of_answers([s.name for s in record.pv_signals], verdict)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -107,15 +107,24 @@ def named(tags: Sequence[Tag]) -> tuple[Tag, ...]:
     return tuple(found)
 
 
-def parse_tag(text: str, role: str) -> Tag:
-    """A tag of an option: ``TAG``, ``TAG[unit]``, ``TAG[unit]=LOW..HIGH``; RecordError for another form."""
+def parse_tag(text: str, role: str, known: Callable[[], Collection[str]] = frozenset) -> Tag:
+    """A tag of an option: ``TAG``, ``TAG[unit]``, ``TAG[unit]=LOW..HIGH``; RecordError for another form.
+
+    Where the last bracket may belong to the tag, as of ``TIC[1]``, the tags ``known`` from the files decide.
+    """
     match = OPTION.match(text.strip())
-    if match is None or "]" in match["tag"]:
+    if match is None or match["tag"].count("[") != match["tag"].count("]"):
         raise RecordError(
             f"--{role} {text}: write TAG, TAG[unit] or TAG[unit]=LOW..HIGH, as in TIC-101.PV[degC]=0..200"
         )
     low, high = (_number(match[key], f"--{role} {text}") if match[key] else None for key in ("low", "high"))
-    tag = Tag(match["tag"].strip(), role, (match["unit"] or "").strip(), low, high)
+    name, unit = match["tag"].strip(), (match["unit"] or "").strip()
+    if match["unit"] is not None:
+        whole = text.strip()[: match.end("unit") + 1]
+        tags = known()
+        if whole in tags or (name not in tags and unit.isdecimal()):
+            name, unit = (whole, "") if name not in tags or unit.isdecimal() else (name, unit)
+    tag = Tag(name, role, unit, low, high)
     if wrong := _wrong(tag):
         raise RecordError(f"--{role} {text}: {'; '.join(wrong)}")
     return tag

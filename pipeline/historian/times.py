@@ -13,32 +13,60 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.errors import RecordError
+from pipeline.historian.date_forms import ELAPSED, calendar_digits, form_of, other_forms, plain_date
+from pipeline.historian.headers import SPELLINGS, TIME_UNITS, TimeHeader, time_header
 from pipeline.metrics import Array
-from pipeline.records.record_file import split_column
 
-NAMES = {
-    "time_s", "time", "timestamp", "datetime", "date", "date time", "date/time", "datetimeutc", "ts", "t", "zeit",
-    "zeitstempel", "datum", "time stamp", "utc", "epoch", "index",
-}  # fmt: skip
 ISO = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?\s*(Z|[+-]\d\d:?(\d\d)?)?$", re.IGNORECASE)
 ZONE = re.compile(r"\d\s*(Z|[+-]\d\d:?(\d\d)?)$", re.IGNORECASE)
 NUMERIC = re.compile(r"^[+-]?\d+([.,]\d+)?([eE][+-]?\d+)?$")
-SHORT = re.compile(r"^(\d{1,4})([./-])(\d{1,2}|[A-Za-z]{3})\2(\d{4}|\d{2})(?=\D|$)(.*)$")
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
-EXCEL_DAYS = 20_000.0, 80_000.0  # since 1899-12-30: years 1954 to 2119
-EXCEL_EPOCH_S = 25_569 * 86_400.0
+DAY_S = 86_400.0
 SINCE_1970_S = 1e8  # numbers of seconds from here on (1973) count from 1970; smaller ones from some start
 UTC, UNSTATED = "UTC", "the export states no zone"
 
 
 @dataclass(frozen=True, slots=True)
+class Days:
+    """A count of days that programs write: which numbers are such, and where it has 1970."""
+
+    words: str
+    low: float
+    high: float
+    at_1970: float
+
+
+# Numbers of a spreadsheet are days since 1899-12-30: these are years 1968 to 2077. With the other origin of some old
+# workbooks, 1904, the same numbers are four years later; they cannot be told apart, and the steps are the same.
+SERIAL = Days("dates of a spreadsheet, in days since 1899-12-30", 25_000.0, 65_000.0, 25_569.0)
+DAYS = (
+    SERIAL,
+    Days("dates of MATLAB, in days since the year 0", 700_000.0, 770_000.0, 719_529.0),
+    Days("Julian dates, in days", 2.43e6, 2.49e6, 2_440_587.5),
+)
+# Ticks of 100 ns: of .NET since the year 1, of Windows since 1601.
+TICKS = ((6.2e17, 6.6e17, 62_135_596_800.0), (1.25e17, 1.45e17, 11_644_473_600.0))
+STARTS = {d.at_1970 * DAY_S for d in DAYS}
+SERIAL_UNIT = "serial"
+FEW_DAYS = 2.0
+
+
+@dataclass(frozen=True, slots=True)
 class Clock:
-    """How one column writes time: ``iso``, ``number`` (seconds = scale x value - start_s) or a ``format``."""
+    """How one column writes time: ``iso``, ``number`` (seconds = scale x value - start_s), ``elapsed`` or a ``format``.
+
+    ``elapsed`` is 26:03:10 since some start. ``says`` is what was assumed, for a person; empty where all is written.
+    """
 
     kind: str
     scale: float = 1.0
     start_s: float = 0.0
     format: str = ""
+    says: str = ""
+
+    @property
+    def dates(self) -> bool:
+        """Whether the column writes dates, and no numbers or hours alone."""
+        return self.kind in {"iso", "format"}
 
     def seconds(self, column: Any) -> Array:
         """Seconds (n,) of an Arrow column (n,); NaN where a stamp cannot be read."""
@@ -53,93 +81,136 @@ class Clock:
                     column = pa.array([_number(c) for c in column.to_pylist()], pa.float64())
             values = np.asarray(pc.cast(column, pa.float64(), safe=False).to_numpy(zero_copy_only=False), np.float64)
             return values * self.scale - self.start_s
-        if self.kind == "iso":
-            return _iso(column)
-        import pandas as pd  # only files with such dates need it
-
-        stamps = pd.to_datetime(column.to_pandas().str.strip(), format=self.format, errors="coerce")
-        return _of_timestamps(pa.array(stamps.dt.as_unit("us")))
+        column = pc.cast(column, pa.string())
+        if self.kind == "elapsed":
+            return np.array([_elapsed(c) for c in column.to_pylist()], dtype=np.float64)
+        return _iso(column) if self.kind == "iso" else _formatted(column, self.format)
 
 
-def clock_of(name: str, sample: Sequence[Any], where: str) -> Clock | None:
+def clock_of(name: str, sample: Sequence[Any], where: str, unit: str = "") -> Clock | None:
     """The clock of a column by its name and first cells (texts or numbers); None where they are no times.
 
-    RecordError for a date whose day and month cannot be told apart.
+    ``unit`` is what a row below the header says. RecordError for a date whose day and month cannot be told apart, and
+    for numbers in an unknown unit.
     """
     cells = [c for c in sample if c is not None and str(c).strip() != ""]
     if not cells:
         return None
     texts = [str(c).strip() for c in cells]
-    if all(isinstance(c, int | float) for c in cells) or all(NUMERIC.match(t) for t in texts):
-        return _numeric(name, np.array([float(t.replace(",", ".")) for t in texts]))
+    header = time_header(name)
+    numbers = all(isinstance(c, int | float) and not isinstance(c, bool) for c in cells)
+    if numbers or all(NUMERIC.match(t) for t in texts):
+        return (
+            _numeric(header, np.array([float(t.replace(",", ".")) for t in texts]), where, unit)
+            if header.named
+            else None
+        )
     if _most(texts, ISO):
         return Clock("iso")
-    if _most(texts, SHORT):
-        return Clock("format", format=_format(texts, where))
+    if form := form_of(texts, where):
+        return Clock("format", format=form)
+    if header.named and _most(texts, ELAPSED):
+        return Clock("elapsed", says="hours, minutes and seconds without a date")
     return None
+
+
+def given_clock(form: str) -> Clock:
+    """The clock of a form that a person gave: as of strptime, or a unit of numbers (ms, s, min, h, d, serial)."""
+    if form.lower() == SERIAL_UNIT:
+        return Clock("number", DAY_S, SERIAL.at_1970 * DAY_S)
+    if form.lower() in TIME_UNITS:
+        return Clock("number", TIME_UNITS[form.lower()])
+    if "%" not in form:
+        raise RecordError(
+            f"--time-format {form}: write a form as in '%d.%m.%Y %H:%M:%S', or a unit of numbers: {allowed_units()}"
+        )
+    return Clock("format", format=form)
+
+
+def allowed_units() -> str:
+    """The units of time that a header may have."""
+    return ", ".join((*SPELLINGS, SERIAL_UNIT))
 
 
 def zone_of(clock: Clock, sample: Sequence[Any]) -> str:
     """The zone that a clock's seconds count in, by the first cells: UTC, or UNSTATED; "" where they are no dates."""
     cells = [c for c in sample if c is not None and str(c).strip() != ""]
-    if not cells:
+    if not cells or clock.kind == "elapsed":
         return ""
     if isinstance(cells[0], date):
         return UTC if getattr(cells[0], "tzinfo", None) else UNSTATED
     if clock.kind == "number":
-        first = float(str(cells[0]).replace(",", ".")) * clock.scale - clock.start_s
-        return "" if first < SINCE_1970_S else UNSTATED if clock.start_s else UTC
+        first = _number(str(cells[0]).replace(",", ".")) * clock.scale - clock.start_s
+        return "" if not first >= SINCE_1970_S else UNSTATED if clock.start_s in STARTS else UTC
     if clock.kind == "iso":
         return UTC if ZONE.search(str(cells[0]).strip()[10:]) else UNSTATED
-    return UNSTATED
+    return UTC if "%z" in clock.format else UNSTATED
 
 
 def _most(texts: Sequence[str], pattern: re.Pattern[str]) -> bool:
     return 2 * sum(bool(pattern.match(t)) for t in texts) > len(texts)
 
 
-def _numeric(name: str, values: Array) -> Clock | None:
-    base, unit = split_column(name)
-    base = base.lower()
-    tail = base.rpartition("_")[2]
-    unit = unit or (tail if tail in UNITS and base != tail else "")
-    if base not in NAMES and not base.startswith(("time", "t_", "epoch", "timestamp", "unix")):
-        return None
+def _numeric(header: TimeHeader, values: Array, where: str, unit: str) -> Clock:
+    factor = header.factor
+    if factor is None and unit:
+        factor = TIME_UNITS.get(unit.strip().lower().rstrip("."))
+    unknown = header.unknown or (unit if unit and factor is None else "")
+    if factor is None and unknown:
+        raise RecordError(
+            f"{where}: {unknown!r} is no unit of time that is known; write one of {allowed_units()} in the "
+            "header, or give --time-format with one of them"
+        )
     size = float(np.median(np.abs(values)))
-    if unit in UNITS and unit != "s":
-        return Clock("number", UNITS[unit])
-    if unit != "s" and EXCEL_DAYS[0] < size < EXCEL_DAYS[1] and np.ptp(values) < 2.0 and np.any(values % 1):
-        return Clock("number", 86_400.0, EXCEL_EPOCH_S)
+    if factor in {None, DAY_S} and (days := _days(header, values, factor)) is not None:
+        return Clock("number", DAY_S, days.at_1970 * DAY_S, says=f"numbers are {days.words}")
+    if factor is not None and factor != 1.0:
+        return Clock("number", factor)
+    if factor is None and (form := calendar_digits(values.tolist(), days=header.date)):
+        return Clock("format", format=form)
+    for low, high, start_s in TICKS:
+        if low < size < high:
+            return Clock("number", 1e-7, start_s, says="numbers are ticks of 100 ns")
     # Seconds since 1970 have ten digits, milliseconds thirteen.
     scale = 1.0 if size < 1e11 else 1e-3 if size < 1e14 else 1e-6 if size < 1e17 else 1e-9
-    return Clock("number", scale)
+    assumed = factor is None and size < SINCE_1970_S
+    says = "numbers are taken as seconds, no unit is written; --time-format names another, as in --time-format min"
+    return Clock("number", scale, says=says if assumed else "")
 
 
-def _format(texts: Sequence[str], where: str) -> str:
-    found = [m for m in map(SHORT.match, texts) if m]
-    _, sign, second, year, rest = found[0].groups()
-    if second.isalpha():
-        order = ["%d", "%b"]
-    else:
-        firsts, seconds = [int(m[1]) for m in found], [int(m[3]) for m in found if m[3].isdigit()]
-        if max(firsts) > 12 or sign == ".":
-            order = ["%d", "%m"]
-        elif max(seconds) > 12:
-            order = ["%m", "%d"]
-        else:
-            raise RecordError(
-                f"{where}: {texts[0]!r} may be month/day or day/month; give --time-format, "
-                "for example '%d/%m/%Y %H:%M:%S', or export ISO-8601 times"
-            )
-    date = sign.join([*order, "%Y" if len(year) == 4 else "%y"])
-    clock = ["%H", "%M", "%S"][: rest.count(":") + 1] if ":" in rest else []
-    half = rest.strip().upper().endswith(("AM", "PM"))
-    hours = ":".join(clock).replace("%H", "%I" if half else "%H")
-    fraction = re.search(r":\d\d([.,])\d+", rest) if rest.count(":") > 1 else None
-    separator = "T" if rest.startswith("T") else " "
-    return (
-        date + (separator + hours if clock else "") + (f"{fraction[1]}%f" if fraction else "") + (" %p" if half else "")
-    )
+def _days(header: TimeHeader, values: Array, factor: float | None) -> Days | None:
+    """The count of days that numbers are, by their size, their digits and the header; None where they are seconds.
+
+    Seconds since a start, in the middle of a long record, have few digits. So have few dates: those of eighths of a
+    day. Whole numbers are days only under the name of a date.
+    """
+    own = next((d for d in DAYS if np.all((values > d.low) & (values < d.high))), None)
+    if own is None or factor == DAY_S or header.date:
+        return own
+    if not np.any(values % 1):
+        return None
+    digits = bool(np.any(np.abs(values * 1000 - np.round(values * 1000)) > 1e-6))
+    eighths = bool(np.all(values * 8 == np.round(values * 8)))
+    return own if digits or eighths or np.ptp(values) < FEW_DAYS else None
+
+
+def _formatted(column: Any, form: str) -> Array:
+    import pandas as pd  # only files with such dates need it
+
+    text = column.to_pandas().str.strip()
+    utc = "%z" in form
+    stamps = pd.to_datetime(text, format=form, errors="coerce", utc=utc)
+    lost = stamps.isna() & text.notna() & (text != "")
+    if lost.any():
+        plain = text[lost].map(plain_date)
+        for other in other_forms(form):
+            again = pd.to_datetime(plain, format=other, errors="coerce", utc=utc)
+            stamps = stamps.fillna(again)
+            plain = plain[again.isna()]
+            if plain.empty:
+                break
+    stamps = stamps.dt.tz_localize(None) if utc else stamps
+    return _of_timestamps(pa.array(stamps.dt.as_unit("us")))
 
 
 def _iso(column: Any) -> Array:
@@ -170,3 +241,11 @@ def _number(cell: str | None) -> float:
         return float(cell) if cell else float("nan")
     except ValueError:
         return float("nan")
+
+
+def _elapsed(cell: str | None) -> float:
+    """Seconds of 26:03:10.5."""
+    if not cell or not ELAPSED.match(cell.strip()):
+        return float("nan")
+    hours, minutes, seconds = cell.strip().replace(",", ".").split(":")
+    return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)

@@ -1,0 +1,177 @@
+"""Forms of dates that are not ISO-8601: day and month told apart, year first or last, months by name, AM and PM."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+
+from pipeline.errors import RecordError
+
+DATE = re.compile(r"^(?P<a>\d{1,4})(?P<sign>[./\- ])(?P<b>\d{1,2})(?P=sign)(?P<c>\d{4}|\d{1,2})(?P<rest>(?:\D.*)?)$")
+COMPACT = re.compile(
+    r"^(?P<date>\d{8})(?P<sign>[T _-]?)(?P<clock>\d{6}|\d{4}|\d{2}:\d\d(?::\d\d)?)?(?P<rest>[.,]?\d*Z?)$"
+)
+REST = re.compile(
+    r"^(?P<gap>[T ,;]*\s*)(?P<clock>\d{1,2}(?P<sign>[:.])\d\d(?:(?P=sign)\d\d)?)(?P<part>[.,:]\d+)?"
+    r"\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d\d:?\d\d)?$"
+)
+HOUR = re.compile(r"^\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?$")
+ELAPSED = re.compile(r"^\d{1,5}:\d\d:\d\d([.,]\d+)?$")
+MONTHS = (
+    "jan januar january janvier enero ene gennaio gen", "feb februar february février fevrier fév febrero febbraio",
+    "mar mär mrz märz march mars marzo", "apr april avril avr abril abr aprile", "may mai mayo maggio mag",
+    "jun juni june juin junio giugno giu", "jul juli july juillet juil julio luglio lug",
+    "aug august août aout agosto ago", "sep sept september septembre septiembre settembre set",
+    "oct okt oktober october octobre octubre ottobre ott", "nov november novembre noviembre",
+    "dec dez dezember december décembre déc diciembre dic dicembre",
+)  # fmt: skip
+MONTH = {word: number for number, words in enumerate(MONTHS, 1) for word in words.split()}
+WORD = re.compile(r"[^\W\d_]{3,9}\.?")
+WEEKDAY = re.compile(r"^[^\W\d_]{2,10}[.,]*\s+(?=\d)")
+PLAIN_ENDS = re.compile(r"(?:([AaPp])\.\s?[Mm]\.|\s*(?:UTC|GMT))$")
+SOME = 0.05  # of the dates, whose form counts
+LEAST_YEAR, MOST_YEAR = 1990, 2100
+ORDERS = {"dmy": ("%d", "%m", "%y"), "mdy": ("%m", "%d", "%y"), "ymd": ("%y", "%m", "%d")}
+
+
+def form_of(texts: Sequence[str], where: str) -> str:
+    """The form, as of strptime, of most of the dates, of which `plain_date` may have to be taken; empty for no dates.
+
+    RecordError where day and month, or year and day, cannot be told apart.
+    """
+    named = 2 * sum(_month_by_name(t) for t in texts) > len(texts)
+    plain = [plain_date(t) for t in texts]
+    compact = [m for m in map(COMPACT.match, plain) if m]
+    if 2 * len(compact) > len(plain):
+        return _compact(compact)
+    found = [m for m in map(DATE.match, plain) if m and len(m["a"]) != 3]
+    if 2 * len(found) <= len(plain):
+        return ""
+    sign = Counter(m["sign"] for m in found).most_common(1)[0][0]
+    own = [m for m in found if m["sign"] == sign]
+    tails = Counter(tail for m in own if (tail := _tail(m["rest"])) is not None)
+    if 2 * sum(tails.values()) <= len(plain):
+        return ""
+    # What is zero may be left out, so that the longest form has all parts.
+    tail = max((t for t, n in tails.items() if n >= SOME * len(own)), key=len)
+    order = ("%d", "%b", "%Y" if len(own[0]["c"]) == 4 else "%y") if named else _order(own, texts[0], where)
+    order = ("%Y", "%b", "%d") if named and len(own[0]["a"]) == 4 else order
+    return sign.join(order) + tail
+
+
+def plain_date(text: str) -> str:
+    """The date as strptime reads it: no day of the week, a month's number for its name, +0000 for UTC, pm for p.m."""
+    text = PLAIN_ENDS.sub(lambda m: f"{m[1]}m" if m[1] else "+0000", text)
+    american = re.match(r"^([^\W\d_]{3,9})\.? (\d{1,2}),? (\d{4})(.*)$", text)
+    if american and american[1].lower() in MONTH:
+        return f"{american[2]} {MONTH[american[1].lower()]:02d} {american[3]}{american[4]}"
+    text = WEEKDAY.sub("", text)
+    return WORD.sub(lambda m: f"{MONTH[w]:02d}" if (w := m[0].lower().rstrip(".")) in MONTH else m[0], text)
+
+
+def other_forms(form: str) -> Iterator[str]:
+    """Forms of the same dates with a fraction of a second, or without what is zero: fraction, seconds, time."""
+    form = form.replace("%b", "%m")
+    yield form
+    if "%f" in form:
+        yield re.sub(r"[.,:]%f", "", form)
+    elif "%S" in form:
+        yield form.replace("%S", "%S.%f")
+    if "%S" in form:
+        yield re.sub(r"[:.]%S([.,:]%f)?", "", form)
+    if "%H" in form or "%I" in form:
+        yield re.split(r"[T ,;]*%[HI]", form)[0]
+
+
+def _month_by_name(text: str) -> bool:
+    return any(m.lower().rstrip(".") in MONTH for m in WORD.findall(text))
+
+
+def calendar_digits(values: Sequence[float], *, days: bool) -> str:
+    """The form of numbers that are dates without signs, as 20240304060000 or ``days``; empty where they are none."""
+    texts = [f"{v:.0f}" for v in values if v == v // 1]
+    if len(texts) < len(values) or len({len(t) for t in texts}) != 1:
+        return ""
+    form = {14: "%Y%m%d%H%M%S", 12: "%Y%m%d%H%M", 8: "%Y%m%d" * days}.get(len(texts[0]), "")
+    return form if form and all(_is_date(t, form) for t in texts) else ""
+
+
+def _is_date(text: str, form: str) -> bool:
+    try:
+        return LEAST_YEAR <= datetime.strptime(text, form).year <= MOST_YEAR
+    except ValueError:
+        return False
+
+
+def _compact(found: Sequence[re.Match[str]]) -> str:
+    first = found[0]
+    clock, rest = first["clock"] or "", first["rest"]
+    form = "%Y%m%d" + first["sign"]
+    if ":" in clock:
+        form += ":".join(["%H", "%M", "%S"][: clock.count(":") + 1])
+    elif clock:
+        form += "%H%M%S"[: len(clock)]
+    digits = rest.rstrip("Z")
+    return form + (f"{digits[0]}%f" if digits else "") + ("%z" if rest.endswith("Z") else "")
+
+
+def _tail(rest: str) -> str | None:
+    """The form of what stands after the date; None where it is no time of the day."""
+    if not rest.strip():
+        return ""
+    match = REST.match(rest)
+    if match is None:
+        return None
+    half = " %p" if match["half"] else ""
+    clock = ["%I" if half else "%H", "%M", "%S"][: match["clock"].count(match["sign"]) + 1]
+    part = f"{match['part'][0]}%f" if match["part"] else ""
+    half = half if not half or re.search(r"\d\s+[AaPp]", rest) else "%p"
+    zone = "" if not match["zone"] else " %z" if re.search(r"\s(?:Z|[+-]\d\d:?\d\d)$", rest) else "%z"
+    return match["gap"] + match["sign"].join(clock) + part + half + zone
+
+
+def _order(found: Sequence[re.Match[str]], first: str, where: str) -> tuple[str, ...]:
+    """The order of day, month and year of dates with one sign between them."""
+    sign, long_year = found[0]["sign"], len(found[0]["c"]) == 4
+    if len(found[0]["a"]) == 4:
+        return "%Y", "%m", "%d"
+    numbers = [(int(m["a"]), int(m["b"]), int(m["c"])) for m in found]
+    a, b, c = (max(n[i] for n in numbers) for i in range(3))
+    possible = {
+        "dmy": a <= 31 and b <= 12,
+        "mdy": a <= 12 and b <= 31 and sign != ".",
+        "ymd": not long_year and b <= 12 and c <= 31 and (sign == "-" or a > 31),
+    }
+    if sign == "." and possible["dmy"]:
+        possible["ymd"] = False
+    orders = [order for order, may in possible.items() if may]
+    if len(orders) > 1:
+        orders = _steady(numbers, orders)
+    if len(orders) != 1:
+        what, forms = ("month/day or day/month", "'%d/%m/%Y %H:%M:%S'") if {*orders} <= {"dmy", "mdy"} else (
+            "day or year first", "'%y-%m-%d %H:%M:%S'")  # fmt: skip
+        raise RecordError(
+            f"{where}: {first!r} may be {what}; give --time-format, for example {forms}, or export ISO-8601 times"
+        )
+    order = ORDERS[orders[0]]
+    return tuple("%Y" if part == "%y" and long_year else part for part in order)
+
+
+def _steady(numbers: Sequence[tuple[int, int, int]], orders: Sequence[str]) -> list[str]:
+    """The orders in which the dates go on by a day at a time, where they are dates of several days; else all."""
+    days: dict[str, list[int]] = {}
+    for order in orders:
+        try:
+            parts = [dict(zip(order, n, strict=True)) for n in numbers]
+            days[order] = [datetime(2000 + p["y"] % 100, p["m"], p["d"]).toordinal() for p in parts]
+        except ValueError:
+            continue
+    spans = {order: max(d) - min(d) for order, d in days.items()}
+    different = len(set(numbers))
+    if different < 2:
+        return list(orders)
+    # Consecutive days are as many as the span between the first and the last; months and years are not.
+    near = [order for order, span in spans.items() if span <= 3 * different]
+    return near if len(near) == 1 else list(orders)

@@ -1,0 +1,245 @@
+"""Which column is the time, in which unit it counts, how it writes dates, and in which zone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from dirty_plant import write
+
+from pipeline.errors import RecordError
+from pipeline.historian.export import Export
+from pipeline.historian.headers import time_header
+from pipeline.historian.reading import read_export
+from pipeline.historian.times import clock_of
+
+START_S = 1_709_532_000.0  # 2024-03-04 06:00 UTC
+N = 40
+STEP_S = 30.0
+TIME_S = START_S + STEP_S * np.arange(N)
+VALUES = [f"{50 + 5 * np.sin(k):.3f}" for k in range(N)]
+
+
+def read(tmp_path: Path, header: Sequence[str], *columns: Sequence[str], **options: str) -> Export:
+    path = write(tmp_path / "x.csv", list(zip(*columns, strict=True)), header)
+    return read_export([path], ["TIC.PV"], **options)
+
+
+def times_of(tmp_path: Path, name: str, stamps: Sequence[str], **options: str) -> np.ndarray:
+    return read(tmp_path, (name, "TIC.PV"), stamps, VALUES[: len(stamps)], **options).series["TIC.PV"].time_s
+
+
+def stamped(form: str, times: np.ndarray = TIME_S) -> list[str]:
+    return [pd.Timestamp(t, unit="s").strftime(form) for t in times]
+
+
+UNITS = {
+    1e-9: ["ns", "nsec", "nanoseconds"], 1e-6: ["us", "µs", "μs", "usec", "microseconds"],
+    1e-3: ["ms", "msec", "millis", "milliseconds", "Millisekunden"],
+    1.0: ["s", "S", "sec", "secs", "seconds", "Sekunden"],
+    60.0: ["min", "MIN", "mins", "minute", "minutes", "Minuten"], 3600.0: ["h", "hr", "hrs", "hours", "Stunden", "std"],
+    86_400.0: ["d", "day", "days", "Tage"],
+}  # fmt: skip
+FORMS = ["Time [{}]", "time ({})", "Zeit({})", "elapsed {{{}}}", "time_{}", "Time {}", "t/{}", "Time in {}", "TIME, {}"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("factor", UNITS)
+def test_every_spelling_of_a_unit_of_time(factor: float, form: str) -> None:
+    for unit in UNITS[factor]:
+        clock = clock_of(form.format(unit), ["0", "1", "2"], "x.csv")
+        assert clock is not None, unit
+        assert (clock.kind, clock.scale, clock.says) == ("number", factor, ""), unit
+
+
+@pytest.mark.parametrize(("header", "factor"), [("Time (min)", 60), ("t [hr]", 3600), ("t_ms", 1e-3), ("TimeMin", 60),
+                                                ("minutes", 60), ("Elapsed Time, h", 3600)])  # fmt: skip
+def test_times_in_a_unit_are_read_as_seconds(header: str, factor: float, tmp_path: Path) -> None:
+    stamps = [f"{t / factor:.9g}" for t in STEP_S * np.arange(N)]
+    np.testing.assert_allclose(times_of(tmp_path, header, stamps), STEP_S * np.arange(N), atol=1e-6)
+
+
+def test_a_unit_below_the_header_counts(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "x.csv", [["min", "degC"], *([str(k), v] for k, v in enumerate(VALUES))], ("time", "TIC.PV")
+    )
+    np.testing.assert_allclose(read_export([path], ["TIC.PV"]).series["TIC.PV"].time_s, 60.0 * np.arange(N))
+
+
+@pytest.mark.parametrize("header", ["Time (m)", "time [foo]", "Zeit [Takte]"])
+def test_an_unknown_unit_is_refused_and_a_person_may_name_it(header: str, tmp_path: Path) -> None:
+    stamps = [str(k) for k in range(N)]
+    with pytest.raises(RecordError, match="is no unit of time that is known; write one of ns, us, ms, s, min, h, d"):
+        times_of(tmp_path, header, stamps)
+    np.testing.assert_allclose(times_of(tmp_path, header, stamps, time_format="min"), 60.0 * np.arange(N))
+
+
+@pytest.mark.parametrize("header", ["FI-7 [min]", "TIC.PV (h)", "Level s", "T (°C)", "Run hours"])
+def test_a_tag_is_no_time(header: str) -> None:
+    assert not time_header(header).named or time_header(header).rank == 2
+
+
+def test_numbers_without_a_unit_are_seconds_and_said(tmp_path: Path) -> None:
+    export = read(tmp_path, ("time", "TIC.PV"), [str(k) for k in range(N)], VALUES)
+    assert [n.column for n in export.notes] == ["time"]
+    assert not read(tmp_path, ("time_s", "TIC.PV"), [str(k) for k in range(N)], VALUES).notes
+
+
+@pytest.mark.parametrize("step_s", [1.0, 60.0, 900.0, 3600.0, 21_600.0, 86_400.0])
+@pytest.mark.parametrize("digits", [6, 10])
+def test_dates_of_a_spreadsheet_are_days_whatever_their_step(step_s: float, digits: int, tmp_path: Path) -> None:
+    times = 1_709_510_400.0 + step_s * np.arange(N)
+    stamps = [f"{25_569 + t / 86_400:.{digits}f}" for t in times]
+    found = times_of(tmp_path, "Date", stamps)
+    np.testing.assert_allclose(found, times, atol=86_400 * 10.0**-digits)
+    if step_s < 86_400 or digits == 0:  # a day has no fraction that tells it from seconds, but for the name
+        np.testing.assert_allclose(times_of(tmp_path, "Time", stamps), times, atol=86_400 * 10.0**-digits)
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0, 5.0])
+def test_seconds_in_the_middle_of_a_record_are_no_dates(step: float, tmp_path: Path) -> None:
+    stamps = [f"{45_000 + step * k:g}" for k in range(N)]
+    np.testing.assert_allclose(times_of(tmp_path, "time", stamps), 45_000 + step * np.arange(N))
+
+
+@pytest.mark.parametrize(
+    ("stamp", "atol"),
+    [
+        (lambda t: f"{719_529 + t / 86_400:.9f}", 1e-3),  # MATLAB
+        (lambda t: f"{2_440_587.5 + t / 86_400:.9f}", 1e-3),  # Julian
+        (lambda t: f"{int(t + 62_135_596_800) * 10**7}", 1e-3),  # ticks of .NET
+        (lambda t: f"{int(t + 11_644_473_600) * 10**7}", 1e-3),  # ticks of Windows
+        (lambda t: f"{int(t) * 10**9}", 1e-3),
+        (lambda t: pd.Timestamp(t, unit="s").strftime("%Y%m%d%H%M%S"), 1e-3),
+    ],
+    ids=["MATLAB", "Julian", ".NET", "Windows", "ns", "digits"],
+)
+def test_counts_that_programs_write(stamp: Callable[[float], str], atol: float, tmp_path: Path) -> None:
+    np.testing.assert_allclose(times_of(tmp_path, "timestamp", [stamp(float(t)) for t in TIME_S]), TIME_S, atol=atol)
+
+
+FORMS_OF_DATES = [
+    "%Y/%m/%d %H:%M:%S", "%Y.%m.%d %H:%M:%S", "%d.%m.%Y %H.%M.%S", "%d.%m.%y %H:%M:%S", "%d-%b-%Y %I:%M:%S %p",
+    "%b %d, %Y %I:%M:%S %p", "%Y%m%dT%H%M%SZ", "%Y%m%d %H:%M:%S", "%Y-%m-%d %H:%M:%S UTC", "%a %d.%m.%Y %H:%M:%S",
+    "%d.%m.%Y %H:%M:%S:000", "%d.%m.%Y %H:%M:%S,000000", "%Y-%m-%dT%H:%M:%S.000000000Z", "%d %B %Y %H:%M:%S",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS_OF_DATES)
+def test_forms_of_dates(form: str, tmp_path: Path) -> None:
+    np.testing.assert_allclose(times_of(tmp_path, "x", stamped(form)), TIME_S, atol=1e-3)
+
+
+def test_german_months_midnight_and_whole_minutes(tmp_path: Path) -> None:
+    for month, number in (("Mrz", 3), ("Mai", 5), ("Okt", 10), ("Dez", 12)):
+        times = pd.Timestamp(f"2024-{number:02d}-04 06:00").timestamp() + STEP_S * np.arange(N)
+        stamps = [s.replace("#", month) for s in stamped("%d-#-%Y %H:%M:%S", times)]
+        np.testing.assert_allclose(times_of(tmp_path, "x", stamps), times)
+    times = pd.Timestamp("2024-03-04").timestamp() + STEP_S * np.arange(N)
+    short = [s.removesuffix(" 00:00:00") for s in stamped("%d.%m.%Y %H:%M:%S", times)]
+    assert short[0] == "04.03.2024"
+    np.testing.assert_allclose(times_of(tmp_path, "x", short), times)
+
+
+@pytest.mark.parametrize(("form", "days"), [("%y-%m-%d", 3), ("%d-%m-%y", 3), ("%m/%d/%Y", 20), ("%d/%m/%Y", 20)])
+def test_day_month_and_year_are_told_by_how_they_go_on(form: str, days: int, tmp_path: Path) -> None:
+    times = pd.Timestamp("2024-03-04 06:00").timestamp() + days * 86_400 / N * np.arange(N)
+    found = times_of(tmp_path, "x", stamped(f"{form} %H:%M:%S", times))
+    np.testing.assert_allclose(found, times, atol=1)
+
+
+@pytest.mark.parametrize("form", ["%y-%m-%d %H:%M:%S", "%d/%m/%Y %H:%M:%S", "%m/%d/%y %H:%M:%S"])
+def test_what_cannot_be_told_is_refused(form: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match=r"may be .* give --time-format"):
+        times_of(tmp_path, "x", stamped(form))
+
+
+def test_hours_of_the_day_count_over_midnight(tmp_path: Path) -> None:
+    times = 23 * 3600 + 3000 + STEP_S * np.arange(N)
+    found = times_of(tmp_path, "Time", stamped("%H:%M:%S", times))
+    np.testing.assert_allclose(found, times)
+
+
+DATES = stamped("%Y-%m-%d %H:%M:%S")
+
+
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [
+        ("index", [str(k) for k in range(N)]),
+        ("T", VALUES),
+        ("t", VALUES),
+        ("time", [str(k) for k in range(N)]),
+        ("Date of calibration", ["2020-05-17"] * N),
+        ("epoch", [f"{t:.0f}" for t in TIME_S + 7200]),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_dates_that_rise_are_the_time(name: str, other: list[str], first: bool, tmp_path: Path) -> None:
+    columns = {name: other, "Recorded at": DATES}
+    order = list(columns) if first else list(columns)[::-1]
+    export = read(tmp_path, (*order, "TIC.PV"), *(columns[c] for c in order), VALUES)
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, TIME_S)
+    named = read(tmp_path, (*order, "TIC.PV"), *(columns[c] for c in order), VALUES, time_column="Recorded at")
+    np.testing.assert_allclose(named.series["TIC.PV"].time_s, TIME_S)
+    said = [n for n in export.notes if n.column == "Recorded at"]
+    assert bool(said) == (name in {"index", "time", "epoch"})
+
+
+def test_a_temperature_alone_is_no_time(tmp_path: Path) -> None:
+    for name in ("T", "T_s", "T (°C)"):
+        with pytest.raises(RecordError, match="no column holds times"):
+            read(tmp_path, (name, "TIC.PV"), VALUES, VALUES)
+
+
+def test_newest_rows_first(tmp_path: Path) -> None:
+    export = read(tmp_path, ("T", "Datum", "TIC.PV"), VALUES, DATES[::-1], VALUES[::-1])
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, TIME_S)
+    np.testing.assert_allclose(export.series["TIC.PV"].value, [float(v) for v in VALUES])
+
+
+# ---------------------------------------------------------------------- zones
+@pytest.mark.parametrize("newest_first", [False, True])
+@pytest.mark.parametrize("day", ["2024-10-26 18:00", "2024-03-30 18:00", "2024-07-01"])
+def test_local_times_of_a_zone_become_utc(day: str, newest_first: bool, tmp_path: Path) -> None:
+    utc = pd.date_range(day, periods=100, freq="10min", tz="UTC")
+    stamps = [t.strftime("%d.%m.%Y %H:%M:%S") for t in utc.tz_convert("Europe/Berlin")]
+    values = [str(k) for k in range(100)]
+    way = slice(None, None, -1 if newest_first else 1)
+    export = read(tmp_path, ("Zeit", "TIC.PV"), stamps[way], values[way], time_zone="Europe/Berlin")
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, utc.as_unit("s").asi8)
+    np.testing.assert_allclose(export.series["TIC.PV"].value, np.arange(100))
+    assert export.series["TIC.PV"].counts() == {"good": 100}
+    assert export.zone == "UTC"
+
+
+def test_an_offset_is_a_zone(tmp_path: Path) -> None:
+    found = times_of(tmp_path, "Zeit", stamped("%d.%m.%Y %H:%M:%S", TIME_S + 5400), time_zone="+01:30")
+    np.testing.assert_allclose(found, TIME_S)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "zone", "says"),
+    [
+        (stamped("%Y-%m-%d %H:%M:%S"), "Europe/Berlon", "no such zone"),
+        (stamped("%Y-%m-%dT%H:%M:%SZ"), "Europe/Berlin", "no file has dates without a zone"),
+        (["2024-03-31 01:59:30", "2024-03-31 02:00:00", "2024-03-31 02:00:30"], "Europe/Berlin", "do not exist"),
+    ],
+)
+def test_a_zone_that_cannot_be_is_refused(stamps: list[str], zone: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match=says):
+        times_of(tmp_path, "x", stamps, time_zone=zone)
+
+
+def test_dates_are_told_by_rows_far_below(tmp_path: Path) -> None:
+    times = pd.Timestamp("2024-03-04 06:00").timestamp() + 600.0 * np.arange(2500)
+    for form in ("%d/%m/%Y", "%m/%d/%Y", "%y-%m-%d"):
+        rows = [[s, "1.5"] for s in stamped(f"{form} %H:%M:%S", times)]
+        export = read_export([write(tmp_path / "x.csv", rows, ("time", "TIC.PV"))])
+        np.testing.assert_allclose(export.series["TIC.PV"].time_s, times)
+        apart = [[*s.split(), v] for s, v in rows]
+        export = read_export([write(tmp_path / "y.csv", apart, ("Day", "Hour", "TIC.PV"))])
+        np.testing.assert_allclose(export.series["TIC.PV"].time_s, times)
