@@ -102,8 +102,10 @@ def _run(options: argparse.Namespace) -> int:
     export = asked(options, given)
     tags = with_units(controlled_first(named(given)), export)
     found = screened_export(export, tags)
-    if found.report.period_s != found.step_s:  # the record that stage `screen` makes has the same one
-        export = dataclasses.replace(export, period_s=found.report.period_s)
+    period_s = found.report.period_s
+    # The record that stage `screen` makes has the same one; that of longer files may differ in its last digits.
+    if period_s != found.step_s or period_s != float(f"{period_s:.3g}"):
+        export = dataclasses.replace(export, period_s=period_s)
     return _write(name, folder, found, options, tags, export=export)
 
 

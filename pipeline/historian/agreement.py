@@ -58,8 +58,8 @@ def check_period(params: ExportParams, plant: PlantParams, period_s: float) -> N
     """ParamsError where the record has another sampling period than the plant."""
     if period_s != plant.period_s:
         raise ParamsError(
-            f"the record of exports.{params.case} has a period of {period_s:g} s, plants.{params.case} has "
-            f"{plant.period_s:g} s; write `period_s: {plant.period_s:g}` in exports.{params.case}, or "
+            f"the record of exports.{params.case} has a period of {period_s:.9g} s, plants.{params.case} has "
+            f"{plant.period_s:.9g} s; write `period_s: {plant.period_s}` in exports.{params.case}, or "
             f"{_remedy(params.case)}"
         )
 

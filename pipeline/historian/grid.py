@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
+from pipeline.historian.clock import exact_step, row_numbers, whole_multiple
 from pipeline.historian.export import Series
 from pipeline.historian.numbers import Codes
 from pipeline.historian.reason import Reason
@@ -51,36 +52,41 @@ def resampled(
 ) -> tuple[Grid, tuple[Sampling, ...]]:
     """All series on one grid: PVs and measured disturbances (``pv``) drawn or averaged, the others held.
 
-    Grid: pieces of the PVs' time without a gap longer than their hold, each with the phase of its own stamps.
+    Grid: pieces of the PVs' time without a gap longer than their hold. Where the PVs' stamps keep time and the period
+    is a whole multiple of their step, every reading (every n-th) is a row at its own time, so that nothing adds up
+    along the record; else rows at one period, with the phase of the piece's stamps.
     PVs: held where they are stored beyond a dead band, else on a straight line between two good readings no farther
     apart than the hold; where two or more readings fall into a period, the mean over (t - h, t], against aliasing.
-    Held ones: the reading that holds at the middle of [t, t + h), so that jitter of less than half a period does not
-    matter; the mean over it where they are thinned out. ``done`` is told each tag that needs its readings no more.
+    Held ones: the reading that holds at the middle between t and the next row, so that jitter of less than half a
+    period does not matter; the mean over it where they are thinned out. ``done`` is told each tag that needs its
+    readings no more.
     """
     if not period_s > 0:
         raise RecordError(f"the period is {period_s:g} s; it must be positive")
     rates = {s.tag: sampling(s, period_s, hold_s) for s in (*pv, *held)}
-    time_s, piece = _times(pv, period_s, max(rates[s.tag].hold_s for s in pv))
+    time_s, piece, step_s = _times(pv, period_s, max(rates[s.tag].hold_s for s in pv))
+    middle = time_s + 0.5 * np.minimum(np.diff(time_s, append=np.inf), period_s)
     value, code, bridged = {}, {}, {}
     for s in (*pv, *held):
         rate = rates[s.tag]
         thin = 0 < rate.step_s * THINNED <= period_s and not s.categories and not rate.irregular
         if s in pv and thin:
-            out, over = _mean(time_s, *_good(s), period_s)
+            out, over = _mean(time_s, *_good(s), period_s, 0.5 * step_s)
         elif thin:
-            out, over = _held(time_s, *_good(s), period_s, rate.hold_s, thin)
+            out, over = _held(time_s, middle, *_good(s), period_s, rate.hold_s, thin)
         else:
-            out, over = _in_chunks(_line if s in pv and not rate.dead_band else _held, time_s, s, period_s, rate.hold_s)
+            rule = _line if s in pv and not rate.dead_band else _held
+            out, over = _in_chunks(rule, time_s, middle, s, period_s, rate.hold_s)
         value[s.tag], code[s.tag] = out, _reasons(time_s, s, out, period_s)
         bridged[s.tag] = 0 if rate.irregular else int(np.count_nonzero(over))
         done(s.tag)
     return Grid(period_s, time_s, piece, value, code, bridged), tuple(rates.values())
 
 
-def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray[np.int64]]:
-    clock = (
-        pv[0].time_s if all(s.time_s is pv[0].time_s for s in pv) else np.unique(np.concatenate([s.time_s for s in pv]))
-    )
+def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray[np.int64], float]:
+    """Times (n,) of the rows, their pieces (n,), and the step of the readings that are rows, 0 where none are."""
+    one = all(s.time_s is pv[0].time_s for s in pv) and bool(np.all(np.diff(pv[0].time_s) > 0))
+    clock = pv[0].time_s if one else np.unique(np.concatenate([s.time_s for s in pv]))
     if not clock.size:
         raise RecordError("the process variables have no reading with a time; export a longer time")
     cuts = np.flatnonzero(np.diff(clock) > gap_s) + 1
@@ -90,15 +96,19 @@ def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray
         raise RecordError(
             f"a period of {h:g} s gives {rows.sum():.3g} rows from {len(clock)} readings; give a longer --period"
         )
+    step_s = exact_step(clock) or 0.0
+    factor = whole_multiple(h, step_s) if step_s else 0
     times: list[Array] = []
     pieces: list[NDArray[np.int64]] = []
+    own = factor > 0
     for start, end in zip(starts, ends, strict=True):
         part = clock[start:end]
-        first = _phase(part[:1000], h)
-        n = int(np.floor((part[-1] - first) / h + 0.5)) + 1
-        if n >= LEAST_PIECE:
-            times.append(first + h * np.arange(n, dtype=np.float64))
-            pieces.append(np.full(n, len(pieces), dtype=np.int64))
+        number = row_numbers(part, step_s) if factor else None
+        at = _even_times(part, h) if number is None else _own_times(part, number, step_s, factor)
+        own = own and number is not None
+        if len(at) >= LEAST_PIECE:
+            times.append(at)
+            pieces.append(np.full(len(at), len(pieces), dtype=np.int64))
     if not times and len(clock) > 1 and gap_s < float(np.median(np.diff(clock))):
         raise RecordError(
             f"the hold of {gap_s:g} s is shorter than the time between two readings, "
@@ -108,7 +118,20 @@ def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray
         raise RecordError(
             f"no stretch of the export is longer than {LEAST_PIECE} periods of {h:g} s; give a shorter --period"
         )
-    return np.concatenate(times), np.concatenate(pieces)
+    return np.concatenate(times), np.concatenate(pieces), step_s if own else 0.0
+
+
+def _own_times(t: Array, number: NDArray[np.int64], step_s: float, factor: int) -> Array:
+    """Times of every ``factor``-th row of the stamps t (m,): their own, on a line where a reading is lost."""
+    row = np.arange(0, int(number[-1]) + (factor + 1) // 2, factor, dtype=np.float64)
+    if len(row) == len(t) == number[-1] + 1:
+        return t
+    return np.interp(row, number, t) + step_s * np.maximum(row - number[-1], 0.0)
+
+
+def _even_times(t: Array, h: float) -> Array:
+    first = _phase(t[:1000], h)
+    return first + h * np.arange(int(np.floor((t[-1] - first) / h + 0.5)) + 1, dtype=np.float64)
 
 
 def _phase(t: Array, h: float) -> float:
@@ -126,7 +149,7 @@ def _good(s: Series, rows: slice = slice(None)) -> tuple[Array, Array]:
 
 
 def _in_chunks(
-    rule: Callable[..., tuple[Array, NDArray[np.bool_]]], at: Array, s: Series, h: float, hold_s: float
+    rule: Callable[..., tuple[Array, NDArray[np.bool_]]], at: Array, middle: Array, s: Series, h: float, hold_s: float
 ) -> tuple[Array, NDArray[np.bool_]]:
     """The rule over CHUNK rows at a time, and the readings that these rows can see.
 
@@ -137,11 +160,11 @@ def _in_chunks(
     for i in range(0, len(at), CHUNK):
         own = slice(i, min(i + CHUNK, len(at)))
         first, last = np.searchsorted(s.time_s, (at[own.start] - reach, at[own.stop - 1] + reach))
-        out[own], over[own] = rule(at[own], *_good(s, slice(first, last)), h, hold_s)
+        out[own], over[own] = rule(at[own], middle[own], *_good(s, slice(first, last)), h, hold_s)
     return out, over
 
 
-def _line(at: Array, t: Array, v: Array, h: float, hold_s: float) -> tuple[Array, NDArray[np.bool_]]:
+def _line(at: Array, _middle: Array, t: Array, v: Array, h: float, hold_s: float) -> tuple[Array, NDArray[np.bool_]]:
     out = np.full(len(at), np.nan)
     if not t.size:
         return out, np.zeros(len(at), dtype=bool)
@@ -164,7 +187,9 @@ def _line(at: Array, t: Array, v: Array, h: float, hold_s: float) -> tuple[Array
     return out, np.isfinite(out) & (distance > 0.5 * h + slack)
 
 
-def _mean(at: Array, t: Array, v: Array, h: float) -> tuple[Array, NDArray[np.bool_]]:
+def _mean(at: Array, t: Array, v: Array, h: float, later_s: float = 0.0) -> tuple[Array, NDArray[np.bool_]]:
+    """Means over (at - h, at], these ends ``later_s`` later: half a step, where jitter must not move a reading."""
+    t = t - later_s if later_s else t
     row = np.searchsorted(at, t - 1e-6 * h, "left")
     inside = row < len(at)
     inside[inside] = at[row[inside]] - t[inside] < h * (1 - 1e-6)
@@ -176,11 +201,10 @@ def _mean(at: Array, t: Array, v: Array, h: float) -> tuple[Array, NDArray[np.bo
 
 
 def _held(
-    at: Array, t: Array, v: Array, h: float, hold_s: float, thin: bool = False
+    at: Array, middle: Array, t: Array, v: Array, h: float, hold_s: float, thin: bool = False
 ) -> tuple[Array, NDArray[np.bool_]]:
     if not t.size:
         return np.full(len(at), np.nan), np.zeros(len(at), dtype=bool)
-    middle = at + 0.5 * h
     last = np.searchsorted(t, middle, "right") - 1
     age = middle - t[np.maximum(last, 0)]
     ok = (last >= 0) & (age <= hold_s + 0.5 * h)

@@ -76,7 +76,7 @@ class Pace:
         usual = [n for n in NICE_S if slow / MOST_PERIODS <= n <= slow / LEAST_PERIODS and _is_multiple(n, step_s)]
         if usual:
             return float(min(usual, key=lambda n: abs(np.log(n / wanted))))
-        return float(f"{step_s * np.ceil(wanted / step_s - 1e-6):.6g}")
+        return float(f"{step_s * np.ceil(wanted / step_s - 1e-6):.12g}")
 
 
 def of_period(pace: Pace, period_s: float, step_s: float, *, given: bool) -> list[Finding]:

@@ -8,13 +8,14 @@ import numpy as np
 
 from pipeline.historian.cells import noise_sd, usual
 from pipeline.historian.character import quantum, staircase, straight_share
+from pipeline.historian.clock import whole_multiple
 from pipeline.historian.excitation import HELD
 from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.first_answer import first_answer
 from pipeline.historian.grid import Grid
 from pipeline.historian.linear import Linear
-from pipeline.historian.sampling import Sampling
+from pipeline.historian.sampling import Sampling, sampling
 from pipeline.historian.tags import SIGNAL_ROLES, Tag
 from pipeline.metrics import Array
 from pipeline.records.record import Record
@@ -64,6 +65,18 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
 def of_notes(export: Export) -> list[Finding]:
     """What was assumed when the files were read: their times, qualities, sheets."""
     return [Finding("reading", note.column, note.words) for note in export.notes]
+
+
+def of_rows(series: Sequence[Series], period_s: float, step_s: float) -> list[Finding]:
+    """PVs sampled at a rate that is no whole part of the record's: their rows lie between readings."""
+    if whole_multiple(period_s, step_s) or sampling(series[0]).irregular:
+        return []
+    better = max(1, round(period_s / step_s)) * step_s
+    words = (
+        f"a reading every {step_s:.9g} s and a row every {period_s:.9g} s: rows are drawn between readings, and the "
+        f"MVs are held; --period {better:.9g} takes them as they are"
+    )
+    return [Finding("between", series[0].tag, words)]
 
 
 def of_files(export: Export, tags: Sequence[Tag]) -> list[Finding]:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import RecordError
+from pipeline.historian.character import quantum
+from pipeline.historian.clock import exact_step, keeps_time
 from pipeline.historian.export import Series
 from pipeline.historian.reason import Reason
 from pipeline.metrics import Array
@@ -16,10 +18,11 @@ NICE_S = (
     *(0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.5, 1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30),
     *(60, 120, 300, 600, 900, 1800, 3600),
 )
-NICE_SHARE = 0.02
 HOLD_PERIODS = 3.2
 IRREGULAR = 2.5  # 90 % over 10 % quantile of the steps, above which a tag reports by exception
-SMALLEST_MOVE = 0.05  # over the median move, of a tag with a dead band
+EDGE = 0.35  # smallest moves over the median one, of a tag with a dead band
+RESTED, LONGEST, ON_TIME, FEWEST = 2.0, 0.999, 0.02, 15  # of the shortest step; of the longest; share of such; moves
+FAR, TO_AND_FRO = 5.0, 0.55  # scans between two steps, and share of the moves that go back
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,29 +42,58 @@ def sampling(series: Series, period_s: float | None = None, hold_s: float | None
     Without a stated one, three steps of a tag sampled regularly; of one that reports by exception, twice the 99 %
     quantile of its steps.
     """
-    step = np.diff(series.time_s[series.code != Reason.DUPLICATE])
+    once = series.code != Reason.DUPLICATE
+    step = np.diff(series.time_s[once])
     step = step[step > 0]
     if not step.size:
         return Sampling(series.tag, 0.0, False, False, hold_s or HOLD_PERIODS * (period_s or 1.0))
     low, median, high = np.quantile(step[:: max(1, len(step) // 200_000)], [0.1, 0.5, 0.9])
-    irregular = bool(high > IRREGULAR * low)
+    irregular = bool(high > IRREGULAR * low) and not keeps_time(_stamps(series))
     own = 2.0 * float(np.quantile(step, 0.99)) if irregular else HOLD_PERIODS * float(median)
-    band = irregular and _has_dead_band(series.value[series.good])
+    stored = series.time_s[series.good], series.value[series.good]
+    band = irregular and len(stored[0]) > 1 and _is_held(np.diff(stored[0]), stored[1])
     return Sampling(series.tag, float(median), irregular, band, hold_s or max(own, HOLD_PERIODS * (period_s or 0.0)))
 
 
-def _has_dead_band(values: Array) -> bool:
-    """Whether no move between two stored values is small: of a compressed signal some are."""
-    moves = np.abs(np.diff(values))
-    moves = moves[moves > 0]
-    return bool(moves.size) and float(np.quantile(moves, 0.02)) > SMALLEST_MOVE * float(np.median(moves))
+def _is_held(step: Array, values: Array) -> bool:
+    """Whether a tag holds its value between two stored ones; step (n-1,) [s] between the values (n,).
+
+    A dead band stores no small move: after a rest of some scans the moves have a sharp lower edge. A swinging door
+    stores the ends of lines, and some of them lie as high as the ones before, however much noise there is. Moves to
+    and fro, stored long after one another with nothing in between, are steps: a line has no such corners.
+    """
+    move = np.diff(values)
+    usual = step < LONGEST * step.max()
+    # Where many steps are the longest one, the archive stored because of the time.
+    rested = (move != 0) & (step >= RESTED * step.min()) & (usual | (usual.mean() > 1 - ON_TIME))
+    if np.count_nonzero(rested) < FEWEST:
+        rested = move != 0
+    if not rested.any():
+        return True
+    low, middle = np.quantile(np.abs(move[rested]), [0.05, 0.5])
+    if low > EDGE * middle:
+        return True
+    scan = quantum(step)
+    back = move[1:] * move[:-1] < 0
+    return bool(scan > 0 and np.quantile(step, 0.05) >= FAR * scan and back.mean() > TO_AND_FRO)
 
 
 def proposed_period(series: Sequence[Series]) -> float:
-    """The period [s] that the PVs' own steps propose: the median step, the slowest PV's, rounded to a usual number."""
-    steps = [s for s in (sampling(one).step_s for one in series) if s > 0]
+    """The period [s] that the PVs' own steps propose: the slowest PV's, exactly where its clock keeps time.
+
+    The median step of a PV that keeps none.
+    """
+    steps = [s for s in (_step(one) for one in series) if s > 0]
     if not steps:
         raise RecordError("no process variable has two readings of different times; export a longer time")
-    step = max(steps)
-    near = min(NICE_S, key=lambda n: abs(n / step - 1))
-    return float(near) if abs(near / step - 1) < NICE_SHARE else float(f"{step:.6g}")
+    return max(steps)
+
+
+def _step(series: Series) -> float:
+    rate = sampling(series)
+    exact = None if rate.irregular or not rate.step_s else exact_step(_stamps(series))
+    return float(f"{rate.step_s:.6g}") if exact is None else exact
+
+
+def _stamps(series: Series) -> Array:
+    return series.time_s[series.code != Reason.DUPLICATE]

@@ -26,7 +26,7 @@ from pipeline.historian.pace import of_period, pace_of
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of, with_texts_of_one_side
 from pipeline.historian.reason import Reason
-from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_notes, of_series
+from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_notes, of_rows, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.sampling import Sampling, proposed_period, sampling
 from pipeline.historian.static import explained
@@ -82,6 +82,7 @@ def screened(
     pace = pace_of(own, tags, step)
     period = period_s or pace.period(step)
     findings += of_period(pace, period, step, given=period_s is not None)
+    findings += of_rows(pvs, period, step)
     role_of = {t.tag: t.role for t in tags}
     findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag])]
     steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}

@@ -68,9 +68,44 @@ def test_a_grid_begins_anew_after_a_gap() -> None:
     assert grid.time_s[grid.piece == 1][0] == pytest.approx(500.7)
 
 
-@pytest.mark.parametrize(("step", "period"), [(1.0, 1.0), (9.998, 10.0), (59.97, 60.0), (7.3, 7.3), (0.1, 0.1)])
-def test_the_period_is_the_median_step(step: float, period: float) -> None:
+@pytest.mark.parametrize(("step", "period"), [(1.0, 1.0), (9.998, 9.998), (59.97, 59.97), (7.3, 7.3), (0.1, 0.1)])
+def test_the_period_is_the_exact_step(step: float, period: float) -> None:
     assert proposed_period([series("y", step * np.arange(200), np.arange(200.0))]) == pytest.approx(period)
+
+
+@pytest.mark.parametrize("step", [1 / 610.35, 0.985, 59.97, 1 / 3, 60.0])
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_each_reading_of_a_regular_record_is_a_row_to_its_end(step: float, jitter: float) -> None:
+    random, n = np.random.default_rng(3), 40_000
+    t = step * (np.arange(n) + jitter * random.uniform(-1, 1, n))
+    y, u = random.normal(size=n), random.integers(0, 9, n).astype(float)
+    h = proposed_period([series("y", t, y)])
+    assert abs(h - step) * n < 0.1 * step  # no tenth of a row at the end of the record
+    grid, (rate, _) = resampled([series("y", t, y)], [series("u", t, u)], h)
+    assert not rate.irregular
+    np.testing.assert_array_equal(grid.value["y"], y)
+    np.testing.assert_array_equal(grid.value["u"], u)
+
+
+def test_lost_readings_and_a_clock_that_wanders_move_no_row() -> None:
+    random = np.random.default_rng(4)
+    n = np.flatnonzero(random.random(40_000) > 0.1)
+    t = 0.985 * n + 3.0 * np.sin(n / 8000)  # by three rows to and fro
+    grid, _ = resampled([series("y", t, n)], [series("u", t, n)], 0.985, hold_s=20.0)
+    known = np.isin(np.arange(len(grid)), n)
+    assert len(grid) == n[-1] - n[0] + 1
+    np.testing.assert_array_equal(grid.value["y"][known], n)
+    np.testing.assert_array_equal(grid.value["u"][known], n)
+
+
+def test_every_third_row_of_a_regular_record_is_the_mean_of_its_three_readings() -> None:
+    n = 30_000
+    t, y = 0.985 * np.arange(n), np.random.default_rng(5).normal(size=n)
+    grid, _ = resampled([series("y", t, y)], [series("u", t, y)], 3 * 0.985)
+    k = np.arange(1, len(grid) - 1)
+    np.testing.assert_allclose(grid.time_s[k], t[3 * k])
+    np.testing.assert_allclose(grid.value["y"][k], y[: 3 * len(grid)][np.add.outer(3 * k, [-2, -1, 0])].mean(axis=1))
+    np.testing.assert_allclose(grid.value["u"][k], y[: 3 * len(grid)][np.add.outer(3 * k, [0, 1, 2])].mean(axis=1))
 
 
 def test_what_cannot_be_resampled_is_told() -> None:
