@@ -1,9 +1,11 @@
 """Identification on public records: free-run error over their test rows beside published figures.
 
 ``python benchmarks/identification.py DIR [RECORD ...]``; a row a record whose files are in DIR, all with the defaults
-of the part ``identified`` (member 0, and the pointwise median of the three members). The records are not part of this
-repository; nonlinearbenchmark.org and its mirrors hold them. DIR holds, flat or in folders of any name, as .csv (a
-head of column names, each column as long as it is) or as .mat with variables of the same names:
+of the part ``identified`` (member 0, and the pointwise median of the three members), for each of ``--seeds`` seeds of
+the search. ``--screened`` passes the rows to learn through `loopwright new` first, as the export of a plant. This is
+the way of a user, and `loopwright run` then has seed 0. The records are not part of this repository;
+nonlinearbenchmark.org and its mirrors hold them. DIR holds, flat or in folders of any name, as .csv (a head of column
+names, each column as long as it is) or as .mat with variables of the same names:
 
     tanks      dataBenchmark    uEst, yEst: 1,024 rows to learn; uVal, yVal: 1,024 rows to test; 4 s      [V]
     drives_low, drives_high   DATAUNIF    u11, z11 and u12, z12: 500 rows each, the first 400 to learn; 20 ms
@@ -24,6 +26,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -32,6 +35,8 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat
 
+from pipeline.config.exports import ExportedTag, ExportParams
+from pipeline.historian.exported import screened_export, signal_tags
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.identified_part import IdentifiedPart
@@ -142,6 +147,16 @@ def record_of(part: Part, period_s: float) -> Record:
     return Record.of(signals, part.y[:, None], part.u[:, None])
 
 
+def screened_rows(part: Part, period_s: float) -> Record:
+    """The rows as `loopwright new` keeps them of an export with the columns time_s, y (a PV) and u (an MV)."""
+    tags = (ExportedTag("y", "pv"), ExportedTag("u", "mv"))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "export.csv"
+        rows = np.column_stack([period_s * np.arange(len(part.y)), part.y, part.u])
+        np.savetxt(path, rows, delimiter=",", header="time_s,y,u", comments="", fmt="%.10g")
+        return screened_export(ExportParams("record", (path,), tags), signal_tags(tags)).record
+
+
 def velocity(part: Part) -> Part:
     """The differences of the output a row; the last input has none."""
     return Part(part.u[:-1], np.diff(part.y))
@@ -161,12 +176,14 @@ def free_run(model: Identified, part: Part, begin: int, same_row: bool) -> Array
     return np.asarray(run[0][:, 0] * of["y_scale"] + of["y_center"])
 
 
-def row_of(name: str, task: Task, unit: str, published: str, part: IdentifiedPart) -> str:
-    """The row of one record."""
+def row_of(
+    name: str, task: Task, unit: str, published: str, part: IdentifiedPart, seed: int = 0, screened: bool = False
+) -> str:
+    """The row of one record and one seed of the search; ``screened``: learnt from what `loopwright new` keeps."""
     began = time.perf_counter()
     learn = velocity(task.learn) if task.summed else task.learn
-    record = record_of(learn, task.period_s)
-    source = Source(record, record_signals(record))
+    record = screened_rows(learn, task.period_s) if screened else record_of(learn, task.period_s)
+    source = Source(record, record_signals(record), seed=seed)
     work = part.groundwork()
     source = replace(source, groundwork={work: work.done(source, name)})
     learnt = [replace(part, member=k).learn(source) for k in range(3)]
@@ -184,8 +201,8 @@ def row_of(name: str, task: Task, unit: str, published: str, part: IdentifiedPar
             for r in (runs[0], np.median(runs, axis=0))
         ]
         cells.append(f"{test}: {errors[0]:.4g}, median of members {errors[1]:.4g} {unit}")
-    form = f"{structure['start']} {structure['order']} states, {structure['hidden']} units"
-    return f"{name:20} {'; '.join(cells):70} {minutes:5.1f} min  ({published}; {form})"
+    form = f"{structure['start']} {structure['order']} states, {structure['hidden']} units, {len(record)} rows"
+    return f"{name:20} seed {seed}  {'; '.join(cells):70} {minutes:5.1f} min  ({published}; {form})"
 
 
 def record_signals(record: Record) -> Signals:
@@ -200,6 +217,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("records", nargs="*", choices=[[], *RECORDS], help="(default: all whose files are there)")
     parser.add_argument("--rows", type=int, default=8_000, help="that are fitted at most (8000)")
     parser.add_argument("--minutes", type=float, help="of the search on one core (2)")
+    parser.add_argument("--seeds", type=int, default=1, help="of the search, a row each (1)")
+    parser.add_argument("--screened", action="store_true", help="learn from the rows that `loopwright new` keeps")
     options = parser.parse_args(argv)
     if not options.folder.is_dir():
         parser.error(f"{options.folder} is no folder; give the one that holds the records")
@@ -212,7 +231,9 @@ def main(argv: list[str]) -> int:
         if len(there) < len(paths):
             print(f"{name:20} {' and '.join(public.files)} .csv or .mat not found under {options.folder}", flush=True)
             continue
-        print(row_of(name, public.task([columns(p) for p in there]), public.unit, public.published, part), flush=True)
+        task = public.task([columns(p) for p in there])
+        for seed in range(options.seeds):
+            print(row_of(name, task, public.unit, public.published, part, seed, options.screened), flush=True)
         rows += 1
     return 0 if rows else 1
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.historian.findings import Screening, Verdict
+from pipeline.historian.findings import InputReport, Screening, Verdict
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.drawing import axis_label, ratio_unit
 
@@ -33,7 +33,10 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
                   f"or record more and give all files again with --replace")  # fmt: skip
         print(f"then: loopwright run {name}")
     if test:
-        print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h")
+        moved = zip(test.names, test.units, test.sizes, strict=True)
+        sizes = ", ".join(f"{mv} by up to {axis_label(f'{size:.3g}', unit)} to each side" for mv, unit, size in moved)
+        print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h; "
+              f"it moves {sizes}")  # fmt: skip
 
 
 def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:
@@ -47,15 +50,24 @@ def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:
             first = i.first_answer_s.get(pv)
             rate = i.rate.get(pv)
             if not gain and first is None and rate is None:
+                if i.role == "mv":
+                    lines.append(
+                        f"{i.name} -> {pv}: not clear from the record; does it move it on the plant, and which way?"
+                    )
                 continue
             # The report has the gain at the middle of the record, by the models that are fitted later.
             known = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
             words = [known if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
             words += [_after(first, i.first_possible_s[pv])] if first is not None else []
-            words += [f"the slowest settles in {i.settling_s:g} s"] if i.settling_s and gain else []
-            words += ["gain and settling unreliable: drift"] if gain and pv in verdict.unsure else []
+            words += [_settles(i, pv)] if gain else []
+            words += ["gain and settling unreliable: drift or loads"] if gain and pv in verdict.unsure else []
             lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
     return lines
+
+
+def _settles(report: InputReport, pv: str) -> str:
+    """How long the slowest PV takes to settle, where that is certain."""
+    return f"the slowest settles in {report.settling_s:g} s" if pv in report.certain else "settling time not certain"
 
 
 def _ramp(rate: float, top: str, bottom: str) -> str:

@@ -65,7 +65,7 @@ def _run(options: argparse.Namespace) -> int:
     list_files()
     if not options.dry:
         try:
-            ask("commit", "--quiet", "--force", "code", finish=True)
+            ask("commit", "--force", "code", finish=True)
         except PipelineError as error:
             raise PipelineError(
                 f"the list of the files that each stage runs could not be made, so no stage ran ({error}); "

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from configparser import ConfigParser
 from pathlib import Path
 
 from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
@@ -28,6 +29,25 @@ for command in json.loads(sys.argv[1]):
     print(sys.argv[2], end="", flush=True)
 """
 OF_DVC = ("ERROR:", "WARNING:", "Stage '", "Running stage '", "> ")  # beginnings of its own lines
+
+
+def suit_history(root: Path = Path()) -> None:
+    """Let DVC keep its results without git in a copy of the repository that has no history, as a source archive.
+
+    It says so in ``.dvc/config.local``, which git ignores, and takes it back once there is a history.
+    """
+    folder = root / ".dvc"
+    if not folder.is_dir():
+        return
+    file, config = folder / "config.local", ConfigParser()
+    bare = not any((above / ".git").exists() for above in (root.resolve(), *root.resolve().parents))
+    config.read(file)
+    if bare != config.getboolean("core", "no_scm", fallback=False):
+        if not config.has_section("core"):
+            config.add_section("core")
+        config.set("core", "no_scm", str(bare).lower())
+        with file.open("w") as lines:
+            config.write(lines)
 
 
 def environment() -> dict[str, str]:
@@ -62,6 +82,7 @@ def ask_in_turn(*commands: Sequence[str]) -> list[str]:
 
 def _done(command: Sequence[str], finish: bool = False) -> tuple[int, str, str]:
     """(exit status, standard output, standard error) of a command."""
+    suit_history()
     own, pipe = os.getpid(), subprocess.PIPE
 
     def begin() -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.historian.findings import InputReport, Verdict
 from pipeline.historian.first_answer import first_answer
 from pipeline.historian.linear import Linear
+from pipeline.historian.settled import certain
 from pipeline.historian.spectra import Spectrum, spectra
 from pipeline.metrics import Array
 from pipeline.records.record import Record
@@ -98,12 +99,20 @@ def judged(
     parameters = 3 * len(record.pv_signals) + 7 * len(signals) + 1
     used = max((len(m.rows) for m in models.values() if m), default=0)
     reasons, level = _reasons(record, inputs, correlation, parameters, moved_sp, rows)
-    unsure = tuple(n for n, m in models.items() if n in drifts and m is not None and not m.sure)
+    unsure = tuple(n for n, m in models.items() if n in drifts and m is not None and _unsure(n, m, inputs))
     if unsure:
-        reasons.append(f"gain and settling time of {', '.join(unsure)} are unreliable: drift looks like a slow answer")
+        words = "are unreliable: drift or loads look like a slow answer"
+        reasons.append(f"gain and settling time of {', '.join(unsure)} {words}")
         level = max(level, 1)
     carries = ("yes", "doubtful", "no")[level]
     return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used, unsure)
+
+
+def _unsure(pv: str, model: Linear, inputs: list[InputReport]) -> bool:
+    """Whether the gain and settling time of a PV that drifts may come from the drift, or from loads that wander."""
+    seen = [i for i in inputs if i.role == "mv" and i.answers[pv] > SEEN]
+    unconfirmed = bool(seen) and not model.integrates and not any(pv in i.certain for i in seen)
+    return unconfirmed or not model.sure
 
 
 def with_rows_out_of_range(verdict: Verdict, dropped: int, rows: int) -> Verdict:
@@ -153,7 +162,9 @@ def _input(
     pvs = dict(zip((s.name for s in record.pv_signals), record.pv.T, strict=True))
     answers = {n: m.strength[i] if m else 0.0 for n, m in models.items()}
     seen = {n: m for n, m in models.items() if m and answers[n] > SEEN}
-    settling = max((m.settling(i) for m in seen.values()), default=0)
+    settling = {n: m.settling(i) for n, m in seen.items()}
+    inputs = [*record.mv.T, *record.dv.T]
+    sure = tuple(n for n, rows in settling.items() if rows and certain(pvs[n], inputs, record.run, i, rows))
     first = {n: first_answer(y, u, record.run) for n, y in pvs.items()} if held >= HELD else {}
     median, largest = (float(np.median(moves)), float(moves.max())) if moves.size else (0.0, 0.0)
     return InputReport(
@@ -168,7 +179,9 @@ def _input(
         held_share=held,
         answers=answers,
         follows={n: follows(u, y, record.run) for n, y in pvs.items()} if role == "mv" else {},
-        settling_s=settling * record.period_s,
+        settling_s=max((settling[n] for n in sure), default=0) * record.period_s,
+        uncertain_s=max((rows for n, rows in settling.items() if n not in sure), default=0) * record.period_s,
+        certain=sure,
         first_answer_s={n: k.last * record.period_s for n, k in first.items() if k},
         against=tuple(n for n, k in first.items() if k and k.feedback) if role == "mv" else (),
         first_possible_s={n: k.first * record.period_s for n, k in first.items() if k},

@@ -51,7 +51,9 @@ class InputReport:
     held_share: float  # of the rows
     answers: dict[str, float]  # PV -> strength of its answer; above 4 it is seen
     follows: dict[str, float]  # PV -> share of the moves that its past explains
-    settling_s: float  # [s] of the slowest PV that answers; 0 where none does
+    settling_s: float  # [s] of the slowest PV that answers; 0 where none does, or its settling time is not certain
+    uncertain_s: float  # [s] of the slowest PV whose settling time is not certain: no more than a guess
+    certain: tuple[str, ...]  # PVs whose settling time two models agree on
     first_answer_s: dict[str, float]  # PV -> [s] after a move, of an input that is held and where one is seen
     first_possible_s: dict[str, float]  # PV -> [s] from which on that answer may begin already, beneath the noise
     against: tuple[str, ...]  # PVs against whose past the input is moved, by hand or by a controller
@@ -59,6 +61,7 @@ class InputReport:
     rate: dict[str, float]  # PV that integrates -> change in a minute over the input's, after its answer has begun
     band_share: float  # of its power in the band of the plant; -1 where the record is too short to tell
     coherence: dict[str, float]  # PV -> median in that band; empty where it is too short
+    load_move: float = 0.0  # change whose answer stands out of the loads within a step test; 0 where that is unknown
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from pipeline.historian.findings import Finding
 from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear, fitted
 from pipeline.historian.sampling import NICE_S
+from pipeline.historian.settled import certain, grows
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
 
@@ -46,10 +47,14 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """The clear answers of a plant, and how long its MVs are usually held."""
+    """The clear answers of a plant, and how long its MVs are usually held.
+
+    Only ``answers`` decide anything; ``uncertain`` are those whose settling time another model does not confirm.
+    """
 
     answers: tuple[Answer, ...] = ()
     hold_s: float = np.inf  # [s] the shortest usual one
+    uncertain: tuple[Answer, ...] = ()
 
     @property
     def slowest(self) -> Answer | None:
@@ -82,7 +87,9 @@ class Pace:
 def of_period(pace: Pace, period_s: float, step_s: float, *, given: bool) -> list[Finding]:
     """What the record's period is and why, where it is not the export's own or short for the plant."""
     slowest = pace.slowest
-    if slowest is None or slowest.settles_s <= MOST_PERIODS * step_s:
+    if slowest is None:
+        return _undecided(pace, step_s, given=given)
+    if slowest.settles_s <= MOST_PERIODS * step_s:
         return []
     settles = f"takes about {in_words(slowest.settles_s)} to settle after {slowest.mv}"
     if slowest.settles_s > MOST_PERIODS * period_s:
@@ -94,6 +101,19 @@ def of_period(pace: Pace, period_s: float, step_s: float, *, given: bool) -> lis
         return []
     words = f"one row every {period_s:g} s: it {settles}, and the export has a reading every {step_s:g} s"
     return [Finding("period", slowest.pv, words + "; --period says another" * (not given))]
+
+
+def _undecided(pace: Pace, step_s: float, *, given: bool) -> list[Finding]:
+    """That the export's step stays where no settling time is certain, and the plant may be slow beside it."""
+    slow = max(pace.uncertain, key=lambda a: a.settles_s, default=None)
+    if given or slow is None or Pace((slow,)).suits(step_s):
+        return []
+    words = (
+        f"one model says that it takes {in_words(slow.settles_s)} to settle after {slow.mv}, another does not agree: "
+        f"loads or a controller may look like a slow answer. The rows stay at the export's {step_s:g} s; where you "
+        f"know how long it takes, give --period, a {WANTED}th of that"
+    )
+    return [Finding("period", slow.pv, words)]
 
 
 def in_words(seconds: float) -> str:
@@ -120,10 +140,11 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
     names, inputs = [s.tag for s in pv], [s.tag for s in (*mv, *dv)]
     spans = np.array([_span(grid.value[tag]) for tag in inputs])
     found: dict[tuple[str, str], list[tuple[int, bool, float]]] = {}
+    thinned: dict[int, tuple[dict[str, Array], NDArray[np.int64]]] = {}
     for factor in FACTORS:
         if factor > 1 and len(grid) < factor * LEAST_ROWS:
             break
-        value, run = _thinned(grid, {s.tag for s in mv}, factor)
+        thinned[factor] = value, run = _thinned(grid, {s.tag for s in mv}, factor)
         for name in names:
             model = fitted(value[name], [value[tag] for tag in inputs], run)
             if model is not None:
@@ -131,8 +152,17 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
                     found.setdefault((name, inputs[i]), []).append((factor, *answer))
     settled = {pair: _settling(rows) for pair, rows in found.items()}
     most = MOST_SHARE * len(grid)
-    answers = tuple(Answer(*pair, n * step_s, shown) for pair, (n, shown) in settled.items() if 0 < n <= most)
-    return Pace(answers, min((_hold(grid.value[s.tag], grid.piece) for s in mv), default=np.inf) * step_s)
+    answers: dict[bool, list[Answer]] = {True: [], False: []}
+    for (name, moved), (n, shown) in settled.items():
+        if 0 < n <= most:
+            factor = max((f for f, _, _ in found[name, moved] if n >= RESOLVED * f), default=1)
+            value, run = thinned[factor]
+            u, i, rows = [value[tag] for tag in inputs], inputs.index(moved), max(round(n / factor), 1)
+            kind = found[name, moved][-1][1]
+            sure = certain(value[name], u, run, i, rows) if kind else grows(value[name], u, run, i)
+            answers[sure].append(Answer(name, moved, n * step_s, shown))
+    hold = min((_hold(grid.value[s.tag], grid.piece) for s in mv), default=np.inf) * step_s
+    return Pace(tuple(answers[True]), hold, tuple(answers[False]))
 
 
 def _excerpt(clock: Sequence[Series], series: Sequence[Series], step_s: float) -> dict[str, Series]:

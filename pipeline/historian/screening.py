@@ -21,6 +21,7 @@ from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.free_run import believed
 from pipeline.historian.grid import Grid, resampled
 from pipeline.historian.linear import Linear
+from pipeline.historian.loads import with_load_moves
 from pipeline.historian.modes import check_modes
 from pipeline.historian.pace import of_period, pace_of
 from pipeline.historian.pulses import pulses
@@ -125,7 +126,8 @@ def screened(
     findings += of_models(excerpt, models)
     drifts = {t.name for t in signals for f in findings if f.kind == "drift" and f.tag == t.tag}
     counts = np.bincount(code, minlength=len(Reason))
-    verdict = with_levels(judged(excerpt, models, moved, len(record), drifts), excerpt, tags)
+    verdict = with_load_moves(judged(excerpt, models, moved, len(record), drifts), excerpt, models)
+    verdict = with_levels(verdict, excerpt, tags)
     verdict = with_rows_out_of_range(verdict, int(counts[Reason.RANGE]), len(code))
     verdict = with_texts_of_one_side(verdict, findings)
     findings += of_answers([s.name for s in record.pv_signals], verdict)

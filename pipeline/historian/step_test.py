@@ -13,9 +13,13 @@ import numpy as np
 from pipeline.historian.excitation import SEEN
 from pipeline.historian.findings import InputReport
 
-MOVES = 24  # of each MV
+MOVES = 24  # random ones
 AMPLITUDE, LARGEST = 0.05, 0.12  # of the range, to each side of the present value
+MOST = 0.25  # of the range, to each side, where loads would hide the answer to less
 UNKNOWN_PERIODS = 60  # for settling where the record does not show it
+GUESSED_H, LONGEST_H = 12.0, 24.0  # [h] of a test, its hold guessed, and any
+FEWEST = 8  # random moves
+ALONE = 1.5  # settling times that one MV alone is held for
 HOLDS = (0.4, 0.7, 1.0, 1.6)  # of the settling time
 LEAST_PERIODS = 5
 SEED = 0
@@ -40,6 +44,12 @@ class StepTest:
         """Length of the whole test."""
         return (self.start_s[-1] + self.hold_s[-1]) / 3600.0
 
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """The largest change of each MV from the value that the test begins at."""
+        values = np.array(self.values)
+        return tuple(float(v) for v in np.abs(values - values[0]).max(axis=0))
+
     def table(self) -> str:
         """CSV: step, time after the start, hold [min], one column an MV; of ramps their time [min] too."""
         out = io.StringIO()
@@ -63,30 +73,30 @@ def planned(
 ) -> StepTest:
     """Steps around the present values: first one MV at a time, then all at random, from a fixed seed.
 
-    Amplitude: AMPLITUDE of the range, LARGEST where no answer was seen. Holds: HOLDS of the settling time that the
-    record shows, or of UNKNOWN_PERIODS periods. ``fastest``: MV -> its largest change in a minute; a step beyond it
-    becomes a ramp, and its hold begins when the ramp has ended.
+    Amplitude: AMPLITUDE of the range, LARGEST where no answer was seen; more where loads would hide the answer, up to
+    MOST, or up to LARGEST where the gain is not certain. Holds: HOLDS of ``usual_hold``. ``fastest``: MV -> its largest
+    change in a minute; a step beyond it becomes a ramp, and its hold begins when the ramp has ended.
     """
     mvs = [i for i in inputs if i.role == "mv"]
     random = np.random.default_rng(SEED)
-    settling = max([i.settling_s for i in mvs if i.settling_s > 0], default=UNKNOWN_PERIODS * period_s)
-    size = [(LARGEST if not _seen(i) else AMPLITUDE) * (i.high - i.low) for i in mvs]
+    settling, moves = usual_hold(inputs, period_s)
+    size = [_size(i, fastest.get(i.name, np.inf) / 60.0 * settling) for i in mvs]
     middle = [min(max(v, i.low + s), i.high - s) for v, i, s in zip(now, mvs, size, strict=True)]
     values, holds = [tuple(middle)], [settling]
     for j in range(len(mvs)):  # one at a time: up, down, back
         for sign in (1.0, -1.0, 0.0):
             values.append(tuple(m + sign * s * (i == j) for i, (m, s) in enumerate(zip(middle, size, strict=True))))
-            holds.append(1.5 * settling)
+            holds.append(ALONE * settling)
     share = np.array([-1.0, -0.5, 0.5, 1.0])
-    for _ in range(MOVES):
+    for _ in range(moves):
         values.append(tuple(float(m + s * random.choice(share)) for m, s in zip(middle, size, strict=True)))
         holds.append(float(random.choice(HOLDS)) * settling)
     values.append(tuple(middle))
     holds.append(settling)
     rates = np.array([fastest.get(i.name, np.inf) for i in mvs]) / 60.0
-    moves = np.abs(np.diff(np.array([tuple(now), *values]), axis=0))
-    one_period = moves <= rates * period_s * (1 + 1e-9)
-    needed = np.where(one_period, 0.0, moves / rates).max(axis=1)  # [s]
+    change = np.abs(np.diff(np.array([tuple(now), *values]), axis=0))
+    one_period = change <= rates * period_s * (1 + 1e-9)
+    needed = np.where(one_period, 0.0, change / rates).max(axis=1)  # [s]
     ramps = np.ceil(needed / period_s - 1e-9) * period_s
     hold_s = tuple(
         float(max(LEAST_PERIODS, round(h / period_s)) * period_s + r) for h, r in zip(holds, ramps, strict=True)
@@ -94,6 +104,38 @@ def planned(
     start = tuple(float(t) for t in np.r_[0.0, np.cumsum(hold_s[:-1])])
     names, units = tuple(i.name for i in mvs), tuple(i.unit for i in mvs)
     return StepTest(names, units, start, hold_s, tuple(values), tuple(map(float, ramps)))
+
+
+def usual_hold(inputs: Sequence[InputReport], period_s: float) -> tuple[float, int]:
+    """A hold [s] of the test, and how many moves all MVs make at random.
+
+    The settling time, where it is certain; else UNKNOWN_PERIODS, or a longer guess of it as far as the test does not
+    take longer than GUESSED_H. A plant whose settling time is certain and long has FEWEST random moves, and shorter
+    holds where the test would take longer than LONGEST_H.
+    """
+    mvs = [i for i in inputs if i.role == "mv"]
+    alone = 2 + 3 * ALONE * len(mvs)  # holds outside the random moves
+    many = alone + MOVES * float(np.mean(HOLDS))
+    certain = max((i.settling_s for i in mvs), default=0.0)
+    if certain <= 0:
+        guess = min(max((i.uncertain_s for i in mvs), default=0.0), GUESSED_H * 3600 / many)
+        return min(max(guess, UNKNOWN_PERIODS * period_s), LONGEST_H * 3600 / many), MOVES
+    longest = LONGEST_H * 3600 / certain  # holds within the longest test
+    moves = int(np.clip((longest - alone) / np.mean(HOLDS), FEWEST, MOVES))
+    return min(certain, LONGEST_H * 3600 / (alone + moves * float(np.mean(HOLDS)))), moves
+
+
+def length_of_test(inputs: Sequence[InputReport], period_s: float) -> float:
+    """About how long [s] the whole test takes, without ramps."""
+    hold, moves = usual_hold(inputs, period_s)
+    return hold * (2 + 3 * ALONE * sum(i.role == "mv" for i in inputs) + moves * float(np.mean(HOLDS)))
+
+
+def _size(report: InputReport, most: float) -> float:
+    """The largest step of an MV to each side; one sized over loads is at most ``most``, that its rate allows."""
+    span = report.high - report.low
+    least = (AMPLITUDE if _seen(report) else LARGEST) * span
+    return max(least, min(report.load_move, (MOST if report.certain else LARGEST) * span, most))
 
 
 def _seen(report: InputReport) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import os
 import site
 import subprocess
@@ -79,3 +80,31 @@ def test_what_depends_on_a_change_is_affected() -> None:
     assert dvc.affected(DOT, ["fit@a-one", "fit@b-one"], ["design@a-inc", "report@b"]) == [
         *("design@a-inc", "fit@a-one", "fit@b-one", "report@b"),
     ]
+
+
+def test_a_copy_without_history_needs_no_git(tmp_path: Path) -> None:
+    """DVC refuses a folder without git unless it is told; a history that comes later counts again."""
+    (tmp_path / ".dvc").mkdir()
+    (tmp_path / ".dvc" / "config").write_text("[core]\n    analytics = false\n")
+    local = tmp_path / ".dvc" / "config.local"
+
+    def without_git() -> bool:
+        read = configparser.ConfigParser()
+        read.read(local)
+        return read.getboolean("core", "no_scm", fallback=False)
+
+    local.write_text("[core]\n    remote = mine\n")
+    dvc.suit_history(tmp_path)
+    assert without_git()
+    assert "remote = mine" in local.read_text()
+    (tmp_path / ".git").mkdir()
+    dvc.suit_history(tmp_path)
+    assert not without_git()
+    dvc.suit_history(tmp_path / "nowhere")  # no folder of DVC: nothing to tell
+
+
+def test_a_repository_with_history_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / ".dvc").mkdir()
+    (tmp_path / ".git").write_text("gitdir: elsewhere")  # as in a work tree
+    dvc.suit_history(tmp_path)
+    assert not (tmp_path / ".dvc" / "config.local").exists()
