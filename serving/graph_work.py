@@ -14,6 +14,8 @@ from itertools import zip_longest
 from math import prod
 from typing import TypeAlias
 
+from serving.graph_operators import require_signature
+
 Shape: TypeAlias = tuple[int, ...]
 
 FLOAT, INT32, INT64, BOOL, DOUBLE = 1, 6, 7, 9, 11  # TensorProto.DataType
@@ -86,8 +88,9 @@ class Node:
 def results(node: Node) -> tuple[list[Value], int]:
     """The shapes and types of an operator's outputs, and its work in multiply-adds.
 
-    Raises ValueError where the rules of ONNX do not allow the inputs.
+    Raises ValueError where the rules of ONNX do not allow the inputs or the attributes.
     """
+    require_signature(node.op, [v is not None for v in node.inputs], node.attributes)
     if node.op in FLOAT_ONLY and node.input(0).dtype not in (FLOAT, DOUBLE):
         # An integer divided by -1 may overflow, and the processor then kills the process.
         raise ValueError("it divides integers; cast them to double first")

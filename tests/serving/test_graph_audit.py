@@ -18,7 +18,8 @@ from onnx import TensorProto, helper, numpy_helper
 from shipped_files import SHIPPED
 
 from serving import ArtifactError
-from serving.graph_audit import audit, graph_values
+from serving.graph_audit import MAX_OPSET, MIN_OPSET, audit, graph_values
+from serving.graph_operators import SIGNATURES
 from serving.graph_work import MAX_WORK, RULES
 from serving.onnx_bytes import SCHEMA, read_model
 
@@ -373,7 +374,7 @@ def test_work_is_counted_in_multiply_adds() -> None:
         ([helper.make_node("Identity", ["y"], ["z"]), node("Identity")], "nothing before it gives"),
         ([helper.make_node("Identity", ["x"], ["z"])], "computed nowhere"),
         ([node("Concat", ["x", "x"], axis=0)], "has not the shape"),
-        ([node("Identity", []), node("Identity")], "input 0 is missing"),
+        ([node("Identity", []), node("Identity")], "it has 0 inputs; it takes 1 to 1"),
     ],
 )
 def test_a_graph_whose_work_cannot_be_known_is_refused(nodes: list[Any], message: str) -> None:
@@ -561,8 +562,40 @@ CASES: list[Case] = [
 ]  # fmt: skip
 
 
+KILLS = [["x", ""], ["x", "", "x"], ["x", "x", ""], ["x", "", ""]]  # inputs with which onnxruntime ends the process
+
+
+@pytest.mark.parametrize("inputs", KILLS, ids=str)
+@pytest.mark.parametrize("op", ["Max", "Mean", "Min", "Sum", "Concat"])
+def test_a_variadic_operator_with_an_input_left_out_is_refused(op: str, inputs: list[str]) -> None:
+    """onnxruntime 1.20 to 1.32 reads through a null pointer there."""
+    with pytest.raises(ArtifactError, match="has no name"):
+        audit(model_bytes([node(op, inputs, **({"axis": 0} if op == "Concat" else {}))], [1]))
+
+
+@pytest.mark.parametrize("opset", range(MIN_OPSET, MAX_OPSET + 1))
+@pytest.mark.parametrize("op", sorted(SIGNATURES))
+def test_a_signature_is_that_of_onnx(op: str, opset: int) -> None:
+    schema, ours = onnx.defs.get_schema(op, opset), SIGNATURES[op]
+    assert (ours.least, ours.most) == (schema.min_input, schema.max_input)
+    options = [one.option.name for one in schema.inputs]
+    assert {options[place] for place in ours.optional} <= {"Optional"}
+    kinds = {"INT": int, "FLOAT": float, "INTS": list}
+    theirs = {name: kinds[a.type.name] for name, a in schema.attributes.items()}
+    assert theirs.items() <= ours.attributes.items()
+    assert {name for name in ours.attributes if name not in theirs} <= {"saturate"}  # of Cast since opset 19
+
+
+@pytest.mark.parametrize(
+    ("op", "changed"), [("Max", {"axis": 0}), ("Softmax", {"axis": 0.5}), ("Transpose", {"perm": [0.0]})]
+)
+def test_an_attribute_that_the_operator_does_not_take_is_refused(op: str, changed: dict[str, Any]) -> None:
+    with pytest.raises(ArtifactError, match="the attributes it takes"):
+        audit(model_bytes([node(op, ["x"], **changed)], [1]))
+
+
 def test_every_operator_of_the_list_has_a_case() -> None:
-    assert {op for op, *_ in CASES} == set(RULES)
+    assert {op for op, *_ in CASES} == set(RULES) == set(SIGNATURES)
 
 
 @pytest.mark.parametrize(("op", "inputs", "attributes", "n_out"), CASES, ids=lambda v: v if isinstance(v, str) else "")

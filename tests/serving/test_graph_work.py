@@ -33,7 +33,7 @@ M = tensor(2, 3)
         (node("Reshape", M, tensor(2, dtype=INT64)), "it must be a constant"),
         (node("Reshape", M, numbers(2, 2)), "cannot become"),
         (node("Reshape", M, numbers(6, 1, 0)), "has no length for each 0"),
-        (node("MatMul", M), "input 1 is missing"),
+        (node("MatMul", M), "it has 1 inputs; it takes 2 to 2"),
         (node("MatMul", tensor(), M), "multiplies a scalar"),
         (node("MatMul", M, M), "cannot be multiplied"),
         (node("Gemm", tensor(3), M), "must have rank 2"),
