@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -53,6 +54,12 @@ def opened(path: Path, *, write: bool, fsync: str = "crash") -> sqlite3.Connecti
     return base
 
 
+def is_damage(error: Exception) -> bool:
+    """Whether SQLite says that the file is no longer a database that it can read."""
+    code = getattr(error, "sqlite_errorcode", None)
+    return code is not None and code & 0xFF in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+
+
 def sole_writer(path: Path) -> int:
     """A handle of the lock that the one writer of a journal keeps until it closes it, or its process ends.
 
@@ -68,6 +75,14 @@ def sole_writer(path: Path) -> int:
         ) from None
     except OSError as error:
         raise LoopError(f"{lock} cannot be opened or locked: {error.strerror}") from None
+
+
+def holds(path: Path, handle: int) -> bool:
+    """Whether the lock's file is still the one that is locked: one that was deleted keeps nobody out."""
+    try:
+        return os.path.samestat(os.stat(lock_of(path)), os.fstat(handle))
+    except OSError:
+        return False
 
 
 def lock_of(path: Path) -> Path:

@@ -71,6 +71,24 @@ class Waiting:
             self._shorten(most)
         self._some.set()
 
+    def rows(self) -> int:
+        """How many scans and events wait or are taken: what would be lost."""
+        with self._lock:
+            return self._rows()
+
+    def give_up(self) -> int:
+        """Nothing will be written any more: how many scans and events are lost by that."""
+        with self._lock:
+            n = self._rows()
+            self.lost += n
+            self._kinds, self._taken = {}, []
+        return n
+
+    def _rows(self) -> int:
+        return sum(kind in DROPPED for kind, _ in (item for _, item in self._taken)) + sum(
+            len(self._kinds.get(kind, ())) for kind in DROPPED
+        )
+
     def _shorten(self, most: int) -> None:
         for kind in DROPPED:
             old = self._kinds.get(kind)

@@ -19,8 +19,9 @@ import numpy as np
 
 from serving.errors import LoopError
 from serving.journal.entries import Event, Scan, columns
-from serving.journal.file import opened, sole_writer
+from serving.journal.file import holds, is_damage, opened, sole_writer
 from serving.journal.packing import packed
+from serving.journal.recovery import Harm, OpenFiles, alarm, cleared, copied
 from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
 from serving.journal.waiting import Item, Waiting
 from serving.manifest import Manifest
@@ -32,6 +33,7 @@ FRESH = 1200  # the last scans, a row each
 WAITING = 200_000  # scans and events that wait in memory while the disk takes none
 TOGETHER = 2_000  # are written at most in one transaction
 STALL_S = 10.0  # a write that takes longer is told
+AGAIN_S = 10.0  # until a file is tried again that could not be made again
 CLOSE_S = 30.0  # without a scan written, after which an end waits no longer
 
 
@@ -43,7 +45,8 @@ class Journal:
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
     takes nothing, or does not answer, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are
     ``lost``, scans before events; what a run is stays. That is told once, and once the journal writes again, an alarm
-    in it says how many they were.
+    in it says how many they were. A file that is deleted, replaced or damaged meanwhile is made again: with its rows as
+    far as the open one still gives them, and an alarm says how many went with it (see ``recovery``).
 
     Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
@@ -68,6 +71,11 @@ class Journal:
         except LoopError:
             self._base.close()
             raise
+        self._files = OpenFiles(path.resolve())
+        self._harm: Harm | None = None  # which has yet to be mended
+        self._run_id, self._run_row = 0, None  # the run of the scans that come
+        self._rows, self._ids = 0, dict[str, int]()  # scans and events that stand in the file by this journal
+        self._told = 0  # of what is lost, as much as stands in the journal
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
@@ -111,7 +119,9 @@ class Journal:
             waiting = self.behind
             self._thread.join(CLOSE_S)
         if self._thread.is_alive():  # which has the file open still
-            self.tell(f"the journal cannot be written: the last {waiting} scans and events are lost")
+            n = self._queue.give_up()
+            end = f"the last {n} scans and events are lost" if n else "nothing waits to be written"
+            self.tell(f"the journal's disk does not answer: {end}")
             return
         self._base.close()
         os.close(self._lock)
@@ -126,21 +136,24 @@ class Journal:
 
     # ------------------------------------------------------------------ the writer
     def _run(self) -> None:
-        run = told = 0  # of what is lost, as much as stands in the journal
         while True:
             self._take()
-            if not self._taken and self._closing.is_set():
-                return
+            last = not self._taken and self._closing.is_set()
             self._writing_s = time.monotonic()
             try:
-                run = self._write(run)
+                self._tend()
+                if last:
+                    return
+                self._write()
                 self._queue.written()
-                lost, told = self.lost - told, self.lost
+                lost = self.lost - self._told
                 if self.trouble or lost:
                     self.tell("the journal writes again" + (LOSS.format(lost) if lost else ""))
-                self.trouble, self._taken = "", _loss(lost) if lost else []
-                if self._taken:
-                    run = self._write(run)
+                self.trouble = ""
+                if lost:
+                    what = "the journal could not be written" + LOSS.format(lost)
+                    self._note(alarm(time.time(), what, "over: it writes again"))
+                    self._told += lost
                 self._pack()
                 self._rotate()
             except Exception as error:
@@ -149,7 +162,10 @@ class Journal:
                 if not self.trouble:
                     self.tell(f"the journal cannot be written: {named(error)}")
                 self.trouble = named(error)
-                if self._closing.is_set():
+                damaged = self._harm is None and is_damage(error)
+                self._harm = Harm.DAMAGED if damaged else self._harm
+                if self._closing.is_set() and not damaged:
+                    self._give_up()
                     return
                 self._queue.give_back(WAITING)
             finally:
@@ -160,36 +176,108 @@ class Journal:
         if not self._closing.is_set():
             self._queue.wait()
         if self.trouble or len(self._queue) < TOGETHER:
-            self._closing.wait(FLUSH_S)
+            self._closing.wait(FLUSH_S if self._harm is None else AGAIN_S)
         self._taken = self._queue.take(TOGETHER)
 
-    def _write(self, run: int) -> int:
+    def _write(self) -> None:
+        run, row, ids, rows = self._run_id, self._run_row, dict(self._ids), 0
         with self._base:
             for kind, item in self._taken:
                 if kind == "run":
-                    cursor = self._base.execute(
-                        "insert into run (began, controller, sha256, period_s, speed, columns, signals) "
-                        "values (?, ?, ?, ?, ?, ?, ?)",
-                        item,
-                    )
-                    run = int(cursor.lastrowid or 0)
+                    run, row = self._begun(item), item
                 elif kind == "scan":
                     numbers = np.asarray(item.numbers, dtype=np.float64).tobytes()
                     quality = json.dumps(item.quality) if any(item.quality) else None
-                    self._base.execute(
+                    cursor = self._base.execute(
                         "insert into scan (run, time, mode, numbers, quality, reason) values (?, ?, ?, ?, ?, ?)",
                         (run, item.time_s, item.mode, numbers, quality, item.reason or None),
                     )
+                    ids["scan"], rows = int(cursor.lastrowid or 0), rows + 1
                 elif kind == "learnt":
                     self._base.execute("insert or replace into learnt (name, value) values (?, ?)", item)
                 else:
-                    self._events += 1
-                    self._base.execute(
-                        "insert into event (time, kind, who, what, reason, alarm, raised, about) "
-                        "values (?, ?, ?, ?, ?, ?, ?, ?)",
-                        astuple(item),
-                    )
-        return run
+                    ids["event"], rows = self._noted(item), rows + 1
+        self._run_id, self._run_row, self._ids, self._rows = run, row, ids, self._rows + rows
+
+    def _begun(self, row: Any) -> int:
+        cursor = self._base.execute(
+            "insert into run (began, controller, sha256, period_s, speed, columns, signals) "
+            "values (?, ?, ?, ?, ?, ?, ?)",
+            row,
+        )
+        return int(cursor.lastrowid or 0)
+
+    def _noted(self, event: Event) -> int:
+        self._events += 1
+        cursor = self._base.execute(
+            "insert into event (time, kind, who, what, reason, alarm, raised, about) values (?, ?, ?, ?, ?, ?, ?, ?)",
+            astuple(event),
+        )
+        return int(cursor.lastrowid or 0)
+
+    def _note(self, events: list[Event]) -> None:
+        """Write down what the journal has to say of itself."""
+        with self._base:
+            for event in events:
+                self._ids["event"] = self._noted(event)
+
+    def _give_up(self) -> None:
+        """Count what is lost at the end."""
+        n = self._queue.give_up() + (self._rows if self._harm else 0)
+        self._queue.lost += self._rows if self._harm else 0
+        if n:
+            self.tell(f"the journal cannot be written: the last {n} scans and events are lost")
+
+    # ------------------------------------------------------------------ a file that went away
+    def _tend(self) -> None:
+        """Make the file again where it is no longer the one that was opened; before that its lock."""
+        self._harm = self._harm or self._files.harm()
+        if not holds(self.path, self._lock):
+            self._files.path.parent.mkdir(parents=True, exist_ok=True)
+            lock = sole_writer(self.path)
+            os.close(self._lock)
+            self._lock = lock
+        if self._harm is not None:
+            self._make_again(self._harm)
+
+    def _make_again(self, harm: Harm) -> None:
+        """A new file with all rows of the open one; an empty one where that cannot be read any more."""
+        path, old, copy = self._files.path, self._base, None
+        try:
+            copy = copied(old, path)
+        except sqlite3.Error as error:
+            if not is_damage(error):
+                raise  # the disk takes no copy now; the open file has the rows still
+        aside = cleared(self._files, keep=copy is None)
+        try:
+            if copy is not None:
+                copy.rename(path)
+            self._base = opened(path, write=True, fsync=self._fsync)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        with suppress(sqlite3.Error):
+            old.close()
+        self._files, self._harm = OpenFiles(path), None
+        lost = 0
+        if copy is None:
+            lost, self._rows = self._rows, 0
+            self._queue.lost, self._told = self._queue.lost + lost, self._told + lost
+            with self._base:
+                for table, last in self._ids.items():  # whoever has seen a row asks for those after it
+                    self._base.execute("insert into sqlite_sequence (name, seq) values (?, ?)", (table, last))
+                self._run_id = 0 if self._run_row is None else self._begun(self._run_row)
+        what = (
+            f"the journal's file {harm.value} while it was written: "
+            + (
+                "it is made again with all its rows"
+                if copy
+                else f"a new one begins, and {lost} scans and events are lost"
+            )
+            + (f"; the file that lay there is now {aside.name}" if aside else "")
+        )
+        self.tell(what)
+        self._note(alarm(time.time(), what, "over: it is made again"))
 
     def _pack(self) -> None:
         """Pack the oldest scans once there are enough, and drop the oldest blocks once there are too many."""
@@ -221,13 +309,3 @@ class Journal:
 
 
 LOSS = "; {} scans and events are lost that the disk did not take"
-
-
-def _loss(n: int) -> list[Any]:
-    """An alarm that is over and that somebody has to see."""
-    what = "the journal could not be written" + LOSS.format(n)
-    found = Event(time.time(), "fault", "journal", what, alarm="journal", raised=True)
-    return [
-        ("event", found),
-        ("event", Event(found.time_s, "fault", "journal", "over: it writes again", alarm="journal")),
-    ]

@@ -32,6 +32,7 @@ from serving.station.template import template
 from serving.trust import Controller, ending
 
 SETTINGS = Path("loop.toml")
+JOURNAL_LOST = 3  # exit status of a loop whose journal lacks scans or events
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -232,8 +233,11 @@ def _run(options: argparse.Namespace) -> int:
     if station.last is not None:
         station.tell(_left(station.manifest, station.last[1]))
     station.tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
-    station.tell(f"journal: {settings.journal.file}")
-    return 0
+    lost = station.journal.lost
+    station.tell(
+        f"journal: {settings.journal.file}" + (f"; {lost} scans and events of this loop are lost" if lost else "")
+    )
+    return JOURNAL_LOST if lost else 0
 
 
 def _misfits(settings: Settings) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import socket
+import sqlite3
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,8 +18,10 @@ from processes import within
 
 from pipeline.__main__ import main
 from serving import LoopError, Signal
+from serving.journal import Journal
 from serving.opcua.inspection import _refused, _unfit, other_unit
 from serving.opcua.settings import Point
+from serving.station.command import JOURNAL_LOST
 from serving.station.lease import Lease
 from serving.station.settings import Settings
 
@@ -95,6 +98,19 @@ def test_a_shadow_writes_nothing_but_its_heartbeat(
     assert "(law T_j" in said
     assert "ended in SHADOW: this loop does not write, and the plant keeps what others set" in said
     assert len({row["asked"][0] for row in plant.actuator()[before:]}) == 1
+
+
+def test_what_the_journal_lost_is_in_the_exit_status(
+    settings: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: Journal) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(Journal, "_write", full)
+    assert main(["loop", "run", "--scans", "2"]) == JOURNAL_LOST == 3
+    lost = re.search(r"(\d+) scans and events of this loop are lost$", capsys.readouterr().out.splitlines()[-1])
+    assert lost is not None
+    assert int(lost[1]) >= 4  # two scans, the start and the end
 
 
 def test_check_names_what_would_stop_the_loop(settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]) -> None:

@@ -269,11 +269,11 @@ def test_a_disk_that_takes_nothing_loses_nothing(
     journal.begin(controller.manifest, controller.sha256, 1e9)
     write, full = journal._write, [True] * 3
 
-    def sometimes(run: int) -> int:
+    def sometimes() -> None:
         if full:
             full.pop()
             raise sqlite3.OperationalError("database or disk is full")
-        return write(run)
+        write()
 
     monkeypatch.setattr(journal, "_write", sometimes)
     given = scans(5)
@@ -301,10 +301,10 @@ def test_what_a_full_disk_costs_is_said_and_no_run_is_lost(
     journal = Journal(tmp_path / "loop.journal", tell=told.append)
     write, full = journal._write, [True]
 
-    def sometimes(run: int) -> int:
+    def sometimes() -> None:
         if full:
             raise sqlite3.OperationalError("database or disk is full")
-        return write(run)
+        write()
 
     monkeypatch.setattr(journal, "_write", sometimes)
     journal.begin(controller.manifest, controller.sha256, 1e9)
@@ -353,10 +353,10 @@ def test_a_write_that_hangs_makes_nothing_grow(
     journal = Journal(tmp_path / "loop.journal", tell=told.append)
     write, hangs, answers = journal._write, threading.Event(), threading.Event()
 
-    def slow(run: int) -> int:
+    def slow() -> None:
         hangs.set()
         answers.wait(60)
-        return write(run)
+        write()
 
     monkeypatch.setattr(journal, "_write", slow)
     journal.begin(controller.manifest, controller.sha256, 1e9)
@@ -387,14 +387,131 @@ def test_a_disk_that_hangs_for_good_is_not_waited_for(
     told, answers = list[str](), threading.Event()
     journal = Journal(tmp_path / "loop.journal", tell=told.append)
     write = journal._write
-    monkeypatch.setattr(journal, "_write", lambda run: write(run) if answers.wait(60) else 0)
+    monkeypatch.setattr(journal, "_write", lambda: write() if answers.wait(60) else None)
     journal.begin(controller.manifest, controller.sha256, 1e9)
     journal.scan(scans(1)[0])
     journal.close()
-    assert told == ["the journal cannot be written: the last 2 scans and events are lost"]
+    assert told == ["the journal's disk does not answer: the last 1 scans and events are lost"]
+    assert journal.lost == 1  # the run is neither
     answers.set()
     journal._thread.join(60)
     journal.close()
+    assert journal.lost == 1
+
+
+def deleted(path: Path) -> None:
+    path.unlink()
+
+
+def moved_with_its_folder(path: Path) -> None:
+    path.parent.rename(path.parent.with_name("elsewhere"))
+
+
+def without_its_log(path: Path) -> None:
+    path.with_name(path.name + "-wal").unlink()
+
+
+def without_its_lock(path: Path) -> None:
+    path.with_name(path.name + ".lock").unlink()
+
+
+def replaced(path: Path) -> None:
+    path.unlink()
+    path.write_text("of somebody else")
+
+
+@pytest.mark.parametrize("at_the_end", [False, True])
+@pytest.mark.parametrize("harm", [deleted, moved_with_its_folder, without_its_log, without_its_lock, replaced])
+def test_a_file_that_goes_while_it_is_written_is_made_again_with_its_rows(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch, harm: Any, at_the_end: bool
+) -> None:
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    path, told, given = tmp_path / "plant" / "loop.journal", list[str](), scans(40)
+    path.parent.mkdir()
+    journal = Journal(path, tell=told.append)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    for scan in given[:25]:
+        journal.scan(scan)
+    assert within(20, lambda: journal.behind == 0)
+    harm(path)
+    for scan in given[25 : 25 if at_the_end else None]:
+        journal.scan(scan)
+    if not at_the_end:
+        assert within(20, lambda: path.is_file() and journal.behind == 0)
+        if harm is without_its_lock:
+            with pytest.raises(LoopError, match="is written by another loop"):
+                Journal(path)
+    journal.close()
+    assert (journal.lost, journal.trouble) == (0, "")
+    reader = JournalReader(path)
+    found = list(reader.scans())
+    assert [(id_, run) for id_, run, _ in found] == [(k + 1, 1) for k in range(25 if at_the_end else 40)]
+    assert all(same(a, b) for a, (_, _, b) in zip(given, found, strict=False))
+    alarms = [e.event.alarm for e in reader.entries() if e.event.raised]
+    assert alarms == ["journal"] * (harm is not without_its_lock)
+    assert (len(told), reader.active()) == (len(alarms), [])
+    reader.close()
+    aside = path.with_name("loop.journal.aside-1")
+    assert (aside.read_text() if aside.exists() else "") == ("of somebody else" if harm is replaced else "")
+
+
+def test_a_file_that_cannot_be_read_any_more_costs_its_rows_and_they_are_counted(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that see rows by id see the new ones, too."""
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+
+    def damaged(*_: Any) -> Path:
+        error = sqlite3.DatabaseError("database disk image is malformed")
+        error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+        raise error
+
+    path, given = tmp_path / "loop.journal", scans(40)
+    journal = Journal(path)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    for scan in given[:25]:
+        journal.scan(scan)
+    assert within(20, lambda: journal.behind == 0)
+    monkeypatch.setattr(writer, "copied", damaged)
+    os.truncate(path, 100)
+    for scan in given[25:]:
+        journal.scan(scan)
+    journal.close()
+    assert journal.lost == 25
+    reader = JournalReader(path)
+    assert [(id_, run) for id_, run, _ in reader.scans()] == [(k + 26, 1) for k in range(15)]
+    assert [e.event.alarm for e in reader.entries() if e.event.raised] == ["journal"]
+    reader.close()
+    assert path.with_name("loop.journal.aside-1").is_file()
+
+
+@pytest.mark.parametrize(("gone", "lost"), [(False, 46), (True, 76)])
+def test_what_a_disk_that_is_full_at_the_end_costs_is_counted(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch, gone: bool, lost: int
+) -> None:
+    """A deleted file that cannot be made again costs what stood in it, too."""
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    told: list[str] = []
+    journal = Journal(tmp_path / "loop.journal", tell=told.append)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    for scan in scans(30):
+        journal.scan(scan)
+    assert within(20, lambda: journal.behind == 0)
+
+    def full(*_: Any) -> Any:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(writer, "copied", full)
+    monkeypatch.setattr(journal, "_write", full)
+    if gone:
+        journal.path.unlink()
+    for scan in scans(45):
+        journal.scan(scan)
+    journal.event(Event(1e9, "change", "loop", "ended"))
+    journal.keep("monitor", "learnt")
+    journal.close()
+    assert journal.lost == lost
+    assert f"the last {lost} scans and events are lost" in told[-1]
 
 
 def test_an_alarm_that_is_over_stays_over() -> None:
