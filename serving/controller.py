@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable
-from math import isfinite
+from math import inf, isfinite
 from os import PathLike
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from serving.digest import DIGEST_KEY, file_digest, unseal
 from serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
 from serving.graph_audit import MAX_BYTES, audit
-from serving.manifest import INPUTS, MANIFEST_KEY, Manifest
+from serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
 _LINE = 8  # float64 in a cache line: each vector starts on one, so that no result depends on its neighbours
@@ -94,7 +94,8 @@ class Controller:
         SampleError
             An input is not finite: no MV is computed from it.
         OutputError
-            The law's output is not finite or lies outside the MV's range.
+            The law's output is not finite, lies outside the MV's range, or is further from ``mv_applied`` than the
+            MV moves in a period (``max_move``).
         """
         given = (sp, pv, dv, mv_applied, state)
         with self._lock:
@@ -105,7 +106,8 @@ class Controller:
                 else:
                     buffer[...] = self._vector(name, value, shape[0])
             # A sum of finite numbers may overflow; then the exact check clears the sample.
-            if not isfinite(sum(self._in.tolist())):
+            fed = self._in.tolist()
+            if not isfinite(sum(fed)):
                 self._check_finite()
             try:
                 self._session.run_with_iobinding(self._binding)
@@ -119,6 +121,9 @@ class Controller:
                 self._refuse(values)
         if not isfinite(sum(values)):
             self._refuse(values)
+        for i, at, signal in self._limited:
+            if not signal.moves(fed[at], values[i]):
+                self._refuse_move(signal, fed[at], values[i])
         return Step(out[:n_mv], out[a:b], out[c:d])
 
     def warm(self) -> None:
@@ -146,6 +151,11 @@ class Controller:
         starts = [(p.ctypes.data - self._out.ctypes.data) // 8 for p in outs]
         self._cuts = (len(m.mv), starts[1], starts[1] + m.n_state, starts[2], starts[2] + len(m.info))
         self._ranges = [(s.low, s.high, s.values) for s in m.mv]
+        begins = next(
+            ((part.ctypes.data - self._in.ctypes.data) // 8 for _, n, part, _ in self._inputs if n == "mv_applied"), 0
+        )
+        # Each MV whose moves are limited: its place, that of its applied value among the inputs, and its signal.
+        self._limited = [(i, begins + i, s) for i, s in enumerate(m.mv) if s.most < inf]
         self._binding = self._session.io_binding()
         for _, name, part, shape in self._inputs:
             self._binding.bind_input(name, "cpu", 0, np.float64, shape, part.ctypes.data)
@@ -206,6 +216,13 @@ class Controller:
                 )
             if signal.values is not None and value not in signal.values:
                 raise OutputError(f"the law gave {signal.name} = {value}; it may be one of {list(signal.values)}")
+
+    @staticmethod
+    def _refuse_move(signal: Signal, applied: float, value: float) -> NoReturn:
+        raise OutputError(
+            f"the law gave {signal.name} = {value} {signal.unit} after {applied} {signal.unit}; it may move by at most "
+            f"{signal.max_move:g} {signal.unit} a period"
+        )
 
 
 _FLOAT64 = np.dtype(np.float64)

@@ -5,7 +5,7 @@ LoopwrightError
 |   +-- SignatureError the file is unsigned, signed by a foreign key, changed since, or its signature expired
 +-- ContractError      an input has the wrong name, shape or type
 +-- SampleError        a value is not finite, so no manipulated variable may be computed from it
-+-- OutputError        the law gave a value that is not finite or outside its signal's range
++-- OutputError        the law gave a value that is not finite, outside its signal's range, or too far from the last one
 +-- LoopError          the loop was asked for something that its configuration does not allow
     +-- EndpointError  the plant's side (server, device) cannot be read or written
 """
@@ -34,7 +34,7 @@ class SampleError(LoopwrightError):
 
 
 class OutputError(LoopwrightError):
-    """The law's output is not finite or lies outside its signal's range."""
+    """The law's output is not finite, lies outside its signal's range, or moves by more than its signal may."""
 
 
 class LoopError(LoopwrightError):

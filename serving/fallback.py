@@ -21,8 +21,9 @@ Array: TypeAlias = NDArray[np.float64]
 class Fallback:
     """HOLD keeps the last MV; after ``after_s`` [s] of a fault in a row the loop does more than that.
 
-    With ``mv`` (n_mv,) each MV moves there, by at most ``rate`` (n_mv,) [mv units/s]. With ``hand_back`` the command
-    asks to hand the plant to its own controller; once that is done the loop writes no more (SHADOW).
+    With ``mv`` (n_mv,) each MV moves there, by at most ``rate`` (n_mv,) [mv units/s] and its ``max_move``. With
+    ``hand_back`` the command asks to hand the plant to its own controller; once that is done the loop writes no more
+    (SHADOW).
 
     Raises LoopError for times or rates that are not above zero, and where both ways or none is asked for.
     """
@@ -58,7 +59,10 @@ class Fallback:
         if self.mv is None or self.rate is None:
             return mv
         most = np.array(
-            [inf if s.values is not None else r * period_s for s, r in zip(signals, self.rate, strict=True)]
+            [
+                inf if s.values is not None else min(r * period_s, s.max_move or inf)
+                for s, r in zip(signals, self.rate, strict=True)
+            ]
         )
         move = np.array(self.mv) - mv
         near = np.abs(move) <= most

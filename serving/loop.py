@@ -47,9 +47,11 @@ class ControlLoop:
     the fallback go on from there, and nothing writes an old MV over it. Nothing is written while the read-back is bad,
     nor, where the MV stands outside its range, until it is back. A plant that reads nothing back gets the old MV.
 
-    Every written MV lies in its range, in every mode and with any guards; a discrete MV has one
-    of its values. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range:
-    it is clipped to the range, for the law and for HOLD. A larger excess is a fault.
+    Every written MV lies in its range, in every mode and with any guards; a discrete MV has one of its values. The law
+    and the fallback move an MV by at most its ``max_move`` a period from where it stands: a law that gives more has a
+    fault. The operator's own ``set_mv`` goes there at once. A read-back may exceed the range by
+    ``guard.READ_BACK_MARGIN`` times the range: it is clipped to the range, for the law and for HOLD. A larger excess is
+    a fault.
 
     Parameters
     ----------
@@ -299,7 +301,7 @@ class ControlLoop:
         """Count the scans of a fault, and go where the fallback says once it has lasted."""
         self._mode.hold()
         if moves and self.fallback is not None and self._mode.overdue(self.fallback, self.manifest.period_s):
-            self._mv = self.fallback.toward(self._mv, self.manifest.mv, self.manifest.period_s)
+            self._mv = self.fallback.toward(self._mv, self.controller.manifest.mv, self.manifest.period_s)
 
     def _handing_back(self) -> bool:
         return self._mode.handing_back(self.fallback, self.manifest.period_s)

@@ -19,6 +19,7 @@ MAX_DEPTH = 20  # of lists and objects in each other
 MAX_DIGITS = 300  # of an integer
 MAX_STATE = 1_000_000
 SHORTEST_S, LONGEST_S = 1e-6, 1e9  # a period
+MOVE_ROUNDING = 1e-9  # share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,8 @@ class Signal:
     """A named quantity in engineering units, with the range in which it is meaningful.
 
     ``values`` lists the allowed values of a discrete signal (a valve that is open or shut);
-    None for a continuous one. ``max_move`` is the largest change of an MV a period; None: no limit.
+    None for a continuous one. ``max_move`` is the largest change of an MV a period; None: no limit. A discrete MV has
+    no way between its values, so no such limit.
     """
 
     name: str
@@ -53,6 +55,20 @@ class Signal:
             raise ArtifactError(
                 f"signal {self.name!r} has the max_move {self.max_move}; it must be above 0 and finite, or left out"
             )
+
+    @property
+    def most(self) -> float:
+        """Largest move a period that is let through: ``max_move`` and what rounding adds; infinite without a limit."""
+        if self.max_move is None or self.values is not None:
+            return math.inf
+        return self.max_move + MOVE_ROUNDING * max(abs(self.low), abs(self.high))
+
+    def moves(self, applied: float, value: float) -> bool:
+        """Whether an MV may go from ``applied`` to ``value`` in a period.
+
+        An applied MV outside the range counts as its end: scaling carries a sound read-back over it.
+        """
+        return abs(value - min(max(applied, self.low), self.high)) <= self.most
 
     @property
     def middle(self) -> float:
@@ -122,6 +138,12 @@ class Manifest:
         if strange or len(set(self.inputs)) < len(self.inputs):
             raise ArtifactError(
                 f"the manifest's inputs are {list(self.inputs)}; allowed are {', '.join(INPUTS)}, each once"
+            )
+        limited = [s.name for s in self.mv if s.most < math.inf]
+        if limited and "mv_applied" not in self.inputs:
+            raise ArtifactError(
+                f"the manifest limits the moves of {limited[0]!r}, but its law does not read mv_applied, "
+                "from which they count"
             )
 
     def signals(self, name: str) -> tuple[Signal, ...]:

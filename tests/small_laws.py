@@ -92,12 +92,17 @@ def with_feedforward(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_app
     return mv, total, dv * error
 
 
-@pytest.fixture(scope="session")
-def disobedient_file(make_formula: Callable[..., ControlLaw], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A controller that takes a measured disturbance and leaves its MV's range, which its manifest makes narrower."""
+STRICTER = {"range": Signal("valve", "%", 10.0, 90.0), "move": Signal("valve", "%", 0.0, 100.0, max_move=30.0)}
+
+
+@pytest.fixture(scope="session", params=list(STRICTER))
+def disobedient_file(
+    make_formula: Callable[..., ControlLaw], tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Path:
+    """A controller that takes a measured disturbance and does with its MV what its manifest does not allow."""
     path = tmp_path_factory.mktemp("controller") / "disobedient.onnx"
     export(make_formula(with_feedforward, 1, ("product",)), path, case="tank", provenance={})
-    narrow = replace(Controller(path).manifest, mv=(Signal("valve", "%", 10.0, 90.0),))
+    narrow = replace(Controller(path).manifest, mv=(STRICTER[request.param],))
     model = onnx.ModelProto.FromString(path.read_bytes()[:-TRAILER_BYTES])
     del model.metadata_props[:]
     path.write_bytes(assembled(model.SerializeToString(), narrow))

@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import isnan
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from serving.errors import EndpointError, LoopError
+from serving.first_steps import tried
 from serving.guard import Sample
 from serving.journal import JournalReader
 from serving.loop import Command, Mode
@@ -168,7 +169,7 @@ def _init(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     settings = Settings.read(options.file)
     _quiet()
-    controller = Controller(settings.controller, settings.sha256 or None, settings.trusted)
+    controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
     manifest = controller.manifest
     from serving.opcua.inspection import Found, inspected
     from serving.station.rehearsal import rehearsed
@@ -212,7 +213,8 @@ def _warnings(settings: Settings) -> list[str]:
 def _run(options: argparse.Namespace) -> int:
     settings = Settings.read(options.file)
     _quiet()
-    misfits = _misfits(settings)
+    controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
+    misfits = _misfits(settings, controller.manifest)
     for line in misfits:
         print(f"would stop the loop: {line}", file=sys.stderr)
     if misfits:
@@ -222,7 +224,8 @@ def _run(options: argparse.Namespace) -> int:
     def tell(line: str) -> None:
         print(line, flush=True)
 
-    station = Station(settings, tell=tell)
+    # The very bytes that were tried, whoever writes another file there meanwhile.
+    station = Station(replace(settings, sha256=controller.sha256), tell=tell)
     station.warnings = _warnings(settings)
     for line in station.warnings + station.ending():
         station.tell(f"note: {line}")
@@ -240,11 +243,10 @@ def _run(options: argparse.Namespace) -> int:
     return JOURNAL_LOST if lost else 0
 
 
-def _misfits(settings: Settings) -> list[str]:
+def _misfits(settings: Settings, manifest: Manifest) -> list[str]:
     """What of ``loop check`` is wrong for good: another unit, a node that is not there. None while nobody answers."""
     from serving.opcua.inspection import lasting
 
-    manifest = Controller(settings.controller, settings.sha256 or None, settings.trusted).manifest
     writes = settings.start != "SHADOW"
     with suppress(EndpointError):
         return lasting(manifest, settings.server, settings.nodes, settings.guards.margin, writes=writes)

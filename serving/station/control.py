@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from serving.errors import LoopError, LoopwrightError
+from serving.first_steps import DEADLINE_S
 from serving.station.places import runtime_folder
 from serving.words import first_line, named
 
@@ -73,7 +74,11 @@ def ask(journal: Path, request: Answer, patience_s: float = PATIENCE_S) -> Answe
 
 
 def asked(path: Path, request: Answer, patience_s: float = PATIENCE_S) -> Answer:
-    """The answer at a socket, a refusal too. LoopError where nobody answers."""
+    """The answer at a socket, a refusal too. LoopError where nobody answers.
+
+    A swap is waited for longer: the loop first has the new file tried by another process.
+    """
+    patience_s += DEADLINE_S if isinstance(request, dict) and request.get("do") == "swap" else 0.0
     try:
         with socket.socket(socket.AF_UNIX) as wire:
             wire.settimeout(patience_s)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from serving.clock import MonotonicClock
 from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
+from serving.first_steps import tried
 from serving.grid import RunReport
 from serving.guard import Sample
 from serving.journal import Journal, JournalReader
@@ -293,9 +294,12 @@ class Station:
         return public_keys(self.settings.trusted)
 
     def _opened(self, file: str, sha256: str | None) -> Controller:
-        """A controller that is to be tried; a relative path lies beside the one in charge."""
+        """A controller that is to be tried; a relative path lies beside the one in charge.
+
+        Its first steps are another process's: a file that ends a process does not end this one.
+        """
         charge = self.controller if self.loop is None else self.loop.controller
-        return TrustedController(charge.path.parent / file, sha256, self.trusted)
+        return tried(charge.path.parent / file, sha256, self.trusted)
 
     def answer(self, tree: Any) -> Answer:
         """What a request gets, from any thread: a view, or the change once a scan has carried it out."""

@@ -451,7 +451,9 @@ def undefined(model: onnx.ModelProto) -> None:
 
 
 def mistyped(model: onnx.ModelProto) -> None:
-    model.graph.node[0].attribute.append(helper.make_attribute("surprise", 1))
+    """A sum of numbers and truth values."""
+    model.graph.node.append(helper.make_node("Cast", ["pv"], ["truth"], to=TensorProto.BOOL))
+    model.graph.node.append(helper.make_node("Add", ["pv", "truth"], ["sum"]))
 
 
 def headless(model: onnx.ModelProto) -> None:
@@ -503,6 +505,56 @@ def test_an_output_outside_its_range_is_refused(pi_file: Path, controller: Contr
     with pytest.raises(OutputError, match=r"it may be one of \[0.0, 100.0\]"):
         c.step(**FEED)
     assert c.step(**{**FEED, "mv_applied": [900.0]}).mv.tolist() == [100.0]
+
+
+SLOW = Signal("valve", "%", 0.0, 100.0, max_move=5.0)
+
+
+def slow_file(pi_file: Path, controller: Controller, folder: Path) -> Path:
+    """A law that knows no rate, in a file whose manifest has one."""
+    return sealed(folder / "slow.onnx", onnx.load(pi_file), edited(controller, mv=[SLOW.to_dict()]))
+
+
+@pytest.mark.parametrize(
+    ("level", "applied", "mv"),
+    [
+        (-2.8, 40.0, 44.94),
+        (-2.9, 40.0, None),
+        (4.8, 40.0, 35.06),
+        (4.9, 40.0, None),
+        (-8.0, 98.0, 100.0),  # the law's own end
+        (-2.8, -1.0, 3.94),  # scaling carried the read-back below 0, where it counts as 0
+        (-3.6, -1.0, 4.98),
+        (-3.7, -1.0, None),
+    ],
+)
+def test_an_output_further_from_the_applied_mv_than_it_moves_a_period_is_refused(
+    pi_file: Path, controller: Controller, tmp_path: Path, level: float, applied: float, mv: float | None
+) -> None:
+    """The first step of the PI from a state of zeros moves by 1.3 times the error."""
+    slow = Controller(slow_file(pi_file, controller, tmp_path))
+    feed = {**FEED, "pv": [level, 300.0], "mv_applied": [applied], "state": [0.0, 0.0]}
+    if mv is not None:
+        assert slow.step(**feed).mv.tolist() == pytest.approx([mv], abs=1e-12)
+        return
+    with pytest.raises(OutputError, match="at most 5 % a period"):
+        slow.step(**feed)
+
+
+def test_rounding_refuses_no_move() -> None:
+    """The sum of an applied MV and the largest move is rounded up or down."""
+    s = Signal("valve", "%", 0.0, 100.0, max_move=0.1)
+    applied = np.random.default_rng(0).uniform(0, 99, 1000)
+    assert all(s.moves(a, a + 0.1) and s.moves(a + 0.1, a) for a in applied.tolist())
+    assert not any(s.moves(a, a + 0.1 + 1e-6) for a in applied.tolist())
+    on_off = Signal("valve", "%", 0.0, 100.0, (0.0, 100.0), max_move=0.1)
+    assert on_off.moves(0.0, 100.0)
+
+
+def test_a_limit_of_moves_needs_the_applied_mv(controller: Controller) -> None:
+    text = edited(controller, mv=[SLOW.to_dict()], inputs=["sp", "pv", "state"])
+    with pytest.raises(ArtifactError, match="does not read mv_applied"):
+        Manifest.from_json(text)
 
 
 def test_an_output_that_is_not_finite_is_refused(controller: Controller) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +210,53 @@ def test_a_law_error_holds_the_applied_mv(make_loop: Callable[..., ControlLoop],
     with monkeypatch.context() as patch:
         patch.setattr(loop.controller, "step", explode)
         assert loop.scan(sample()).reason == "out of memory"
+
+
+def slow_loop(shared: Controller, **options: Any) -> ControlLoop:
+    """A loop whose valve moves by at most 5 % a period, with a law that moves by 1.3 % of an error of 1 m."""
+    return ControlLoop(limited(shared, 5.0), sp=[1.0], mv=[40.0], mode=Mode.AUTO, **options)
+
+
+def limited(controller: Controller, max_move: float | None) -> Controller:
+    """The same law, in a manifest with another largest move."""
+    changed = copy.copy(controller)
+    (valve,) = controller.manifest.mv
+    changed.manifest = replace(controller.manifest, mv=(replace(valve, max_move=max_move),))
+    changed._bind()
+    return changed
+
+
+def test_a_move_beyond_the_mvs_rate_is_a_fault_and_never_written(shared: Controller) -> None:
+    loop = slow_loop(shared, guards=())
+    assert loop.scan(sample(-2.8)).mv[0] == pytest.approx(44.94)
+    loop = slow_loop(shared, guards=())
+    command = loop.scan(sample(-2.9))
+    assert (command.mode, command.mv.tolist(), bool(command.reason)) == (Mode.HOLD, [40.0], True)
+    # Others moved the valve while the loop could not write: the law moves from there.
+    loop = slow_loop(shared, guards=())
+    before = loop.mv
+    loop.scan(sample(-2.8))
+    loop.unwritten(before, "the plant cannot be written")
+    loop.set_mode(Mode.AUTO)
+    assert loop.scan(sample(-2.8, 70.0)).mv[0] == pytest.approx(74.94)
+    # By hand it goes there at once.
+    loop.set_mode(Mode.MANUAL)
+    loop.set_mv([10.0])
+    assert loop.scan(sample(-2.8, 70.0)).mv.tolist() == [10.0]
+
+
+def test_a_fallback_is_no_faster_than_the_mv_may_move(shared: Controller) -> None:
+    loop = slow_loop(shared, fallback=Fallback(0.0, (100.0,), (1e3,)))
+    assert [loop.miss("nothing is read").mv[0] for _ in range(3)] == [45.0, 50.0, 55.0]
+
+
+def test_who_takes_over_is_held_to_its_own_rate(shared: Controller) -> None:
+    loop = slow_loop(shared, guards=())
+    loop.swap(limited(shared, 4.0), 1)
+    assert [loop.scan(sample(level)).mode for level in (-1.0, -1.1)] == [Mode.AUTO, Mode.HOLD]
+    loop = slow_loop(shared, guards=())
+    loop.swap(limited(shared, 5.0), 1)
+    assert [loop.scan(sample(level)).mode for level in (-1.0, -1.1)] == [Mode.AUTO, Mode.AUTO]
 
 
 def test_a_guard_that_fails_does_not_clear_the_sample(make_loop: Callable[..., ControlLoop]) -> None:

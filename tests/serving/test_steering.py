@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from killers import blind_children, killer
 from plant_servers import UNKNOWN, Plant, RunningLoop, spoil
 from processes import within
 
@@ -90,7 +91,9 @@ def becomes(capsys: pytest.CaptureFixture[str], mode: str) -> bool:
     return within(20, lambda: state(capsys)["mode"] == mode)
 
 
-def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixture[str]) -> None:
+def test_modes_set_points_and_mvs(
+    loop: RunningLoop, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     who = ("--who", "anna", "--reason", "start of the shift")
     assert state(capsys)["mode"] == "SHADOW"
     assert done(capsys, "mode", "manual", *who).startswith("mode SHADOW -> MANUAL")
@@ -104,6 +107,8 @@ def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixtu
         return (now["mode"], now["sp"], now["quality"]) == ("AUTO", {"C_A": 0.5}, ["Good", "Good", "Good"])
 
     assert within(20, good)
+    killer(tmp_path / "killer.onnx", loop.station.manifest)
+    blind_children(monkeypatch, tmp_path / "blind")
     for words, refusal in (
         (("mode", "fast"), "mode is 'FAST'; "),
         (("sp", "C_A=2"), "the set point C_A = 2.0 mol/l is outside [0, 1] mol/l"),
@@ -115,6 +120,7 @@ def test_modes_set_points_and_mvs(loop: RunningLoop, capsys: pytest.CaptureFixtu
         (("swap", "--keep"), "no controller is on trial"),
         (("swap", "nowhere.onnx"), "nowhere.onnx: the file cannot be read"),
         (("swap", "pid.onnx"), "is in charge already"),
+        (("swap", "killer.onnx"), "it ended the process that tried its first steps (SIGSEGV)"),
         (("mode", "auto", "--who", " "), "who is empty: a change is written down with a name"),
     ):
         status, said = loopwright(capsys, *words)

@@ -12,13 +12,13 @@ options.intra_op_num_threads = 1
 session = ort.InferenceSession(file, options, providers=["CPUExecutionProvider"])
 m = json.loads(session.get_modelmeta().custom_metadata_map["loopwright.manifest"])
 names = [output.name for output in session.get_outputs()]
-state, mv = np.zeros(m["n_state"]), np.array([s["low"] for s in m["mv"]])  # mv stands for your read-back
+low, high, most = np.array([[s["low"], s["high"], s.get("max_move", np.inf)] for s in m["mv"]]).T  # of continuous MVs
+state, mv = np.zeros(m["n_state"]), low  # mv stands for your read-back
 for k in range(100):  # once every m["period_s"] seconds
     given = {n: np.array([(s["low"] + s["high"]) / 2 for s in m[n]]) for n in ("sp", "dv")}
     pv = np.array([s["low"] + (s["high"] - s["low"]) * (k % 10) / 10 for s in m["pv"]])
     given |= {"pv": pv, "mv_applied": mv, "state": state}
     result = dict(zip(names, session.run(None, {n: given[n] for n in m["inputs"]}), strict=True))
-    mv, state, info = result["mv"], result.get("state_next", state), result.get("info", np.zeros(0))
-    if not np.isfinite(mv).all():  # the runtime also checks ranges, inputs and the file itself
-        sys.exit("no MV")
-    print(mv.tolist(), dict(zip(m["info"], info.tolist(), strict=True)))
+    old, mv, state, info = mv, result["mv"], result.get("state_next", state), result.get("info", np.zeros(0))
+    allowed = (low <= mv) & (mv <= high) & (abs(mv - old) <= most * (1 + 1e-9))  # the runtime also checks the file
+    print(mv.tolist(), dict(zip(m["info"], info.tolist(), strict=True))) if allowed.all() else sys.exit("no MV")

@@ -238,6 +238,7 @@ typedef struct {
   double low, high;
   double *values; /* of a discrete signal */
   size_t n_values;
+  double max_move; /* of an MV: its largest change a period; INFINITY without a limit */
 } Signal;
 
 typedef struct {
@@ -306,6 +307,14 @@ static bool may_be(const Signal *s, double value, double margin) {
   return s->low - slack <= value && value <= s->high + slack;
 }
 
+/* Whether an MV may go from `applied` to `value` in a period. The share is what rounding adds to a sum. An applied MV
+   outside the range counts as its end. */
+#define MOVE_ROUNDING 1e-9
+static bool may_move(const Signal *s, double applied, double value) {
+  double most = s->max_move + MOVE_ROUNDING * fmax(fabs(s->low), fabs(s->high));
+  return fabs(value - fmin(fmax(applied, s->low), s->high)) <= most;
+}
+
 static bool read_signals(Controller *c, const char *key, Signals *signals) {
   const Json *list = json_get(&c->manifest, key);
   if (!list || list->kind != J_LIST) return failed(c, "the manifest has no list %s", key);
@@ -318,9 +327,13 @@ static bool read_signals(Controller *c, const char *key, Signals *signals) {
     s->low = json_number(json_get(row, "low"));
     s->high = json_number(json_get(row, "high"));
     if (!(s->low < s->high) || !isfinite(s->high - s->low)) return failed(c, "%s %s has no range", key, s->name);
+    const Json *move = json_get(row, "max_move");
+    s->max_move = move && move->kind != J_NULL ? json_number(move) : INFINITY;
+    if (!(s->max_move > 0)) return failed(c, "%s %s has a max_move that is not above 0", key, s->name);
     if (!values || values->kind != J_LIST) continue;
     if (!(s->values = calloc(values->n + 1, sizeof *s->values))) return failed(c, "no memory");
     s->n_values = values->n;
+    s->max_move = INFINITY; /* it has no way between its values */
     for (size_t k = 0; k < values->n; k++) s->values[k] = json_number(&values->items[k]);
   }
   return true;
@@ -351,6 +364,9 @@ static bool read_manifest(Controller *c, const char *digest) {
     if (i == INPUTS) return failed(c, "the manifest names an input that no controller has");
     c->uses[i] = true;
   }
+  for (size_t i = 0; i < c->n_in[MV]; i++)
+    if (!c->uses[MV] && c->signals[MV].at[i].max_move < INFINITY)
+      return failed(c, "the moves of %s are limited, but its law does not read mv_applied", c->signals[MV].at[i].name);
   return true;
 }
 
@@ -480,6 +496,11 @@ static Outcome controller_step(Controller *c, const double *const given[STATE]) 
     double value = c->out[OUT_MV][k];
     if (!may_be(s, value, 0) || (s->values && !among(s, value))) {
       failed(c, "the law gave %s = %.17g %s, which it may not have", s->name, value, s->unit);
+      return REFUSED_OUTPUT;
+    }
+    if (s->max_move < INFINITY && !may_move(s, c->in[MV][k], value)) {
+      failed(c, "the law gave %s = %.17g %s after %.17g; it may move by at most %g a period", s->name, value, s->unit,
+             c->in[MV][k], s->max_move);
       return REFUSED_OUTPUT;
     }
   }

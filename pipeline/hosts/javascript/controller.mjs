@@ -15,6 +15,8 @@ const OUTPUTS = ["mv", "state_next", "info"];
 const hex = (bytes) => [...new Uint8Array(bytes)].map((b) => b.toString(16).padStart(2, "0")).join("");
 const same = (a, b) => [...a].sort().join() === [...b].sort().join();
 
+const MOVE_ROUNDING = 1e-9; // share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
+
 export class Controller {
   // `bytes` is the .onnx file, `manifest` the parsed .json beside it; the digest ties one to the other.
   // `provider` is "cpu" in Node and "wasm" in a browser.
@@ -44,6 +46,9 @@ export class Controller {
     const sizes = { mv: manifest.mv.length, state_next: manifest.n_state, info: manifest.info.length };
     if (!same(session.inputNames, manifest.inputs) || !same(session.outputNames, OUTPUTS.filter((name) => sizes[name])))
       throw new Refused("the graph has other inputs or outputs than the manifest says");
+    const limited = manifest.mv.find((s) => limits(s));
+    if (limited && !manifest.inputs.includes("mv_applied"))
+      throw new Refused(`the moves of ${limited.name} are limited, but its law does not read mv_applied`);
     for (const name of INPUTS.filter((n) => manifest.inputs.includes(n))) {
       const n = name === "state" ? manifest.n_state : this.signals[name].length;
       this.buffers[name] = new Float64Array(n);
@@ -85,9 +90,17 @@ export class Controller {
       const value = outputs.mv[i];
       if (!(s.low <= value && value <= s.high)) throw new Refused(`the law gave ${s.name} = ${value} ${s.unit}, outside its range [${s.low}, ${s.high}] ${s.unit}`, "output");
       if (s.values && !s.values.includes(value)) throw new Refused(`the law gave ${s.name} = ${value}; it may be one of ${s.values.join(", ")}`, "output");
+      if (!limits(s)) continue;
+      const applied = this.buffers.mv_applied[i]; // outside the range it counts as its end
+      const most = s.max_move + MOVE_ROUNDING * Math.max(Math.abs(s.low), Math.abs(s.high));
+      if (!(Math.abs(value - Math.min(Math.max(applied, s.low), s.high)) <= most))
+        throw new Refused(`the law gave ${s.name} = ${value} ${s.unit} after ${applied} ${s.unit}; it may move by at most ${s.max_move} ${s.unit} a period`, "output");
     }
   }
 }
+
+// Whether an MV's moves are limited. A discrete one has no way between its values.
+const limits = (s) => Boolean(s.max_move && !s.values);
 
 const PV_MARGIN = 0.05; // share of a PV's range beyond which the sensor is broken
 const READ_BACK_MARGIN = 0.02; // share of an MV's range by which scaling may carry a sound read-back over its ends

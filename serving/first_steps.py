@@ -1,0 +1,125 @@
+"""The first steps of a controller's file in a process of their own, which may die.
+
+A file can pass every check of its bytes and still end the process that computes it: a fault of onnxruntime, a library
+that lacks an instruction of this processor. A process that writes to a plant loads a file only after another one has
+taken its first steps with these very bytes.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import product
+from os import PathLike
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from serving import controller, trust
+from serving.errors import ArtifactError, LoopwrightError, OutputError
+from serving.manifest import Manifest
+from serving.words import first_line
+
+if TYPE_CHECKING:
+    from serving.signing.verify import Trusted
+
+DEADLINE_S = 30.0  # of the whole process; it takes .3 s, and a step at most 2 s
+CHAINED = 3  # steps from a state of zeros at each set of inputs
+REFUSED = 2  # exit status of a process whose file is refused
+NICENESS = 10  # the loop that runs beside it goes first
+
+
+def tried(path: str | PathLike[str], sha256: str | None = None, trusted: Trusted | None = None) -> trust.Controller:
+    """The controller in a file, once another process has taken its first steps.
+
+    The arguments and errors are those of ``serving.trust.Controller``. ArtifactError too where the file ends that
+    process, does not let it end within 30 s, or onnxruntime cannot compute it. The bytes that were tried are those
+    that are loaded: their digest is pinned.
+    """
+    if trusted is not None:  # nothing of a file that nobody signed is run
+        from serving.signing.verify import verified  # here: it needs the package cryptography
+
+        signed = verified(path, trusted).sha256
+        sha256 = signed if sha256 is None else sha256
+    return trust.Controller(path, _digest_tried(path, sha256), trusted)
+
+
+def _digest_tried(path: str | PathLike[str], sha256: str | None) -> str:
+    """The SHA-256 of the bytes whose first steps another process has survived."""
+    command = [sys.executable, "-m", "serving.first_steps", os.fspath(path), *([] if sha256 is None else [sha256])]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=DEADLINE_S)
+    except subprocess.TimeoutExpired:
+        raise ArtifactError(
+            f"{path}: its first steps, tried in a process of their own, do not end within {DEADLINE_S:g} s"
+        ) from None
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+        raise ArtifactError(f"{path}: no process can be started that tries its first steps: {error}") from None
+    if done.returncode == REFUSED:
+        raise ArtifactError(done.stderr.strip())
+    if done.returncode:
+        raise ArtifactError(
+            f"{path}: it ended the process that tried its first steps ({_ending(done.returncode)}); "
+            "it would end the loop's too, so it is not loaded"
+        )
+    return done.stdout.strip()
+
+
+def _ending(status: int) -> str:
+    with suppress(ValueError):
+        return signal.Signals(-status).name
+    return f"status {status}"
+
+
+def take(loaded: controller.Controller) -> None:
+    """The first steps: the middle of every range, then both ends of each kind of input, a few in a row from no past.
+
+    Raises ArtifactError where onnxruntime cannot compute one, or where no step at all gives an MV. A law may refuse
+    some of these inputs: in a loop that is a fault, which no process dies of.
+    """
+    given, refused = 0, ""
+    for inputs in _inputs(loaded.manifest):
+        state = loaded.cold_state()
+        for _ in range(CHAINED):
+            try:
+                state = loaded.step(**inputs, state=state).state
+                given += 1
+            except OutputError as error:
+                if error.__cause__ is not None:
+                    raise ArtifactError(f"{loaded.path}: {first_line(error)}") from error
+                refused = refused or first_line(error)
+                break
+    if not given:
+        raise ArtifactError(f"{loaded.path}: none of its first steps gives an MV: {refused}")
+
+
+def _inputs(m: Manifest) -> Iterator[dict[str, np.ndarray]]:
+    names = ("sp", "pv", "dv", "mv_applied")
+    yield {name: np.array([s.middle for s in m.signals(name)], dtype=np.float64) for name in names}
+    for ends in product((False, True), repeat=len(names)):
+        yield {
+            name: np.array([s.high if end else s.low for s in m.signals(name)], dtype=np.float64)
+            for name, end in zip(names, ends, strict=True)
+        }
+
+
+def main(path: str, sha256: str | None = None) -> int:
+    """Take the first steps of a file and say its SHA-256; the exit status."""
+    with suppress(OSError):
+        os.nice(NICENESS)
+    try:
+        loaded = controller.Controller(path, sha256)
+        take(loaded)
+    except LoopwrightError as error:
+        print(first_line(error), file=sys.stderr)
+        return REFUSED
+    print(loaded.sha256)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,101 @@
+"""A new file takes its first steps in a process that may die before it enters one that writes to a plant."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from killers import blind_children, killer
+from shipped_files import SHIPPED
+
+from serving import ArtifactError, Controller, OutputError, SignatureError, first_steps
+from serving.first_steps import take, tried
+
+pytest_plugins = ["small_laws"]
+
+
+def test_what_was_tried_is_what_is_loaded(pi_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert tried(pi_file).sha256 == Controller(pi_file).sha256
+    file = tmp_path / "x.onnx"
+    file.write_bytes(pi_file.read_bytes())
+    of_old = first_steps._digest_tried(file, None)
+
+    def replaced(*_: Any) -> str:
+        file.write_bytes(SHIPPED[0].read_bytes())
+        return of_old
+
+    monkeypatch.setattr(first_steps, "_digest_tried", replaced)
+    with pytest.raises(ArtifactError, match="not the pinned"):
+        tried(file)
+
+
+def test_a_file_that_ends_its_process_is_refused_and_ends_no_other(
+    controller: Controller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = killer(tmp_path / "killer.onnx", controller.manifest)
+    with pytest.raises(ArtifactError, match="has no name"):  # as the audit says it in the child
+        tried(file)
+    blind_children(monkeypatch, tmp_path / "blind")
+    with pytest.raises(ArtifactError, match="SIGSEGV") as caught:
+        tried(file)
+    assert "\n" not in str(caught.value)
+
+
+def fails(error: Exception) -> Callable[..., Any]:
+    def run(*_: Any, **__: Any) -> Any:
+        raise error
+
+    return run
+
+
+@pytest.mark.parametrize("error", [subprocess.TimeoutExpired("python", 30), OSError("no memory"), ValueError("NUL")])
+def test_steps_that_do_not_end_or_begin_are_a_refusal(
+    pi_file: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(subprocess, "run", fails(error))
+    with pytest.raises(ArtifactError):
+        tried(pi_file)
+
+
+def test_nothing_of_an_unsigned_file_is_run(pi_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "run", fails(AssertionError("it was run")))
+    with pytest.raises(SignatureError):
+        tried(pi_file, trusted=[])
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
+def test_every_shipped_file_takes_its_first_steps(file: Path) -> None:
+    take(Controller(file))
+
+
+def test_a_law_may_refuse_some_inputs_but_not_all(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = copy.copy(controller)
+    (valve,) = controller.manifest.mv
+    slow.manifest = replace(controller.manifest, mv=(replace(valve, max_move=1e-6),))
+    slow._bind()
+    with pytest.raises(OutputError):  # far from its set point it wants to move faster
+        slow.step(sp=[2.0], pv=[0.0, 300.0], mv_applied=[50.0], state=slow.cold_state())
+    take(slow)
+    monkeypatch.setattr(slow, "step", fails(OutputError("not finite")))
+    with pytest.raises(ArtifactError, match="none of its first steps"):
+        take(slow)
+
+
+def test_a_step_that_onnxruntime_cannot_compute_is_a_refusal(
+    controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = controller.step, iter(range(100))
+
+    def step(**given: Any) -> Any:
+        if next(calls) == 10:
+            raise OutputError("it cannot be computed") from RuntimeError("an index out of range")
+        return real(**given)
+
+    monkeypatch.setattr(controller, "step", step)
+    with pytest.raises(ArtifactError, match="cannot be computed"):
+        take(controller)
