@@ -14,6 +14,7 @@ from serving.conformance.kit import VECTORS, write_kit
 from serving.errors import LoopwrightError
 from serving.signing import command as signing
 from serving.trust import Controller
+from serving.words import plain
 
 
 def inspect_options(parser: argparse.ArgumentParser) -> None:
@@ -95,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return COMMANDS[options.command][2](options) or 0
     except LoopwrightError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {plain(str(error))}", file=sys.stderr)
         return 2
     except BrokenPipeError:  # `| head`: the reader has seen enough
         sys.stderr.close()

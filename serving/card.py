@@ -8,6 +8,7 @@ from typing import Any
 from serving.controller import Controller
 from serving.manifest import Signal
 from serving.trust import ending, signer
+from serving.words import plain
 
 SHOWN = {"scenarios", "units", "locked_up", "as_printed"}  # entries of the evidence that have a place of their own
 
@@ -33,7 +34,7 @@ def card(controller: Controller) -> str:
     lines += [f"state       {m.n_state} numbers, all zero: no past", f"info        {', '.join(m.info) or '-'}"]
     lines += ["", "provenance"] + (_tree(m.provenance) or ["  -"])
     lines += ["", "evidence"] + (_evidence(m.evidence) or ["  none yet: this controller was not validated"])
-    return "\n".join(lines)
+    return "\n".join(map(plain, lines))  # provenance and evidence hold any text
 
 
 def card_json(controller: Controller) -> str:

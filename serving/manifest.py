@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 from typing import Any, Self
@@ -18,6 +19,8 @@ MAX_NAME = 200  # characters
 MAX_DEPTH = 20  # of lists and objects in each other
 MAX_DIGITS = 300  # of an integer
 MAX_STATE = 1_000_000
+# Line breaks, control characters and overrides of direction: a name with one could forge a line wherever it is shown.
+FORBIDDEN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 SHORTEST_S, LONGEST_S = 1e-6, 1e9  # a period
 MOVE_ROUNDING = 1e-9  # share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
@@ -167,15 +170,7 @@ class Manifest:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """The manifest in ``text``; ArtifactError names what is missing or malformed."""
-        if len(text) > MAX_CHARACTERS:
-            raise ArtifactError(f"the manifest has {len(text)} characters; it may have {MAX_CHARACTERS}")
-        try:
-            row = json.loads(
-                text, parse_constant=_finite, parse_float=_finite, parse_int=_integer, object_pairs_hook=_object
-            )
-        except (ValueError, RecursionError) as error:
-            raise ArtifactError(f"the manifest is not JSON: {error}") from error
-        _check_depth(row)
+        row = strictly(text)
         if not isinstance(row, dict):
             raise ArtifactError("the manifest is not a JSON object")
         schema = row.get("schema")
@@ -217,6 +212,23 @@ def _increasing(values: tuple[float, ...]) -> bool:
 
 
 # ---------------------------------------------------------------------- JSON, strictly
+def strictly(text: str) -> Any:
+    """What JSON says in which readers may not differ: no entry twice, no number that is none, nothing too deep.
+
+    Raises ArtifactError.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise ArtifactError(f"the manifest has {len(text)} characters; it may have {MAX_CHARACTERS}")
+    try:
+        row = json.loads(
+            text, parse_constant=_finite, parse_float=_finite, parse_int=_integer, object_pairs_hook=_object
+        )
+    except (ValueError, RecursionError) as error:
+        raise ArtifactError(f"the manifest is not JSON: {error}") from error
+    _check_depth(row)
+    return row
+
+
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
@@ -258,6 +270,10 @@ def _name(value: object) -> str:
     if not isinstance(value, str) or len(value) > MAX_NAME:
         raise TypeError(f"a name is {_shown(value)}; it must be a text of at most {MAX_NAME} characters")
     value.encode()  # half a surrogate pair cannot be printed
+    if FORBIDDEN.search(value):
+        raise ValueError(
+            f"a name is {ascii(value)[:MAX_NAME]}; it may hold no line break, control or direction character"
+        )
     return value
 
 

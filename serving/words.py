@@ -1,15 +1,36 @@
-"""Errors in one line, for a command's reason and for a log."""
+"""Texts as they may be shown: in one line, and without characters that would act on whoever shows them."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from serving.errors import LoopwrightError
+
+
+def plain(text: str) -> str:
+    """A text of a file, a server or a person as it may be shown: control and direction characters are spelt out.
+
+    It then clears no screen, turns no line round, and begins no line of its own.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def plain_tree(value: Any) -> Any:
+    """The same for all texts and keys in lists and objects."""
+    if isinstance(value, str):
+        return plain(value)
+    if isinstance(value, dict):
+        return {plain(str(key)): plain_tree(inner) for key, inner in value.items()}
+    return [plain_tree(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def first_line(error: Exception) -> str:
     """The first line of the error's text; its type if the text is empty."""
     name = type(error).__name__
     try:
-        return (str(error).strip().splitlines() or [name])[0]
+        return plain((str(error).strip().splitlines() or [name])[0])
     except Exception:
         return name
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 
 from pipeline.cases import CASES, beside
 from pipeline.cases.batch_reactor.case import CALMED
@@ -26,10 +26,12 @@ from pipeline.evaluation.case import Case
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.validation import SCHEMA, Validation
 from pipeline.evaluation.verdicts import PLAIN, Claims
+from pipeline.export.controller_file import assembled, write_sidecar
 from pipeline.report.for_programs import validation
 from pipeline.report.page import write_report
 from pipeline.report.verdicts import judge
 from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from serving.manifest import Manifest
 
 SEEDS = (0, 1, 2)
 GAINS = ("kc", "tau_i_s", "tau_d_s", "penalty", "linearization_error")
@@ -151,8 +153,8 @@ def write_controller(path: Path, law: str, gain: float, mini: Miniature = THIOSU
     ins = [helper.make_tensor_value_info(n, TensorProto.DOUBLE, [k]) for n, k in sizes]
     outs = [helper.make_tensor_value_info("mv", TensorProto.DOUBLE, [1])]
     constants = [
-        helper.make_tensor("gain", TensorProto.DOUBLE, [1], [gain]),
-        helper.make_tensor("first", TensorProto.INT64, [1], [0]),
+        numpy_helper.from_array(np.array([gain]), "gain"),
+        numpy_helper.from_array(np.array([0]), "first"),
     ]
     nodes = [
         helper.make_node("Gather", ["pv", "first"], ["cv"]),
@@ -161,18 +163,22 @@ def write_controller(path: Path, law: str, gain: float, mini: Miniature = THIOSU
     ]
     graph = helper.make_graph(nodes, "law", ins, outs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    manifest = {
-        "schema": 1,
-        "case": mini.case,
-        "law": law,
-        "period_s": mini.of.plant.period_s,
-        "provenance": {},
-        "evidence": {},
-    }
-    helper.set_model_props(model, {"loopwright.manifest": json.dumps(manifest)})
+    plant = mini.of.plant
+    manifest = Manifest(
+        case=mini.case,
+        law=law,
+        period_s=plant.period_s,
+        sp=tuple(plant.pv_signals[:1]),
+        pv=tuple(plant.pv_signals),
+        dv=(),
+        mv=tuple(plant.mv_signals[:1]),
+        n_state=0,
+        info=(),
+        inputs=("sp", "pv"),
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.SerializeToString())
-    write_json(path.with_suffix(".json"), manifest)
+    path.write_bytes(assembled(model.SerializeToString(), manifest))
+    write_sidecar(path, manifest)
 
 
 def write_models(root: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from numpy.linalg import LinAlgError
 
 from serving.errors import LoopwrightError
+from serving.words import plain
 
 FAILURES = (LoopwrightError, OSError, LinAlgError)
 """Errors that bad input can raise: one line on standard error, exit status 2."""
@@ -15,7 +16,7 @@ FAILURES = (LoopwrightError, OSError, LinAlgError)
 
 def reason(error: Exception) -> str:
     """The line for one of FAILURES."""
-    text = " ".join(str(error).split())
+    text = plain(" ".join(str(error).split()))
     if isinstance(error, LinAlgError):
         return (
             f"a system of linear equations has no single solution ({text}); check the plant's "

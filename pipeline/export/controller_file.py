@@ -18,6 +18,7 @@ from pipeline.files import draft_of, write_text
 from serving.controller import Controller
 from serving.digest import TRAILER_BYTES, file_digest, seal
 from serving.manifest import MANIFEST_KEY, Manifest
+from serving.sidecar import sidecar
 
 
 def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any]) -> Manifest:
@@ -51,5 +52,4 @@ def assembled(model: bytes, manifest: Manifest) -> bytes:
 
 def write_sidecar(path: Path, manifest: Manifest) -> None:
     """``<law>.json``: the manifest again and the file's SHA-256, for hosts that cannot read ONNX metadata."""
-    text = json.dumps({**json.loads(manifest.to_json()), "sha256": file_digest(path.read_bytes())}, indent=2)
-    write_text(path.with_suffix(".json"), text + "\n")
+    write_text(path.with_suffix(".json"), sidecar(manifest, file_digest(path.read_bytes())))

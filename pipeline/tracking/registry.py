@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import tempfile
@@ -29,7 +28,8 @@ from pipeline.tracking import card, signing
 from pipeline.tracking.gate import Gate
 from pipeline.tracking.signing import Signer
 from pipeline.tracking.store import missing_file
-from serving.errors import SignatureError
+from serving.errors import ArtifactError, SignatureError
+from serving.sidecar import manifest_in, require_sidecar
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
 BY_HAND = "champion_by"
@@ -83,8 +83,10 @@ def register(
     if not client.search_registered_models(f"name = '{name}'"):
         client.create_registered_model(name, tags={"standing": "not compared yet", "case": case, "law": law})
     known = next((v for v in versions(client, name) if v.tags.get("sha256") == digest), None)
-    manifest = json.loads(path.with_suffix(".json").read_text()) if path.with_suffix(".json").exists() else {}
-    own = {"sha256": digest, "law": law, "case": case, "period_s": str(manifest.get("period_s", ""))}
+    manifest = manifest_in(path.read_bytes())
+    if path.with_suffix(".json").exists():
+        require_sidecar(path)
+    own = {"sha256": digest, "law": law, "case": case, "period_s": str(manifest.period_s)}
     before, at = ({}, run_id) if known is None else (dict(known.tags), str(known.run_id))
     signature = signing.present(before) if signer is None else signer.attach(client, at, path, before)
     description = card.version_description(validation, gate, run_id, picture, signing.words(signature))
@@ -272,8 +274,9 @@ def fetch(
 ) -> tuple[list[Path], str]:
     """Write a registered controller, its manifest and its signature into ``folder``; the files, and who signed.
 
-    The file is checked against its digest. Where public keys are ``trusted``, nothing is written unless one of them
-    signed it: whoever can write the store can write its digest too. SignatureError says why.
+    The file is checked against its digest, and the JSON file against the manifest inside it. Where public keys are
+    ``trusted``, nothing is written unless one of them signed it: whoever can write the store can write its digest too.
+    SignatureError says why.
     """
     version = _find(client, what, BEST)
     law = version.tags.get("law", "")
@@ -286,6 +289,10 @@ def fetch(
                 "registered (its sha256 differs); delete the version and run `make registry`"
             )
         words = _signer(version, files[0], trusted)
+        try:
+            require_sidecar(files[0])
+        except ArtifactError as error:
+            raise TrackingError(f"{version.name} version {version.version}: {error}") from None
         for file in files:
             write_bytes(folder / file.name, file.read_bytes())
         if len(files) < 3:  # of a version that was fetched here before

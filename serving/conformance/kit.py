@@ -16,6 +16,7 @@ from serving.conformance.steps import Answer, answered
 from serving.controller import Controller, runtime_version
 from serving.errors import LoopwrightError
 from serving.guard import READ_BACK_MARGIN, InRange, Sample
+from serving.sidecar import sidecar
 
 # Version of the format. 1 began its scans at an MV that was told, so it shows nothing of a start without one; up to 2
 # every command arrived, so it shows nothing of what follows one that did not.
@@ -48,13 +49,12 @@ def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
     Raises LoopwrightError if the folder cannot be written.
     """
     vectors = vectors_of(controller)
-    manifest = json.loads(controller.manifest.to_json()) | {"sha256": controller.sha256}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         copy = folder / controller.path.name
         if not (copy.exists() and copy.samefile(controller.path)):
             shutil.copyfile(controller.path, copy)
-        copy.with_suffix(".json").write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+        copy.with_suffix(".json").write_text(sidecar(controller.manifest, controller.sha256), encoding="utf-8")
         rows = json.dumps(vectors, allow_nan=False).replace('{"part"', '\n{"part"').replace('{"what"', '\n{"what"')
         (folder / VECTORS).write_text(rows + "\n", encoding="utf-8")
     except OSError as error:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from serving.words import plain
+
 MODES = ("SHADOW", "MANUAL", "AUTO", "HOLD")
 LEVELS = {"not known yet": -1, "as validated": 0, "watch": 1, "retrain": 2}
 GROUPS = (
@@ -63,5 +65,7 @@ def _labels(labels: Mapping[str, Any]) -> str:
     """Labels in braces, with what the format forbids in a value escaped."""
     if not labels:
         return ""
-    escaped = {k: str(v).replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n") for k, v in labels.items()}
+    escaped = {
+        k: plain(str(v)).replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n") for k, v in labels.items()
+    }
     return "{" + ",".join(f'{k}="{v}"' for k, v in escaped.items()) + "}"

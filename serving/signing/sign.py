@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 from datetime import UTC, datetime
@@ -10,9 +9,9 @@ from os import PathLike
 from pathlib import Path
 
 from serving import graph_audit
-from serving.digest import file_digest, unseal
+from serving.digest import file_digest
 from serving.errors import ArtifactError, SignatureError
-from serving.manifest import MANIFEST_KEY, Manifest
+from serving.sidecar import difference, manifest_in
 from serving.signing import bundle
 from serving.signing.keys import PrivateKey
 from serving.signing.reading import contents
@@ -50,8 +49,7 @@ def _files(path: Path) -> dict[str, str]:
     except FileNotFoundError:
         raise SignatureError(f"{path} does not exist; give a controller's .onnx file") from None
     try:
-        unseal(data)
-        manifest = Manifest.from_json(graph_audit.audit(data).metadata.get(MANIFEST_KEY, ""))
+        manifest = manifest_in(data)
     except ArtifactError as error:
         raise ArtifactError(f"{path}: {error}") from None
     files = {path.name: file_digest(data)}
@@ -60,17 +58,9 @@ def _files(path: Path) -> dict[str, str]:
         text = contents(sidecar, MAX_SIDECAR)
     except FileNotFoundError:
         return files
-    if not _tells_of(text, manifest, files[path.name]):
+    if difference(text, manifest, files[path.name]):
         raise SignatureError(f"{sidecar} is not the manifest of {path.name}; get both from one place, or remove it")
     return {**files, sidecar.name: file_digest(text)}
-
-
-def _tells_of(text: bytes, manifest: Manifest, sha256: str) -> bool:
-    """Whether a JSON file repeats the manifest, and names the file by its SHA-256."""
-    try:
-        return bool(json.loads(text) == {**json.loads(manifest.to_json()), "sha256": sha256})
-    except (ValueError, RecursionError):
-        return False
 
 
 def _replace(path: Path, data: bytes) -> None:

@@ -31,6 +31,7 @@ from serving.station.requests import TRIAL
 from serving.station.settings import Settings
 from serving.station.template import template
 from serving.trust import Controller, ending
+from serving.words import plain
 
 SETTINGS = Path("loop.toml")
 JOURNAL_LOST = 3  # exit status of a loop whose journal lacks scans or events
@@ -176,21 +177,21 @@ def _check(options: argparse.Namespace) -> int:
 
     here = rehearsed(settings, controller)
     for line in here.wrong:
-        print(f"would stop the loop: {line}", file=sys.stderr)
+        print(plain(f"would stop the loop: {line}"), file=sys.stderr)
     rows = inspected(manifest, settings.server, settings.nodes, settings.guards.margin)
     names = [f.name for f in fields(Found) if f.name not in {"wrong", "note", "passing"}]
     table = [names, *([getattr(row, name) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
     for cells in table:
-        print("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
+        print(plain("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()))
     if controller.signed is not None:
         print(f"{controller.path.name}: signed by {controller.signed.words}")
     wrong = [f"{row.signal}: {row.wrong}" for row in rows if row.wrong]
     notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
     for note in [*notes, *here.notes, *_warnings(settings), *ending(controller)]:
-        print(f"note: {note}")
+        print(plain(f"note: {note}"))
     for line in wrong:
-        print(f"would stop the loop: {line}", file=sys.stderr)
+        print(plain(f"would stop the loop: {line}"), file=sys.stderr)
     if not wrong and not here.wrong:
         print("nothing would stop the loop")
     return 2 if wrong or here.wrong else 0
@@ -216,13 +217,13 @@ def _run(options: argparse.Namespace) -> int:
     controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
     misfits = _misfits(settings, controller.manifest)
     for line in misfits:
-        print(f"would stop the loop: {line}", file=sys.stderr)
+        print(plain(f"would stop the loop: {line}"), file=sys.stderr)
     if misfits:
         return 2
     from serving.station.station import Station
 
     def tell(line: str) -> None:
-        print(line, flush=True)
+        print(plain(line), flush=True)
 
     # The very bytes that were tried, whoever writes another file there meanwhile.
     station = Station(replace(settings, sha256=controller.sha256), tell=tell)

@@ -12,6 +12,7 @@ from typing import TextIO
 from serving.errors import LoopError
 from serving.journal import Event, JournalReader
 from serving.station.settings import Settings
+from serving.words import plain
 
 FIELDS = ("time", "kind", "who", "what", "reason")
 
@@ -56,7 +57,7 @@ def _cells(event: Event) -> list[str]:
     # An acknowledgement is written down with the text of its alarm.
     what = f"acknowledged: {event.what}" if event.kind == "acknowledged" else event.what
     moment = datetime.fromtimestamp(event.time_s, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    return [moment, event.kind, *(" ".join(text.split()) for text in (event.who, what, event.reason))]
+    return [moment, event.kind, *(plain(" ".join(text.split())) for text in (event.who, what, event.reason))]
 
 
 def _seconds(since: str) -> float:

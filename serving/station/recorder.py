@@ -19,6 +19,7 @@ from serving.journal import Event, Journal, JournalReader, Scan
 from serving.journal.entries import Kind
 from serving.loop import Command, ControlLoop
 from serving.manifest import Manifest
+from serving.words import plain
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -62,7 +63,8 @@ class Recorder:
         raised: bool = False,
         about: int = 0,
     ) -> None:
-        """Write an event down, and say it."""
+        """Write an event down, and say it. A server's or a file's text is spelt out where it would act on a reader."""
+        what, reason = plain(what), plain(reason)
         if kind == "change" and what.startswith("mode "):  # "mode AUTO" or "mode SHADOW -> AUTO"
             self._mode = what.rpartition(" ")[2]
         self.journal.event(Event(time.time(), kind, who, what, reason, alarm, raised, about))

@@ -8,6 +8,7 @@ from pathlib import Path
 from serving.controller import Controller
 from serving.manifest import Signal
 from serving.station.settings import MAX_AGE, TRANSFER
+from serving.words import plain
 
 
 def template(controller: Controller, path: Path, endpoint: str, journal: str = "loop.journal") -> str:
@@ -15,9 +16,9 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
     m = controller.manifest
     period, over = m.period_s, TRANSFER * m.period_s
     lines = [
-        f"# The loop of {m.law} for {m.case}, a scan every {period:g} s.",
+        f"# The loop of {plain(m.law)} for {plain(m.case)}, a scan every {period:g} s.",
         "# `loopwright loop check` reads every node and writes none.",
-        f'controller = "{path.as_posix()}"',
+        f"controller = {_text(path.as_posix())}",
         f'sha256 = "{controller.sha256}"  # this very file and no other',
         '# trusted = ["maker.pub"]  # only controllers that one of these public keys signed; see docs/trust.md',
         'start = "SHADOW"  # the law is computed and shown, nothing is written; or MANUAL, AUTO',
@@ -26,7 +27,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         f"transfer_s = {over:g}  # [s] in which an MV crosses its range at most once after a change to AUTO",
         "",
         "[server]",
-        f'endpoint = "{endpoint}"',
+        f"endpoint = {_text(endpoint)}",
         'security = "Basic256Sha256"  # signed and encrypted',
         'certificate = "loop-certificate.der"  # let the server trust it',
         'private_key = "loop-key.pem"  # keep it to yourself',
@@ -45,7 +46,8 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         "",
         "[nodes.mv]  # read_back: what the actuator really has",
         *(
-            f'{_key(s.name)} = {{ node = "{_id("MV", s.name)}", read_back = "{_id("RB", s.name)}" }}  # {_words(s)}'
+            f"{_key(s.name)} = {{ node = {_text(_id('MV', s.name))}, read_back = {_text(_id('RB', s.name))} }}"
+            f"  # {_words(s)}"
             for s in m.mv
         ),
     ]
@@ -78,7 +80,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         f"# rate = {_table(m.mv, lambda s: (s.high - s.low) / 60)}  # [unit/s] on the way there",
         "",
         "[journal]",
-        f'file = "{journal}"',
+        f"file = {_text(journal)}",
         "max_mb = 2000  # the oldest scans go beyond that",
         'fsync = "crash"  # what it survives without loss; "power loss" waits for the disk each time',
         "",
@@ -100,11 +102,17 @@ def _id(group: str, name: str) -> str:
 
 def _key(name: str) -> str:
     bare = name.replace("_", "").replace("-", "")
-    return name if bare.isascii() and bare.isalnum() else '"' + name.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return name if bare.isascii() and bare.isalnum() else _text(name)
+
+
+def _text(value: str) -> str:
+    """A text of TOML: a quote, a backslash or a line break in it ends neither the text nor the line."""
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
 
 
 def _node(group: str, s: Signal) -> str:
-    return f'{_key(s.name)} = "{_id(group, s.name)}"  # {_words(s)}'
+    return f"{_key(s.name)} = {_text(_id(group, s.name))}  # {_words(s)}"
 
 
 def _table(signals: Sequence[Signal], value: Callable[[Signal], float]) -> str:
@@ -112,5 +120,5 @@ def _table(signals: Sequence[Signal], value: Callable[[Signal], float]) -> str:
 
 
 def _words(s: Signal) -> str:
-    unit = "" if s.unit == "-" else f" {s.unit}"
+    unit = "" if s.unit == "-" else f" {plain(s.unit)}"
     return f"{s.low:g} .. {s.high:g}{unit}"

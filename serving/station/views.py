@@ -13,6 +13,7 @@ from serving.controller import Controller
 from serving.journal import columns
 from serving.opcua.values import words
 from serving.trust import signer
+from serving.words import plain_tree
 
 if TYPE_CHECKING:
     from serving.station.station import Station
@@ -113,7 +114,7 @@ def _card(controller: Controller) -> View:
     scenarios = evidence.get("scenarios")
     rows = scenarios if isinstance(scenarios, dict) else {}
     signed = signer(controller)
-    return {
+    found = {
         "law": m.law,
         "case": m.case,
         "file": controller.path.name,
@@ -128,6 +129,8 @@ def _card(controller: Controller) -> View:
         "units": evidence.get("units", {}),
         "picture": picture(controller) is not None,
     }
+    shown: View = plain_tree(found)  # provenance and evidence hold any text
+    return shown
 
 
 def picture(controller: Controller) -> Path | None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pipeline.export.controller_file import with_evidence
-from serving import Controller
+from serving import ArtifactError, Controller, Manifest
 from serving.__main__ import main
+from serving.station.template import template
+from serving.words import plain
 
 pytest_plugins = ["small_laws"]
 Capture = pytest.CaptureFixture[str]
@@ -122,3 +126,52 @@ def test_errors_are_one_line(pi_file: Path, tmp_path: Path, capsys: Capture) -> 
 def test_without_a_command_it_says_what_it_can(capsys: Capture) -> None:
     assert main([]) == 0
     assert "inspect" in capsys.readouterr().out
+
+
+FORGED = 'x"\nstart = "AUTO"\n[hold]\x1b[2J\x85\u202e\u2067\u2028\r'
+"""A text that would write settings, clear a screen and turn a line round."""
+
+
+def test_a_text_of_a_file_acts_on_nobody_who_reads_it(pi_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    """Provenance and evidence hold any text, as keys and as values."""
+    forged = tmp_path / "forged.onnx"
+    with_evidence(pi_file, forged, {FORGED: {FORGED: 1.0}, "scenarios": {FORGED: {FORGED: 1.0}}, "units": [FORGED]})
+    assert main(["inspect", str(forged)]) == 0
+    said = capsys.readouterr().out
+    assert all(line.isprintable() for line in said.split("\n"))
+    assert plain(FORGED) in said
+    assert main(["inspect", str(tmp_path / f"{FORGED}.onnx".replace("/", ""))]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.isprintable()
+
+
+@pytest.mark.parametrize("bad", ["\n", "\r", "\x00", "\x1b[2J", "\x7f", "\x85", "\u2028", "\u202e", "\u2066"])
+@pytest.mark.parametrize("place", ["law", "case", "name", "unit", "info"])
+def test_a_name_that_could_forge_a_line_is_refused(pi_file: Path, bad: str, place: str) -> None:
+    row = json.loads(Controller(pi_file).manifest.to_json())
+    (row["pv"][1] if place in {"name", "unit"} else row)[place] = ["a", bad] if place == "info" else f"T{bad}"
+    with pytest.raises(ArtifactError, match="line break, control or direction"):
+        Manifest.from_json(json.dumps(row))
+
+
+@pytest.mark.parametrize("name", ["m³/h", "Ölstand", "TIC-101.PV", "温度", "حرارة", "a\u200eb", "a\u00a0b", "%", "°C"])
+def test_a_name_of_any_script_is_none_of_them(pi_file: Path, name: str) -> None:
+    row = json.loads(Controller(pi_file).manifest.to_json())
+    row["pv"][1].update(name=name, unit=name)
+    assert Manifest.from_json(json.dumps(row)).pv[1].name == name
+
+
+def test_no_text_writes_settings_into_a_loop_toml(pi_file: Path) -> None:
+    """Also where a controller was made in Python, whose manifest nobody has read."""
+    made = Controller(pi_file)
+    m = made.manifest
+    pv = tuple(replace(s, name=s.name + FORGED, unit=FORGED) for s in m.pv)
+    mv = tuple(replace(s, name=s.name + FORGED, unit=FORGED) for s in m.mv)
+    made.manifest = replace(m, law=FORGED, case=FORGED, pv=pv, mv=mv)
+    found = tomllib.loads(template(made, Path(f"{FORGED}.onnx"), f"opc.tcp://{FORGED}", f"{FORGED}.journal"))
+    assert (found["start"], found["controller"], found["journal"]["file"]) == (
+        "SHADOW", f"{FORGED}.onnx", f"{FORGED}.journal",
+    )  # fmt: skip
+    assert found["hold"]["then"] == "stay"
+    assert list(found["nodes"]["pv"]) == [s.name for s in pv]
+    assert found["nodes"]["mv"][mv[0].name]["node"].endswith(mv[0].name)

@@ -148,6 +148,7 @@ def test_a_forged_file_in_the_store_is_refused_though_its_digest_was_forged_too(
     publish(work)
     forged = SHIPPED / "inverse_dob.onnx"
     shutil.copy(forged, artifact("pid.onnx"))
+    shutil.copy(forged.with_suffix(".json"), artifact("pid.json"))
     with store() as client:
         client.set_model_version_tag(NAME, "1", "sha256", made_up.hashlib.sha256(forged.read_bytes()).hexdigest())
     status, _, err = fetched("--key", str(keys / "anna.pub"))

@@ -212,6 +212,17 @@ def test_the_best_version_falls_only_to_better_evidence(root, capsys):
     with store() as client:
         run = client.get_model_version(name, "6").run_id
     stored = root / "mlruns" / CASE / run / "artifacts" / "inverse_dob.onnx"
+    manifest = stored.with_suffix(".json")
+    text = manifest.read_text()
+    row = json.loads(text)
+    row["mv"][0]["high"] = 450.0
+    for forged in (json.dumps(row), text.replace('"high":', '"high": 450.0, "high":', 1), "{}", "no JSON"):
+        manifest.write_text(forged)
+        assert "is not the manifest of inverse_dob.onnx" in refused("fetch", f"{name}/6", "forged")
+    assert not (root / "forged").exists()
+    manifest.write_text(text)
+    assert main(["fetch", f"{name}/6", "forged"]) == 0
+    capsys.readouterr()
     stored.write_bytes(b"tampered")
     assert "is not the file that was registered" in refused("fetch", f"{name}/6", "out")
 
