@@ -64,10 +64,7 @@ class AppliedMV:
         written then, and none while the read-back is bad: what would be written is old.
         """
         try:
-            given = sample.mv_applied
-            if given is not None and np.asarray(given).dtype.kind not in "fiu":
-                return self._unread(sample)
-            applied = None if given is None else self.read_back(sample, last)
+            applied = None if sample.mv_applied is None else self.read_back(sample, last)
         except Exception:  # no sample, or no MV that any actuator can have
             return self._unread(sample)
         if applied is not None:
@@ -81,14 +78,18 @@ class AppliedMV:
     def read_back(self, sample: Sample, last: Array) -> Array:
         """The applied MV (n_mv,) within its range; the last command if there is no read-back.
 
-        Raises ContractError for a wrong shape, and SampleError for an implausible value or where there is neither. HOLD
-        commands the read-back, so this check does not depend on the guards.
+        Raises ContractError for a wrong shape or type, and SampleError for an implausible value or where there is
+        neither. HOLD commands the read-back, so this check does not depend on the guards.
         """
         if sample.mv_applied is None:
             if isnan(last[0]):
                 raise SampleError("there is no read-back, so where the MV stands is not known and nothing is written")
             return last
-        applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
+        given = np.asarray(sample.mv_applied)
+        if given.dtype.kind not in "fiu" or (given is not sample.mv_applied and _holds_bool(sample.mv_applied)):
+            kind = "bool" if given.dtype.kind in "fiu" else str(given.dtype)
+            raise ContractError(f"applied MV is of the type {kind}; it needs numbers")  # "1" and True are none
+        applied = np.array(given, dtype=np.float64, ndmin=1)
         if applied.shape != last.shape:
             raise ContractError(f"applied MV has the shape {applied.shape} instead of {last.shape}")
         values = applied.tolist()
@@ -118,3 +119,8 @@ class AppliedMV:
             if applied.shape == self._given.shape and np.isfinite(applied).all():
                 return implausible(self._signals, applied.tolist()) or ""
         return ""
+
+
+def _holds_bool(given: object) -> bool:
+    """Whether a list, which numpy makes numbers of, holds a truth value."""
+    return any(isinstance(v, bool | np.bool_) for v in given) if isinstance(given, list | tuple) else False

@@ -18,6 +18,7 @@ from serving.monitor.batches import Batches
 from serving.monitor.chart import Chart
 from serving.monitor.error import Swing, harris_index
 from serving.monitor.estimates import Estimates
+from serving.monitor.following import Following
 from serving.monitor.memory import TIME_S, number
 from serving.monitor.numbers import numbers
 from serving.monitor.pace import DAY_S, WEEK_S, blocks, dead_times, pooled, settle_scans
@@ -82,6 +83,8 @@ class Monitor:
         self.batches = Batches(m, rate)
         self.swings = [Swing(BAND * (s.high - s.low)) for s in m.sp]
         self.plight = Plight(m.mv, 2 * self.settle)
+        self.following = Following(m.mv, self.settle)
+        self._commanded: Array | None = None  # at the scan before, where it was written
         self.harris = [Share(1, 20) for _ in m.sp]
         self.dead_time = dead_times(m)
         self._window = [deque[float](maxlen=HARRIS_SCANS) for _ in m.sp]
@@ -113,6 +116,7 @@ class Monitor:
             self._gap()
 
     def _observe(self, time_s: float, sample: Sample | None, command: Command) -> None:
+        self._follow(time_s, sample, command)
         if command.mode is not Mode.SHADOW:
             self.hold.add(float(command.mode is Mode.HOLD))
         if sample is None or command.mode is not Mode.AUTO or command.law_mv is None:
@@ -142,6 +146,22 @@ class Monitor:
         self._still += 1
         if self._still > 2 * self.settle:
             self._rest(time_s, errors, mv, saturated)
+
+    def _follow(self, time_s: float, sample: Sample | None, command: Command) -> None:
+        """What became of the command before, in each mode that writes; a fault of any kind tells nothing of it."""
+        before, self._commanded = self._commanded, None
+        if sample is None or sample.mv_applied is None or command.reason or not command.writes:
+            self.following.forget()
+            return
+        self._commanded = command.mv
+        applied = np.asarray(sample.mv_applied, dtype=np.float64)
+        if before is None or applied.shape != before.shape or not np.isfinite(applied).all():
+            return
+        error = None
+        if command.mode is Mode.AUTO:
+            off = np.abs(np.asarray(sample.pv, dtype=np.float64)[: len(command.sp)] - command.sp) / self._sp_span
+            error = float(off.max())
+        self.following.add(applied, before, error, time_s)
 
     def _shares(self, shares: list[float], command: Command) -> bool:
         saturated = any(s <= AT_END or s >= 1 - AT_END for s in shares)

@@ -5,6 +5,7 @@
 | saturated, at a rate limit, outside the domain | twice the share of the learning time, at least .2 (domain: .1) |
 | time in HOLD | .02 |
 | MV at its end beside an error above a tenth of the range | two settling times |
+| read-back that stands | a settling time with the command .05 of the range off, or two beside a large error |
 | MV that turns round | four of five moves, of a twentieth of its range |
 | swing | regularity 1, with errors beyond LOUD times the learning time's at rest (before that: a tenth of the range) |
 | variability | the learning time's scatter at rest (chart); the mean error also against the validation's largest |
@@ -42,7 +43,7 @@ RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a line
 
 def verdicts(m: Monitor) -> list[Verdict]:
     """All of them; whoever asks is to be ready for any error, for what was learnt came from a file."""
-    parts = (_plight, _residual, _answers, _estimates, _batches, _rest, _variability, _swing, _shares)
+    parts = (_plight, _following, _residual, _answers, _estimates, _batches, _rest, _variability, _swing, _shares)
     found = [verdict for part in parts for verdict in part(m)]
     if m.trouble:
         found.append(failed(m.trouble))
@@ -64,6 +65,21 @@ def _plight(m: Monitor) -> list[Verdict]:
             found.append(Verdict(name, "watch", text, float(plight.turns[i])))
         else:
             found.append(Verdict(name, "as validated", "neither stuck at an end nor to and fro at each scan"))
+    return found
+
+
+def _following(m: Monitor) -> list[Verdict]:
+    found, following = [], m.following
+    for i, s in enumerate(m.manifest.mv):
+        name = f"{s.name} read back"
+        if following.stuck(i):
+            stands, asked = following.at(i)
+            text = f"{s.name} stands at {stands:.5g} {unit_of(s)}since {when(following.since_s[i])}"
+            text += f" and does not follow the command, now {asked:.5g}: the actuator is stuck, or its read-back is"
+            scans = float(max(following.away[i], following.pushed[i]))
+            found.append(Verdict(name, "watch", text, scans, float(following.patience)))
+        else:
+            found.append(Verdict(name, "as validated", "the read-back follows the command"))
     return found
 
 

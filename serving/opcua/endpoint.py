@@ -6,7 +6,7 @@ import asyncio
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import TypeAlias
 
@@ -21,6 +21,7 @@ from serving.opcua.ages import Ages
 from serving.opcua.heartbeat import Heartbeat
 from serving.opcua.lease import LeaseRefusedError, NodeLease
 from serving.opcua.link import LateError, Link
+from serving.opcua.nameplates import Identity, Nameplates, identity
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import Nodes, Server
@@ -49,7 +50,8 @@ class OpcUaEndpoint:
     Shortly before each scan is due, all values are read in one request; ``read`` gives the last ones with their age.
     ``write`` passes the MV on and returns; whether the plant took it is known at the next scan. An answer that is late
     is a fault and never waited for. After ``SILENT_SCANS`` without one the connection is broken off, and made anew with
-    growing pauses; types and namespaces are asked for again then.
+    growing pauses; ids are resolved anew then. Nodes that are others now than when the loop began, or of another type,
+    unit or range, are a fault, see ``serving.opcua.nameplates``.
 
     Parameters
     ----------
@@ -65,6 +67,10 @@ class OpcUaEndpoint:
         Called with a line for whoever watches: connected, lost, refused.
     clock
         Monotonic seconds.
+    spaces
+        The namespaces by number that an earlier run found behind the ids.
+    identified
+        Called at each connection, before anything is written, with what it is to.
 
     Raises
     ------
@@ -82,6 +88,8 @@ class OpcUaEndpoint:
         speed: float = 1.0,
         tell: Callable[[str], None] = lambda _: None,
         clock: Callable[[], float] = time.monotonic,
+        spaces: Mapping[int, str] | None = None,
+        identified: Callable[[Identity], object] = lambda _: None,
     ) -> None:
         nodes.check(manifest)
         self.manifest, self.server, self.nodes = manifest, server, nodes
@@ -105,7 +113,8 @@ class OpcUaEndpoint:
         # and which one `read` told of.
         self._shown, self._told = 0, 0
         self.lease = NodeLease(self.period_s)
-        self._heartbeat, self._sampling = Heartbeat(), Sampling(manifest, server, nodes)
+        self.nameplates, self._identified = Nameplates(nodes, manifest, spaces), identified
+        self._heartbeat, self._sampling = Heartbeat(), Sampling(manifest, server, nodes, self.nameplates)
         self._handed_back = False
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -234,11 +243,16 @@ class OpcUaEndpoint:
                 await self._rest(pause)
                 pause = min(pause * GROWTH, LAST_RETRY_S)
                 continue
-            plan = None
+            plan = watching = None
             try:
-                plan = await Plan.made(link, self.manifest, self.nodes, max(self.answer_s, self.server.connect_s))
+                patience_s = max(self.answer_s, self.server.connect_s)
+                await self.nameplates.require_spaces(link, patience_s)
+                plan = await Plan.made(link, self.manifest, self.nodes, patience_s)
+                self.nameplates.require_types(plan, [kind for _, kind in plan.written])
+                await self.nameplates.look(link, plan, patience_s)
                 self.connections += 1
                 anew = await self._anew(link)
+                self._identified(await identity(link, self.nodes, self._started_s, patience_s))
                 if self._outbox:
                     self._outbox.clear()  # what was to be written then is too old now
                     self.unwritten = self.unwritten or "the connection was lost before the MV was sent"
@@ -247,12 +261,16 @@ class OpcUaEndpoint:
                 pause = FIRST_RETRY_S
                 self._told_lost = ""
                 self.tell(f"connected to {self.server.endpoint}{anew}")
+                self.nameplates.moved = None
+                watching = asyncio.create_task(self.nameplates.watch(link, plan, patience_s))
                 await self._exchange(link, plan)
             except Exception as error:
                 why = first_line(error) if isinstance(error, LoopError) else named(error)
                 self._lost(why, late=isinstance(error, LateError))
             finally:
                 self._link = None
+                if watching is not None:
+                    watching.cancel()
                 if self._closed.is_set():
                     with suppress(Exception):
                         if plan is not None and plan.lease is not None:
@@ -300,6 +318,8 @@ class OpcUaEndpoint:
         while not self._closed.is_set():
             if link.gone:
                 raise EndpointError(f"{self.server.endpoint}: {link.gone}")
+            if self.nameplates.moved is not None:
+                raise self.nameplates.moved
             now = self.clock()
             due = self._next_s if self._next_s > read_at else read_at + self.period_s
             if self._outbox:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from asyncua import ua
@@ -14,6 +16,18 @@ from serving.guard import InRange, Sample, implausible
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
 from serving.opcua.link import Link
+from serving.opcua.nameplates import (
+    Identity,
+    Plate,
+    by_name,
+    identity,
+    numbers,
+    other_unit,
+    plates,
+    renumbered,
+    signal_of,
+    uri_of,
+)
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import NO_NUMBERS
 from serving.opcua.settings import Nodes, Point, Server
@@ -45,47 +59,104 @@ class Found:
     passing: bool = False
 
 
-def lasting(manifest: Manifest, server: Server, nodes: Nodes, margin: float, *, writes: bool) -> list[str]:
-    """A line for all that would stop the loop and does not pass by itself; ``writes``: whether it is to write at once.
+class _Asked(NamedTuple):
+    """What the server says of one node."""
 
-    Raises EndpointError where the server cannot be asked now, LoopError where the settings do not fit.
-    """
-    rows = inspected(manifest, server, nodes, margin)
-    wrong = [row for row in rows if row.wrong and not row.passing]
-    return [f"{row.signal}: {row.wrong}" for row in wrong if writes or not row.signal.endswith(", written")]
+    at: ua.NodeId
+    reading: Reading
+    writable: bool | None  # by this user; None: the server does not say
+    plate: Plate
 
 
-def inspected(manifest: Manifest, server: Server, nodes: Nodes, margin: float) -> list[Found]:
-    """A row for every node, and one for the connection. Raises LoopError where the settings do not fit.
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """A row for every node, and what the connection is to."""
 
-    ``margin`` is the share of a PV's range by which the loop's guards let it exceed that range.
+    rows: list[Found]
+    identity: Identity
+
+    def lasting(self, *, writes: bool) -> list[str]:
+        """A line for all that would stop the loop for good; ``writes``: whether it is to write at once."""
+        wrong = [row for row in self.rows if row.wrong and not row.passing]
+        return [f"{row.signal}: {row.wrong}" for row in wrong if writes or not row.signal.endswith(", written")]
+
+
+def inspected(
+    manifest: Manifest, server: Server, nodes: Nodes, margin: float, spaces: Mapping[int, str] | None = None
+) -> Inspection:
+    """A row for every node, and for each namespace that is used by its number.
+
+    ``margin`` is the share of a PV's range by which the loop's guards let it exceed that range; ``spaces`` are the
+    namespaces by number that the loop found when it last ran. Raises EndpointError where the server cannot be asked
+    now, LoopError where the settings do not fit.
     """
     nodes.check(manifest)
-    return asyncio.run(_inspected(manifest, server, nodes, margin))
+    return asyncio.run(_inspected(manifest, server, nodes, margin, spaces or {}))
 
 
-async def _inspected(manifest: Manifest, server: Server, nodes: Nodes, margin: float) -> list[Found]:
+async def _inspected(
+    manifest: Manifest, server: Server, nodes: Nodes, margin: float, spaces: Mapping[int, str]
+) -> Inspection:
     link = await Link.opened(server)
     try:
         plan = Plan(nodes, manifest)
         # A watchdog that cannot be read counts as dead, though no sample is judged by its quality.
         rows = [(name, p.read_back or p.node, p, judged or name == "watchdog") for name, p, judged in plan.points]
         rows += [(f"MV {s.name}, written", p.node, p, True) for s, p in zip(manifest.mv, plan.mv_points, strict=True)]
-        found = []
-        for name, node, point, judged in rows:
-            found.append(await _one(link, manifest, server, name, node, point, judged, margin))
-        if nodes.heartbeat:
-            at = nodes.heartbeat
-            found.append(await _one(link, manifest, server, "heartbeat, written", at, Point(at), True, margin))
-        if nodes.hand_back is not None:
-            at, value = nodes.hand_back.node, nodes.hand_back.value
-            row = await _one(link, manifest, server, "hand_back, written", at, Point(at), True, margin)
-            found.append(row if row.wrong else replace(row, wrong=_unfit(value, row.kind)))
+        beat, back = nodes.heartbeat, nodes.hand_back
+        rows += [("heartbeat, written", beat, Point(beat), True)] if beat else []
+        rows += [("hand_back, written", back.node, Point(back.node), True)] if back is not None else []
+        asked = await _asked(link, server, [node for _, node, _, _ in rows] + ([nodes.lease] if nodes.lease else []))
+        found = [_one(manifest, server, *row, asked[row[1]], margin) for row in rows]
+        if back is not None and not found[-1].wrong:
+            found[-1] = replace(found[-1], wrong=_unfit(back.value, found[-1].kind))
         if nodes.lease:
-            found.append(await _lease(link, server, nodes.lease))
-        return [*found, *_certificates(link, server)]
+            found.append(_lease(nodes.lease, asked[nodes.lease]))
+        found += _namespaces(nodes, await link.namespaces(server.connect_s), spaces)
+        try:
+            known = await identity(link, nodes, await link.started_s(server.connect_s), server.connect_s)
+        except EndpointError:  # an id that is none, which its own row says
+            known = Identity({}, {})
+        if not known.writes:
+            note = "the server does not tell its name or its start: a loop that spells its nodes otherwise is not found"
+            found.append(Found("locks", "-", note=note))
+        return Inspection([*found, *_certificates(link, server)], known)
     finally:
         await link.close()
+
+
+async def _asked(link: Link, server: Server, nodes: list[str]) -> dict[str, _Asked | str]:
+    """What the server says of each node, read all at once as each scan does; of an id that is none, why."""
+    ids: dict[str, ua.NodeId] = {}
+    found: dict[str, _Asked | str] = {}
+    for node in nodes:
+        try:
+            (ids[node],) = await link.resolved([node], server.connect_s)
+        except EndpointError as error:
+            found[node] = first_line(error)
+    at = list(ids.values())
+    readings = await link.read(at, server.connect_s)
+    access = await link.values(at, server.connect_s, ua.AttributeIds.UserAccessLevel)
+    told = await plates(link, at, server.connect_s)
+    for node, reading, may, plate in zip(ids, readings, access, told, strict=True):
+        level = None if may.Value is None else may.Value.Value
+        found[node] = _Asked(ids[node], reading, bool(level & WRITABLE) if isinstance(level, int) else None, plate)
+    return found
+
+
+def _namespaces(nodes: Nodes, now: list[str], before: Mapping[int, str]) -> list[Found]:
+    """What each namespace is that ids name by its number: it is another one once the server numbers them otherwise."""
+    found = []
+    for number, text in sorted(numbers(nodes.ids()).items()):
+        uri, name = uri_of(now, number), f"namespace {number}"
+        if before.get(number, uri) != uri:
+            found.append(Found(name, uri or "-", wrong=renumbered(number, text, before[number], uri)))
+        elif uri:
+            note = f"it is {uri} now; write {by_name(text, uri)}, which stays right when the server numbers otherwise"
+            found.append(Found(name, uri, note=note))
+        else:
+            found.append(Found(name, "-", note="the server does not say what it is: no loop knows if it changes"))
+    return found
 
 
 def _certificates(link: Link, server: Server) -> list[Found]:
@@ -102,13 +173,12 @@ def _certificates(link: Link, server: Server) -> list[Found]:
     return rows
 
 
-async def _lease(link: Link, server: Server, node: str) -> Found:
+def _lease(node: str, asked: _Asked | str) -> Found:
     """The text node by which loops on different machines find each other: without it no MV is written."""
     name = "lease, written"
-    try:
-        reading, writable = await _read(link, server, node)
-    except EndpointError as error:
-        return Found(name, node, wrong=first_line(error))
+    if isinstance(asked, str):
+        return Found(name, node, wrong=asked)
+    reading, writable = asked.reading, asked.writable
     kind = reading.kind.name if reading.kind is not None else "-"
     wrong = ""
     if reading.quality == BAD:
@@ -121,15 +191,6 @@ async def _lease(link: Link, server: Server, node: str) -> Found:
     note = f"{owner} has the plant, or had it last" if owner else ""
     quality = "Good" if reading.quality == GOOD else words(reading.status)
     return Found(name, node, kind, owner or "-", quality=quality, writable=MAY[writable], wrong=wrong, note=note)
-
-
-async def _read(link: Link, server: Server, node: str) -> tuple[Reading, bool | None]:
-    """What a node holds, and whether this user may write it; None: the server does not say."""
-    (at,) = await link.resolved([node], server.connect_s)
-    (reading,) = await link.read([at], server.connect_s)
-    (access,) = await link.values([at], server.connect_s, ua.AttributeIds.UserAccessLevel)
-    level = access.Value.Value if access.Value is not None else None
-    return reading, bool(level & WRITABLE) if isinstance(level, int) else None
 
 
 def _bad(reading: Reading, node: str) -> str:
@@ -164,18 +225,23 @@ def _outside(signal: Signal, number: float) -> str:
     return f"{number:.6g} lies outside {signal.low:g} .. {signal.high:g} {signal.unit}; another unit?"
 
 
-async def _one(
-    link: Link, manifest: Manifest, server: Server, name: str, node: str, point: Point, judged: bool, margin: float
+def _one(
+    manifest: Manifest,
+    server: Server,
+    name: str,
+    node: str,
+    point: Point,
+    judged: bool,
+    asked: _Asked | str,
+    margin: float,
 ) -> Found:
-    try:
-        (at,) = await link.resolved([node], server.connect_s)
-        reading, writable = await _read(link, server, node)
-    except EndpointError as error:
-        return Found(name, node, wrong=first_line(error))
+    if isinstance(asked, str):
+        return Found(name, node, wrong=asked)
+    _, reading, writable, (unit, limits) = asked
     kind = reading.kind.name if reading.kind is not None else "-"
     number = point.scale * reading.number + point.offset
     age = "-" if reading.source_s is None else f"{time.time() - reading.source_s:.3g} s"
-    signal = _signal(manifest, name)
+    signal = signal_of(manifest, name)
     wrong, passing = "", False
     if reading.quality == BAD or (reading.quality == UNCERTAIN and server.uncertain == "fault"):
         wrong, passing = _bad(reading, node), words(reading.status) != "BadNodeIdUnknown"
@@ -187,7 +253,6 @@ async def _one(
         wrong = "it may not be written by this user"
     elif signal is not None:
         wrong, passing = _refused(name, signal, number, margin), True
-    unit, limits = await _properties(link, server, at)
     note = ""
     if signal is not None:
         outside = "" if wrong or reading.text else _outside(signal, number)
@@ -199,44 +264,6 @@ async def _one(
         wrong, note = "", "; ".join(filter(None, (wrong, note)))
     shown = "-" if reading.text else f"{number:.6g}"
     return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note, passing)
-
-
-def _signal(manifest: Manifest, name: str) -> Signal | None:
-    group, _, rest = name.partition(" ")
-    rest = rest.removesuffix(", written")
-    signals = {"PV": manifest.pv, "MV": manifest.mv, "DV": manifest.dv, "SP": manifest.sp}.get(group, ())
-    return next((s for s in signals if s.name == rest), None)
-
-
-async def _properties(link: Link, server: Server, at: ua.NodeId) -> tuple[str, str]:
-    """(unit, range) as the server tells them; "-" where it does not."""
-    unit = limits = "-"
-    try:
-        node = link.client.get_node(at)
-        async with asyncio.timeout(server.connect_s):
-            for child in await node.get_properties():
-                name = (await child.read_browse_name()).Name
-                if name == "EngineeringUnits":
-                    unit = (await child.read_value()).DisplayName.Text or "-"
-                elif name == "EURange":
-                    value = await child.read_value()
-                    limits = f"{value.Low:g} .. {value.High:g}"
-    except Exception:  # properties are a courtesy of the server
-        return unit, limits
-    return unit, limits
-
-
-def other_unit(unit: str, point: Point, signal: Signal) -> str:
-    """What is wrong with the server's unit of a signal; empty where loop.toml explains it."""
-    converted = (point.scale, point.offset) != (1.0, 0.0)
-    if unit in {"-", point.unit} or (not point.unit and (converted or unit == signal.unit)):
-        return ""
-    if point.unit:
-        return f"the server says the unit is {unit}, loop.toml says {point.unit}"
-    return (
-        f"the server says the unit is {unit}, the controller's is {signal.unit}: give scale and offset, or "
-        f'unit = "{unit}" where it is only another name'
-    )
 
 
 def _other_range(limits: str, point: Point, signal: Signal) -> str:

@@ -15,6 +15,7 @@ from asyncua.crypto import security_policies
 
 from serving.errors import EndpointError, LoopError
 from serving.opcua.certificates import APPLICATION, identity, require_valid
+from serving.opcua.limits import LIMITS, OperationLimits, TooManyError, in_pieces
 from serving.opcua.settings import Server
 from serving.opcua.values import EPOCH, Reading, reading, words
 from serving.words import named
@@ -56,6 +57,8 @@ class Link:
         self._asked_s = 0.0  # when the last request was made that the server has answered
         self._keeping: asyncio.Task[None] | None = None
         self._securing = False
+        self._spaces: list[str] | None = None  # the server's namespaces, once they were asked for
+        self.limits = OperationLimits()
 
     @classmethod
     async def opened(cls, server: Server, period_s: float = 0.0) -> Link:
@@ -127,6 +130,7 @@ class Link:
         self._asked_s = asyncio.get_running_loop().time()
         await client.connect()
         self._securing = False
+        self.limits = await self._asked_limits(server.connect_s)
         self._keeping = asyncio.create_task(self._keep())
         renewing = client._renew_channel_task
         if renewing is not None:
@@ -163,34 +167,52 @@ class Link:
             self._gone = f"the secure channel could not be renewed: {_reason(error)}"
             self.on_gone()
 
+    async def _asked_limits(self, timeout_s: float) -> OperationLimits:
+        """How many nodes the server takes in one request, as far as it says; one by one, as it may take one alone."""
+        nodes = [ua.NodeId(ua.Int32(i)) for i in LIMITS]
+        try:
+            return OperationLimits.told([v for n in nodes for v in await self.values([n], timeout_s)])
+        except LateError:
+            raise
+        except EndpointError:
+            return OperationLimits()
+
+    async def namespaces(self, timeout_s: float, *, anew: bool = False) -> list[str]:
+        """The server's namespaces, each at its index; empty where it does not tell. Asked once unless ``anew``."""
+        if self._spaces is None or anew:
+            (answer,) = await self.values([ua.NodeId(ua.Int32(ua.ObjectIds.Server_NamespaceArray))], timeout_s)
+            self._spaces = _texts(answer)
+        return self._spaces
+
+    async def server_uri(self, timeout_s: float) -> str:
+        """The server's own name of itself (``ServerArray[0]``); empty where it does not tell."""
+        (answer,) = await self.values([ua.NodeId(ua.Int32(ua.ObjectIds.Server_ServerArray))], timeout_s)
+        return next(iter(_texts(answer)), "")
+
     async def resolved(self, nodes: Sequence[str], timeout_s: float) -> list[ua.NodeId]:
         """The server's ids of nodes. EndpointError for a text that is no id and a namespace that is not there."""
-        spaces: list[str] = []
-        if any(n.startswith("nsu=") for n in nodes):
-            (answer,) = await self._within(
-                self.client.uaclient.session.read_attributes(
-                    [ua.NodeId(ua.Int32(ua.ObjectIds.Server_NamespaceArray))], ua.AttributeIds.Value
-                ),
-                timeout_s,
-            )
-            spaces = list(answer.Value.Value or [])
+        spaces = await self.namespaces(timeout_s) if any(n.startswith("nsu=") for n in nodes) else []
         return [node_id(n, spaces) for n in nodes]
 
     async def read(
         self, nodes: Sequence[ua.NodeId], timeout_s: float, attribute: ua.AttributeIds = ua.AttributeIds.Value
     ) -> list[Reading]:
-        """The values of nodes, in one request."""
+        """The values of nodes, in as few requests as the server allows."""
         return [reading(v) for v in await self.values(nodes, timeout_s, attribute)]
 
     async def values(
         self, nodes: Sequence[ua.NodeId], timeout_s: float, attribute: ua.AttributeIds = ua.AttributeIds.Value
     ) -> list[ua.DataValue]:
         """An attribute of nodes, as the server gives it."""
-        request = ua.ReadParameters()
-        request.TimestampsToReturn = ua.TimestampsToReturn.Source
-        request.MaxAge = 0.0
-        request.NodesToRead = [ua.ReadValueId(NodeId=n, AttributeId=attribute) for n in nodes]
-        return list(await self._within(self.client.uaclient.session.read(request), timeout_s))
+
+        async def ask(piece: Sequence[ua.NodeId], left_s: float) -> list[ua.DataValue]:
+            request = ua.ReadParameters()
+            request.TimestampsToReturn = ua.TimestampsToReturn.Source
+            request.MaxAge = 0.0
+            request.NodesToRead = [ua.ReadValueId(NodeId=n, AttributeId=attribute) for n in piece]
+            return list(await self._within(self.client.uaclient.session.read(request), left_s))
+
+        return await in_pieces(nodes, self.limits.read, ask, timeout_s)
 
     async def started_s(self, timeout_s: float) -> float | None:
         """When the server started [s since 1970, by its clock]; None where it does not say."""
@@ -206,13 +228,35 @@ class Link:
         return started if started > 0 else None
 
     async def write(self, values: Sequence[tuple[ua.NodeId, ua.Variant]], timeout_s: float) -> list[int]:
-        """Write values, in one request; the status of each."""
-        request = ua.WriteParameters()
-        for node, value in values:
-            row = ua.WriteValue(NodeId=node, AttributeId=ua.AttributeIds.Value)
-            row.Value = ua.DataValue(value)
-            request.NodesToWrite.append(row)
-        return [int(s.value) for s in await self._within(self.client.uaclient.session.write(request), timeout_s)]
+        """Write values, in as few requests as the server allows; the status of each."""
+
+        async def ask(piece: Sequence[tuple[ua.NodeId, ua.Variant]], left_s: float) -> list[int]:
+            request = ua.WriteParameters()
+            for node, value in piece:
+                row = ua.WriteValue(NodeId=node, AttributeId=ua.AttributeIds.Value)
+                row.Value = ua.DataValue(value)
+                request.NodesToWrite.append(row)
+            return [int(s.value) for s in await self._within(self.client.uaclient.session.write(request), left_s)]
+
+        return await in_pieces(values, self.limits.write, ask, timeout_s)
+
+    async def browsed(
+        self, nodes: Sequence[ua.NodeId], reference: ua.ObjectIds, timeout_s: float, *, inverse: bool = False
+    ) -> list[list[ua.ReferenceDescription]]:
+        """What a kind of reference leads to from each node, or what leads there; empty where nothing does."""
+        result = ua.BrowseResultMask.BrowseName | ua.BrowseResultMask.NodeClass
+
+        async def ask(piece: Sequence[ua.NodeId], left_s: float) -> list[list[ua.ReferenceDescription]]:
+            request = ua.BrowseParameters()
+            for node in piece:
+                row = ua.BrowseDescription(NodeId=node, ReferenceTypeId=ua.NodeId(ua.Int32(reference)))
+                row.BrowseDirection = ua.BrowseDirection.Inverse if inverse else ua.BrowseDirection.Forward
+                row.ResultMask = ua.UInt32(result)
+                request.NodesToBrowse.append(row)
+            found = await self._within(self.client.uaclient.session.browse(request), left_s)
+            return [list(row.References or []) for row in found]
+
+        return await in_pieces(nodes, self.limits.browse, ask, timeout_s)
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Log off; where the server does not answer, break off."""
@@ -244,8 +288,11 @@ class Link:
         except TimeoutError:
             raise LateError(f"{self.server.endpoint} does not answer within {timeout_s:.3g} s") from None
         except Exception as error:
-            if isinstance(error, ua.UaStatusCodeError) and getattr(error, "code", None) in GONE:
+            code = getattr(error, "code", None) if isinstance(error, ua.UaStatusCodeError) else None
+            if code in GONE:
                 self._gone = _reason(error)
+            if code == ua.StatusCodes.BadTooManyOperations:
+                raise TooManyError(f"{self.server.endpoint}: {_reason(error)}") from None
             raise EndpointError(f"{self.server.endpoint}: {_reason(error)}") from None
         self._asked_s = max(self._asked_s, asked_s)
         return found
@@ -287,7 +334,15 @@ def node_id(text: str, spaces: Sequence[str]) -> ua.NodeId:
     try:
         return ua.NodeId.from_string(text)
     except Exception:
-        raise EndpointError(f"{text!r} is no node id; it is written as 'ns=2;s=TIC101.PV' or 'ns=2;i=1001'") from None
+        raise EndpointError(
+            f"{text!r} is no node id; it is written as 'nsu=urn:plant;s=TIC101.PV' or 'nsu=urn:plant;i=1001'"
+        ) from None
+
+
+def _texts(answer: ua.DataValue) -> list[str]:
+    """A list of texts; empty where the server gives none."""
+    given = None if answer.Value is None else answer.Value.Value
+    return [str(text) for text in given] if isinstance(given, list) else []
 
 
 def _reason(error: BaseException) -> str:

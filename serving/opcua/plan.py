@@ -72,6 +72,13 @@ class Plan:
             plan._hand_back = rest[0]
         return plan
 
+    def measuring(self) -> list[tuple[str, Point, ua.NodeId]]:
+        """The nodes whose numbers the loop uses, by name and scale: what is read for it, and the MVs that it writes."""
+        read = [(n, p, at) for (n, p, judged), at in zip(self.points, self.asked, strict=False)
+                if (judged or n.startswith("SP "))]  # fmt: skip
+        written = zip(self.mv_names, self.mv_points, self.written, strict=True)
+        return [*read, *((f"MV {n}, written", p, at) for n, p, (at, _) in written)]
+
     def beat_in(self, node: ua.NodeId, kind: ua.VariantType) -> None:
         """Count the heartbeat in this type of its node."""
         self.heartbeat = (node, kind, 2 if kind is ua.VariantType.Boolean else 100)

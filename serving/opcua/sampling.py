@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
+from serving.opcua.nameplates import Nameplates
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
 from serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading
@@ -42,10 +43,11 @@ class Values:
 
 
 class Sampling:
-    """Makes values of answers. It remembers the plant's watchdog from reading to reading."""
+    """Makes values of answers. It remembers the plant's watchdog, and the nodes' types, from reading to reading."""
 
-    def __init__(self, manifest: Manifest, server: Server, nodes: Nodes) -> None:
+    def __init__(self, manifest: Manifest, server: Server, nodes: Nodes, nameplates: Nameplates | None = None) -> None:
         self.manifest, self.server, self.nodes = manifest, server, nodes
+        self.nameplates = nameplates or Nameplates(nodes, manifest)
         self._watched = float("nan"), 0  # the watchdog, and for how many readings it has stood there
         self._dead, self._slow = "", False  # why the plant counts as dead; whether its watchdog has moved since
 
@@ -53,13 +55,18 @@ class Sampling:
         self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, *, unbeaten: str, starts: int
     ) -> Values:
         """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
-        fault, found = "", dict[str, float]()
+        fault, typed, found = "", "", dict[str, float]()
         for (name, point, judged), answer in zip(plan.points, answers, strict=False):
             usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
             # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
             # is a read-back, which says where the MV stands also while a PV is bad.
             told = usable or (judged and not name.startswith("MV "))
             found[name] = point.scale * answer.number + point.offset if told else np.nan
+            if usable and not answer.text and (judged or name == "mode" or name.startswith("SP ")):
+                changed = self.nameplates.typed(name, answer.kind)
+                typed = typed or changed
+                if changed:  # another number: no PV to be shown, no place of the MV, no wish
+                    found[name] = np.nan
             if fault or not judged:
                 continue
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
@@ -76,7 +83,7 @@ class Sampling:
             mode = next((name for name, value in self.nodes.mode.values.items() if value == wanted), "")
         if self.nodes.watchdog and not fault:
             fault = self.dead(found["watchdog"])
-        fault = fault or unbeaten
+        fault = fault or typed or self.nameplates.fault or unbeaten
         n = len(m.pv) + len(m.mv) + len(plan.dv_names)
         return Values(
             arrived_s,

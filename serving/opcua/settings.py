@@ -20,10 +20,11 @@ POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss", "None
 class Point:
     """A node, and how its number becomes the signal's: value = scale raw + offset, in the signal's unit.
 
-    ``node`` is a node id as OPC UA writes it (``ns=2;s=TIC101.PV``), or one with the namespace's own name
-    (``nsu=urn:plant;s=TIC101.PV``), which stays right when the server numbers its namespaces anew. ``read_back``, of
-    an MV alone, is the node of what the actuator really has; empty: ``node`` itself. ``unit`` is the server's name of
-    the unit, where it is another name of the controller's unit, or ``scale`` and ``offset`` convert it.
+    ``node`` is a node id with its namespace's own name (``nsu=urn:plant;s=TIC101.PV``). An id with the namespace's
+    number (``ns=2;s=TIC101.PV``) is another node once the server numbers its namespaces otherwise: the loop then holds
+    until the id is written by name. `loop check` says which name each number has now. ``read_back``, of an MV alone,
+    is the node of what the actuator really has; empty: ``node`` itself. ``unit`` is the server's name of the unit,
+    where it is another name of the controller's unit, or ``scale`` and ``offset`` convert it.
     """
 
     node: str
@@ -34,7 +35,7 @@ class Point:
 
     def __post_init__(self) -> None:
         if not self.node:
-            raise LoopError("node is empty; it needs a node id such as 'ns=2;s=TIC101.PV'")
+            raise LoopError("node is empty; it needs a node id such as 'nsu=urn:plant;s=TIC101.PV'")
         if not (isfinite(self.scale) and self.scale != 0 and isfinite(self.offset)):
             raise LoopError(f"scale is {self.scale} and offset {self.offset}; scale must not be 0, both finite")
 
@@ -89,6 +90,14 @@ class Nodes:
     def points(self, name: Literal["pv", "dv", "mv", "sp"]) -> dict[str, Point]:
         """The points of one group by signal name."""
         return {n: Point(p) if isinstance(p, str) else p for n, p in getattr(self, name).items()}
+
+    def ids(self) -> list[str]:
+        """Every node id that is given, as it is written."""
+        groups: tuple[Literal["pv", "dv", "mv", "sp"], ...] = ("pv", "dv", "mv", "sp")
+        points = [p for name in groups for p in self.points(name).values()]
+        others = [p.node for p in (self.mode, self.hand_back) if p is not None]
+        texts = [*(t for p in points for t in (p.node, p.read_back)), *others]
+        return [t for t in [*texts, self.heartbeat, self.watchdog, self.lease] if t]
 
     def check(self, manifest: Manifest) -> None:
         """LoopError where a signal that the law needs has no node, or a node no signal."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
+from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import TypeAlias
@@ -13,11 +15,13 @@ from numpy.typing import NDArray
 from serving.controller import Controller
 from serving.errors import LoopError
 from serving.guard import implausible
-from serving.journal import JournalReader
+from serving.journal import Journal, JournalReader
 from serving.manifest import Signal
 from serving.opcua.sampling import Values
 
 Array: TypeAlias = NDArray[np.float64]
+
+NAMESPACES = "namespaces"  # what they are kept under
 
 
 def usable(values: Values | None) -> bool:
@@ -50,6 +54,21 @@ def another_before(journal: Path, controller: Controller) -> str:
         return ""
     last = f"{runs[-1]['controller']} ({str(runs[-1]['sha256'])[:12]})"
     return f"begins with {controller.path.name} ({controller.sha256[:12]}); the journal's last controller was {last}"
+
+
+def keep_namespaces(journal: Journal, endpoint: str, spaces: Mapping[int, str]) -> None:
+    """Write down which namespace each number stands for at a server, for the next run of the loop."""
+    journal.keep(NAMESPACES, json.dumps({"endpoint": endpoint, "spaces": spaces}))
+
+
+def namespaces_before(journal: Path, endpoint: str) -> dict[int, str]:
+    """The namespaces by number that the last run found at this server; empty where a journal tells of none."""
+    with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
+        kept = json.loads(reader.learnt(NAMESPACES) or "{}")
+        spaces = kept.get("spaces") if isinstance(kept, dict) and kept.get("endpoint") == endpoint else None
+        if isinstance(spaces, dict):
+            return {int(number): uri for number, uri in spaces.items() if isinstance(uri, str)}
+    return {}
 
 
 def _allowed(value: float, signal: Signal) -> float:

@@ -173,12 +173,18 @@ def _check(options: argparse.Namespace) -> int:
     controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
     manifest = controller.manifest
     from serving.opcua.inspection import Found, inspected
-    from serving.station.rehearsal import rehearsed
+    from serving.station.beginning import namespaces_before
+    from serving.station.rehearsal import rehearsed, require_free
 
     here = rehearsed(settings, controller)
     for line in here.wrong:
         print(plain(f"would stop the loop: {line}"), file=sys.stderr)
-    rows = inspected(manifest, settings.server, settings.nodes, settings.guards.margin)
+    said = len(here.wrong)
+    before = namespaces_before(settings.journal.file, settings.server.endpoint)
+    inspection = inspected(manifest, settings.server, settings.nodes, settings.guards.margin, before)
+    rows = inspection.rows
+    if not here.runs:
+        here.tried(lambda: require_free(settings, inspection.identity.writes))
     names = [f.name for f in fields(Found) if f.name not in {"wrong", "note", "passing"}]
     table = [names, *([getattr(row, name) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
@@ -186,7 +192,7 @@ def _check(options: argparse.Namespace) -> int:
         print(plain("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()))
     if controller.signed is not None:
         print(f"{controller.path.name}: signed by {controller.signed.words}")
-    wrong = [f"{row.signal}: {row.wrong}" for row in rows if row.wrong]
+    wrong = [*here.wrong[said:], *(f"{row.signal}: {row.wrong}" for row in rows if row.wrong)]
     notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
     for note in [*notes, *here.notes, *_warnings(settings), *ending(controller)]:
         print(plain(f"note: {note}"))
@@ -246,11 +252,15 @@ def _run(options: argparse.Namespace) -> int:
 
 def _misfits(settings: Settings, manifest: Manifest) -> list[str]:
     """What of ``loop check`` is wrong for good: another unit, a node that is not there. None while nobody answers."""
-    from serving.opcua.inspection import lasting
+    from serving.opcua.inspection import inspected
+    from serving.station.beginning import namespaces_before
+    from serving.station.rehearsal import require_free
 
-    writes = settings.start != "SHADOW"
+    before = namespaces_before(settings.journal.file, settings.server.endpoint)
     with suppress(EndpointError):
-        return lasting(manifest, settings.server, settings.nodes, settings.guards.margin, writes=writes)
+        found = inspected(manifest, settings.server, settings.nodes, settings.guards.margin, before)
+        require_free(settings, found.identity.writes)
+        return found.lasting(writes=settings.start != "SHADOW")
     return []
 
 

@@ -7,7 +7,8 @@ import ipaddress
 import os
 import socket
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -25,6 +26,9 @@ class Lease:
     The locks are files in a folder for temporary ones: ``tend`` keeps them young, and makes one anew that is gone. A
     node that another loop has locked meanwhile is lost: ``lost`` says so, until ``tend`` has it back.
 
+    The first locks are of the nodes as they are spelt. Once the server is known, ``claim`` locks them by what they are,
+    since a host and an id can be written in many ways.
+
     Raises LoopError that names the process which has one, OSError where a lock cannot be opened.
     """
 
@@ -32,6 +36,7 @@ class Lease:
         self._folder, self._endpoint, self._address = folder, endpoint, address_of(endpoint)
         self._held: dict[str, int] = {}  # handles by node
         self._lost: dict[str, str] = {}  # by node, who has it
+        self._claimed: dict[str, str] = {}  # how a node is spelt, by what the server calls it
         self._tending = threading.Lock()
         try:
             for node in nodes:
@@ -40,11 +45,26 @@ class Lease:
             self.release()
             raise
 
+    def claim(self, nodes: Mapping[str, str]) -> None:
+        """Lock nodes by what the server calls them, in place of those claimed before; each is given with its spelling.
+
+        One that another loop has is ``lost``.
+        """
+        with self._tending, suppress(OSError):  # a lock that cannot be made says nothing of another loop
+            for key in [k for k in self._claimed if k not in nodes]:
+                self._lost.pop(key, None)
+                if key in self._held:
+                    os.close(self._held.pop(key))
+            self._claimed = dict(nodes)
+            for key in nodes:
+                with suppress(LoopError):  # ``lost`` says so
+                    self._tend(key)
+
     def tend(self) -> None:
         """Keep all files. LoopError where one was removed and another loop has it now, OSError where one cannot be."""
         troubles: list[LoopError | OSError] = []
         with self._tending:
-            for node in list(self._held):
+            for node in {**self._held, **self._claimed}:
                 try:
                     self._tend(node)
                 except (LoopError, OSError) as error:
@@ -58,8 +78,8 @@ class Lease:
         return next(iter(self._lost.values()), "")
 
     def _tend(self, node: str) -> None:
-        path, handle = self._path(node), self._held[node]
-        if path.exists() and os.path.samestat(path.stat(), os.fstat(handle)):
+        path, handle = self._path(node), self._held.get(node)
+        if handle is not None and path.exists() and os.path.samestat(path.stat(), os.fstat(handle)):
             os.utime(path)
             return
         try:
@@ -67,7 +87,8 @@ class Lease:
         except LoopError as error:
             self._lost[node] = first_line(error)
             raise
-        os.close(handle)
+        if handle is not None:
+            os.close(handle)
         self._lost.pop(node, None)
 
     def release(self) -> None:
@@ -76,19 +97,21 @@ class Lease:
             os.close(self._held.popitem()[1])
 
     def _path(self, node: str) -> Path:
-        return runtime_folder(self._folder) / hashlib.sha256(f"{self._address} {node}".encode()).hexdigest()[:32]
+        name = node if node in self._claimed else f"{self._address} {node}"
+        return runtime_folder(self._folder) / hashlib.sha256(name.encode()).hexdigest()[:32]
 
     def _locked(self, node: str) -> int:
         try:
             return locked(self._path(node))
         except LockTakenError as error:
+            text = self._claimed.get(node, node)
             raise LoopError(
-                f"{node} at {self._endpoint} is written by another loop (process {error.owner}); end that one first"
+                f"{text} at {self._endpoint} is written by another loop (process {error.owner}); end that one first"
             ) from None
 
 
 def address_of(endpoint: str) -> str:
-    """Where a server listens, however its host is spelt: ``localhost``, 127.0.0.1 and ::1 are the same one."""
+    """Where a server listens, however its host is spelt: all addresses of this machine are the same one."""
     try:
         parts = urlsplit(endpoint)
         host, port = parts.hostname or "", parts.port or OPC_UA_PORT
@@ -98,6 +121,20 @@ def address_of(endpoint: str) -> str:
         found = sorted({str(row[4][0]) for row in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)})
     except OSError:
         return f"{host}:{port}"
-    if any(ipaddress.ip_address(address.partition("%")[0]).is_loopback for address in found):
+    if any(_of_this_machine(address) for address in found):
         return f"this machine:{port}"
     return f"{found[0]}:{port}"
+
+
+def _of_this_machine(address: str) -> bool:
+    """Whether an address is one of this machine: a socket can be bound to no other."""
+    at = ipaddress.ip_address(address.partition("%")[0])
+    at = (at.ipv4_mapped or at) if isinstance(at, ipaddress.IPv6Address) else at
+    if at.is_loopback or at.is_unspecified:
+        return True
+    try:
+        with socket.socket(socket.AF_INET6 if at.version == 6 else socket.AF_INET, socket.SOCK_DGRAM) as tried:
+            tried.bind((str(at), 0))
+    except OSError:
+        return False
+    return True

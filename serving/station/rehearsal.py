@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,13 +25,15 @@ class Rehearsal:
 
     wrong: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    runs: bool = False  # this very loop does, already
 
     def tried(self, make: Callable[[], object]) -> None:
-        """Make a part, and say why it cannot be made."""
+        """Make a part, and say once why it cannot be made."""
         try:
             make()
         except (LoopwrightError, OSError) as error:
-            self.wrong.append(first_line(error))
+            if first_line(error) not in self.wrong:
+                self.wrong.append(first_line(error))
 
 
 def rehearsed(settings: Settings, controller: Controller) -> Rehearsal:
@@ -39,12 +41,13 @@ def rehearsed(settings: Settings, controller: Controller) -> Rehearsal:
     found, page = Rehearsal(), settings.served()
     found.tried(lambda: control_loop(settings, controller))
     owner = _owner(settings.journal.file)
+    found.runs = bool(owner)
     if owner:
         found.notes.append(
             f"this loop runs already (process {owner}); its MVs, its journal and its page's address are its own"
         )
     else:
-        found.tried(lambda: _require_free(settings))
+        found.tried(lambda: require_free(settings))
         found.tried(lambda: _require_journal(settings.journal.file))
         if page is not None:
             found.tried(lambda: listening(page).close())
@@ -68,9 +71,15 @@ def _owner(journal: Path) -> str:
     return ""
 
 
-def _require_free(settings: Settings) -> None:
-    """LoopError where another loop writes one of the MVs."""
-    Lease(settings.server.endpoint, [p.node for p in settings.nodes.points("mv").values()]).release()
+def require_free(settings: Settings, writes: Mapping[str, str] | None = None) -> None:
+    """LoopError where another loop writes one of the MVs, also as ``writes`` (see ``Lease.claim``) names them."""
+    lease = Lease(settings.server.endpoint, [p.node for p in settings.nodes.points("mv").values()])
+    try:
+        lease.claim(writes or {})
+        if lease.lost:
+            raise LoopError(lease.lost)
+    finally:
+        lease.release()
 
 
 def _require_journal(journal: Path) -> None:

@@ -24,9 +24,10 @@ from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import expiries
 from serving.opcua.endpoint import OpcUaEndpoint
+from serving.opcua.nameplates import Identity
 from serving.opcua.sampling import Values
 from serving.page.process import PageProcess
-from serving.station.beginning import another_before, begun_at, near, usable
+from serving.station.beginning import another_before, begun_at, keep_namespaces, namespaces_before, near, usable
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
 from serving.station.making import control_loop
@@ -74,7 +75,14 @@ class Station:
         control_loop(settings, self.controller)  # settings that do not fit it are said before it is connected
         self.clock = MonotonicClock(settings.speed)
         self.endpoint = OpcUaEndpoint(
-            m, settings.server, settings.nodes, max_age_s=age, speed=settings.speed, tell=self._connection
+            m,
+            settings.server,
+            settings.nodes,
+            max_age_s=age,
+            speed=settings.speed,
+            tell=self._connection,
+            spaces=namespaces_before(settings.journal.file, settings.server.endpoint),
+            identified=self._identified,
         )
         points = settings.nodes.points("mv").values()
         self.lease = Lease(settings.server.endpoint, [p.node for p in points])
@@ -231,6 +239,7 @@ class Station:
             return
         with suppress(LoopError, OSError):
             self.lease.tend()  # the other loop may have ended since
+            self._untended("")
         if self.lease.lost:
             self.recorder.note("change", "loop", f"mode {loop.mode} -> {Mode.SHADOW}", self.lease.lost)
             loop.set_mode(Mode.SHADOW)
@@ -338,6 +347,15 @@ class Station:
             raise LoopError(f"{entry.acknowledged.who} has acknowledged it already")
         self.recorder.note("acknowledged", request.who, entry.event.what, request.reason, about=entry.id)
         return {"done": f"acknowledged: {entry.event.what}"}
+
+    def _identified(self, found: Identity) -> None:
+        """The server is known now: its namespaces are kept, and its nodes locked however others spell them."""
+        if found.spaces:
+            keep_namespaces(self.journal, self.settings.server.endpoint, found.spaces)
+        before = self.lease.lost
+        self.lease.claim(found.writes)
+        if self.lease.lost != before:
+            self._untended(self.lease.lost)
 
     def _connection(self, what: str) -> None:
         up = what.startswith("connected")

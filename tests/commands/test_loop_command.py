@@ -17,9 +17,10 @@ from plant_servers import Plant, RunningLoop, spoil
 from processes import within
 
 from pipeline.__main__ import main
-from serving import LoopError, Signal
+from serving import Controller, LoopError, Signal
 from serving.journal import Journal
-from serving.opcua.inspection import _refused, _unfit, other_unit
+from serving.opcua.inspection import _refused, _unfit, inspected
+from serving.opcua.nameplates import other_unit
 from serving.opcua.settings import Point
 from serving.station.command import JOURNAL_LOST
 from serving.station.lease import Lease
@@ -227,6 +228,27 @@ def test_check_tells_of_a_port_and_an_mv_that_others_have(settings: Path, capsys
     port, lock = sorted(capsys.readouterr().err.splitlines(), key=lambda line: "written by" in line)
     assert port.startswith(f"would stop the loop: the page cannot listen at {taken}")
     assert f"is written by another loop (process {os.getpid()}); end that one first" in lock
+
+
+def test_check_says_what_a_numbered_namespace_is_and_finds_an_mv_that_is_spelt_otherwise(
+    settings: Path, plant: Plant, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings.write_text(settings.read_text().replace("nsu=urn:loopwright:plant;", "ns=2;"))
+    read = Settings.read(settings)
+    found = inspected(Controller(PID).manifest, read.server, read.nodes, 0.05)
+    capsys.readouterr()
+    assert main(["loop", "check"]) == 0
+    named = "note: namespace 2: it is urn:loopwright:plant now; write nsu=urn:loopwright:plant;s="
+    assert named in capsys.readouterr().out
+    other = Lease("opc.tcp://plant.invalid:4840", ["nsu=urn:loopwright:plant;s=MV.T_j"])
+    other.claim(found.identity.writes)
+    try:
+        assert main(["loop", "check"]) == 2
+        assert f"is written by another loop (process {os.getpid()})" in capsys.readouterr().err
+        assert main(["loop", "run", "--scans", "1"]) == 2
+        assert f"is written by another loop (process {os.getpid()})" in capsys.readouterr().err
+    finally:
+        other.release()
 
 
 def test_check_beside_the_loop_itself_finds_nothing_wrong(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:

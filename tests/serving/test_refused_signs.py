@@ -36,6 +36,15 @@ class MadeUpLink:
     async def resolved(self, nodes: Sequence[str], _: float) -> list[ua.NodeId]:
         return [node_id(n, []) for n in nodes]
 
+    async def namespaces(self, _: float, *, anew: bool = False) -> list[str]:
+        return ["http://opcfoundation.org/UA/", "urn:server", "urn:plant"]
+
+    async def server_uri(self, _: float) -> str:
+        return "urn:server"
+
+    async def browsed(self, nodes: Sequence[ua.NodeId], _: int, __: float, *, inverse: bool = False) -> list[Any]:
+        return [[] for _ in nodes]
+
     async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
         self.reads += 1
         if self.silent:

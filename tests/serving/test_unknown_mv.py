@@ -103,3 +103,13 @@ def test_after_a_first_command_that_did_not_arrive_nothing_is_known(pi_file: Pat
     loop_on(pi_file, plant).run(4, observe=lambda _, command: seen.append(command.writes))
     assert seen == [False, False, True, True]
     assert plant.written == [STANDS] * 2
+
+
+@pytest.mark.parametrize("given", [np.array(["1"]), np.array([b"1"]), np.array([True]), [True], ["1"], [None]])
+def test_a_read_back_that_is_no_number_is_believed_by_no_loop(given: Any, pi_file: Path) -> None:
+    """Not by one without guards either: 400 became 1 within a scan."""
+    loop = loop_on(pi_file, guards=(), mv=[STANDS])
+    command = loop.scan(Sample(np.array([0.8, 300.0]), given, np.zeros(1)))
+    assert (command.mode, command.mv.tolist()) == (Mode.HOLD, [STANDS])
+    unknown = loop_on(pi_file, guards=(), mode=Mode.MANUAL)
+    assert not unknown.scan(Sample(np.array([0.8, 300.0]), given, np.zeros(1))).writes

@@ -1,0 +1,225 @@
+"""What a loop's nodes are: namespace, type, unit and range, held against what the first connection of a run found.
+
+A server that was started anew may number its namespaces otherwise, and an engineer may change a node under a loop that
+runs: the same id then means another signal, or another number. Neither is believed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+from asyncua import ua
+
+from serving.errors import EndpointError
+from serving.manifest import Manifest, Signal
+from serving.opcua.link import Link, node_id
+from serving.opcua.plan import Plan
+from serving.opcua.settings import Nodes, Point
+
+LOOK_S = 60.0  # between two looks at what may change without a new connection
+UNKNOWN = "-"
+NULL = ua.VariantType.Null
+
+
+class ChangedNodeError(EndpointError):
+    """A node is another one, or of another type, than the loop began with: nothing is written there."""
+
+
+class Plate(NamedTuple):
+    """A node's unit and range as its server tells them; ``UNKNOWN`` where it does not."""
+
+    unit: str = UNKNOWN
+    limits: str = UNKNOWN
+
+
+class Identity(NamedTuple):
+    """What a connection is to: the URI of each namespace that is used by its number, and the nodes it may write.
+
+    ``writes`` has each by a key that is the same however host and id are spelt; empty where a server tells too little.
+    """
+
+    spaces: Mapping[int, str]
+    writes: Mapping[str, str]
+
+
+class Nameplates:
+    """What the nodes were when the loop began. ``fault``: why a unit or a range is another one now; empty: none is.
+
+    Parameters
+    ----------
+    nodes, manifest
+        Of the loop.
+    spaces
+        The namespaces by number that an earlier run found behind these ids.
+    """
+
+    def __init__(self, nodes: Nodes, manifest: Manifest, spaces: Mapping[int, str] | None = None) -> None:
+        self.nodes, self.manifest = nodes, manifest
+        self.spaces = dict(spaces or {})
+        self.fault = ""
+        self.moved: ChangedNodeError | None = None  # what ``watch`` has found
+        self._kinds: dict[str, ua.VariantType] = {}
+        self._plates: dict[str, Plate] = {}
+
+    async def require_spaces(self, link: Link, timeout_s: float, *, anew: bool = False) -> None:
+        """ChangedNodeError where a number stands for another namespace now."""
+        numbered = numbers(self.nodes.ids())
+        if not numbered:
+            return
+        now = await link.namespaces(timeout_s, anew=anew)
+        for number, text in numbered.items():
+            before, uri = self.spaces.get(number), uri_of(now, number)
+            if before is not None and uri != before:
+                raise ChangedNodeError(renumbered(number, text, before, uri))
+            if uri:
+                self.spaces[number] = uri
+
+    def typed(self, name: str, kind: ua.VariantType | None) -> str:
+        """Why a node's type is another one than the loop began with; empty where it is the same, or not known."""
+        if kind in {None, NULL}:
+            return ""
+        assert kind is not None
+        before = self._kinds.setdefault(name, kind)
+        if kind is before:
+            return ""
+        return f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
+
+    def require_types(self, plan: Plan, kinds: Sequence[ua.VariantType | None]) -> None:
+        """ChangedNodeError where a node of an MV (n_mv,) has another type now than the loop began with."""
+        for name, kind in zip(plan.mv_names, kinds, strict=True):
+            changed = self.typed(f"MV {name}, written", kind)
+            if changed:
+                raise ChangedNodeError(changed)
+
+    async def look(self, link: Link, plan: Plan, timeout_s: float) -> None:
+        """See which unit and range each node has now; EndpointError where nobody answers."""
+        rows = plan.measuring()
+        found = await plates(link, [node for _, _, node in rows], timeout_s)
+        wrong = [self._other(name, point, p) for (name, point, _), p in zip(rows, found, strict=True)]
+        self.fault = next(filter(None, wrong), "")
+
+    async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
+        """Look again now and then, until a node is another one: ``moved`` then says so."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            try:
+                await self.again(link, plan, timeout_s)
+            except ChangedNodeError as error:
+                self.moved = error
+                link.on_gone()
+                return
+            except EndpointError:  # the loop's own readings judge a server that is silent
+                continue
+
+    async def again(self, link: Link, plan: Plan, timeout_s: float) -> None:
+        """All that may change without a new connection. ChangedNodeError, EndpointError."""
+        await self.require_spaces(link, timeout_s, anew=True)
+        written = await link.read([node for node, _ in plan.written], timeout_s)
+        self.require_types(plan, [answer.kind for answer in written])
+        await self.look(link, plan, timeout_s)
+
+    def _other(self, name: str, point: Point, now: Plate) -> str:
+        """Why a unit or a range is another one; what the server does not tell is none."""
+        before = self._plates.get(name, Plate())
+        self._plates[name] = Plate(*(n if b == UNKNOWN else b for b, n in zip(before, now, strict=True)))
+        for what, was, is_now in zip(("unit", "range"), before, now, strict=True):
+            if UNKNOWN not in {was, is_now} and was != is_now:
+                return f"{name}: its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
+        signal = signal_of(self.manifest, name)
+        misfit = "" if signal is None or name.startswith("SP ") else other_unit(now.unit, point, signal)
+        return f"{name}: {misfit}" if misfit else ""
+
+
+def numbers(ids: Iterable[str]) -> dict[int, str]:
+    """The namespaces that ids name by number, each with the first such id. What is no id is told elsewhere."""
+    found: dict[int, str] = {}
+    for text in ids:
+        with suppress(EndpointError):
+            number = 0 if text.startswith("nsu=") else int(node_id(text, []).NamespaceIndex)
+            if number:
+                found.setdefault(number, text)
+    return found
+
+
+def uri_of(spaces: Sequence[str], number: int) -> str:
+    """A namespace's name by its number; empty where there is none."""
+    return spaces[number] if number < len(spaces) else ""
+
+
+def by_name(text: str, uri: str) -> str:
+    """An id that names its namespace by number, with the namespace's own name."""
+    return f"nsu={uri};" + ";".join(part for part in text.split(";") if not part.startswith("ns="))
+
+
+def renumbered(number: int, text: str, before: str, now: str) -> str:
+    """What is wrong with a number that stands for another namespace now."""
+    present = f"is {now} now and was {before}" if now else f"was {before} and is not there now"
+    return f"namespace {number} {present}, so {text} would be another node; write {by_name(text, before)} in loop.toml"
+
+
+async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s: float) -> Identity:
+    """Which server this is, and which nodes of it the loop writes, however they are spelt.
+
+    Two servers may have one name, so a server is known by its name, its namespaces and the moment of its start.
+    """
+    spaces, texts = await link.namespaces(timeout_s), [p.node for p in nodes.points("mv").values()]
+    found = {n: uri_of(spaces, n) for n in numbers(nodes.ids())}
+    name = await link.server_uri(timeout_s)
+    if not name or started_s is None:
+        return Identity(found, {})
+    at = f"{name} {started_s!r} {spaces}"
+    return Identity(found, {f"{at} {_whole(node_id(t, spaces), spaces)}": t for t in texts})
+
+
+def _whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
+    number = int(node.NamespaceIndex)
+    return by_name(node.to_string(), uri_of(spaces, number) or str(number))
+
+
+async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> list[Plate]:
+    """Unit and range of nodes, in two requests; UNKNOWN where the server does not tell: they are its courtesy."""
+    try:
+        found = await link.browsed(nodes, ua.ObjectIds.HasProperty, timeout_s)
+        asked = [
+            (i, str(r.BrowseName.Name), r.NodeId)
+            for i, rows in enumerate(found)
+            for r in rows
+            if r.BrowseName.Name in {"EngineeringUnits", "EURange"}
+        ]
+        answers = await link.values([ua.NodeId(n.Identifier, n.NamespaceIndex) for _, _, n in asked], timeout_s)
+    except EndpointError:
+        if link.gone:
+            raise
+        return [Plate() for _ in nodes]
+    told: list[dict[str, str]] = [{} for _ in nodes]
+    for (i, name, _), answer in zip(asked, answers, strict=True):
+        value = None if answer.Value is None else answer.Value.Value
+        if name == "EURange" and isinstance(value, ua.Range):
+            told[i]["limits"] = f"{value.Low:g} .. {value.High:g}"
+        elif name == "EngineeringUnits" and isinstance(value, ua.EUInformation):
+            told[i]["unit"] = value.DisplayName.Text or UNKNOWN
+    return [Plate(**plate) for plate in told]
+
+
+def signal_of(manifest: Manifest, name: str) -> Signal | None:
+    """The signal of a row such as "PV T" or "MV T_j, written"; None for what is no signal."""
+    group, _, rest = name.partition(" ")
+    rest = rest.removesuffix(", written")
+    signals = {"PV": manifest.pv, "MV": manifest.mv, "DV": manifest.dv, "SP": manifest.sp}.get(group, ())
+    return next((s for s in signals if s.name == rest), None)
+
+
+def other_unit(unit: str, point: Point, signal: Signal) -> str:
+    """What is wrong with the server's unit of a signal; empty where loop.toml explains it."""
+    converted = (point.scale, point.offset) != (1.0, 0.0)
+    if unit in {UNKNOWN, point.unit} or (not point.unit and (converted or unit == signal.unit)):
+        return ""
+    if point.unit:
+        return f"the server says the unit is {unit}, loop.toml says {point.unit}"
+    return (
+        f"the server says the unit is {unit}, the controller's is {signal.unit}: give scale and offset, or "
+        f'unit = "{unit}" where it is only another name'
+    )

@@ -1,0 +1,202 @@
+"""Nodes that are others than when the loop began: another namespace, type, unit or range is held, and named."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from asyncua import ua
+
+from serving import Controller
+from serving.errors import EndpointError
+from serving.journal import Journal
+from serving.manifest import Manifest
+from serving.opcua.ages import Ages
+from serving.opcua.link import node_id
+from serving.opcua.nameplates import ChangedNodeError, Nameplates, identity
+from serving.opcua.plan import Plan
+from serving.opcua.sampling import Sampling, Values
+from serving.opcua.settings import ModeNode, Nodes, Point, Server
+from serving.opcua.values import Reading
+from serving.station.beginning import keep_namespaces, namespaces_before
+
+pytest_plugins = ["small_laws"]
+UA_SPACE = "http://opcfoundation.org/UA/"
+DOUBLE, INT32, STRING = ua.VariantType.Double, ua.VariantType.Int32, ua.VariantType.String
+UNITS = {"level": "m", "T": "K", "inflow": "l/s", "valve": "%"}
+
+
+class MadeUpLink:
+    """A server that was started with some namespaces, and whose nodes tell a type, a unit and a range."""
+
+    def __init__(self, *spaces: str) -> None:
+        self.spaces, self.gone = [UA_SPACE, "urn:server", *spaces], ""
+        self.kinds: dict[str, ua.VariantType] = {}
+        self.units: dict[str, str] = {}
+        self.ends: dict[str, float] = {}
+
+    async def namespaces(self, _: float, *, anew: bool = False) -> list[str]:
+        return self.spaces
+
+    async def server_uri(self, _: float) -> str:
+        return "urn:server"
+
+    async def resolved(self, nodes: Sequence[str], _: float) -> list[ua.NodeId]:
+        return [node_id(n, self.spaces) for n in nodes]
+
+    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
+        return [Reading(1.0, 0, None, self.kinds.get(str(n.Identifier), DOUBLE)) for n in nodes]
+
+    async def browsed(
+        self, nodes: Sequence[ua.NodeId], _: int, __: float, *, inverse: bool = False
+    ) -> list[list[ua.ReferenceDescription]]:
+        names = ("EngineeringUnits", "EURange")
+        return [
+            [
+                ua.ReferenceDescription(
+                    NodeId=ua.NodeId(f"{n.Identifier} {name}", 2), BrowseName=ua.QualifiedName(name)
+                )
+                for name in names
+            ]
+            for n in nodes
+        ]
+
+    async def values(self, nodes: Sequence[ua.NodeId], _: float) -> list[ua.DataValue]:
+        found = []
+        for node in nodes:
+            of, _, what = str(node.Identifier).rpartition(" ")
+            unit = ua.EUInformation(DisplayName=ua.LocalizedText(self.units.get(of, UNITS[of])))
+            given: Any = unit if what == "EngineeringUnits" else ua.Range(Low=0.0, High=self.ends.get(of, 100.0))
+            found.append(ua.DataValue(ua.Variant(given, ua.VariantType.ExtensionObject)))
+        return found
+
+
+def nodes_of(m: Manifest, head: str) -> Nodes:
+    groups: Any = {g: {s.name: f"{head};s={s.name}" for s in m.signals(g)} for g in ("pv", "mv", "dv")}
+    return Nodes(**groups, sp={"level": f"{head};s=level"}, mode=ModeNode(f"{head};s=mode", {"AUTO": 1.0}))
+
+
+@pytest.fixture
+def manifest(controller: Controller) -> Manifest:
+    return controller.manifest
+
+
+def connected(link: Any, made: Nameplates) -> Plan:
+    """What the endpoint does at each connection."""
+
+    async def act() -> Plan:
+        await made.require_spaces(link, 1.0)
+        plan = await Plan.made(link, made.manifest, made.nodes, 1.0)
+        made.require_types(plan, [kind for _, kind in plan.written])
+        await made.look(link, plan, 1.0)
+        return plan
+
+    return asyncio.run(act())
+
+
+def test_a_number_that_stands_for_another_namespace_is_no_node_of_this_loop(manifest: Manifest) -> None:
+    """A server that was started anew had its namespaces the other way round: the loop wrote another unit's valve."""
+    made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
+    connected(MadeUpLink("urn:one", "urn:two"), made)
+    for other in (("urn:two", "urn:one"), ("urn:two",), ()):
+        with pytest.raises(ChangedNodeError, match=r"write nsu=urn:one;s=level in loop\.toml"):
+            connected(MadeUpLink(*other), made)
+    connected(MadeUpLink("urn:one", "urn:three"), made)  # it is there again, and what lies behind it is no matter
+    by_name = Nameplates(nodes_of(manifest, "nsu=urn:one"), manifest)
+    assert connected(MadeUpLink("urn:one", "urn:two"), by_name).asked[0].NamespaceIndex == 2
+    assert connected(MadeUpLink("urn:two", "urn:one"), by_name).asked[0].NamespaceIndex == 3
+    with pytest.raises(EndpointError, match="no namespace 'urn:one'"):
+        connected(MadeUpLink("urn:two"), by_name)
+
+
+def test_what_a_number_stood_for_outlives_the_loop(manifest: Manifest, tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "loop.journal")
+    made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
+    connected(MadeUpLink("urn:one"), made)
+    keep_namespaces(journal, "opc.tcp://a:1", made.spaces)
+    journal.close()
+    assert namespaces_before(journal.path, "opc.tcp://b:1") == {}
+    assert namespaces_before(tmp_path / "none", "opc.tcp://a:1") == {}
+    after = Nameplates(made.nodes, manifest, namespaces_before(journal.path, "opc.tcp://a:1"))
+    with pytest.raises(ChangedNodeError):
+        connected(MadeUpLink("urn:two"), after)
+    connected(MadeUpLink("urn:one"), after)
+
+
+def valued(made: Nameplates, plan: Plan, **kinds: ua.VariantType) -> Values:
+    """The values of a reading in which some nodes have another type."""
+    server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
+    answers = [Reading(1.0, 0, None, kinds.get(name.replace(" ", "_"), DOUBLE)) for name, _, _ in plan.points]
+    sampling = Sampling(made.manifest, server, made.nodes, made)
+    return sampling.valued(plan, answers, Ages(len(plan.timed)), 0.0, unbeaten="", starts=0)
+
+
+@pytest.mark.parametrize("name", ["PV level", "MV valve", "DV inflow", "SP level", "mode"])
+def test_a_node_of_another_type_is_a_fault_while_it_is(name: str, manifest: Manifest) -> None:
+    """A PV went on in AUTO when its Double became an integer. A value of the wrong type is no wish either."""
+    made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
+    plan = connected(MadeUpLink("urn:one"), made)
+    used = "dv" in manifest.inputs or not name.startswith("DV")
+    assert valued(made, plan).fault == ""
+    other = valued(made, plan, **{name.replace(" ", "_"): INT32})
+    assert other.fault.startswith(f"{name}: its type is Int32 now and was Double") is used
+    assert (other.asked_mode, bool(other.asked_sp)) == ("" if name == "mode" else "AUTO", name != "SP level")
+    assert np.isnan(other.mv[0]) == (name == "MV valve")
+    assert valued(made, plan).fault == ""
+
+
+def test_an_mv_whose_written_node_has_another_type_is_not_written(manifest: Manifest) -> None:
+    made, link = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
+    plan = connected(link, made)
+    link.kinds["valve"] = INT32
+    for again in (lambda: connected(link, made), lambda: asyncio.run(made.again(link, plan, 1.0))):  # type: ignore[arg-type]
+        with pytest.raises(ChangedNodeError, match="MV valve, written: its type is Int32 now and was Double"):
+            again()
+    link.kinds.clear()
+    asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+
+
+def test_another_unit_or_range_is_a_fault_while_it_is(manifest: Manifest) -> None:
+    made, link = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
+    plan = connected(link, made)
+    assert made.fault == ""
+    for told, words in (({"units": {"T": "degC"}}, "unit is degC now and was K"), ({"ends": {"T": 200.0}}, "range is")):
+        for name, values in told.items():
+            setattr(link, name, values)
+        asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+        assert made.fault.startswith(f"PV T: its {words}")
+        assert valued(made, plan).fault == made.fault
+        link.units, link.ends = {}, {}
+        asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+        assert made.fault == valued(made, plan).fault == ""
+
+
+def test_a_unit_that_never_was_the_controllers_is_a_fault_of_the_first_connection(manifest: Manifest) -> None:
+    """`loop run` asks before it begins, but not a server that is not there yet; what loop.toml explains is right."""
+    link = MadeUpLink("urn:one")
+    link.units["T"] = "degC"
+    made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
+    connected(link, made)
+    assert made.fault.startswith("PV T: the server says the unit is degC, the controller's is K")
+    pv = {**made.nodes.pv, "T": Point("ns=2;s=T", offset=273.15)}
+    explained = Nameplates(Nodes(pv, made.nodes.mv, made.nodes.dv), manifest)
+    connected(link, explained)
+    assert explained.fault == ""
+
+
+def test_a_node_is_the_same_however_it_is_spelt_and_on_another_server_another_one(manifest: Manifest) -> None:
+    def keys(link: Any, head: str, started_s: float | None) -> list[str]:
+        return list(asyncio.run(identity(link, nodes_of(manifest, head), started_s, 1.0)).writes)
+
+    link = MadeUpLink("urn:one", "urn:two")
+    numbered = keys(link, "ns=2", 1.5)
+    assert len(numbered) == 1
+    assert keys(link, "nsu=urn:one", 1.5) == numbered
+    assert keys(link, "ns=3", 1.5) != numbered
+    assert keys(link, "ns=2", 2.5) != numbered  # of the same name and make, started at another time
+    assert keys(MadeUpLink("urn:one"), "ns=2", 1.5) != numbered
+    assert keys(link, "ns=2", None) == []  # one that does not tell when it started may be another one
