@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
 from pipeline.historian.cells import MV_CONVERSIONS, outliers, unit_slips, usual
-from pipeline.historian.copies import copied
 from pipeline.historian.dialect import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
@@ -41,9 +40,6 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
             f"{counts['clock']} readings have an ambiguous time: the clock was set back, or zones are mixed; export UTC"
         )
         found.append(Finding("clock", tag.tag, words, True))
-    if tag.role == "pv" and (n := series.flag(_copies(series), Reason.COPY)):
-        words = f"{n} readings repeat a block of earlier ones to the last digit; the first of each stays"
-        found.append(Finding("copy", tag.tag, words, True))
     if series.rounded_s:
         words = f"stamps are rounded to {series.rounded_s:g} s: readings that share one were spread evenly over it"
         found.append(Finding("rounded", tag.tag, words))
@@ -58,13 +54,6 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
         place = np.flatnonzero(series.good & (series.value != 0.0))  # zero is a closed valve in every unit
         found += _slipped(series, tag, place, *unit_slips(series.value[place], MV_CONVERSIONS))
     return found
-
-
-def _copies(series: Series) -> NDArray[np.bool_]:
-    where = np.zeros(len(series), dtype=bool)
-    place = np.flatnonzero(series.good)
-    where[place] = copied(series.value[place])
-    return where
 
 
 def _out_of_range(series: Series, tag: Tag) -> list[Finding]:
