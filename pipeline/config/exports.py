@@ -19,7 +19,8 @@ class ExportedTag:
     """A column of the files and its role; unit, range and name where a person gave them.
 
     Else the unit is the files', the range is what the readings show, and the name is the tag's own, made safe.
-    ``unit_certain``: no reading is in another unit, so that none is left out for looking like it.
+    ``unit_certain``: no reading is in another unit, so that none is left out for looking like it. ``between``: a line
+    or a step from one reading to the next. ``ends``: rows at the lowest or highest value are kept or dropped.
     """
 
     tag: str
@@ -29,6 +30,8 @@ class ExportedTag:
     high: float | None = None
     name: str = ""
     unit_certain: bool = False
+    between: Literal["", "step", "line"] = ""
+    ends: Literal["", "keep", "drop"] = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -13,6 +13,8 @@ SAMPLE = 50_000
 STUCK_CHANCE = 1e-4  # of a stretch as long by chance anywhere in the record
 SHORTEST_STUCK, LONGEST_STUCK = 8, 400  # rows
 NOISY = 0.2  # share of equal neighbours, up to which a value that repeats is a fault whatever the others do
+ALTERNATING = 0.6  # share of the second differences that change their sign, from which they are noise
+SEEN_MOVE, SEEN_STEPS = 0.05, 3  # of its span that another signal moves, and steps of the converter that this must be
 CLIPPED_ROWS = 5
 HELD = 0.6  # share of rows without a move, from which a signal is moved in steps
 LINEAR_ROWS = 5  # of a stretch that a compressed signal's interpolation makes straight
@@ -49,6 +51,19 @@ def smallest_difference(values: Array) -> float:
     return float(f"{apart.min():.6g}") if apart.size else 0.0
 
 
+def noisy(values: Array) -> bool:
+    """Whether noise larger than the converter's step moves the values (n,): second differences change their sign.
+
+    Of white noise 73 % of them do; a smooth curve's keep it, and those of a coarse converter are its steps.
+    """
+    v = values[np.isfinite(values)][:SAMPLE]
+    second = np.diff(v, 2)
+    if not second.size:
+        return False
+    sd = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0)
+    return sd > quantum(v) and float(np.mean(second[1:] * second[:-1] < 0)) > ALTERNATING
+
+
 def runs_of(mask: Where) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First row and first row after each stretch of True, both (m,)."""
     edge = np.diff(np.r_[False, mask, False].astype(np.int8))
@@ -60,8 +75,10 @@ def stuck(values: Array, others: Sequence[tuple[Array, float]], same_piece: Wher
 
     values (n,); others: all other signals, (n,) each, with their usual spans; same_piece (n-1,): no gap between rows.
     With p the share of equal neighbours outside the longest stretches, a stretch of L rows comes by chance
-    n p^L times; L is where this is STUCK_CHANCE. Others move where one leaves its mean over the stretch's first
-    quarter by more than 5 % of its span. Where p is below NOISY, noise alone moves the value, and the others need not.
+    n p^L times; L is where this is STUCK_CHANCE. Where p is below NOISY and the value has noise, noise alone would
+    move it. Else, as of a plant at rest, another signal must move within the first half of the stretch, so that an
+    answer had as long to come: it leaves its mean over the first quarter by more than SEEN_MOVE of its span. A move
+    that the converter's steps would hide is none.
     """
     scale = max(float(np.nanmax(np.abs(values), initial=0.0)), 1e-300)
     same = (np.abs(np.diff(values)) <= 1e-12 * scale) & same_piece
@@ -74,9 +91,13 @@ def stuck(values: Array, others: Sequence[tuple[Array, float]], same_piece: Wher
     rest = len(values) - int(length[~usual].sum())
     p = min(max(int(length[usual].sum()) / max(rest, 1), 1e-3), 0.999)
     least = np.clip(np.log(STUCK_CHANCE / len(values)) / np.log(p), SHORTEST_STUCK, LONGEST_STUCK)
+    moves = p < NOISY and noisy(values)
+    span = float(np.nanmax(values) - np.nanmin(values))
+    least_move = max(SEEN_MOVE, SEEN_STEPS * quantum(values) / span) if span > 0 else SEEN_MOVE
     for a, b in zip(start[length >= least], end[length >= least], strict=True):
         quarter = max((b - a) // 4, 1)
-        if p < NOISY or any(_moved(other[a : b + 1], quarter) > 0.05 * span for other, span in others if span > 0):
+        half = slice(a, a + max((b - a + 1) // 2, 1))
+        if moves or any(_moved(other[half], quarter) > least_move * span for other, span in others if span > 0):
             where[a + 1 : b + 1] = True
     return where
 
@@ -86,17 +107,17 @@ def _moved(values: Array, first: int) -> float:
     return float(np.nanmax(np.abs(values - np.mean(values[:first])), initial=0.0))
 
 
-def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where, str]:
-    """Where (n,) a sensor stands at the end of its range, and the end in words.
+def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where, tuple[tuple[float, int], ...]]:
+    """Where (n,) values stand at an end, and of each end its value and rows.
 
     An end is the range that was given, or the largest (smallest) value, where that is repeated at least CLIPPED_ROWS
     rows on end and three times as often as all values within the next 2 % of the span. Of values that move in steps,
     each held, only the range that was given is an end: the largest step is none.
     """
-    where, words = np.zeros(len(values), dtype=bool), []
+    where, ends = np.zeros(len(values), dtype=bool), list[tuple[float, int]]()
     finite = values[np.isfinite(values)]
     if finite.size < 10 * CLIPPED_ROWS or np.ptp(finite) == 0:
-        return where, ""
+        return where, ()
     span = float(np.ptp(finite))
     held = held_share(values) >= HELD
     for end, given, sign in ((float(finite.max()), high, 1), (float(finite.min()), low, -1)):
@@ -107,8 +128,8 @@ def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where
         at_given = given is not None and abs(end - given) <= 1e-6 * span
         if longest >= CLIPPED_ROWS and (at_given or (at.sum() > 3 * near and not held)):
             where |= at
-            words.append(f"{end:g} in {int(at.sum())} rows")
-    return where, " and ".join(words)
+            ends.append((end, int(at.sum())))
+    return where, tuple(ends)
 
 
 def held_share(values: Array) -> float:

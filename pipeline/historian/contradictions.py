@@ -87,6 +87,8 @@ def contradict(
     found = []
     for tag in (t for t in signals if t.role == "pv"):
         y = np.where(grid.code[tag.tag] == 0, grid.value[tag.tag], np.nan)
+        if tag.tag in grid.limits:
+            y[grid.limits[tag.tag]] = np.nan  # there it answers to nothing by right
         length = int(np.clip(SETTLINGS * settling.get(tag.tag, 0), SHORTEST, LONGEST))
         windows = Windows.of(y, expected[tag.tag], length)
         for kind, rows in _judged(windows, len(y)).items():
@@ -94,7 +96,7 @@ def contradict(
                 rows = _with_its_rest(rows, [grid.value[t.tag] for t in signals if t.role == "mv"])
             elif rows.any():
                 rows = _to_its_edges(rows, np.abs(y - expected[tag.tag]), length // 2)
-            new = rows & (grid.code[tag.tag] == 0) & np.isfinite(grid.value[tag.tag])
+            new = rows & (grid.code[tag.tag] == 0) & np.isfinite(y)
             if new.any():
                 grid.code[tag.tag][new] = Reason.UNLIKE
                 start, end = runs_of(rows)

@@ -1,12 +1,19 @@
-"""Blocks of rows that stand in an export again with later times: their noise repeats to the last digit."""
+"""Blocks of rows that stand in an export again with later times: every column repeats, its noise to the last digit."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.historian.character import noisy
+from pipeline.historian.export import Series
+from pipeline.historian.findings import Finding
+from pipeline.historian.reason import Reason
+from pipeline.historian.sent_again import row_keys, with_the_same_stamps
+from pipeline.historian.tags import SIGNAL_ROLES, Tag
 from pipeline.metrics import Array
 
 FOLDS = (2, 2, 2, 3)
@@ -15,10 +22,35 @@ DIFFERENT = 16  # changes of the value among them
 FACTOR = 0x9E3779B97F4A7C15
 
 
-def copied(values: Array) -> NDArray[np.bool_]:
-    """Where (n,) readings repeat WINDOW earlier ones or more, in the same order.
+def drop_copies(own: Mapping[str, Series], tags: Sequence[Tag]) -> list[Finding]:
+    """Readings of PVs that repeat a block of earlier ones get their reason; the first of each stays.
 
-    A window counts where its value changes DIFFERENT times or more: noise does not repeat by chance, a rest does.
+    A value with noise larger than its converter's step does not repeat by chance. Of a coarser PV the whole row must
+    repeat, every signal with the same stamps, and one of them must have such noise: a motion that was made again
+    looks the same, and both are good.
+    """
+    found = []
+    pvs = {t.tag for t in tags if t.role == "pv"}
+    for group in with_the_same_stamps([own[t.tag] for t in tags if t.role in SIGNAL_ROLES]):
+        loud = [s for s in group if noisy(s.value[s.good])]
+        rows = row_keys(group) if loud else None
+        for series in (s for s in group if s.tag in pvs):
+            place = np.flatnonzero(series.good)
+            where = np.zeros(len(series), dtype=bool)
+            if series in loud:
+                where[place] = copied(series.value[place], row_keys([series])[place])
+            elif rows is not None:
+                where[place] = copied(loud[0].value[place], rows[place])
+            if n := series.flag(where, Reason.COPY):
+                words = f"{n} readings repeat a block of earlier ones to the last digit; the first of each stays"
+                found.append(Finding("copy", series.tag, words, True))
+    return found
+
+
+def copied(values: Array, rows: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Where (n,) rows repeat WINDOW earlier ones or more, in the same order; ``rows`` (n,) are their keys.
+
+    A window counts where the value (n,) changes DIFFERENT times or more: noise does not repeat by chance, a rest does.
     """
     n = len(values)
     where = np.zeros(n, dtype=bool)
@@ -28,7 +60,7 @@ def copied(values: Array) -> NDArray[np.bool_]:
     first = np.flatnonzero(changes[WINDOW - 1 :] - changes[: n - WINDOW + 1] >= DIFFERENT)
     if not first.size:
         return where
-    keys = _keys(values)[first]
+    keys = _keys(rows)[first]
     ordered = np.sort(keys)  # much faster than argsort, and nearly always there is no copy
     twice = ordered[1:][ordered[1:] == ordered[:-1]]
     if not twice.size:
@@ -44,15 +76,14 @@ def copied(values: Array) -> NDArray[np.bool_]:
     return np.asarray(np.cumsum(edge[:-1]) > 0)
 
 
-def _keys(values: Array) -> NDArray[np.uint64]:
-    """A number (n - WINDOW + 1,) for each window of the values (n,); two equal by chance are next to impossible.
+def _keys(rows: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """A number (n - WINDOW + 1,) for each window of the rows (n,); two equal by chance are next to impossible.
 
         key(k) = sum_i FACTOR^(WINDOW - 1 - i) x(k + i)   modulo 2^64
 
-    with x the mixed bits of a value; keys of short windows make those of longer ones.
+    with x the key of a row; keys of short windows make those of longer ones.
     """
-    bits = np.ascontiguousarray(values, dtype=np.float64).view(np.uint64)
-    keys, length = bits ^ (bits >> np.uint64(29)), 1
+    keys, length = rows, 1
     for fold in FOLDS:
         power = np.uint64(pow(FACTOR, length, 1 << 64))
         n = len(keys) - (fold - 1) * length

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations, pairwise
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ class Series:
     code: Codes  # (n,) Reason
     texts: Counter[str] = field(default_factory=Counter)  # cells that hold no number; of a mode, its names
     categories: tuple[str, ...] = ()  # of a mode: value i is categories[i]
+    between: Literal["", "step", "line"] = ""  # how it goes from one reading to the next; "" is to be guessed
     rounded_s: float = 0.0  # to which the stamps were rounded, where several readings shared each
 
     def __len__(self) -> int:

@@ -15,12 +15,21 @@ from pipeline.historian.tags import Tag, named, safe_name
 def exported(tag: Tag) -> ExportedTag:
     """The entry of a tag that a person gave; what the controller may command stands with the plant."""
     name = "" if tag.name == safe_name(tag.tag) else tag.name
-    return ExportedTag(tag.tag, tag.role, tag.unit, tag.low, tag.high, name, tag.unit_certain)  # type: ignore[arg-type]
+    said = (tag.unit_certain, tag.between, tag.ends)
+    return ExportedTag(tag.tag, tag.role, tag.unit, tag.low, tag.high, name, *said)  # type: ignore[arg-type]
 
 
 def signal_tags(tags: Sequence[ExportedTag]) -> tuple[Tag, ...]:
     """The tags with the names and in the order of the plant's signals; units as given."""
-    given = [Tag(t.tag, t.role, t.unit, t.low, t.high, t.name, unit_certain=t.unit_certain) for t in tags]
+    given = [
+        Tag(
+            *(t.tag, t.role, t.unit, t.low, t.high, t.name),
+            unit_certain=t.unit_certain,
+            between=t.between,
+            ends=t.ends,
+        )
+        for t in tags
+    ]
     return controlled_first(named(given))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ class Grid:
     value: dict[str, Array]  # (n,) NaN where there is no value
     code: Mapping[str, Codes]  # (n,) why there is none; GOOD where there is one
     bridged: Mapping[str, int]  # rows whose value was drawn or held over a bad or missing reading
+    limits: dict[str, NDArray[np.bool_]] = field(default_factory=dict)  # (n,) at its lowest or highest value
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -55,8 +56,9 @@ def resampled(
     Grid: pieces of the PVs' time without a gap longer than their hold. Where the PVs' stamps keep time and the period
     is a whole multiple of their step, every reading (every n-th) is a row at its own time, so that nothing adds up
     along the record; else rows at one period, with the phase of the piece's stamps.
-    PVs: held where they are stored beyond a dead band, else on a straight line between two good readings no farther
-    apart than the hold; where two or more readings fall into a period, the mean over (t - h, t], against aliasing.
+    PVs: held where they are stored beyond a dead band, or their series says so, else on a straight line between two
+    good readings no farther apart than the hold; where two or more readings fall into a period, the mean over
+    (t - h, t], against aliasing.
     Held ones: the reading that holds at the middle between t and the next row, so that jitter of less than half a
     period does not matter; the mean over it where they are thinned out. ``done`` is told each tag that needs its
     readings no more.
@@ -75,8 +77,10 @@ def resampled(
         elif thin:
             out, over = _held(time_s, middle, *_good(s), period_s, rate.hold_s, thin)
         else:
-            rule = _line if s in pv and not rate.dead_band else _held
-            out, over = _in_chunks(rule, time_s, middle, s, period_s, rate.hold_s)
+            line = s.between == "line" or (s in pv and not rate.dead_band)
+            # A held signal that goes on a line is worth its middle over a period.
+            at = time_s if s in pv or not line else middle
+            out, over = _in_chunks(_line if line else _held, at, middle, s, period_s, rate.hold_s)
         value[s.tag], code[s.tag] = out, _reasons(time_s, s, out, period_s)
         bridged[s.tag] = 0 if rate.irregular else int(np.count_nonzero(over))
         done(s.tag)

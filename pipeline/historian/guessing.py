@@ -20,7 +20,7 @@ from pipeline.historian.linear import fitted
 from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import proposed_period
-from pipeline.historian.tags import Guess, Tag
+from pipeline.historian.tags import GUESSED_PAD, Guess, Tag
 from pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
@@ -210,5 +210,5 @@ def _range(values: Sequence[float] | np.ndarray, unit: str, role: str) -> tuple[
         return 0.0, 100.0
     if role == "mv":
         return float(np.min(values)), float(np.max(values))
-    pad = 0.25 * (high - low)
+    pad = GUESSED_PAD * (high - low)
     return float(f"{low - pad:.3g}"), float(f"{high + pad:.3g}")

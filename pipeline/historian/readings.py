@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
 from pipeline.historian.cells import MV_CONVERSIONS, outliers, unit_slips, usual
-from pipeline.historian.copies import copied
 from pipeline.historian.dialect import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding, Verdict
@@ -52,9 +51,6 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
             "UTC, or name the zone with --time-zone"
         )
         found.append(Finding("clock", tag.tag, words, True))
-    if tag.role == "pv" and (n := series.flag(_copies(series), Reason.COPY)):
-        words = f"{n} readings repeat a block of earlier ones to the last digit; the first of each stays"
-        found.append(Finding("copy", tag.tag, words, True))
     if series.rounded_s:
         words = f"stamps are rounded to {series.rounded_s:g} s: readings that share one were spread evenly over it"
         found.append(Finding("rounded", tag.tag, words))
@@ -108,13 +104,6 @@ def with_texts_of_one_side(verdict: Verdict, findings: Sequence[Finding]) -> Ver
     words = f"one end of the readings of {', '.join(tags)} is text where a number belongs: export them as numbers"
     carries = verdict.carries if verdict.carries == "no" else "doubtful"
     return replace(verdict, carries=carries, reasons=(*verdict.reasons, words))
-
-
-def _copies(series: Series) -> NDArray[np.bool_]:
-    where = np.zeros(len(series), dtype=bool)
-    place = np.flatnonzero(series.good)
-    where[place] = copied(series.value[place])
-    return where
 
 
 def _out_of_range(series: Series, tag: Tag) -> list[Finding]:

@@ -37,8 +37,14 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
     span = high - low
     if rate.irregular:
         kind = "by exception, beyond a dead band" if rate.dead_band else "by exception, or compressed (swinging door)"
+        line = series.between == "line" or (role in {"pv", "dv"} and not rate.dead_band)
+        taken = "drawn on lines" if line else "held"
+        other = (
+            "" if series.between or role == "mode" else f"; {'step' if line else 'line'} in column between says another"
+        )
         words = (
-            f"stored {kind}: a reading every {rate.step_s:.4g} s in the median; used for at most {rate.hold_s:.4g} s"
+            f"stored {kind}: a reading every {rate.step_s:.4g} s in the median; {taken} from one to the next{other}; "
+            f"used for at most {rate.hold_s:.4g} s"
         )
         found.append(Finding("compression", series.tag, words))
     elif (share := straight_share(values)) > STRAIGHT:

@@ -15,13 +15,15 @@ from pipeline.historian.character import clipped, runs_of, stuck
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.grid import Grid
+from pipeline.historian.missing_codes import PERCENT
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import Sampling
-from pipeline.historian.tags import Tag
+from pipeline.historian.tags import GUESSED_PAD, Tag
 from pipeline.metrics import Array
 from pipeline.records.record import Record
 from serving.manifest import Signal
 
+KEEP = "where the plant ends there, as a tank that overflows, write keep into column ends of the table of tags"
 SHORTEST_RUN = 20  # rows
 PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
 
@@ -38,21 +40,53 @@ def stretches(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, Sampling])
         if tag.role == "mv" or rates[tag.tag].irregular:
             continue
         values, code = grid.value[tag.tag], grid.code[tag.tag]
+        zero = values == 0.0 if tag.role == "dv" else np.zeros(len(values), dtype=bool)  # a flow that stopped stays
+        at_end, ends = clipped(values, tag.low, tag.high)
+        at_end &= ~zero
+        if at_end.any():
+            kept = tag.ends == "keep" or (tag.ends == "" and _within_its_range(tag, values, [end for end, _ in ends]))
+            if not kept:
+                code[at_end & (code == 0)] = Reason.SATURATED
+            grid.limits[tag.tag] = at_end
+            kind = "limit" if kept else "saturated"
+            found.append(Finding(kind, tag.tag, _of_ends(tag, ends, kept=kept), not kept))
         others = [(grid.value[name], span) for name, span in spans.items() if name != tag.tag]
-        for reason, where, words in (
-            (Reason.SATURATED, *clipped(values, tag.low, tag.high)),
-            (Reason.STUCK, stuck(values, others, together), ""),
-        ):
-            if tag.role == "dv":
-                where &= values != 0.0  # a flow that stopped holds its zero
-            new = where & (code == 0)
-            if new.any():
-                code[new] = reason
-                start, end = runs_of(where)
-                own = f"repeats one value in {len(start)} stretches, the longest of {int((end - start).max())} rows"
-                text = f"stands at the end of its range: {words}" if words else f"{own}, while others move"
-                found.append(Finding(reason.name.lower(), tag.tag, text, True))
+        still = stuck(values, others, together) & ~zero & ~at_end
+        new = still & (code == 0)
+        if new.any():
+            code[new] = Reason.STUCK
+            start, end = runs_of(still)
+            words = f"repeats one value in {len(start)} stretches, the longest of {int((end - start).max())} rows"
+            found.append(Finding("stuck", tag.tag, f"{words}, while others move", True))
     return found
+
+
+def _of_ends(tag: Tag, ends: Sequence[tuple[float, int]], *, kept: bool) -> str:
+    places = " and ".join(f"{end:g} in {n} rows" for end, n in ends)
+    if kept:
+        return f"stands at a limit of the plant: {places}; these rows stay"
+    given = [v for v in (tag.low, tag.high) if v is not None and any(abs(v - end) <= 1e-6 * abs(v) for end, _ in ends)]
+    if given:
+        return f"stands at the end of its range: {places}; {KEEP}"
+    return f"stands at its lowest or highest value: {places}, taken for the end of the transmitter's range; {KEEP}"
+
+
+def _within_its_range(tag: Tag, values: Array, ends: Sequence[float]) -> bool:
+    """Whether a range that was given goes beyond the ends: then the plant ends there, and the transmitter does not.
+
+    A range that may be the guess of the table of tags says nothing.
+    """
+    if tag.low is None or tag.high is None:
+        return False
+    low, high = usual(values)
+    span = high - low
+    guess = (low - GUESSED_PAD * span, high + GUESSED_PAD * span)
+    near = 0.05 * span
+    guessed = abs(tag.low - guess[0]) < near and abs(tag.high - guess[1]) < near
+    slack = 1e-6 * (tag.high - tag.low)
+    return not (guessed or (tag.unit == "%" and (tag.low, tag.high) == PERCENT)) and all(
+        tag.low + slack < end < tag.high - slack for end in ends
+    )
 
 
 def row_codes(

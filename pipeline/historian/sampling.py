@@ -52,6 +52,7 @@ def sampling(series: Series, period_s: float | None = None, hold_s: float | None
     own = 2.0 * float(np.quantile(step, 0.99)) if irregular else HOLD_PERIODS * float(median)
     stored = series.time_s[series.good], series.value[series.good]
     band = irregular and len(stored[0]) > 1 and _is_held(np.diff(stored[0]), stored[1])
+    band = series.between == "step" or (band and not series.between)
     return Sampling(series.tag, float(median), irregular, band, hold_s or max(own, HOLD_PERIODS * (period_s or 0.0)))
 
 

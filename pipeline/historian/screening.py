@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from pipeline.historian.cells import usual
 from pipeline.historian.character import quantum
 from pipeline.historian.confirming import confirm
 from pipeline.historian.contradictions import contradict
+from pipeline.historian.copies import drop_copies
 from pipeline.historian.excerpt import SEEN, evenly
 from pipeline.historian.excitation import judged, moves_of, with_rows_out_of_range
 from pipeline.historian.export import Export, Series
@@ -68,9 +69,10 @@ def screened(
 
     RecordError where nothing of a signal is left, or its given range misses most of its readings.
     """
-    own = {t.tag: export.series[t.tag] for t in tags}
+    own = {t.tag: replace(export.series[t.tag], between=t.between) for t in tags}
     check_modes(without_modes, tags, own)
     findings: list[Finding] = [*of_notes(export), *of_files(export, tags)]
+    findings += drop_copies(own, tags)
     for tag in tags:
         if tag.role != "mode":
             findings += clean(own[tag.tag], tag)
@@ -175,9 +177,13 @@ def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
 
 
 def _kept(grid: Grid, tag: str) -> Array:
-    """The tag's values (n,), NaN where it has a reason; the grid's own array where there is none."""
+    """The tag's values (n,), NaN where it has a reason or stands at its end; the grid's own array where it never does.
+
+    At the end it answers to nothing.
+    """
     code = grid.code[tag]
-    return np.where(code == 0, grid.value[tag], np.nan) if code.any() else grid.value[tag]
+    out = (code != 0) | grid.limits[tag] if tag in grid.limits else code != 0
+    return np.where(out, np.nan, grid.value[tag]) if out.any() else grid.value[tag]
 
 
 def models_of(record: Record) -> dict[str, Linear | None]:

@@ -21,14 +21,14 @@ def drop_repeated_rows(series: Mapping[str, Series]) -> None:
     where stamps are rounded the rows differ, but a resting tag repeats its value by right.
     """
     found = []
-    for group in _with_the_same_stamps(list(series.values())):
+    for group in with_the_same_stamps(list(series.values())):
         t = group[0].time_s
         if not len(t) or np.all(np.diff(t) > 0):
             continue
         shared = len(t) - len(np.unique(t))
         if not shared:
             continue
-        again = _repeated(t, _row_keys(group))
+        again = _repeated(t, row_keys(group))
         if np.count_nonzero(again) <= SENT_AGAIN * shared:
             return
         found.append((group, again))
@@ -37,7 +37,8 @@ def drop_repeated_rows(series: Mapping[str, Series]) -> None:
             one.code[again] = Reason.DUPLICATE
 
 
-def _with_the_same_stamps(series: Sequence[Series]) -> list[list[Series]]:
+def with_the_same_stamps(series: Sequence[Series]) -> list[list[Series]]:
+    """Tags in groups that share their stamps: the columns of one file."""
     groups: list[list[Series]] = []
     for one in series:
         t = one.time_s
@@ -49,7 +50,7 @@ def _with_the_same_stamps(series: Sequence[Series]) -> list[list[Series]]:
     return groups
 
 
-def _row_keys(group: Sequence[Series]) -> NDArray[np.uint64]:
+def row_keys(group: Sequence[Series]) -> NDArray[np.uint64]:
     """A number (n,) for the values of each row; two that are equal by chance are next to impossible."""
     keys = np.zeros(len(group[0]), dtype=np.uint64)
     for one in group:

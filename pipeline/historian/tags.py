@@ -9,6 +9,7 @@ import unicodedata
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from pipeline.config.plants import mistakes_of_mv
 from pipeline.errors import RecordError, nearest
@@ -19,9 +20,11 @@ from serving.manifest import MAX_NAME, Signal
 ROLES = ("pv", "mv", "dv", "sp", "mode")
 SIGNAL_ROLES = ("pv", "mv", "dv")
 COMMANDS = ("command_low", "command_high", "max_move_per_min")  # of an MV, for the controller
+WORDS = {"between": ("step", "line"), "ends": ("keep", "drop")}  # of columns that say how readings are taken
+GUESSED_PAD = 0.25  # of the usual span, beyond it, in the range that the table guesses
 CERTAIN = {"": False, "no": False, "yes": True}
 NUMBERS = ("low", "high", *COMMANDS)
-COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, "step", "good_percent", "remark")
+COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "step", "good_percent", "remark")
 OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
 UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
 RANGES = """low, high: the range in which a reading can be true; of an mv it holds all that the valve did
@@ -33,6 +36,10 @@ EXPLAINED = f"""role: pv (to be controlled), mv (what the controller commands), 
 name: of the signal in reports and in the controller
 unit_certain: yes where no reading can be in another unit; empty lets the screening look for such readings
 {RANGES}
+between: line or step, how a tag that is stored by exception or compressed goes from one reading to the next; empty
+  guesses
+ends: keep or drop rows at the lowest or highest value, a limit of the plant or the end of the transmitter; empty
+  drops them unless low and high, given by you, go beyond
 step, good_percent, remark: the smallest difference of two readings, the share of good ones, what was seen; only to
   read. docs/tag_table.md says more"""
 
@@ -62,6 +69,8 @@ class Tag:
     command_high: float | None = None
     max_move_per_min: float | None = None
     unit_certain: bool = False  # no reading is in another unit
+    between: Literal["", "step", "line"] = ""  # how it goes from one reading to the next; "" is guessed
+    ends: Literal["", "keep", "drop"] = ""  # rows at its lowest or highest value; "" as its range says
 
     @property
     def commands(self) -> dict[str, float]:
@@ -201,6 +210,7 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
                 t.unit,
                 "yes" if t.unit_certain else "",
                 *numbers,
+                *("" for _ in WORDS),
                 f"{g.step:.6g}" if g.step else "",
                 good,
                 g.remark,
@@ -245,9 +255,15 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
         certain = cells.get("unit_certain", "").lower()
         if certain not in CERTAIN:
             wrong.append(f"{where}, unit_certain: {certain!r} is neither yes nor no; empty is no")
+        taken = {key: cells.get(key, "").lower() for key in WORDS}
+        wrong += [
+            f"{where}, {key}: {word!r} is neither {' nor '.join(WORDS[key])}; empty leaves it to the screening"
+            for key, word in taken.items()
+            if word not in ("", *WORDS[key])
+        ]
         unit, name = cells.get("unit", ""), cells.get("name", "")
         given = Tag(cells["tag"], role, unit, name=name, **numbers)  # type: ignore[arg-type]
-        tag = widen(replace(given, unit_certain=CERTAIN.get(certain, False)))
+        tag = widen(replace(given, unit_certain=CERTAIN.get(certain, False), **taken))  # type: ignore[arg-type]
         wrong += [f"{where}: {words}" for words in _wrong(tag)]
         found.append(tag)
     if wrong:

@@ -72,4 +72,4 @@ def test_the_table_of_tags_has_the_smallest_difference_and_the_share_of_modes(tm
     assert (found["A.MODE"].step, found["A.MODE"].good) == (0.0, 1.0)
     write_tags(tmp_path / "tags.csv", found.values())
     table = (tmp_path / "tags.csv").read_text().splitlines()
-    assert table[-1].startswith("A.MODE,mode,A.MODE,,,,,,,,,100.00,")
+    assert table[-1].startswith("A.MODE,mode,A.MODE,,,,,,,,,,,100.00,")
