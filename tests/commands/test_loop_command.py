@@ -402,3 +402,20 @@ def test_a_signal_is_spoilt_and_mended_by_a_command(
     assert "has no signal 'T'; write it as PV.NAME" in capsys.readouterr().err
     assert main(["plant", "fault", "PV.T", "bad", "--endpoint", "opc.tcp://127.0.0.1:1"]) == 2
     assert "no served plant answers at opc.tcp://127.0.0.1:1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "text", ["speed = " + "9" * 5001, "x = " + "[" * 5000, "speed = inf", "speed = 1e999", "speed = nan", "\ud7ff="]
+)
+def test_a_loop_toml_that_cannot_be_read_is_one_line(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "loop.toml"
+    path.write_text(f'controller = "c.onnx"\n{text}\n[server]\nendpoint = "opc.tcp://127.0.0.1:1"\n[nodes]\n')
+    with pytest.raises(LoopError) as found:
+        Settings.read(path)
+    assert len(str(found.value).splitlines()) == 1
+    assert len(str(found.value)) < 400
+
+
+def test_a_mark_of_utf_8_before_a_loop_toml_is_none_of_its_text(settings: Path) -> None:
+    settings.write_text("\ufeff" + settings.read_text())
+    assert Settings.read(settings).speed == 5.0
