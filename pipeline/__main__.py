@@ -13,6 +13,7 @@ from pipeline.commands import COMMANDS, Parser
 from pipeline.commands.extras import advice
 from pipeline.engine.command import FAILURES, reason
 from pipeline.errors import nearest
+from serving.arguments import write_any_text
 from serving.version import __version__
 
 EXAMPLES = """examples:
@@ -28,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command: 0 if it went well, 2 after one line on standard error where it could not."""
     # No telemetry, whichever library a command loads.
     os.environ.update(MLFLOW_DISABLE_TELEMETRY="true", DVC_NO_ANALYTICS="1", DO_NOT_TRACK="1")
+    write_any_text()
     words = list(sys.argv[1:] if arguments is None else arguments)
     name = words[0] if words else "--help"
     if name in {"-h", "--help"}:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from serving.arguments import Parser, write_any_text
 from serving.bench import bench, table
 from serving.card import card, card_json
 from serving.conformance.check import check
@@ -85,7 +86,8 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 if it went well, 1 if a host failed, 2 after one line on standard error."""
-    parser = argparse.ArgumentParser(prog="python -m serving", description="Look at a controller file.")
+    write_any_text()
+    parser = Parser(prog="python -m serving", description="Look at a controller file.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for name, (words, add, _) in COMMANDS.items():
         add(commands.add_parser(name, help=words))

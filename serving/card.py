@@ -7,6 +7,7 @@ from typing import Any
 
 from serving.controller import Controller
 from serving.manifest import Signal
+from serving.proof import judged
 from serving.trust import ending, signer
 from serving.words import plain
 
@@ -25,7 +26,7 @@ def card(controller: Controller) -> str:
     ]
     if signed := signer(controller):
         lines[3:3] = [f"  signed    by {signed.words}", *(f"            {words}" for words in ending(controller))]
-    lines[1:1] = _locked_up(m.evidence)
+    lines[1:1] = _locked_up(m.evidence) or [f"  NOT PROVEN: {why}" for why in filter(None, [judged(m).why])]
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         lines += _signals(title, m.signals(name))
     lines += _signals("manipulated variables", m.mv)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import math
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -14,6 +15,7 @@ from typing import Any, TypeVar
 from serving.errors import LoopwrightError
 
 T = TypeVar("T")
+LONGEST_SHOWN = 100  # characters of a wrong value
 
 
 def nearest(word: object, known: Iterable[str]) -> str:
@@ -89,16 +91,21 @@ def _convert(hint: Any, value: Any, where: str, error: type[Exception]) -> Any:
 def _plain(hint: Any, value: Any, where: str, error: type[Exception]) -> Any:
     if hint is Any:
         return value
-    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
-    if hint is float and isinstance(value, str):
-        # YAML 1.1 reads 5e-4 (no dot) as text.
+    if hint is float and isinstance(value, (int, float, str)) and not isinstance(value, bool):
         try:
-            return float(value)
-        except ValueError:
-            raise error(f"{where} is {value!r}; it must be a number") from None
+            number = float(value)  # YAML 1.1 reads 5e-4 (no dot) as text
+        except (ValueError, OverflowError):
+            raise error(f"{where} is {_shown(value)}; it must be a number") from None
+        if not math.isfinite(number):
+            raise error(f"{where} is {_shown(value)}; it must be a finite number")
+        return number
     if hint is Path and isinstance(value, str):
         return Path(value)
     if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
-        raise error(f"{where} is {value!r}; it must be of type {hint.__name__}")
+        raise error(f"{where} is {_shown(value)}; it must be of type {hint.__name__}")
     return value
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."

@@ -5,8 +5,9 @@ Importing this list loads none of them, so that ``loopwright --help`` answers at
 
 from __future__ import annotations
 
-import argparse
 from typing import NoReturn
+
+from serving import arguments
 
 COMMANDS = {
     "new": "make a record of a historian's export: read, screened, judged, and added to params.yaml",
@@ -32,7 +33,7 @@ COMMANDS = {
 }
 
 
-class Parser(argparse.ArgumentParser):
+class Parser(arguments.Parser):
     """Says what is wrong in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from pipeline.config.params import PARAMS_FILE
+from pipeline.config.reading import tree_of
 from pipeline.errors import ParamsError
 from pipeline.files import write_bytes
 
@@ -28,11 +29,11 @@ def add_entries(
     """
     try:
         text = path.read_bytes().decode("utf-8")
-        before = yaml.safe_load(text) or {}
+        before = tree_of(text, path)
     except FileNotFoundError:
         raise ParamsError(f"{path} is not here; run from the repository's root") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ParamsError(f"{path} is not YAML in UTF-8: {' '.join(str(error).split())}") from None
+    except UnicodeDecodeError as error:
+        raise ParamsError(f"{path} is not YAML in UTF-8: {error}") from None
     wanted, end = dict(before), "\r\n" if "\r\n" in text else "\n"
     taken = [
         (section, name) for section, added in entries.items() for name in added if name in (before.get(section) or ())

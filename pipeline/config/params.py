@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
+from pipeline.config.reading import tree_of
 from pipeline.errors import ParamsError, nearest
 from serving import fields
 
@@ -41,21 +40,18 @@ def sections(kind: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
 
 
 @functools.lru_cache(maxsize=4)
-def _parsed(text: str) -> Any:
+def _parsed(text: str, path: Path) -> dict[str, Any]:
     """Whoever checks every section asks for the same text again and again."""
-    return yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    return tree_of(text, path)
 
 
 def _tree(path: Path) -> dict[str, Any]:
     try:
-        tree = _parsed(path.read_text(encoding="utf-8"))
+        return _parsed(path.read_text(encoding="utf-8"), path)
     except FileNotFoundError:
         raise ParamsError(f"{path} is not here; run from the repository's root") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParamsError(f"{path} is not YAML in UTF-8: {' '.join(str(error).split())}") from None
-    if not isinstance(tree, dict):
-        raise ParamsError(f"{path} holds no mapping; it needs the sections cases, records, models, controllers")
-    return tree
+    except UnicodeDecodeError as error:
+        raise ParamsError(f"{path} is not YAML in UTF-8: {error}") from None
 
 
 def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 from numpy.linalg import LinAlgError
 
+from serving.arguments import write_any_text
 from serving.errors import LoopwrightError
 from serving.words import plain
 
@@ -30,6 +31,7 @@ def run_stage(stage: Callable[..., None], argv: Sequence[str], what: str = "") -
 
     ``what`` says what NAME names; a stage over all cases takes none.
     """
+    write_any_text()
     program, names = stage.__name__, list(argv[1:])
     if len(names) != bool(what) or any(name.startswith("-") for name in names):
         print(f"usage: python -m pipeline.stages.{program} {what}".rstrip(), file=sys.stderr)

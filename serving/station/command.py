@@ -24,6 +24,7 @@ from serving.guard import Sample
 from serving.journal import JournalReader
 from serving.loop import Command, Mode
 from serving.manifest import Manifest, Signal
+from serving.proof import judged
 from serving.station.control import ask
 from serving.station.export import export, tag_table
 from serving.station.happened import happened, journal_of, lines, write_csv
@@ -73,6 +74,10 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     swap.add_argument("--trial", metavar="N", type=int, default=TRIAL, help="good scans of trial (%(default)s)")
     mode = commands.add_parser("mode", help="change the mode")
     mode.add_argument("mode", metavar="MODE", type=str.upper, help=", ".join(Mode))
+    for parser in (swap, mode):
+        parser.add_argument(
+            "--accept-unproven", action="store_true", help="let a controller into AUTO that its file does not prove"
+        )
     for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL")):
         values = commands.add_parser(name, help=f"change {words}")
         values.add_argument("values", metavar="NAME=VALUE", nargs="+", help="of one or more signals, in their units")
@@ -116,6 +121,8 @@ def _ask(options: argparse.Namespace) -> int:
     else:
         value = {"file": str(options.controller.absolute()), "trial": options.trial}
     request = {"do": do, "value": value, "who": options.who, "reason": options.reason}
+    if getattr(options, "accept_unproven", False):
+        request["accept_unproven"] = True
     print(ask(settings.journal.file, request)["done"])
     if do == "swap":
         print(f"once it has the plant: {options.loop} still names the old file; a restart brings that one")
@@ -194,13 +201,18 @@ def _check(options: argparse.Namespace) -> int:
         print(f"{controller.path.name}: signed by {controller.signed.words}")
     wrong = [*here.wrong[said:], *(f"{row.signal}: {row.wrong}" for row in rows if row.wrong)]
     notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
-    for note in [*notes, *here.notes, *_warnings(settings), *ending(controller)]:
+    for note in [*notes, *here.notes, *_unproven(manifest), *_warnings(settings), *ending(controller)]:
         print(plain(f"note: {note}"))
     for line in wrong:
         print(plain(f"would stop the loop: {line}"), file=sys.stderr)
     if not wrong and not here.wrong:
         print("nothing would stop the loop")
     return 2 if wrong or here.wrong else 0
+
+
+def _unproven(manifest: Manifest) -> list[str]:
+    verdict = judged(manifest)
+    return [f"{manifest.law} is {verdict.words}"] if verdict.why else []
 
 
 def _warnings(settings: Settings) -> list[str]:
@@ -233,7 +245,7 @@ def _run(options: argparse.Namespace) -> int:
 
     # The very bytes that were tried, whoever writes another file there meanwhile.
     station = Station(replace(settings, sha256=controller.sha256), tell=tell)
-    station.warnings = _warnings(settings)
+    station.warnings = [*_unproven(station.manifest), *_warnings(settings)]
     for line in station.warnings + station.ending():
         station.tell(f"note: {line}")
     station.watch(_Lines(station.manifest, station.tell).show)

@@ -8,6 +8,7 @@ from serving.clock import Clock
 from serving.controller import Controller
 from serving.endpoint import Endpoint
 from serving.loop import WARM_LEAD_S, ControlLoop, Mode
+from serving.proof import require_accepted
 from serving.station.settings import Settings
 
 
@@ -26,6 +27,8 @@ def control_loop(
     the MV that the plant has, None where it is not known.
     """
     s, m = settings, controller.manifest
+    if s.start == "AUTO":
+        require_accepted(m, s.accept_unproven)
     return ControlLoop(
         controller,
         endpoint,

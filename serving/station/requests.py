@@ -14,6 +14,7 @@ from serving.fitted import require_fits
 from serving.journal.entries import Kind
 from serving.loop import ControlLoop, Mode, within
 from serving.manifest import Signal
+from serving.proof import require_accepted
 from serving.station.recorder import named
 from serving.trust import signer
 
@@ -43,22 +44,27 @@ class Request:
     value: Any
     who: str
     reason: str
+    accept_unproven: bool = False  # the word that AUTO needs with a controller that is not proven
 
     @classmethod
     def read(cls, tree: Any) -> Request:
         """LoopError for anything else than an object with ``do``, ``who`` and, if need be, ``value`` and ``reason``."""
         if not isinstance(tree, Mapping) or not isinstance(tree.get("do"), str):
             raise LoopError('a request is an object with "do"')
-        unknown = sorted(set(tree) - {"do", "value", "who", "reason"})
+        known = ("do", "value", "who", "reason", "accept_unproven")
+        unknown = sorted(set(tree) - set(known))
         if unknown:
-            raise LoopError(f"a request has no {unknown[0]!r}{nearest(unknown[0], ('do', 'value', 'who', 'reason'))}")
+            raise LoopError(f"a request has no {unknown[0]!r}{nearest(unknown[0], known)}")
         who, reason = tree.get("who", ""), tree.get("reason", "")
         for word, text, most in (("who", who, LONGEST_NAME), ("reason", reason, LONGEST_REASON)):
             if not isinstance(text, str) or len(text) > most or not (text.isprintable()):
                 raise LoopError(f"{word} must be a line of at most {most} characters")
         if not who.strip():
             raise LoopError("who is empty: a change is written down with a name")
-        return cls(tree["do"], tree.get("value"), who.strip(), reason.strip())
+        accept = tree.get("accept_unproven", False)
+        if not isinstance(accept, bool):
+            raise LoopError("accept_unproven is true or false")
+        return cls(tree["do"], tree.get("value"), who.strip(), reason.strip(), accept)
 
 
 def change(request: Request, loop: ControlLoop, opened: Opened) -> Change:
@@ -77,7 +83,26 @@ def _mode(request: Request, loop: ControlLoop, _: Opened) -> Change:
     if request.value not in [m.value for m in Mode]:
         raise LoopError(f"mode is {request.value!r}{nearest(request.value, [m.value for m in Mode])}")
     mode = Mode(request.value)
-    return Change(lambda loop: loop.set_mode(mode), f"mode {loop.mode} -> {mode}", request.who, request.reason)
+    if mode is not Mode.AUTO:
+        return Change(lambda loop: loop.set_mode(mode), f"mode {loop.mode} -> {mode}", request.who, request.reason)
+    unproven = require_proven(loop, request.accept_unproven)
+    said = f"accepted though {unproven}" if unproven else ""
+    reason = "; ".join(filter(None, (request.reason, said)))
+
+    def act(loop: ControlLoop) -> None:
+        require_proven(loop, request.accept_unproven)  # another controller may have taken over since
+        loop.set_mode(mode)
+
+    return Change(act, f"mode {loop.mode} -> {mode}", request.who, reason)
+
+
+def require_proven(loop: ControlLoop, accepted: bool) -> str:
+    """What is not proven of the controllers that write in AUTO, the one on trial included; empty if nothing.
+
+    LoopError where something is not, and nobody accepts it.
+    """
+    those = [loop.controller, *([] if loop.successor is None else [loop.successor.controller])]
+    return "; ".join(filter(None, (require_accepted(c.manifest, accepted).words for c in those)))
 
 
 def _sp(request: Request, loop: ControlLoop, _: Opened) -> Change:
@@ -131,10 +156,19 @@ def _tried(request: Request, loop: ControlLoop, controller: Controller, trial: A
     require_fits(controller.manifest, loop.manifest)
     if controller.sha256 == loop.controller.sha256:
         raise LoopError(f"{named(controller)} is in charge already")
+    unproven = require_accepted(controller.manifest, request.accept_unproven or loop.mode in {Mode.SHADOW, Mode.MANUAL})
     signed = signer(controller)
     by = "" if signed is None else f", signed by {signed.words},"
     what = f"{named(controller)}{by} beside {named(loop.controller)} for {trial} scans"
-    return Change(lambda loop: loop.swap(controller, trial), what, request.who, request.reason, kind="swap")
+    said = f"accepted though {unproven.words}" if unproven.why and request.accept_unproven else ""
+    reason = "; ".join(filter(None, (request.reason, said)))
+
+    def act(loop: ControlLoop) -> None:
+        if loop.mode in {Mode.AUTO, Mode.HOLD}:  # since when it was asked
+            require_accepted(controller.manifest, request.accept_unproven)
+        loop.swap(controller, trial)
+
+    return Change(act, what, request.who, reason, kind="swap")
 
 
 def _keep(request: Request, loop: ControlLoop, _: Opened) -> Change:

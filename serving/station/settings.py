@@ -16,6 +16,7 @@ from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate
 from serving.manifest import Manifest, Signal
 from serving.opcua.settings import Nodes, Server
 from serving.page.settings import Page
+from serving.words import first_line
 
 MAX_AGE = 1.5  # periods: one answer may be late, two may not
 TRANSFER = 20.0  # periods
@@ -117,7 +118,8 @@ class Settings:
     """A loop: controller, plant, guards, fallback, journal, page. Paths are relative to the file that names them.
 
     ``trusted`` names public keys: only a controller that one of them signed is loaded, at the start and by a swap
-    (None: any is). ``page`` is HOST:PORT or a table (see ``serving.page.settings``); empty: none.
+    (None: any is). ``accept_unproven`` lets a controller into AUTO whose file does not prove it in closed loop, see
+    ``serving.proof``. ``page`` is HOST:PORT or a table (see ``serving.page.settings``); empty: none.
     """
 
     controller: Path
@@ -126,6 +128,7 @@ class Settings:
     sha256: str = ""
     trusted: tuple[Path, ...] | None = None
     start: Literal["SHADOW", "MANUAL", "AUTO"] = "SHADOW"
+    accept_unproven: bool = False
     speed: float = 1.0
     transfer_s: float | None = None
     guards: Guards = Guards()
@@ -149,11 +152,13 @@ class Settings:
     def read(cls, path: Path) -> Settings:
         """The settings in a file. LoopError for a file that is none, and for every mistake in it."""
         try:
-            tree = tomllib.loads(path.read_text(encoding="utf-8"))
+            tree = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         except OSError as error:
             raise LoopError(f"{path} cannot be read: {error.strerror}") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise LoopError(f"{path} is not TOML: {error}") from None
+        except ValueError as error:  # of TOML, of UTF-8, or an integer of thousands of digits
+            raise LoopError(f"{path} is not TOML: {first_line(error)}") from None
+        except RecursionError:
+            raise LoopError(f"{path} is not TOML that can be read: lists or tables are nested too deep") from None
         found = parse(cls, tree, str(path), LoopError)
         at = path.parent
         s = found.server

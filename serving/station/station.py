@@ -27,12 +27,13 @@ from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.nameplates import Identity
 from serving.opcua.sampling import Values
 from serving.page.process import PageProcess
+from serving.proof import judged
 from serving.station.beginning import another_before, begun_at, keep_namespaces, namespaces_before, near, usable
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
 from serving.station.making import control_loop
 from serving.station.recorder import Recorder
-from serving.station.requests import Change, Request, change
+from serving.station.requests import Change, Request, change, require_proven
 from serving.station.said import Said
 from serving.station.settings import Settings
 from serving.station.tending import Tending
@@ -161,7 +162,9 @@ class Station:
                 self.recorder.note("swap", "loop.toml", before)
             signed = signer(self.controller)
             by = "" if signed is None else f"; {self.controller.path.name} is signed by {signed.words}"
-            self.recorder.note("change", "loop.toml", f"started in {s.start}{by}")
+            unproven = judged(m).words if s.start == "AUTO" else ""
+            accepted = f"accepted though {unproven}" if unproven else ""
+            self.recorder.note("change", "loop.toml", f"started in {s.start}{by}", accepted)
             report = self.loop.run(n, before=self._before, observe=self._observe, stop=lambda: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
@@ -254,7 +257,7 @@ class Station:
         if changed:
             self._set_points(loop, changed)
         if mode:
-            self._from_plant(lambda: loop.set_mode(Mode(mode)), f"mode {mode}")
+            self._from_plant(partial(self._set_mode, loop, Mode(mode)), f"mode {mode}")
 
     def _set_points(self, loop: ControlLoop, changed: Mapping[str, float]) -> None:
         """Each for itself: one outside its range takes no other one with it."""
@@ -264,6 +267,11 @@ class Station:
                 wanted[i] = changed[s.name]
                 what = f"set point {_shown(wanted[i : i + 1], (s,))}"
                 self._from_plant(partial(loop.set_sp, wanted), what)
+
+    def _set_mode(self, loop: ControlLoop, mode: Mode) -> None:
+        if mode is Mode.AUTO:
+            require_proven(loop, self.settings.accept_unproven)
+        loop.set_mode(mode)
 
     def _from_plant(self, act: Callable[[], None], what: str) -> None:
         try:
@@ -315,6 +323,8 @@ class Station:
         if isinstance(tree, dict) and tree.get("do") in {"state", "about", "picture"}:
             return self._view(str(tree["do"]))
         request = Request.read(tree)
+        if self.settings.accept_unproven:
+            request = replace(request, accept_unproven=True)
         if request.do == "acknowledge":
             return self._acknowledge(request)
         if self.loop is None:

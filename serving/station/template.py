@@ -22,6 +22,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         f'sha256 = "{controller.sha256}"  # this very file and no other',
         '# trusted = ["maker.pub"]  # only controllers that one of these public keys signed; see docs/trust.md',
         'start = "SHADOW"  # the law is computed and shown, nothing is written; or MANUAL, AUTO',
+        "# accept_unproven = true  # lets a controller into AUTO that its file does not prove in closed loop",
         "# speed = 10  # times the clock, for a plant that is simulated as fast: `loopwright plant serve --speed 10`",
         'page = "127.0.0.1:8080"  # the operator\'s page; leave it out for none',
         f"transfer_s = {over:g}  # [s] in which an MV crosses its range at most once after a change to AUTO",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from serving.controller import Controller
 from serving.journal import columns
 from serving.opcua.values import words
+from serving.proof import judged
 from serving.trust import signer
 from serving.words import plain_tree
 
@@ -125,6 +126,7 @@ def _card(controller: Controller) -> View:
         "commit": m.provenance.get("commit"),
         "versions": m.provenance.get("versions", {}),
         "lock_ups": evidence.get("lock_ups"),
+        "unproven": judged(m).why,  # empty: it is proven
         "scenarios": {name: row for name, row in rows.items() if isinstance(row, dict)},
         "units": evidence.get("units", {}),
         "picture": picture(controller) is not None,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import io
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.__main__ import main
-from pipeline.commands import COMMANDS
+from pipeline.commands import COMMANDS, Parser
 from pipeline.commands.parameters import texts, type_of
 from pipeline.laws import LAWS
 from pipeline.models import MODELS
+from serving.arguments import write_any_text
 
 ROOT = Path(__file__).parents[2]
 COMMANDS_OF_TODAY = {
@@ -123,3 +126,79 @@ def test_the_type_of_a_parameter_does_not_depend_on_how_its_module_reads_annotat
     put_off = dataclasses.make_dataclass("PutOff", [("a", "float"), ("b", "float | None"), ("c", "tuple[float, ...]")])
     shown = [[type_of(f) for f in dataclasses.fields(cls)] for cls in (at_once, put_off)]
     assert shown[0] == shown[1] == ["float", "float | None", "tuple[float, ...]"]
+
+
+def parsed(*words: str) -> dict[str, object]:
+    """What a command reads in its words."""
+    parser = Parser(prog=words[0])
+    importlib.import_module(f"pipeline.commands.{words[0]}").options(parser)
+    found = vars(parser.parse_args(words[1:]))
+    return {key: value for key, value in found.items() if not callable(value)}
+
+
+@pytest.mark.parametrize(
+    ("after", "before"),
+    [
+        ("new tank a.csv b.csv --pv T --mv u", "new --pv T --mv u tank a.csv b.csv"),
+        ("new tank a.csv b.csv --pv T --mv u", "new tank --pv T a.csv --mv u b.csv"),
+        ("new tank a.csv --period 5 --anyway", "new --anyway tank --period=5 a.csv"),
+        ("new tank a.csv --time-format %d", "new --time-f %d tank a.csv"),
+        ("verify pid.onnx --key a.pub", "verify --key a.pub pid.onnx"),
+        ("verify pid.onnx --key a.pub b.pub", "verify --key a.pub b.pub pid.onnx"),
+        ("verify pid.onnx --key a.pub --signature s", "verify --signature s --key a.pub pid.onnx"),
+        ("verify pid.onnx --key a.pub --signature s", "verify --key a.pub --signature s pid.onnx"),
+        ("inspect pid.onnx --json --key a.pub", "inspect --key a.pub pid.onnx --json"),
+        ("registry fetch tank out --key a.pub", "registry fetch --key a.pub tank out"),
+        ("registry fetch tank out --key a.pub b.pub", "registry fetch tank --key a.pub b.pub out"),
+        ("loop sp T=1 F=-2 --who anna", "loop sp --who anna T=1 F=-2"),
+        ("loop sp T=1 F=2 --who anna", "loop sp T=1 --who anna F=2"),
+        ("loop swap pid.onnx --trial 5", "loop swap --trial 5 pid.onnx"),
+        ("loop run my.toml --scans 5", "loop run --scans 5 my.toml"),
+        ("loop mode AUTO --accept-unproven", "loop mode --accept-unproven AUTO"),
+        ("run a b --dry", "run --dry a b"),
+        ("sign a.onnx b.onnx --key k", "sign --key k a.onnx b.onnx"),
+        ("sign a.onnx b.onnx --key k", "sign a.onnx --key k b.onnx"),
+        ("bounds tank --scenario a --scenario b --jobs 2", "bounds --scenario a --jobs 2 --scenario b tank"),
+        ("conformance pid.onnx kit --check a.json", "conformance --check a.json pid.onnx kit"),
+        ("conformance pid.onnx kit --check a.json", "conformance pid.onnx --check a.json kit"),
+    ],
+)
+def test_options_stand_before_the_files_or_behind_them(after: str, before: str) -> None:
+    assert parsed(*before.split()) == parsed(*after.split())
+
+
+@pytest.mark.parametrize(
+    "words", ["verify --key a.pub", "new --pv", "new", "inspect --jsn x.onnx", "loop sp --who anna"]
+)
+def test_what_is_missing_is_one_line(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        parsed(*words.split())
+    assert end.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_stream_spells_out_what_its_encoding_lacks(encoding: str) -> None:
+    """The words of the product hold degrees, arrows, and whatever a signal is called."""
+    raw = io.BytesIO()
+    stream = io.TextIOWrapper(raw, encoding=encoding)
+    write_any_text([stream])
+    stream.write("T [°C] → 3 × 温度")
+    stream.flush()
+    assert raw.getvalue().isascii() == (encoding == "ascii")
+    assert b"\\u2192" in raw.getvalue()
+
+
+@pytest.mark.parametrize("module", ["pipeline", "serving"])
+def test_a_command_runs_where_the_streams_are_ascii(module: str) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        module,
+        "inspect",
+        str(ROOT / "artifacts" / "jacketed_batch_reactor" / "fuzzy_feedforward_pi.onnx"),
+    ]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"\\xb0C" in done.stdout

@@ -17,6 +17,7 @@ from plant_servers import Plant, RunningLoop, spoil
 from processes import within
 
 from pipeline.__main__ import main
+from pipeline.export.controller_file import with_evidence
 from serving import Controller, LoopError, Signal
 from serving.journal import Journal
 from serving.opcua.inspection import _refused, _unfit, inspected
@@ -424,3 +425,40 @@ def test_a_signal_is_spoilt_and_mended_by_a_command(
     assert "has no signal 'T'; write it as PV.NAME" in capsys.readouterr().err
     assert main(["plant", "fault", "PV.T", "bad", "--endpoint", "opc.tcp://127.0.0.1:1"]) == 2
     assert "no served plant answers at opc.tcp://127.0.0.1:1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "text", ["speed = " + "9" * 5001, "x = " + "[" * 5000, "speed = inf", "speed = 1e999", "speed = nan", "\ud7ff="]
+)
+def test_a_loop_toml_that_cannot_be_read_is_one_line(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "loop.toml"
+    path.write_text(f'controller = "c.onnx"\n{text}\n[server]\nendpoint = "opc.tcp://127.0.0.1:1"\n[nodes]\n')
+    with pytest.raises(LoopError) as found:
+        Settings.read(path)
+    assert len(str(found.value).splitlines()) == 1
+    assert len(str(found.value)) < 400
+
+
+def test_a_mark_of_utf_8_before_a_loop_toml_is_none_of_its_text(settings: Path) -> None:
+    settings.write_text("\ufeff" + settings.read_text())
+    assert Settings.read(settings).speed == 5.0
+
+
+def test_a_loop_that_begins_in_auto_needs_a_word_for_a_file_that_is_not_proven(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with_evidence(PID, tmp_path / "new.onnx", {})
+    assert main(["loop", "init", "new.onnx", "--endpoint", plant.endpoint]) == 0
+    path = tmp_path / "loop.toml"
+    text = path.read_text().replace("127.0.0.1:8080", "127.0.0.1:0")
+    path.write_text(text)
+    capsys.readouterr()
+    assert main(["loop", "check"]) == 0  # in SHADOW it is said, and stops nothing
+    assert "note: pid is not proven" in capsys.readouterr().out
+    path.write_text(text.replace('start = "SHADOW"', 'start = "AUTO"'))
+    assert main(["loop", "check"]) == main(["loop", "run", "--scans", "1"]) == 2
+    assert capsys.readouterr().err.count("accept_unproven") == 2
+    path.write_text("accept_unproven = true\n" + path.read_text())
+    assert main(["loop", "check"]) == 0
+    assert "note: pid is not proven" in capsys.readouterr().out

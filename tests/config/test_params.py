@@ -13,7 +13,15 @@ from shipped import required
 
 from pipeline import errors
 from pipeline.cases import CASES
-from pipeline.config.params import ControllerParams, ModelParams, RecordParams, choose, parse, read_section
+from pipeline.config.params import (
+    ControllerParams,
+    ModelParams,
+    RecordParams,
+    choose,
+    parse,
+    read_section,
+    sections,
+)
 from pipeline.errors import ParamsError, PipelineError
 from pipeline.evaluation.evidence import NotMeasuredError
 from pipeline.files import digest
@@ -168,3 +176,66 @@ def test_the_reduced_run_shows_every_case_and_law_and_lacks_nothing_that_it_need
 def test_numbers_that_make_no_sense_are_refused_where_they_stand(cls, values, said):
     with pytest.raises(ParamsError, match=f"here: {re.escape(said)}"):
         parse(cls, values, "here")
+
+
+LAUGHS = "x-a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"x-{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("cases: {a: {noise_seed: " + "9" * 5001 + "}}", "an integer has 5001 digits"),
+        ("cases: {a: {noise_seed: 0x" + "f" * 9000 + "}}", "an integer has 9002 digits"),
+        ("cases: {}\ncontroler: {}", "unknown section 'controler'; did you mean 'controllers'?"),
+        ("cases: {}\n1: {}", "unknown section 1"),
+        ("cases: {}\nyes: {}", "unknown section True"),
+        ("cases: {yes: {}}", "cases has the name True, which YAML reads as no text; put it in quotes"),
+        ("cases: {}\ncases: {}", "the key 'cases' stands twice in one mapping"),
+        ("cases:\n  a: {b: {c: 1, c: 2}}", "the key 'c' stands twice in one mapping"),
+        (LAUGHS, "more than 1000000 values"),
+        ("x-a: &a [*a]", "an alias inside of what it stands for"),
+        ("cases: " + "[" * 60 + "]" * 60, "nested more than 50 deep"),
+        ("cases: " + "[" * 30_000 + "]" * 30_000, "nested more than 50 deep"),
+        ("cases: {a: 2024-13-45}", "holds a value that cannot be read"),
+        ("cases:\n\ta: {}", "is not YAML in UTF-8"),
+        ("- cases", "holds no mapping"),
+        ("cases", "holds no mapping"),
+        ("", "has no 'cases'"),
+        ("cases: !!python/object/apply:os.system [ls]", "is not YAML in UTF-8"),
+    ],
+)
+def test_whatever_spoils_the_file_is_one_line(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text(text)
+    with pytest.raises(ParamsError) as found:
+        sections("cases", path)
+    assert says in str(found.value)
+    assert len(str(found.value).splitlines()) == 1
+    assert len(str(found.value)) < 600
+
+
+@pytest.mark.parametrize("codec", ["utf-8-sig", "utf-16", "latin-1"])
+def test_another_encoding_is_named_and_a_mark_of_utf_8_is_none(codec: str, tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_bytes("cases: {a: {unit: °C}}".encode(codec))
+    if codec == "utf-8-sig":
+        assert sections("cases", path) == ("a",)
+        return
+    with pytest.raises(ParamsError, match="is not YAML in UTF-8"):
+        sections("cases", path)
+
+
+def test_values_of_ones_own_that_aliases_repeat_are_no_mistake(tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text("x-common: &c {noise_seed: 3}\ncases:\n  a: {<<: *c, held_out_seeds: [1]}\n  b: {<<: *c}")
+    assert sections("cases", path) == ("a", "b")
+    assert read_section("cases", "a", path) == {"noise_seed": 3, "held_out_seeds": [1]}
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), "1e999", "-inf", 10**400, "nan"])
+def test_a_number_is_finite(value: Any) -> None:
+    with pytest.raises(ParamsError, match=r"here\.rate is .*; it must be a (finite )?number$") as found:
+        parse(Example, {"count": 1, "rate": value}, "here")
+    assert len(str(found.value)) < 200

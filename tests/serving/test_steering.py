@@ -189,7 +189,8 @@ def test_a_controller_that_reads_fewer_pvs_takes_over(
     narrow = Signals(m.period_s, m.sp, (c_a,), (), m.mv)
     export(make_formula(level, signals=narrow), tmp_path / "level.onnx", case="thiosulfate_cstr", provenance={})
     done(capsys, "mode", "auto")
-    assert loopwright(capsys, "swap", "level.onnx", "--trial", "4")[0] == 0
+    assert loopwright(capsys, "swap", "level.onnx", "--trial", "4")[0] == 2  # it was never validated
+    assert loopwright(capsys, "swap", "level.onnx", "--trial", "4", "--accept-unproven")[0] == 0
     assert within(60, lambda: state(capsys)["replaced"] is not None)
     assert within(10, lambda: loop.station.watching.monitor.manifest.law == "formula")
     before = len(loop.commands)

@@ -20,6 +20,7 @@ export function describe(about) {
     ["sha256", digest],
     ["signed by", c.signed ? signer(c.signed) : "not checked: trusted is not set"],
     ["period", `${c.period_s} s`],
+    ["closed loop", c.unproven === undefined ? "not known" : c.unproven ? `NOT PROVEN: ${c.unproven}` : "proven"],
     ["lock-ups", c.lock_ups === 0 ? "none in its validation" : String(c.lock_ups ?? "not known")],
   ];
   const making = [

@@ -1,0 +1,62 @@
+"""Whether a controller was proven in closed loop, as far as the evidence in its own file says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from serving.errors import LoopError
+from serving.manifest import Manifest
+
+
+class Proof(Enum):
+    """What the evidence amounts to."""
+
+    PROVEN = "proven"
+    NONE = "no evidence"  # straight out of `design`, or of another maker
+    LOCKED_UP = "locked up"
+    MODEL = "model not proven"  # its tests ran on models that the plant's record does not prove
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The judgement, and why in words; ``why`` is empty for a controller that is proven."""
+
+    proof: Proof
+    why: str = ""
+
+    @property
+    def words(self) -> str:
+        """To go on a sentence: ``not proven: ...``; empty for a controller that is proven."""
+        return f"not proven: {self.why}" if self.why else ""
+
+
+def judged(manifest: Manifest) -> Verdict:
+    """The verdict on a controller.
+
+    Proven is one whose file holds figures of closed loops, of which none locked up; where they ran on models of a
+    plant's record, nothing may speak against these models. Figures that missed a requirement are the report's matter.
+    """
+    evidence: dict[str, Any] = manifest.evidence
+    scenarios, lock_ups, grounds = evidence.get("scenarios"), evidence.get("lock_ups", 0), evidence.get("on")
+    if not (isinstance(scenarios, dict) and scenarios and type(lock_ups) is int and lock_ups >= 0):
+        return Verdict(Proof.NONE, "its file holds no evidence of closed loops")
+    if lock_ups:
+        return Verdict(Proof.LOCKED_UP, f"it locked up in {lock_ups} closed loop{'s' if lock_ups > 1 else ''}")
+    unproven = grounds.get("unproven") if isinstance(grounds, dict) else None
+    if unproven:
+        reasons = unproven if isinstance(unproven, list) else [unproven]
+        return Verdict(Proof.MODEL, "; ".join(str(reason).removeprefix("not proven: ") for reason in reasons))
+    return Verdict(Proof.PROVEN)
+
+
+def require_accepted(manifest: Manifest, accepted: bool) -> Verdict:
+    """The verdict on a controller that is to write in AUTO. LoopError where it is not proven and nobody accepts it."""
+    verdict = judged(manifest)
+    if verdict.why and not accepted:
+        raise LoopError(
+            f"{manifest.law} is {verdict.words}; AUTO needs your word for it: accept_unproven = true in loop.toml, or "
+            "--accept-unproven at `loopwright loop mode` and `loop swap`"
+        )
+    return verdict
