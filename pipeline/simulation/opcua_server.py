@@ -28,6 +28,7 @@ from serving.manifest import Signal
 NAMESPACE = "urn:loopwright:plant"
 APPLICATION = "urn:loopwright:plant:server"
 LOCAL, REMOTE = 0, 1  # who has the plant: its own controller, or whoever writes the MVs
+LEASE = "LoopwrightLease"  # its browse name, by which loops find it beside the MVs
 ALIVE_PERIODS = 3
 WATCHDOG = "Control.Watchdog"
 PARTS, LEAST_PART_S = 10, 0.025  # a period has so many parts at most, each at least as long by the clock
@@ -117,8 +118,8 @@ class PlantServer:
                 self._id(f"Control.{name}"), f"{self.index}:{name}", ua.Variant(value, ua.VariantType.Int32)
             )
             await node.set_writable(name != "Watchdog")
-        for name, start in (("LoopAlive", False), ("Lease", "")):
-            node = await self.root.add_variable(self._id(f"Control.{name}"), f"{self.index}:{name}", start)
+        for name, shown, start in (("LoopAlive", "LoopAlive", False), ("Lease", LEASE, "")):
+            node = await self.root.add_variable(self._id(f"Control.{name}"), f"{self.index}:{shown}", start)
             await node.set_writable(name == "Lease")
         for tag in (*self.start, WATCHDOG):
             node = await self.root.add_variable(self._id(f"Faults.{tag}"), f"{self.index}:Faults.{tag}", "")

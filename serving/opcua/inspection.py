@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from serving.errors import EndpointError
 from serving.guard import InRange, Sample, implausible
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
+from serving.opcua.lease import NAME, WRITABLE, beside
 from serving.opcua.link import Link
 from serving.opcua.nameplates import (
     Identity,
@@ -30,11 +32,14 @@ from serving.opcua.nameplates import (
 )
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import NO_NUMBERS
-from serving.opcua.settings import Nodes, Point, Server
+from serving.opcua.settings import NO_LEASE, Nodes, Point, Server
 from serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
 from serving.words import first_line
 
-WRITABLE = 2  # the second bit of an access level
+NO_LEASE_NOTE = (
+    "there is none, so a loop on another machine that writes the same MVs is not found: have the server hold a text "
+    f"{NAME} beside them that this user may write, or name one by nodes.lease"
+)
 MAY = {True: "yes", False: "no", None: "?"}
 
 
@@ -106,12 +111,12 @@ async def _inspected(
         beat, back = nodes.heartbeat, nodes.hand_back
         rows += [("heartbeat, written", beat, Point(beat), True)] if beat else []
         rows += [("hand_back, written", back.node, Point(back.node), True)] if back is not None else []
-        asked = await _asked(link, server, [node for _, node, _, _ in rows] + ([nodes.lease] if nodes.lease else []))
+        lease = await _lease_of(link, server, nodes)
+        asked = await _asked(link, server, [node for _, node, _, _ in rows] + ([lease] if lease else []))
         found = [_one(manifest, server, *row, asked[row[1]], margin) for row in rows]
         if back is not None and not found[-1].wrong:
             found[-1] = replace(found[-1], wrong=_unfit(back.value, found[-1].kind))
-        if nodes.lease:
-            found.append(_lease(nodes.lease, asked[nodes.lease]))
+        found.append(_lease(lease, asked[lease]) if lease else Found("lease", "-", note=NO_LEASE_NOTE))
         found += _namespaces(nodes, await link.namespaces(server.connect_s), spaces)
         try:
             known = await identity(link, nodes, await link.started_s(server.connect_s), server.connect_s)
@@ -171,6 +176,18 @@ def _certificates(link: Link, server: Server) -> list[Found]:
     if own:
         rows.append(Found("certificate of the server", "-", note=f"valid until {last_day(own)}"))
     return rows
+
+
+async def _lease_of(link: Link, server: Server, nodes: Nodes) -> str:
+    """The lease's node: that of the settings, or the one that is found beside the MVs; empty: there is none."""
+    if nodes.lease:
+        return "" if nodes.lease == NO_LEASE else nodes.lease
+    with suppress(EndpointError):  # an id that is none, which its own row says
+        written = await link.resolved([p.node for p in nodes.points("mv").values()], server.connect_s)
+        at = await beside(link, written, server.connect_s)
+        if at is not None:
+            return by_name(at.to_string(), uri_of(await link.namespaces(server.connect_s), int(at.NamespaceIndex)))
+    return ""
 
 
 def _lease(node: str, asked: _Asked | str) -> Found:

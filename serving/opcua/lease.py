@@ -6,6 +6,7 @@ import math
 import os
 import secrets
 import socket
+from collections.abc import Iterable
 from contextlib import suppress
 
 from asyncua import ua
@@ -14,6 +15,8 @@ from serving.errors import EndpointError
 from serving.opcua.link import Link
 from serving.opcua.values import GOOD, words
 
+NAME = "LoopwrightLease"  # of a node beside those of the MVs: it is the lease of every loop that is told of none
+WRITABLE = 2  # the second bit of an access level
 SCANS = 5  # of the slower loop, without a renewal: the one that had the lease is gone
 
 
@@ -91,6 +94,26 @@ class NodeLease:
         (status,) = await link.write([(node, ua.Variant(text, ua.VariantType.String))], timeout_s)
         if status >> 30 != GOOD:
             raise LeaseRefusedError(f"the server refuses lease: {words(status)}")
+
+
+async def beside(link: Link, written: Iterable[ua.NodeId], timeout_s: float) -> ua.NodeId | None:
+    """The node NAME beside all MVs, where it is one text that this user may write; None: there is no such node."""
+    found = set[ua.NodeId]()
+    try:
+        for node in written:
+            found |= set(await link.beside(node, NAME, timeout_s))
+        if len(found) != 1:
+            return None
+        (at,) = found
+        (text,) = await link.read([at], timeout_s)
+        (access,) = await link.values([at], timeout_s, ua.AttributeIds.UserAccessLevel)
+    except EndpointError:
+        if link.gone:
+            raise
+        return None  # this server's folders cannot be looked at
+    level = None if access.Value is None else access.Value.Value
+    may = isinstance(level, int) and bool(level & WRITABLE)
+    return at if may and text.kind is ua.VariantType.String else None
 
 
 def _owner(text: str) -> str:

@@ -258,6 +258,22 @@ class Link:
 
         return await in_pieces(nodes, self.limits.browse, ask, timeout_s)
 
+    async def beside(self, node: ua.NodeId, name: str, timeout_s: float) -> list[ua.NodeId]:
+        """The nodes of a name, in the namespace of ``node``, that lie in the same folder or object as it."""
+        (above,) = await self.browsed([node], ua.ObjectIds.HierarchicalReferences, timeout_s, inverse=True)
+        paths = []
+        for parent in above:
+            step = ua.RelativePathElement(
+                ReferenceTypeId=ua.NodeId(ua.Int32(ua.ObjectIds.HierarchicalReferences)),
+                IsInverse=False,
+                TargetName=ua.QualifiedName(name, node.NamespaceIndex),
+            )
+            at = ua.NodeId(parent.NodeId.Identifier, parent.NodeId.NamespaceIndex)
+            paths.append(ua.BrowsePath(at, ua.RelativePath([step])))
+        found = await self._within(self.client.uaclient.session.translate_browsepaths_to_nodeids(paths), timeout_s)
+        targets = [t.TargetId for row in found for t in row.Targets or []]
+        return [ua.NodeId(t.Identifier, t.NamespaceIndex) for t in targets]
+
     async def close(self, timeout_s: float = 1.0) -> None:
         """Log off; where the server does not answer, break off."""
         with suppress(Exception):

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from serving.errors import EndpointError
 from serving.manifest import Manifest
+from serving.opcua.lease import beside
 from serving.opcua.link import Link
-from serving.opcua.settings import Nodes, Point
+from serving.opcua.settings import NO_LEASE, Nodes, Point
 from serving.opcua.values import exact, variant
 
 Array: TypeAlias = NDArray[np.float64]
@@ -55,9 +56,15 @@ class Plan:
         extra += [nodes.hand_back.node] if nodes.hand_back is not None else []
         ids = await link.resolved([*texts, *(p.node for p in plan.mv_points), *extra], timeout_s)
         plan.asked = ids[: len(texts)]
-        if nodes.lease:
+        if nodes.lease == NO_LEASE:
+            plan.lease = None
+        elif nodes.lease:
             (plan.lease,) = await link.resolved([nodes.lease], timeout_s)
-            plan.asked = [*plan.asked, plan.lease]
+        else:
+            plan.lease = await beside(
+                link, dict.fromkeys(ids[len(texts) : len(texts) + len(plan.mv_points)]), timeout_s
+            )
+        plan.asked += [plan.lease] if plan.lease is not None else []
         kinds = [r.kind for r in await link.read(ids[len(texts) :], timeout_s)]
         names = [*(f"MV {n}" for n in plan.mv_names), *extra]
         for name, kind in zip(names, kinds, strict=True):

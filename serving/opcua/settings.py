@@ -13,6 +13,7 @@ from serving.errors import LoopError
 from serving.fields import nearest
 from serving.manifest import Manifest, Signal
 
+NO_LEASE = "none"  # nodes.lease: none is looked for
 POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss", "None")
 
 
@@ -69,7 +70,8 @@ class Nodes:
     """The node of each signal by its name, and of what else the two sides tell each other.
 
     ``heartbeat`` counts the loop's scans. ``watchdog`` is a number that the server's side changes while it lives; it
-    counts as dead after ``watchdog_scans`` scans without a change. ``lease`` holds who controls this plant.
+    counts as dead after ``watchdog_scans`` scans without a change. ``lease`` is a text that holds who controls this
+    plant. Without it a node LoopwrightLease is the lease that lies beside those of the MVs; "none": there is no lease.
     """
 
     pv: Mapping[str, str | Point]
@@ -97,7 +99,7 @@ class Nodes:
         points = [p for name in groups for p in self.points(name).values()]
         others = [p.node for p in (self.mode, self.hand_back) if p is not None]
         texts = [*(t for p in points for t in (p.node, p.read_back)), *others]
-        return [t for t in [*texts, self.heartbeat, self.watchdog, self.lease] if t]
+        return [t for t in [*texts, self.heartbeat, self.watchdog, self.lease] if t and t != NO_LEASE]
 
     def check(self, manifest: Manifest) -> None:
         """LoopError where a signal that the law needs has no node, or a node no signal."""

@@ -39,6 +39,9 @@ class MadeUpLink:
     async def namespaces(self, _: float, *, anew: bool = False) -> list[str]:
         return ["http://opcfoundation.org/UA/", "urn:server", "urn:plant"]
 
+    async def beside(self, _: ua.NodeId, __: str, ___: float) -> list[ua.NodeId]:
+        return []
+
     async def server_uri(self, _: float) -> str:
         return "urn:server"
 

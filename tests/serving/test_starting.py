@@ -20,10 +20,11 @@ from processes import within as in_time
 from serving import Controller, Mode, MonotonicClock, Sample, VirtualClock
 from serving.journal import JournalReader
 from serving.loop import Command, within
+from serving.opcua.nameplates import Identity
 from serving.opcua.sampling import Values
 from serving.opcua.settings import Nodes, Server
 from serving.station import station
-from serving.station.beginning import another_before
+from serving.station.beginning import another_before, namespaces_before
 from serving.station.command import _Lines
 from serving.station.lease import Lease
 from serving.station.settings import Hold, JournalSettings, Settings
@@ -257,3 +258,30 @@ def test_a_controller_that_is_tried_lies_beside_the_one_in_charge(
     assert made._opened("pid.onnx", None).path == PID
     made.loop = SimpleNamespace(controller=Controller(tmp_path / "elsewhere.onnx"))  # type: ignore[assignment]
     assert made._opened("elsewhere.onnx", None).path == tmp_path / "elsewhere.onnx"
+
+
+def test_a_loop_that_learns_from_its_server_that_another_one_writes_its_mv_does_not_begin_to_write(
+    make_station: Callable[..., tuple[Station, Any]], tmp_path: Path
+) -> None:
+    """The other one spells host and node otherwise, so that each could start."""
+    other = Lease("opc.tcp://plant.invalid:4840", ["nsu=urn:plant;s=c"], tmp_path / "locks")
+    key = "urn:server 1.0 nsu=urn:plant;s=c"
+    other.claim({key: "nsu=urn:plant;s=c"})
+    made, plant = make_station("AUTO")
+    made._identified(Identity({2: "urn:plant"}, {key: "ns=2;s=c"}))
+    modes: list[Mode] = []
+
+    def seen(_: Sample | None, command: Command) -> None:
+        modes.append(command.mode)
+        if made.scans == 3:
+            other.release()
+            assert made.loop is not None
+            made.loop.set_mode(Mode.AUTO)
+
+    made.watch(seen)
+    made.run(5)
+    assert modes == [Mode.SHADOW] * 3 + [Mode.AUTO] * 2
+    assert len(plant.written) == 2
+    alarms = [line for line in events(made) if "ns=2;s=c at opc.tcp://127.0.0.1:1 is written by another loop" in line]
+    assert alarms
+    assert namespaces_before(made.settings.journal.file, made.settings.server.endpoint) == {2: "urn:plant"}

@@ -40,11 +40,11 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
     made.end()
 
 
-def machine(folder: Path, plant: Plant, start: str, monkeypatch: pytest.MonkeyPatch) -> RunningLoop:
+def machine(folder: Path, plant: Plant, start: str, monkeypatch: pytest.MonkeyPatch, nodes: str = LEASE) -> RunningLoop:
     """A loop that another one finds by the node alone: its file locks lie in a folder of its own."""
     folder.mkdir(mode=0o700)
     monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, folder))
-    return RunningLoop(loop_toml(folder, plant.endpoint, speed=SPEED, start=start, nodes=LEASE, more=PATIENT))
+    return RunningLoop(loop_toml(folder, plant.endpoint, speed=SPEED, start=start, nodes=nodes, more=PATIENT))
 
 
 def lease(plant: Plant, text: str | None = None) -> Any:
@@ -68,9 +68,10 @@ def mode(loop: RunningLoop) -> tuple[Mode, str]:
 def test_the_second_loop_holds_until_the_first_is_gone(
     plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
+    """Neither is told of a lease: both find the plant's own."""
+    first = machine(tmp_path / "a", plant, "AUTO", monkeypatch, nodes="")
     assert within(20, lambda: first.station.endpoint.lease.held and mode(first)[0] is Mode.AUTO)
-    second = machine(tmp_path / "b", plant, "SHADOW", monkeypatch)
+    second = machine(tmp_path / "b", plant, "SHADOW", monkeypatch, nodes="")
     try:
         # A shadow beside it needs no lease and takes none.
         assert within(10, lambda: second.station.scans > 10)
@@ -116,6 +117,20 @@ def test_a_check_tells_of_a_lease_or_a_watchdog_that_would_stop_the_loop(
     assert "lease, written" in said.out
     assert wrong in said.err
     assert ("nothing would stop the loop" in said.out) is (not wrong)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "row", "note"),
+    [("", f"lease, written  {SPACE}Control.Lease", False), ('lease = "none"', "lease -", True)],
+)
+def test_check_finds_the_lease_beside_the_mvs(
+    plant: Plant, tmp_path: Path, capsys: pytest.CaptureFixture[str], nodes: str, row: str, note: bool
+) -> None:
+    lease(plant, "")
+    assert main(["loop", "check", str(loop_toml(tmp_path, plant.endpoint, speed=SPEED, nodes=nodes))]) == 0
+    said = capsys.readouterr().out
+    assert any(line.split()[: len(row.split())] == row.split() for line in said.splitlines())
+    assert ("note: lease: there is none" in said) is note
 
 
 def test_a_lease_of_a_loop_that_was_killed_is_taken_over(
