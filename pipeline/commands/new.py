@@ -63,6 +63,8 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="sampling period of the record (default: the export's step, longer for a slow plant)")  # fmt: skip
     add("--hold", metavar="S", type=positive("s"), help="longest time that a reading is held or drawn on over")
     add("--without-mode", metavar="MODE", action="append", default=[], help="leave rows of this mode out")
+    add("--leave-out", metavar="FROM..TO", action="append", default=[],
+        help="leave rows of this time out: ISO dates or times, or seconds; may be given again")  # fmt: skip
     add("--time", metavar="COLUMN", default="", help="the column of times (default: found by name and content)")
     add("--time-format", metavar="FORM", default="",
         help="of times, as in '%%d/%%m/%%Y %%H:%%M:%%S', or a unit of numbers: ms, s, min, h, d, serial")  # fmt: skip

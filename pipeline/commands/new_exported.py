@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pipeline.commands.new_widened import Widening
 from pipeline.config.exports import ExportParams
+from pipeline.config.intervals import Interval
 from pipeline.errors import RecordError
 from pipeline.historian.exported import exported
 from pipeline.historian.guessing import guesses
@@ -45,6 +46,11 @@ def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
 
 def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
     """``exports.<name>``: all that was said of the files."""
+    for text in options.leave_out:
+        try:
+            Interval.of(text)
+        except ValueError as error:
+            raise RecordError(f"--leave-out {error}") from None
     return ExportParams(
         case=options.name,
         files=tuple(options.files),
@@ -52,6 +58,7 @@ def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
         period_s=options.period,
         hold_s=options.hold,
         without_mode=tuple(options.without_mode),
+        leave_out=tuple(options.leave_out),
         time=options.time,
         time_format=options.time_format,
         time_zone=options.time_zone,

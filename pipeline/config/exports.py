@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any, Literal
 
+from pipeline.config.intervals import Interval
 from pipeline.config.params import PARAMS_FILE, parse, read_section, sections
 from pipeline.errors import ParamsError
 
@@ -39,9 +40,9 @@ class ExportParams:
     """``exports.<plant>``: the export files of a plant, and how they are read.
 
     ``period_s``, ``hold_s``: sampling period of the record and the longest time that a reading is held (None: from the
-    data). ``without_mode``: rows of these modes are left out. ``time``, ``time_format``: the column of times and its
-    form ("": found by name and content). ``time_zone``: that of dates which state none. ``anyway``: the record is used
-    even where it cannot carry a model.
+    data). ``without_mode``: rows of these modes are left out. ``leave_out``: times FROM..TO that are. ``time``,
+    ``time_format``: the column of times and its form ("": found by name and content). ``time_zone``: that of dates
+    which state none. ``anyway``: the record is used even where it cannot carry a model.
     """
 
     case: str
@@ -50,6 +51,7 @@ class ExportParams:
     period_s: float | None = None
     hold_s: float | None = None
     without_mode: tuple[str, ...] = ()
+    leave_out: tuple[str, ...] = ()
     time: str = ""
     time_format: str = ""
     time_zone: str = ""
@@ -58,6 +60,8 @@ class ExportParams:
     def __post_init__(self) -> None:
         if not self.files:
             raise ValueError("files is empty; name one or more exports")
+        for text in self.leave_out:
+            Interval.of(text)
         for name in ("period_s", "hold_s"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

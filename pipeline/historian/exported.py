@@ -43,4 +43,6 @@ def screened_export(params: ExportParams, tags: Sequence[Tag]) -> Screened:
     """The files read and screened; ``tags`` have names and units. RecordError as ``read_export`` and ``screened``."""
     values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
     export = read_export(params.files, values, modes, params.time, params.time_format, params.time_zone)
-    return screened(params.case, export, tags, params.period_s, params.hold_s, params.without_mode)
+    return screened(
+        params.case, export, tags, params.period_s, params.hold_s, params.without_mode, leave_out=params.leave_out
+    )

@@ -28,6 +28,8 @@ class Reason(IntEnum):
     SHORT_RUN = 14
     COPY = 15
     UNLIKE = 16
+    STOP = 17
+    LEFT_OUT = 18
 
     @property
     def words(self) -> str:
@@ -53,4 +55,6 @@ WORDS = {
     Reason.SHORT_RUN: "too short a piece between two gaps",
     Reason.COPY: "a block of earlier readings again",
     Reason.UNLIKE: "sensor and inputs contradict each other",
+    Reason.STOP: "the plant stood still, or warmed up",
+    Reason.LEFT_OUT: "a time that was asked to be left out",
 }

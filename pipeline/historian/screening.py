@@ -21,6 +21,7 @@ from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.free_run import believed
 from pipeline.historian.grid import Grid, resampled
+from pipeline.historian.left_out import flag_readings, flag_rows, of_left_out, spans_of
 from pipeline.historian.linear import Linear
 from pipeline.historian.loads import with_load_moves
 from pipeline.historian.modes import check_modes
@@ -31,6 +32,7 @@ from pipeline.historian.reason import Reason
 from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_notes, of_rows, of_series
 from pipeline.historian.rows import record_of, row_codes, stretches
 from pipeline.historian.sampling import Sampling, proposed_period, sampling
+from pipeline.historian.standstill import stops
 from pipeline.historian.static import explained
 from pipeline.historian.stopped import of_zeros
 from pipeline.historian.tags import Tag
@@ -64,6 +66,7 @@ def screened(
     period_s: float | None = None,
     hold_s: float | None = None,
     without_modes: Sequence[str] = (),
+    leave_out: Sequence[str] = (),
 ) -> Screened:
     """Screen, resample, screen again, and judge; ``tags`` have their names.
 
@@ -72,6 +75,11 @@ def screened(
     own = {t.tag: replace(export.series[t.tag], between=t.between) for t in tags}
     check_modes(without_modes, tags, own)
     findings: list[Finding] = [*of_notes(export), *of_files(export, tags)]
+    spans = spans_of(leave_out, export)
+    flag_readings(own.values(), spans, Reason.LEFT_OUT)
+    stopped, stop = stops(own, tags)
+    flag_readings(own.values(), stopped, Reason.STOP)
+    findings += stop
     findings += drop_copies(own, tags)
     for tag in tags:
         if tag.role != "mode":
@@ -105,6 +113,8 @@ def screened(
     grid, rates = resampled(drawn, held, period, hold_s, resampled_one)
     by_tag = {r.tag: r for r in rates}
     signals = [t for t in tags if t.role in {"pv", "mv", "dv"}]
+    findings += of_left_out(leave_out, flag_rows(grid, [t.tag for t in signals], spans, Reason.LEFT_OUT))
+    flag_rows(grid, [t.tag for t in signals], stopped, Reason.STOP)
     findings += of_grid(grid)
     findings += pulses(grid, own, signals)
     for t in (t for t in tags if t.role == "mv"):

@@ -24,6 +24,7 @@ COLOURS = {
     Reason.RANGE: "#882255", Reason.UNIT_SLIP: "#cc79a7", Reason.OUTLIER: "#e69f00", Reason.DUPLICATE: "#dddddd",
     Reason.CLOCK: "#44aa99", Reason.GAP: "#999999", Reason.STUCK: "#009e73", Reason.SATURATED: "#56b4e9",
     Reason.MODE: "#ddcc77", Reason.SHORT_RUN: "#777777", Reason.COPY: "#6699cc", Reason.UNLIKE: "#ee3377",
+    Reason.STOP: "#bbaa88", Reason.LEFT_OUT: "#aaaaaa",
 }  # fmt: skip
 LINE = "#0072b2"
 POINTS = 3000  # of a line; more are drawn by their extremes

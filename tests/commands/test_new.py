@@ -91,6 +91,16 @@ def test_the_same_export_gives_the_same_bytes() -> None:
     assert pages[0] == pages[1]
 
 
+def test_times_left_out_stand_in_params_yaml_and_the_record_is_made_again_without_them() -> None:
+    write(Path("x.csv"), cells(clean()))
+    times = ["600..1200", "2024-03-04T07:00..2024-03-04T07:10"]
+    assert main(["new", "tank", "x.csv", *ROLES, *(w for t in times for w in ("--leave-out", t))]) == 0
+    assert yaml.safe_load(Path("params.yaml").read_text())["exports"]["tank"]["leave_out"] == times
+    _, record = read_back("tank")
+    assert len(record) == 1300
+    assert record.run[-1] == 2
+
+
 def test_without_roles_a_table_is_written_corrected_and_read(capsys: pytest.CaptureFixture[str]) -> None:
     header = ("timestamp", "TIC-101.PV [degC]", "TIC-101.OP [%]", "FI-7 [kg/h]")
     write(Path("x.csv"), cells(clean()), header)
@@ -410,6 +420,8 @@ BAD: dict[str, tuple[list[str], str]] = {
     "a wrong range": (["tank", "x.csv", "--pv", "FI-7=0..1", "--mv", "TIC-101.OP"], "correct the range or the unit"),
     "tags and roles": (["tank", "x.csv", "--tags", "t.csv", *ROLES], "give one of them"),
     "no tags": (["tank", "x.csv", "--tags", "t.csv"], "t.csv: no such file"),
+    "no time to leave out": (["tank", "x.csv", *ROLES, "--leave-out", "5..2"], "ends before it begins"),
+    "no dates": (["tank", "x.csv", *ROLES, "--leave-out", "Monday..Friday"], "neither a date nor seconds"),
     "another time": (["tank", "x.csv", *ROLES, "--time", "when"], "no column 'when'"),
     "too fine": (["tank", "x.csv", *ROLES, "--period", "0.0001"], "longer --period"),
     "too coarse": (["tank", "x.csv", *ROLES, "--period", "1e9"], "shorter --period"),

@@ -1,0 +1,105 @@
+"""Times that nobody should learn from: those that a person leaves out, and stops of the plant with their warm-up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, clean, screen_of, steps
+
+from pipeline.config.exports import ExportParams
+from pipeline.config.intervals import Interval
+from pipeline.errors import RecordError
+from pipeline.historian.reason import Reason
+from pipeline.historian.screening import Screened
+
+DATES = "2024-03-04T06:10:00..2024-03-04T06:20:00"  # minutes 10 to 20 of the record
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        DATES,
+        "2024-03-04 06:10..2024-03-04 06:20",
+        "2024-03-04T07:10+01:00..2024-03-04T07:20+01:00",
+        "600..1200",
+        f"{START_S + 600}..{START_S + 1200}",
+    ],
+)
+def test_a_time_is_left_out_however_it_is_written(text: str, tmp_path: Path) -> None:
+    found = screen_of(clean(), tmp_path, leave_out=[text])
+    assert found.report.dropped_rows == {"left_out": 100}
+    rows = np.flatnonzero(found.code == Reason.LEFT_OUT)
+    assert (rows[0], rows[-1]) == (100, 199)
+    assert found.report.runs == 2
+
+
+def test_days_are_left_out_to_their_end_and_a_time_without_rows_is_said(tmp_path: Path) -> None:
+    found = screen_of(clean(), tmp_path, leave_out=["2024-03-05..2024-03-06", "2024-03-04T06:10..2024-03-04T06:20"])
+    assert [(f.tag[:10], f.drops) for f in found.report.findings if f.kind == "left_out"] == [
+        ("2024-03-05", False),
+        ("2024-03-04", True),
+    ]
+    with pytest.raises(RecordError, match="1500 x a time that was asked to be left out"):
+        screen_of(clean(), tmp_path, leave_out=["2024-03-04..2024-03-04"])
+
+
+@pytest.mark.parametrize(
+    "text", ["", "5", "..", "5..", "7..5", "a..b", "2024-02-30..2024-03-01", "2024-03-01..5", "1..2..3", "nan..5",
+             "2024-03-01T06:00Z..2024-03-02T06:00"]
+)  # fmt: skip
+def test_what_is_no_interval_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r".+"):
+        Interval.of(text)
+    with pytest.raises(ValueError, match=r".+"):
+        ExportParams("tank", (Path("x.csv"),), (), leave_out=(text,))
+
+
+def test_dates_need_an_export_with_dates(tmp_path: Path) -> None:
+    data = clean()
+    with pytest.raises(RecordError, match="give its seconds"):
+        screen_of(data.with_(time_s=data.time_s - START_S), tmp_path, leave_out=[DATES])
+
+
+def with_a_stop(seed: int, first: int = 2000, last: int = 2700) -> tuple[Clean, np.ndarray]:
+    """A plant without feed and heat for a while, cooling down, and heated up again; where (n,) it is at work."""
+    random, n = np.random.default_rng(seed), 5000
+    mv, dv = steps(random, n, 25, 75), 500 + steps(random, n, -50, 50)
+    mv[first:last], dv[first:last] = 0.0, 0.0
+    mv[last : last + 40], dv[last : last + 40] = 60.0, np.linspace(0, 500, 40)
+    y = np.full(n, 60.0)
+    for k in range(n - 1):
+        rest = 20 + 0.8 * mv[max(k - 2, 0)] - 0.02 * (dv[k] - 500) if dv[k] > 50 else 15.0
+        y[k + 1] = y[k] + (0.03 if dv[k] > 50 else 0.01) * (rest - y[k])
+    work = np.ones(n, dtype=bool)
+    work[first : last + int(np.argmax(y[last:] > np.quantile(y[:first], 0.02)))] = False
+    dv = np.where(dv > 0, dv + random.normal(0, 0.5, n), 0.0)
+    return Clean(
+        START_S + PERIOD_S * np.arange(n), np.round(y + random.normal(0, 0.1, n), 3), mv, np.round(dv, 2)
+    ), work
+
+
+def stopped(found: Screened) -> np.ndarray:
+    return found.code == Reason.STOP
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_stop_is_called_one_and_goes_with_its_warm_up(seed: int, tmp_path: Path) -> None:
+    data, work = with_a_stop(seed)
+    found = screen_of(data, tmp_path)
+    assert [f.kind for f in found.report.findings if f.kind in {"stop", "sentinel", "zero", "unlike"}] == ["stop"]
+    assert np.mean(stopped(found)[~work]) > 0.98
+    assert np.mean(stopped(found)[work]) < 0.01
+    assert found.report.verdict.carries == "yes"
+
+
+def test_a_closed_valve_and_a_large_load_are_no_stop(tmp_path: Path) -> None:
+    random = np.random.default_rng(5)
+    mv, dv = steps(random, 1500, 30, 70), 500 + steps(random, 1500, -50, 50)
+    mv[600:700], dv[600:700] = 0.0, 700.0
+    pv = np.round(answer(mv, dv) + random.normal(0, 0.1, 1500), 3)
+    data = Clean(START_S + PERIOD_S * np.arange(1500), pv, mv, dv)
+    assert not stopped(screen_of(data, tmp_path)).any()
+    alone = screen_of(data, tmp_path, TAGS[:2])
+    assert not stopped(alone).any()
