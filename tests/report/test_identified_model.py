@@ -113,7 +113,7 @@ def test_a_share_of_a_gain_of_nearly_zero_is_no_number(
     gain_sd: float, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    part = {**PART, "open": {"gain_sd": [gain_sd], "pace_sd": [0.05], "dead_sd": [0.3]}}
+    part = {**PART, "open": {"gain_sd": [gain_sd, 0.1], "pace_sd": [0.05], "dead_sd": [0.3]}}
     models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
     found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
     assert found is not None
