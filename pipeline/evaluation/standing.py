@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -105,6 +106,14 @@ def because(why: str) -> str:
     words = re.sub(r"^law '[^']+' is withheld: ", "", why)
     words = re.sub(r"^controllers\.\S+ (.*?), so nothing is shipped", r"it \1", words)
     return f"because {words.rstrip('. ')}."
+
+
+def by_reason(withheld: Mapping[str, str]) -> dict[str, str]:
+    """Laws that share a reason, ``a, b``, -> the reason as the end of a sentence, as ``because`` has it."""
+    laws: dict[str, list[str]] = {}
+    for law, why in withheld.items():
+        laws.setdefault(because(why), []).append(law)
+    return {", ".join(names): why for why, names in laws.items()}
 
 
 def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:

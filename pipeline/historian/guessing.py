@@ -29,6 +29,14 @@ ENDINGS: tuple[tuple[str, str], ...] = (
     (r"(^|[ ._:/-])(op|out|mv|co|valve|stellwert|y)([ ._:/-]|$)", "mv"),
     (r"(^|[ ._:/-])(pv|cv|me|meas|istwert|x)([ ._:/-]|$)", "pv"),
 )
+FLOW = re.compile(r"flow|flu(ss|ß)|^f[a-z]{0,3}[ _-]?[0-9]", re.IGNORECASE)
+FLOW_UNIT = re.compile(r"^(n?m3|n?m³|k?g|t|m?l|lb|gal|k?mol|scf)/(s|sec|min|h|hr|d|day)$", re.IGNORECASE)
+LABEL = re.compile(
+    r"(^|[ ._:/-])(batch|lot|charge|campaign|grade|product|recipe|phase|shift|state|status|code|count(er)?|no|nr|id)"
+    r"([ ._:/-]|$)",
+    re.IGNORECASE,
+)
+COUNTED = "a label, a counter or a switch"  # the remark on a column of which none is a signal
 HELD_SHARE = 0.9  # of the readings equal to the one before: moved in steps
 LEAST_GOOD = 0.5  # share of the readings of a tag that is tried as a disturbance
 MOST_TRIED, MOST_READINGS = 60, 20_000
@@ -39,22 +47,47 @@ LOOP = re.compile(r"^(?P<loop>.*?)[ ._:/-]+[A-Za-z ]+$")
 def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     """One guess for every column, in the order of the file."""
     found = [_guess(s, units.get(name, "")) for name, s in export.series.items()]
-    found = [_cascaded(g, found) for g in found]
+    found = _flows_without_loop([_cascaded(g, found) for g in found])
     if not any(g.tag.role == "mv" for g in found):  # names say nothing: what moves in steps may be one
+        moved = [g for g in found if not g.tag.role and g.remark.startswith("moves in steps")]
+        moved = [g for g in moved if not _is_flow(g)] or moved  # a feed that others set, where a valve is there
         found = [
             replace(g, tag=replace(g.tag, role="mv"), remark=f"{g.remark}; guessed: moves in steps".strip("; "))
-            if not g.tag.role and g.remark.startswith("moves in steps")
+            if g in moved
             else g
             for g in found
         ]
     if not any(g.tag.role == "pv" for g in found):
         loops = {m["loop"] for g in found if g.tag.role in {"mv", "sp"} and (m := LOOP.match(g.tag.tag))}
         free = [g for g in found if not g.tag.role and g.good > 0 and g.step >= 0 and g.tag.low is not None]
-        own = [g for g in free if g.tag.tag in loops] or free[:1]
+        free = [g for g in free if not g.remark.startswith(COUNTED)]
+        own = [g for g in free if g.tag.tag in loops] or [g for g in free if not _is_flow(g)][:1] or free[:1]
         found = [replace(g, tag=replace(g.tag, role="pv")) if g in own else g for g in found]
     # A variable that looks like a PV and answers to nothing may drift as the PVs do: no guess makes it a cause of them.
     taken = {g.tag.tag for g in found if g.tag.role == "pv"}
     return disturbances(without_answers(found, export), export, taken)
+
+
+def _is_flow(guess: Guess) -> bool:
+    """Whether a tag is a flow by its name or its unit."""
+    return bool(FLOW.search(guess.tag.tag) or FLOW_UNIT.match(guess.tag.unit))
+
+
+def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
+    """The guesses, flows that no loop holds without a role, where another PV is there.
+
+    An outflow through an MV's valve follows the MV, and a feed disturbs: neither is what a controller shall hold.
+    """
+    matches = {g.tag.tag: m["loop"] for g in found if (m := LOOP.match(g.tag.tag))}
+    held = {matches[g.tag.tag] for g in found if g.tag.role in {"sp", "mv", "mode"} and g.tag.tag in matches}
+    alone = [g for g in found if g.tag.role == "pv" and _is_flow(g) and matches.get(g.tag.tag, g.tag.tag) not in held]
+    if all(g in alone for g in found if g.tag.role == "pv"):
+        return list(found)
+    words = "a flow without a loop of its own: role pv if it is to be controlled"
+    return [
+        replace(g, tag=replace(g.tag, role=""), remark=f"{g.remark}; {words}".strip("; ")) if g in alone else g
+        for g in found
+    ]
 
 
 def _cascaded(guess: Guess, found: Sequence[Guess]) -> Guess:
@@ -118,7 +151,8 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     """
     pvs, mvs = ([g.tag.tag for g in found if g.tag.role == role] for role in ("pv", "mv"))
     free = [g.tag.tag for g in found if not g.tag.role and g.good > LEAST_GOOD and g.tag.low is not None]
-    free = [tag for tag in free if tag not in taken]
+    counted = {g.tag.tag for g in found if g.remark.startswith(COUNTED)}
+    free = [tag for tag in free if tag not in taken and tag not in counted]
     if not pvs or not mvs or not free:
         return list(found)
     roles = dict.fromkeys(pvs, "pv") | dict.fromkeys(mvs, "mv") | dict.fromkeys(free[:MOST_TRIED], "dv")
@@ -126,13 +160,16 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     grid, _ = resampled(
         [own[n] for n in (*pvs, *free[:MOST_TRIED])], [own[n] for n in mvs], proposed_period([own[pvs[0]]])
     )
+    # A flow through an MV's valve is an answer to the MV, and no cause of its own.
+    moved = {n: fitted(grid.value[n], [grid.value[m] for m in mvs], grid.piece) for n in free[:MOST_TRIED]}
+    consequences = {n for n, model in moved.items() if model and max(model.strength.values()) > STRONG}
     causes: dict[str, str] = {}
     for pv in pvs:
         y = grid.value[pv]
         for name in free[:MOST_TRIED]:
             u = [*(grid.value[m] for m in mvs), grid.value[name]]
             model = fitted(y, u, grid.piece)
-            seen = model is not None and model.strength[len(mvs)] > STRONG
+            seen = model is not None and model.strength[len(mvs)] > STRONG and name not in consequences
             if seen and follows(grid.value[name], y, grid.piece) < FOLLOWS and name not in causes:
                 causes[name] = pv
     return [
@@ -171,6 +208,8 @@ def _guess(series: Series, unit: str) -> Guess:
     if np.ptp(plain) == 0:
         remarks.append("constant")
         role = "" if role == "pv" else role
+    elif not role and _counts(tag, plain):
+        remarks.append(COUNTED)
     elif still.mean() >= HELD_SHARE:
         remarks.append("moves in steps")
     if found:
@@ -180,6 +219,15 @@ def _guess(series: Series, unit: str) -> Guess:
     low, high = _range(plain, unit, role)
     kept = good - float(codes.mean())
     return Guess(Tag(tag, role, unit, low, high), smallest_difference(plain), kept, "; ".join(remarks))
+
+
+def _counts(tag: str, plain: Array) -> bool:
+    """Whether whole numbers (n,) only rise, are 0 and 1, or are named as labels are: no valve moves so."""
+    if not np.array_equal(plain, np.round(plain)):
+        return False
+    step = np.diff(plain)
+    rises = bool((step >= 0).all()) and np.count_nonzero(step) > 1
+    return rises or np.array_equal(np.unique(plain), [0.0, 1.0]) or bool(LABEL.search(tag))
 
 
 def seen_range(series: Series) -> tuple[float, float] | None:

@@ -80,12 +80,17 @@ def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
     found = part.get("open")
     if not found:
         return ()
-    gains = ", ".join(f"{100 * sd:.2g} % in the gain of {name}" for name, sd in zip(mvs, found["gain_sd"], strict=True))
-    pace, dead = 100 * found["pace_sd"][0], found["dead_sd"][0]
+    gains = ", ".join(f"{_by(sd)} in the gain of {name}" for name, sd in zip(mvs, found["gain_sd"], strict=True))
+    dead = found["dead_sd"][0]
     return (
-        f"Models as likely as this one differ by {gains}, by {pace:.2g} % in speed and by {dead:.2g} periods in dead "
-        "time (standard deviations).",
+        f"Models as likely as this one differ by {gains}, by {_by(found['pace_sd'][0])} in speed and by {dead:.2g} "
+        "periods in dead time (standard deviations).",
     )
+
+
+def _by(sd: float) -> str:
+    """A relative standard deviation; a share of a figure that is nearly zero would be a number that says nothing."""
+    return f"{100 * sd:.2g} %" if sd <= 1 else "more than 100 %"
 
 
 def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:

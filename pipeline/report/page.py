@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
-from pipeline.evaluation.standing import because
+from pipeline.evaluation.standing import because, by_reason
 from pipeline.evaluation.validation import FILE, reference_words
 from pipeline.evaluation.verdicts import Claims
 from pipeline.optimal.bounds import bounded
@@ -83,7 +83,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "met": sum(row.holds is True for row in judged.acceptance),
         "statements": judged.statements,
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
-        "withheld": {law: because(why) for law, why in evidence.withheld.items()},
+        "withheld": by_reason(evidence.withheld),
         "gate_of": _gate_of(evidence),
         "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),
         "no_baseline": because(evidence.no_baseline) if evidence.no_baseline else "",

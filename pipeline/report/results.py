@@ -14,7 +14,7 @@ from rich.table import Table
 from pipeline.config.params import PARAMS_FILE, entries, sections
 from pipeline.errors import PipelineError
 from pipeline.evaluation.metric import with_unit
-from pipeline.evaluation.standing import LawStanding, Standing, because, tally, withheld_in
+from pipeline.evaluation.standing import LawStanding, Standing, by_reason, tally, withheld_in
 from pipeline.evaluation.validation import FILE, Validation
 from pipeline.pictures.numbers import ratio
 from pipeline.simulation import NOISE_SUFFIX
@@ -47,10 +47,11 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
             continue
         withheld = withheld_in(standing.folder)
         given = _given(artifacts.parent / PARAMS_FILE, name)
-        for law, why in withheld.items():
-            if given is not None and law not in given:
-                continue  # a file that a controller left which has been taken out since
-            console.print(f"{name}: {law} is not shipped, {because(why)}", style="red", markup=False, soft_wrap=True)
+        # A file that a controller left which has been taken out since says nothing.
+        current = {law: why for law, why in withheld.items() if given is None or law in given}
+        for laws, why in by_reason(current).items():
+            line = f"{name}: {laws} {'are' if ', ' in laws else 'is'} not shipped, {why}"
+            console.print(line, style="red", markup=False, soft_wrap=True)
         shipped += [law for law in standing.laws if law.law not in withheld]
         if without_controller(artifacts, name):
             page = standing.folder / "report.html"
@@ -78,8 +79,9 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
     # In quotes where a word has to be put in: a shell takes the brackets for something else.
     one = f"{where / best}.onnx" if best is not None else f"'{where / '<law>.onnx'}'"
-    console.print(f"try one    loopwright simulate {one}")
-    console.print(f"read one   loopwright inspect {one}")
+    if any(any(standing.folder.glob("*.onnx")) for name, standing in standings.items() if case in (None, name)):
+        console.print(f"try one    loopwright simulate {one}")
+        console.print(f"read one   loopwright inspect {one}")
     console.print("registry   make registry, then /#/models in the browser")
 
 

@@ -63,7 +63,7 @@ def design(name: str) -> None:
         rows = parallel_map(partial(_export, *arguments, withhold=case.on_models), work, label, in_folder=True)
     except WithheldError as error:
         _withhold(folder, law, str(error))
-        print(f"design {name}: {error}", file=sys.stderr)
+        print(f"design {name}: withheld; the results and the report say why", file=sys.stderr)
         return
     write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "controllers": rows})
 

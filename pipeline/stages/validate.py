@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from pipeline.cases import all_cases
-from pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section
+from pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section, sections
 from pipeline.engine.command import run_stage
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
@@ -78,7 +78,9 @@ def validate(name: str) -> None:
     locked_up = _locked_up(base)
     how = "locked up or left its limits" if case.on_models else "locked up"
     withheld = f"controllers.{name} {how} on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
-    withheld += "numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
+    withheld += "numbers or models"
+    if params.case not in sections("plants"):  # who runs an own plant must not ship such a law
+        withheld += ", or mark the reproduction of a paper's law with `as_printed: true`"
     refused = bool(locked_up) and not params.as_printed
     if refused and not case.on_models:
         raise LawError(withheld)

@@ -161,7 +161,7 @@ def withdraw(client: MlflowClient, name: str, why: str) -> str:
     client.delete_registered_model_alias(name, BEST)
     verdict = f"no longer the best version: the newest run does not ship this law: {why}"
     client.set_model_version_tag(name, str(holder.version), "verdict", verdict)
-    return f"{name} version {holder.version}: {verdict}"
+    return f"{name} version {holder.version}: no longer the best version, the newest run does not ship this law"
 
 
 def _of_case(client: MlflowClient, case: str) -> list[ModelVersion]:

@@ -75,7 +75,7 @@ def test_dvc_is_told_of_the_list_of_files_and_does_not_make_it_again(monkeypatch
     monkeypatch.setattr(run, "ask_in_turn", in_turn)
     monkeypatch.setattr(run, "show_results", lambda *_, **__: None)
     assert main(["run"]) == 0
-    assert done == ["listed", "commit --quiet --force code to its end", "status --json", "dag --dot"]
+    assert done == ["listed", "commit --force code to its end", "status --json", "dag --dot"]
 
 
 def test_a_first_step_that_fails_says_what_to_do(

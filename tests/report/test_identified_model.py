@@ -104,3 +104,17 @@ def test_a_fit_of_rows_that_hardly_move_is_held_against_the_noise(
     found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
     assert found is not None
     assert found.variables[0][1] == words
+
+
+@pytest.mark.parametrize(
+    ("gain_sd", "says"), [(0.123, "by 12 % in the gain of u0,"), (1.2e4, "by more than 100 % in the gain of u0,")]
+)
+def test_a_share_of_a_gain_of_nearly_zero_is_no_number(
+    gain_sd: float, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = {**PART, "open": {"gain_sd": [gain_sd, 0.1], "pace_sd": [0.05], "dead_sd": [0.3]}}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    assert any(says in line for line in found.verdicts)

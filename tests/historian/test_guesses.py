@@ -1,0 +1,69 @@
+"""Roles that are guessed from names and readings: what a controller shall hold, and what is no signal at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.historian.guessing import guesses
+from pipeline.historian.reading import read_export, units_of
+
+N = 3000
+
+
+def tank() -> dict[str, np.ndarray]:
+    """A tank: its level answers to a valve in its outflow and to the inflow; the outflow follows the valve."""
+    random = np.random.default_rng(0)
+    valve = np.repeat(random.uniform(30, 70, N // 50), 50)
+    inflow = 50 + np.repeat(random.uniform(-8, 8, N // 60), 60)
+    level = np.full(N, 5.0)
+    for k in range(N - 1):
+        level[k + 1] = max(level[k] + 0.002 * (inflow[k] - valve[k] * np.sqrt(level[k] / 5)), 0.2)
+    return {
+        "out": valve * np.sqrt(level / 5) + random.normal(0, 0.2, N),
+        "level": level + random.normal(0, 0.01, N),
+        "valve": valve,
+        "in": inflow,
+        "batch": 4711 + np.arange(N) // 333.0,
+        "switch": np.arange(N) // 500 % 2.0,
+        "grade": np.repeat(random.integers(1, 5, N // 250), 250).astype(float),
+        "two": np.where(valve > 50, 55.0, 45.0),
+    }
+
+
+def roles(path: Path, columns: dict[str, str]) -> dict[str, str]:
+    """Guessed roles of an export of some columns of the tank, by their heads."""
+    data = tank()
+    table = np.column_stack([10.0 * np.arange(N), *(data[key] for key in columns.values())])
+    np.savetxt(path, table, delimiter=",", header=",".join(["time_s", *columns]), comments="", fmt="%.6g")
+    return {g.tag.tag: g.tag.role for g in guesses(read_export([path]), units_of([path]))}
+
+
+NAMED = ("Outflow [m3/h]", "Level [m]", "Valve position [%]", "Inflow [m3/h]")
+BARE = ("FI-2 [m3/h]", "LI-1 [m]", "HV-1 [%]", "FI-3 [m3/h]")
+INDICATED = ("FI-2.PV [m3/h]", "LI-1.PV [m]", "LIC-1.OP [%]", "FI-3.PV [m3/h]")
+
+
+@pytest.mark.parametrize("heads", [NAMED, BARE, INDICATED])
+def test_an_outflow_is_not_what_a_controller_holds(heads: Sequence[str], tmp_path: Path) -> None:
+    found = roles(tmp_path / "export.csv", dict(zip(heads, ("out", "level", "valve", "in"), strict=True)))
+    assert list(found.values()) == ["", "pv", "mv", "dv"]
+
+
+def test_a_flow_with_a_loop_of_its_own_is(tmp_path: Path) -> None:
+    heads = {"FIC-2.PV [m3/h]": "out", "FIC-2.OP [%]": "valve", "LI-1.PV [m]": "level"}
+    assert roles(tmp_path / "export.csv", heads)["FIC-2.PV"] == "pv"
+
+
+@pytest.mark.parametrize("head", ["Batch", "Product grade", "Mixer on"])
+def test_a_label_is_no_mv(head: str, tmp_path: Path) -> None:
+    label = {"Batch": "batch", "Product grade": "grade", "Mixer on": "switch"}[head]
+    found = roles(tmp_path / "export.csv", {head: label, "LI-1 [m]": "level", "HV-1 [%]": "valve"})
+    assert found == {head: "", "LI-1": "pv", "HV-1": "mv"}
+
+
+def test_an_mv_of_two_values_is_one(tmp_path: Path) -> None:
+    assert roles(tmp_path / "export.csv", {"LI-1 [m]": "level", "HV-1 [%]": "two"})["HV-1"] == "mv"
