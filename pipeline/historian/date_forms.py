@@ -30,7 +30,8 @@ MONTHS = (
 MONTH = {word: number for number, words in enumerate(MONTHS, 1) for word in words.split()}
 WORD = re.compile(r"[^\W\d_]{3,9}\.?")
 WEEKDAY = re.compile(r"^[^\W\d_]{2,10}[.,]*\s+(?=\d)")
-PLAIN_ENDS = re.compile(r"(?:([AaPp])\.\s?[Mm]\.|\s*(?:UTC|GMT))$")
+PLAIN_ENDS = re.compile(r"(?:([AaPp])\.\s?[Mm]\.|\s*(UTC|GMT|CET|MEZ|CEST|MESZ))$")
+OFFSETS = {"UTC": "+0000", "GMT": "+0000", "CET": "+0100", "MEZ": "+0100", "CEST": "+0200", "MESZ": "+0200"}
 SOME = 0.05  # of the dates, whose form counts
 LEAST_YEAR, MOST_YEAR = 1990, 2100
 ORDERS = {"dmy": ("%d", "%m", "%y"), "mdy": ("%m", "%d", "%y"), "ymd": ("%y", "%m", "%d")}
@@ -62,8 +63,8 @@ def form_of(texts: Sequence[str], where: str) -> str:
 
 
 def plain_date(text: str) -> str:
-    """The date as strptime reads it: no day of the week, a month's number for its name, +0000 for UTC, pm for p.m."""
-    text = PLAIN_ENDS.sub(lambda m: f"{m[1]}m" if m[1] else "+0000", text)
+    """The date as strptime reads it: no day of the week, a month's number for its name, +0100 for CET, pm for p.m."""
+    text = PLAIN_ENDS.sub(lambda m: f"{m[1]}m" if m[1] else OFFSETS[m[2]], text)
     american = re.match(r"^([^\W\d_]{3,9})\.? (\d{1,2}),? (\d{4})(.*)$", text)
     if american and american[1].lower() in MONTH:
         return f"{american[2]} {MONTH[american[1].lower()]:02d} {american[3]}{american[4]}"
