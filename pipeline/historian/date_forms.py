@@ -14,10 +14,11 @@ COMPACT = re.compile(
     r"^(?P<date>\d{8})(?P<sign>[T _-]?)(?P<clock>\d{6}|\d{4}|\d{2}:\d\d(?::\d\d)?)?(?P<rest>[.,]?\d*Z?)$"
 )
 REST = re.compile(
-    r"^(?P<gap>[T ,;]*\s*)(?P<clock>\d{1,2}(?P<sign>[:.])\d\d(?:(?P=sign)\d\d)?)(?P<part>[.,:]\d+)?"
+    r"^(?P<gap>[T ,;]*\s*)(?P<clock>\d{6}|\d{1,2}(?P<sign>[:.])\d\d(?:(?P=sign)\d\d)?)(?P<part>[.,:]\d+)?"
     r"\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d\d:?\d\d)?$"
 )
 HOUR = re.compile(r"^\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?$")
+HOUR_DIGITS = re.compile(r"^([01]?\d|2[0-3])[0-5]\d[0-5]\d$")  # 060054, or 60054 where a program dropped the zero
 ELAPSED = re.compile(r"^\d{1,5}:\d\d:\d\d([.,]\d+)?$")
 MONTHS = (
     "jan januar january janvier enero ene gennaio gen", "feb februar february février fevrier fév febrero febbraio",
@@ -125,6 +126,8 @@ def _tail(rest: str) -> str | None:
     match = REST.match(rest)
     if match is None:
         return None
+    if match["sign"] is None:
+        return match["gap"] + "%H%M%S"
     half = " %p" if match["half"] else ""
     clock = ["%I" if half else "%H", "%M", "%S"][: match["clock"].count(match["sign"]) + 1]
     part = f"{match['part'][0]}%f" if match["part"] else ""

@@ -248,6 +248,8 @@ def _stamps(block: Any, layout: Layout) -> Any:
     if not layout.time.date:
         return block.column(layout.time.name)
     parts = [pc.utf8_trim_whitespace(pc.cast(block.column(c), pa.string())) for c in layout.time.columns]
+    if "%H%M%S" in layout.time.clock.format:
+        parts[1] = pc.utf8_lpad(parts[1], len("060054"), "0")
     return pc.binary_join_element_wise(*parts, " ")
 
 
