@@ -162,11 +162,6 @@ def tags_in(paths: Sequence[Path]) -> set[str]:
     return found
 
 
-def bare(column: str) -> str:
-    """The tag that a header names, without its unit."""
-    return split_header(column)[0]
-
-
 # ---------------------------------------------------------------------- one file
 def _read(
     source: Opened, layout: Layout, wanted: set[str], modes: set[str], local: LocalClock | None
