@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -79,4 +80,6 @@ def propose_tags(name: str, options: argparse.Namespace) -> None:
     for role, tags in roles.items():
         print(f"  {role:5} {', '.join(tags) or '-'}")
     files = " ".join(map(str, options.files))
-    print(f"{EXPLAINED}\ncorrect the table, then:\n  loopwright new {name} {files} --tags {path}")
+    how = (("--time", options.time), ("--time-format", options.time_format), ("--time-zone", options.time_zone))
+    given = "".join(f" {option} {shlex.quote(value)}" for option, value in how if value)
+    print(f"{EXPLAINED}\ncorrect the table, then:\n  loopwright new {name} {files} --tags {path}{given}")

@@ -14,10 +14,11 @@ COMPACT = re.compile(
     r"^(?P<date>\d{8})(?P<sign>[T _-]?)(?P<clock>\d{6}|\d{4}|\d{2}:\d\d(?::\d\d)?)?(?P<rest>[.,]?\d*Z?)$"
 )
 REST = re.compile(
-    r"^(?P<gap>[T ,;]*\s*)(?P<clock>\d{1,2}(?P<sign>[:.])\d\d(?:(?P=sign)\d\d)?)(?P<part>[.,:]\d+)?"
+    r"^(?P<gap>[T ,;]*\s*)(?P<clock>\d{6}|\d{1,2}(?P<sign>[:.])\d\d(?:(?P=sign)\d\d)?)(?P<part>[.,:]\d+)?"
     r"\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d\d:?\d\d)?$"
 )
 HOUR = re.compile(r"^\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?$")
+HOUR_DIGITS = re.compile(r"^([01]?\d|2[0-3])[0-5]\d[0-5]\d$")  # 060054, or 60054 where a program dropped the zero
 ELAPSED = re.compile(r"^\d{1,5}:\d\d:\d\d([.,]\d+)?$")
 MONTHS = (
     "jan januar january janvier enero ene gennaio gen", "feb februar february février fevrier fév febrero febbraio",
@@ -30,7 +31,8 @@ MONTHS = (
 MONTH = {word: number for number, words in enumerate(MONTHS, 1) for word in words.split()}
 WORD = re.compile(r"[^\W\d_]{3,9}\.?")
 WEEKDAY = re.compile(r"^[^\W\d_]{2,10}[.,]*\s+(?=\d)")
-PLAIN_ENDS = re.compile(r"(?:([AaPp])\.\s?[Mm]\.|\s*(?:UTC|GMT))$")
+PLAIN_ENDS = re.compile(r"(?:([AaPp])\.\s?[Mm]\.|\s*(UTC|GMT|CET|MEZ|CEST|MESZ))$")
+OFFSETS = {"UTC": "+0000", "GMT": "+0000", "CET": "+0100", "MEZ": "+0100", "CEST": "+0200", "MESZ": "+0200"}
 SOME = 0.05  # of the dates, whose form counts
 LEAST_YEAR, MOST_YEAR = 1990, 2100
 ORDERS = {"dmy": ("%d", "%m", "%y"), "mdy": ("%m", "%d", "%y"), "ymd": ("%y", "%m", "%d")}
@@ -62,8 +64,8 @@ def form_of(texts: Sequence[str], where: str) -> str:
 
 
 def plain_date(text: str) -> str:
-    """The date as strptime reads it: no day of the week, a month's number for its name, +0000 for UTC, pm for p.m."""
-    text = PLAIN_ENDS.sub(lambda m: f"{m[1]}m" if m[1] else "+0000", text)
+    """The date as strptime reads it: no day of the week, a month's number for its name, +0100 for CET, pm for p.m."""
+    text = PLAIN_ENDS.sub(lambda m: f"{m[1]}m" if m[1] else OFFSETS[m[2]], text)
     american = re.match(r"^([^\W\d_]{3,9})\.? (\d{1,2}),? (\d{4})(.*)$", text)
     if american and american[1].lower() in MONTH:
         return f"{american[2]} {MONTH[american[1].lower()]:02d} {american[3]}{american[4]}"
@@ -124,6 +126,8 @@ def _tail(rest: str) -> str | None:
     match = REST.match(rest)
     if match is None:
         return None
+    if match["sign"] is None:
+        return match["gap"] + "%H%M%S"
     half = " %p" if match["half"] else ""
     clock = ["%I" if half else "%H", "%M", "%S"][: match["clock"].count(match["sign"]) + 1]
     part = f"{match['part'][0]}%f" if match["part"] else ""

@@ -15,7 +15,7 @@ from pipeline.errors import RecordError
 from pipeline.historian.file_kinds import head_of
 from pipeline.historian.headers import split_header
 from pipeline.historian.numbers import plain
-from pipeline.historian.table_head import Head, head_of_table, kind_of_cell
+from pipeline.historian.table_head import NUMBER, Head, head_of_table, kind_of_cell
 
 SAMPLE_BYTES = 1 << 18
 SAMPLE_LINES = 200
@@ -159,7 +159,10 @@ def _decimal(rows: Sequence[Sequence[str]], separator: str) -> str:
 
     Where all are like 1,234 the comma is between thousands if smaller numbers have none, or if it separates cells.
     """
-    cells = [[plain(c) for c in column if c and kind_of_cell(c) == "number"] for column in zip(*rows, strict=True)]
+    cells = [
+        [c if NUMBER.match(c) else plain(c) for c in column if kind_of_cell(c) == "number"]
+        for column in zip(*rows, strict=True)
+    ]
     every = [c for column in cells for c in column]
     comma = sum(bool(COMMA_DECIMAL.match(c)) and not EITHER.match(c) for c in every)
     point = sum(bool(POINT_DECIMAL.match(c)) and not EITHER.match(c) for c in every)

@@ -101,7 +101,7 @@ def time_header(column: str) -> TimeHeader:
     factor, unknown, name = None, "", text
     if (match := BRACKET.match(text)) is not None:
         inner = match["unit"].lower().rstrip(".")
-        name, factor = match["name"], TIME_UNITS.get(inner)
+        name, factor = match["name"], TIME_UNITS.get(inner, TIME_UNITS.get(inner.partition(" ")[0]))  # s since start
         unknown = "" if factor is not None or inner in NO_UNITS else match["unit"]
     if factor is None and not unknown:
         parts = TAIL.match(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name))

@@ -68,7 +68,7 @@ def layout_of(
         return Layout("long", time, (value,), qualities, tags_of(header), tag, tuple(notes))
     qualities, whole = {}, ""
     for h in others:
-        found = _quality_word(h, sample)
+        found = _quality_word(h, sample, more)
         if found is None:
             continue
         own = [o for o in others if o != h and split_header(o)[0] in {found, found.rstrip(" ._:/-")}] if found else []
@@ -86,12 +86,25 @@ def layout_of(
     return Layout("wide", time, values, qualities, tags_of(header), notes=tuple(notes))
 
 
-def _quality_word(column: str, sample: Mapping[str, Sequence[Any]]) -> str | None:
-    """The tag in front of a word of quality ("" for the word alone); None where the column is no quality."""
+def _quality_word(
+    column: str,
+    sample: Mapping[str, Sequence[Any]],
+    spread: Callable[[str], Sequence[Any]] | None = None,
+) -> str | None:
+    """The tag in front of a word of quality ("" for the word alone); None where the column is no quality.
+
+    ``spread`` where a row has several readings, so that the word alone needs words or codes of quality below it: the
+    first rows may all be good, so that the whole column counts. It is read for such a column only.
+    """
     match = QUALITY.match(column)
-    if match is None or not is_quality(match["word"], _texts(sample.get(column, ()))):
+    if match is None:
         return None
-    return match["tag"].strip()
+    word, tag = match["word"], match["tag"].strip()
+    alone = not tag and spread is not None
+    found = is_quality(word, _texts(sample.get(column, ())), beside=not alone)
+    if not found and alone and spread is not None:
+        found = is_quality(word, _texts(spread(column)), beside=False)
+    return tag if found else None
 
 
 def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], time: TimeColumn) -> tuple[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ THOUSANDS = {  # by the decimal sign: certain ones, and those of one sign alone,
         r"^[+-]?\d*\.\d+([eE][+-]?\d+)?$",
     ),
 }  # fmt: skip
-OTHER = {".": ",", ",": "."}
+ODD = re.compile(rf"[{MINUS}{UNSEEN}\uff0b{BLANKS}'’‘ʼ`´]|-$")  # what a plain number has not
 LOOSE = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
 
 Codes = NDArray[np.uint8]
@@ -61,8 +62,11 @@ def numbers(column: Any, decimal: str = ".") -> tuple[Array, Codes, Counter[str]
     return _of_numbers(found)
 
 
+@lru_cache(maxsize=4096)
 def plain(text: str) -> str:
     """The cell with the signs of a plain number: every minus is ``-``, no blanks or apostrophes between thousands."""
+    if not ODD.search(text):
+        return text
     return str(_plain(pa.array([text]))[0])
 
 

@@ -112,10 +112,11 @@ def _figure(text: str) -> int | None:
     return int(match[1], 16) if match else None
 
 
-def is_quality(word: str, texts: Sequence[str]) -> bool:
-    """Whether a column named by ``word``, such as quality or status, holds qualities, by its first cells.
+def is_quality(word: str, texts: Sequence[str], *, beside: bool) -> bool:
+    """Whether a column named by ``word``, such as quality or status, holds qualities, by some of its cells.
 
-    Any flag or code will do under a certain name; under another, as status or q, words of quality or codes of OPC.
+    Any flag or code will do under a certain name, or ``beside`` a tag of that name. A status or q by itself needs words
+    of quality or codes of OPC: it may be the state of the plant, or a tag.
     """
     known = {t.strip().lower() for t in texts if t.strip()}
     figures = {v for w in known if (v := _figure(w)) is not None}
@@ -123,5 +124,5 @@ def is_quality(word: str, texts: Sequence[str]) -> bool:
     words = {w for w in known if w in GOOD or w.startswith("good") or BAD.match(w)}
     if not all(w in words or w in flags or _figure(w) is not None for w in known):
         return bool(words)
-    sure = bool(NEGATIVE.search(word) or POSITIVE.search(word)) and word.lower() != "q"
-    return sure or bool(words) or any(v >= OPC_GOOD for v in figures)
+    sure = beside or bool(NEGATIVE.search(word) or POSITIVE.search(word))
+    return (sure and word.lower() != "q") or bool(words) or any(v >= OPC_GOOD for v in figures)

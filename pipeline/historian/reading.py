@@ -162,11 +162,6 @@ def tags_in(paths: Sequence[Path]) -> set[str]:
     return found
 
 
-def bare(column: str) -> str:
-    """The tag that a header names, without its unit."""
-    return split_header(column)[0]
-
-
 # ---------------------------------------------------------------------- one file
 def _read(
     source: Opened, layout: Layout, wanted: set[str], modes: set[str], local: LocalClock | None
@@ -248,6 +243,8 @@ def _stamps(block: Any, layout: Layout) -> Any:
     if not layout.time.date:
         return block.column(layout.time.name)
     parts = [pc.utf8_trim_whitespace(pc.cast(block.column(c), pa.string())) for c in layout.time.columns]
+    if "%H%M%S" in layout.time.clock.format:
+        parts[1] = pc.utf8_lpad(parts[1], len("060054"), "0")
     return pc.binary_join_element_wise(*parts, " ")
 
 

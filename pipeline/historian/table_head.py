@@ -35,13 +35,13 @@ def kind_of_cell(cell: str) -> str:
         return "empty"
     if len(cell) > LARGEST:
         return "text"
-    if NUMBER.match(cell) or (not cell[0].isalpha() and NUMBER.match(plain(cell))):
+    if NUMBER.match(cell):
         return "number"
-    if any(c.isdigit() for c in cell):
-        date = plain_date(cell)
-        if ISO_DAY.match(cell) or HOUR.match(cell) or DATE.match(date) or COMPACT.match(date):
-            return "time"
-    return "text"
+    if not any(c.isdigit() for c in cell):
+        return "text"
+    if ISO_DAY.match(cell) or HOUR.match(cell) or DATE.match(date := plain_date(cell)) or COMPACT.match(date):
+        return "time"
+    return "number" if not cell[0].isalpha() and NUMBER.match(plain(cell)) else "text"
 
 
 def head_of_table(lines: Sequence[Sequence[str]]) -> Head | str:

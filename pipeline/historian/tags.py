@@ -122,7 +122,7 @@ def parse_tag(text: str, role: str, known: Callable[[], Collection[str]] = froze
     Where the last bracket may belong to the tag, as of ``TIC[1]``, the tags ``known`` from the files decide.
     """
     match = OPTION.match(text.strip())
-    if match is None or match["tag"].count("[") != match["tag"].count("]"):
+    if match is None or match["tag"].count("[") < match["tag"].count("]"):
         raise RecordError(
             f"--{role} {text}: write TAG, TAG[unit] or TAG[unit]=LOW..HIGH, as in TIC-101.PV[degC]=0..200"
         )

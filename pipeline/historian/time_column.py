@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.errors import RecordError, nearest
-from pipeline.historian.date_forms import HOUR
+from pipeline.historian.date_forms import HOUR, HOUR_DIGITS
 from pipeline.historian.headers import split_header, time_header
 from pipeline.historian.table_head import kind_of_cell
 from pipeline.historian.times import SINCE_1970_S, Clock, clock_of, given_clock
@@ -182,6 +182,7 @@ def _day_and_hour(header: Sequence[str], sample: Mapping[str, Sequence[Any]]) ->
     """The columns of the day and of the hour, where time is written in two."""
     texts = {h: [str(c).strip() for c in sample.get(h, ()) if c is not None and str(c).strip()] for h in header}
     hours = [h for h, own in texts.items() if own and all(HOUR.match(c) for c in own)]
+    hours += [h for h, own in texts.items() if own and _may_be_hours(h) and all(HOUR_DIGITS.match(c) for c in own)]
     if not hours:
         return None
     for day, own in texts.items():
@@ -190,6 +191,11 @@ def _day_and_hour(header: Sequence[str], sample: Mapping[str, Sequence[Any]]) ->
             if clock is not None and clock.dates:
                 return day, hours[0]
     return None
+
+
+def _may_be_hours(column: str) -> bool:
+    header = time_header(column)
+    return header.named and header.factor is None
 
 
 def _quiet(column: str, cells: Sequence[str]) -> Clock | None:
@@ -220,11 +226,12 @@ def _paired(
     time: str,
     spread: Callable[[str], Sequence[Any]],
 ) -> TimeColumn:
-    both = [f"{a} {b}" for a, b in zip(sample[date], sample[time], strict=False)]
-    hour = str(sample[time][0])
+    digits = all(HOUR_DIGITS.match(str(c).strip()) for c in sample[time])
+    hours = [str(c).strip().zfill(len("060054") if digits else 0) for c in sample[time]]
+    both = [f"{a} {b}" for a, b in zip(sample[date], hours, strict=False)]
 
     def more() -> list[str]:
-        return [f"{day} {hour}" for day in spread(date)]
+        return [f"{day} {hours[0]}" for day in spread(date)]
 
     clock = _clock_by_all("time", both[:SAMPLE], f"{path}: columns {date!r} and {time!r}", "", more)
     if clock is None:

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from pipeline.errors import RecordError
 from pipeline.historian.date_forms import ELAPSED, calendar_digits, form_of, other_forms, plain_date
-from pipeline.historian.headers import SPELLINGS, TIME_UNITS, TimeHeader, time_header
+from pipeline.historian.headers import NO_UNITS, SPELLINGS, TIME_UNITS, TimeHeader, time_header
 from pipeline.metrics import Array
 
 ISO = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?\s*(Z|[+-]\d\d:?(\d\d)?)?$", re.IGNORECASE)
@@ -152,7 +152,7 @@ def _most(texts: Sequence[str], pattern: re.Pattern[str]) -> bool:
 
 
 def _numeric(header: TimeHeader, values: Array, where: str, unit: str) -> Clock:
-    factor = header.factor
+    factor, unit = header.factor, "" if unit.strip().lower() in NO_UNITS else unit
     if factor is None and unit:
         factor = TIME_UNITS.get(unit.strip().lower().rstrip("."))
     unknown = header.unknown or (unit if unit and factor is None else "")

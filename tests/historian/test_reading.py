@@ -226,8 +226,12 @@ def test_the_decimal_sign_is_told_from_the_separator(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("day", "hour"), [("%Y-%m-%d", "%H:%M:%S"), ("%d.%m.%Y", "%H:%M:%S"), ("%d-%b-%y", "%H:%M:%S")]
-)
+    ("day", "hour"),
+    [
+        ("%Y-%m-%d", "%H:%M:%S"), ("%d.%m.%Y", "%H:%M:%S"), ("%d-%b-%y", "%H:%M:%S"), ("%Y-%m-%d", "%H%M%S"),
+        ("%Y-%m-%d", "%-H%M%S"), ("%Y%m%d", "%H%M%S"), ("%Y%m%d", "%H:%M:%S"), ("%Y-%m-%d", "%I:%M:%S %p"),
+    ],
+)  # fmt: skip
 def test_day_and_hour_in_two_columns(day: str, hour: str, tmp_path: Path) -> None:
     rows = [[utc(day)(float(r[0])), utc(hour)(float(r[0])), *r[1:]] for r in cells(DATA)]
     check(write(tmp_path / "x.csv", rows, ("Date", "Time", *NAMES)))

@@ -62,6 +62,20 @@ def test_times_in_a_unit_are_read_as_seconds(header: str, factor: float, tmp_pat
     np.testing.assert_allclose(times_of(tmp_path, header, stamps), STEP_S * np.arange(N), atol=1e-6)
 
 
+def test_what_is_written_beside_the_unit(tmp_path: Path) -> None:
+    for header, factor in (("Timestamp (ms since start)", 1e-3), ("Time (UTC)", 1.0), ("t [min elapsed]", 60.0)):
+        stamps = [str(10 * k) for k in range(N)]
+        np.testing.assert_allclose(times_of(tmp_path, header, stamps), 10 * factor * np.arange(N))
+    path = write(tmp_path / "x.csv", [["-", "degC"], *([str(k), v] for k, v in enumerate(VALUES))], ("time", "TIC.PV"))
+    np.testing.assert_allclose(read_export([path], ["TIC.PV"]).series["TIC.PV"].time_s, np.arange(N))
+
+
+def test_the_zone_may_stand_behind_a_date(tmp_path: Path) -> None:
+    for zone, hours in (("CET", 1), ("MESZ", 2), ("+05:30", 5.5)):
+        stamps = [f"{s} {zone}" for s in stamped("%d.%m.%Y %H:%M:%S", TIME_S + 3600 * hours)]
+        np.testing.assert_allclose(times_of(tmp_path, "x", stamps), TIME_S)
+
+
 def test_a_unit_below_the_header_counts(tmp_path: Path) -> None:
     path = write(
         tmp_path / "x.csv", [["min", "degC"], *([str(k), v] for k, v in enumerate(VALUES))], ("time", "TIC.PV")
@@ -124,6 +138,7 @@ def test_counts_that_programs_write(stamp: Callable[[float], str], atol: float, 
 FORMS_OF_DATES = [
     "%Y/%m/%d %H:%M:%S", "%Y.%m.%d %H:%M:%S", "%d.%m.%Y %H.%M.%S", "%d.%m.%y %H:%M:%S", "%d-%b-%Y %I:%M:%S %p",
     "%b %d, %Y %I:%M:%S %p", "%Y%m%dT%H%M%SZ", "%Y%m%d %H:%M:%S", "%Y-%m-%d %H:%M:%S UTC", "%a %d.%m.%Y %H:%M:%S",
+    "%d.%m.%Y %H:%M:%S UTC",
     "%d.%m.%Y %H:%M:%S:000", "%d.%m.%Y %H:%M:%S,000000", "%Y-%m-%dT%H:%M:%S.000000000Z", "%d %B %Y %H:%M:%S",
 ]  # fmt: skip
 
@@ -235,7 +250,7 @@ def test_a_zone_that_cannot_be_is_refused(stamps: list[str], zone: str, says: st
 
 
 def test_dates_are_told_by_rows_far_below(tmp_path: Path) -> None:
-    times = pd.Timestamp("2024-03-04 06:00").timestamp() + 600.0 * np.arange(2500)
+    times = pd.Timestamp("2024-03-04 06:00").timestamp() + 7200.0 * np.arange(600)
     for form in ("%d/%m/%Y", "%m/%d/%Y", "%y-%m-%d"):
         rows = [[s, "1.5"] for s in stamped(f"{form} %H:%M:%S", times)]
         export = read_export([write(tmp_path / "x.csv", rows, ("time", "TIC.PV"))])

@@ -199,6 +199,14 @@ def test_columns_of_quality(header: str, flags: tuple[str, str], bad: bool, tmp_
     assert export.series[NAMES[1]].good.all() == (header != "Quality")
 
 
+@pytest.mark.parametrize("header", ["TIC-101.PV Status", "TIC-101.PV Quality", "Status", "Quality"])
+def test_a_quality_that_is_bad_far_below_only(header: str, tmp_path: Path) -> None:
+    data = clean(900)
+    own = [[*row, "2147483648" if k > 700 else "0"] for k, row in enumerate(cells(data))]
+    series = read_export([write(tmp_path / "x.csv", own, ("timestamp", *NAMES, header))], NAMES).series[NAMES[0]]
+    np.testing.assert_array_equal(np.flatnonzero(~series.good), np.arange(701, 900))
+
+
 def test_a_quality_beside_every_tag_under_one_name(tmp_path: Path) -> None:
     own = [[r[0], r[1], "Good", r[2], "Bad" if k == 5 else "Good", r[3], "Good"] for k, r in enumerate(rows())]
     header = ("time", NAMES[0], "Status", NAMES[1], "Status", NAMES[2], "Status")
