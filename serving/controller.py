@@ -8,7 +8,6 @@ from collections.abc import Callable
 from math import inf, isfinite
 from os import PathLike
 from pathlib import Path
-from threading import Lock
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 import numpy as np
@@ -18,6 +17,7 @@ from serving.digest import DIGEST_KEY, file_digest, unseal
 from serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
 from serving.graph_audit import MAX_BYTES, audit
 from serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
+from serving.step_lock import step_lock
 
 Array: TypeAlias = NDArray[np.float64]
 _LINE = 8  # float64 in a cache line: each vector starts on one, so that no result depends on its neighbours
@@ -50,7 +50,8 @@ class Controller:
 
     Notes
     -----
-    A step holds a lock, because its buffers are bound to the session once and used by every step.
+    A step holds a lock, because its buffers are bound to the session once and used by every step. A fork of the process
+    waits for a step that is under way, so that the child finds buffers, session and lock as between two steps.
     """
 
     def __init__(self, path: str | PathLike[str], sha256: str | None = None) -> None:
@@ -65,7 +66,7 @@ class Controller:
             raise ArtifactError(f"{self.path}: {error}") from error.__cause__
         self.size_bytes = len(data)
         self.sha256 = file_digest(data)
-        self._lock = Lock()
+        self._lock = step_lock()
         self._bind()
 
     def cold_state(self) -> Array:

@@ -48,10 +48,9 @@ class ControlLoop:
     nor, where the MV stands outside its range, until it is back. A plant that reads nothing back gets the old MV.
 
     Every written MV lies in its range, in every mode and with any guards; a discrete MV has one of its values. The law
-    and the fallback move an MV by at most its ``max_move`` a period from where it stands: a law that gives more has a
-    fault. The operator's own ``set_mv`` goes there at once. A read-back may exceed the range by
-    ``guard.READ_BACK_MARGIN`` times the range: it is clipped to the range, for the law and for HOLD. A larger excess is
-    a fault.
+    and the fallback move an MV by at most its ``max_move`` a period; a law that gives more has a fault. ``set_mv`` goes
+    there at once. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range: it is clipped to the
+    range, for the law and for HOLD. A larger excess is a fault.
 
     Parameters
     ----------

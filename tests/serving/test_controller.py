@@ -7,6 +7,7 @@ import json
 import math
 import os
 import resource
+import signal
 import socket
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from pipeline.laws import ControlLaw
-from serving import ArtifactError, ContractError, Controller, Manifest, SampleError, Signal
+from serving import ArtifactError, ContractError, Controller, Manifest, SampleError, Signal, step_lock
 from serving.digest import TRAILER_BYTES, seal
 from serving.errors import OutputError
 from serving.graph_audit import audit
@@ -106,6 +107,40 @@ def test_threads_do_not_mix_their_steps(controller: Controller) -> None:
     for thread in threads:
         thread.join()
     assert not wrong
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes fork on POSIX only")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")
+@pytest.mark.parametrize("ends", [True, False], ids=["a step that ends", "a step that is too slow"])
+def test_a_forked_child_does_not_wait_for_a_step_of_another_thread(
+    controller: Controller, monkeypatch: pytest.MonkeyPatch, ends: bool
+) -> None:
+    """The thread that steps is none of the child's: it would never release the lock there."""
+    monkeypatch.setattr(step_lock, "LONGEST_STEP_S", 60.0 if ends else 0.0)
+    stepping, forking = threading.Event(), threading.Event()
+
+    def step() -> None:
+        with controller._lock:
+            stepping.set()
+            if ends:
+                while not step_lock._forking.locked():
+                    pass
+            else:
+                forking.wait()
+
+    thread = threading.Thread(target=step)
+    thread.start()
+    stepping.wait()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        os._exit(0 if controller.step(**FEED).mv.size else 1)
+    forking.set()
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
+    assert not controller._lock.locked()
+    assert not step_lock._forking.locked()
+    controller.step(**FEED)
 
 
 # ---------------------------------------------------------------------- wrong inputs
