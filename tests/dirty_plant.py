@@ -81,10 +81,10 @@ def write(
     return path
 
 
-def screen(path: Path, tags: Sequence[Tag] = TAGS, **options: object) -> Screened:
+def screen(path: Path, tags: Sequence[Tag] = TAGS, time_zone: str = "", **options: object) -> Screened:
     own = named(tags)
     values, modes = ([t.tag for t in own if (t.role == "mode") is m] for m in (False, True))
-    return screened("plant", read_export([path], values, modes), own, **options)
+    return screened("plant", read_export([path], values, modes, time_zone=time_zone), own, **options)
 
 
 def screen_of(data: Clean, folder: Path, tags: Sequence[Tag] = TAGS, **options: object) -> Screened:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import tzinfo
 from itertools import combinations, pairwise
 from typing import Any, Literal, NamedTuple
 
@@ -97,6 +98,7 @@ class Export:
     zone: str = ""  # that its dates are in, or that it states none; empty where times are no dates
     contents: tuple[Contents, ...] = ()  # of each file
     notes: tuple[Note, ...] = ()
+    local: tzinfo | None = None  # the zone that a person named for dates which state none; they are kept as UTC
 
 
 def in_order(series: Series, files: NDArray[np.int64] = NO_CUTS) -> Series:

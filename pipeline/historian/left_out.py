@@ -22,8 +22,9 @@ Span = tuple[float, float]  # [s] as the export counts, from the first to before
 def spans_of(texts: Iterable[str], export: Export) -> list[Span]:
     """The intervals [s] as the export counts. RecordError for another form, or for dates where the export has none.
 
-    A date without a zone counts as the export's own dates do. Seconds count from the first reading of an export with
-    dates, unless they count from 1970 themselves; else as the export's do.
+    A date without a zone counts as the export writes its own: in the zone that a person named for them, if any.
+    Seconds count from the first reading of an export with dates, unless they count from 1970 themselves; else as the
+    export's do.
     """
     first_s = min((float(s.time_s[0]) for s in export.series.values() if len(s)), default=0.0)
     found = []
@@ -43,7 +44,7 @@ def _seconds(moment: datetime | float, text: str, export: Export, first_s: float
         raise RecordError(f"leave_out: {text!r} has dates, and the times of the export are none; give its seconds")
     if moment.tzinfo is not None and export.zone == UNSTATED:
         raise RecordError(f"leave_out: {text!r} has a time zone, and the export states none; give its own times")
-    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
+    return (moment if moment.tzinfo is not None else moment.replace(tzinfo=export.local or UTC)).timestamp()
 
 
 def flag_readings(series: Iterable[Series], spans: Sequence[Span], reason: Reason) -> None:

@@ -89,6 +89,7 @@ def read_export(
     """
     if not paths:
         raise RecordError("no file is named; give one or more exports")
+    local = zone_named(time_zone) if time_zone else None
     parts: dict[str, list[Series]] = {}
     files, kinds, zones, totals, contents = [], [], list[str](), Counter[str](), list[Contents]()
     known, notes = set[str](), list[Note]()
@@ -98,7 +99,7 @@ def read_export(
     for path, source in zip(paths, sources, strict=True):
         layout = layout_of(path, source.header, source.sample, time_column, time_format, source.units, source.spread)
         zone = zone_of(layout.time.clock, source.sample[layout.time.columns[0]])
-        clock = LocalClock(time_zone, zone_named(time_zone)) if time_zone and zone == UNSTATED else None
+        clock = LocalClock(time_zone, local) if local is not None and zone == UNSTATED else None
         found, counts, more = _read(source, layout, set(tags) | set(modes), set(modes), clock)
         notes += [*source.notes, *layout.notes, *more]
         zones.append(UTC if clock else zone)
@@ -127,7 +128,7 @@ def read_export(
     if time_zone and not any(n.column == time_zone for n in notes):
         raise RecordError(f"--time-zone {time_zone}: no file has dates without a zone of their own; leave it out")
     own = tuple(dict.fromkeys(notes))
-    return Export(together, tuple(files), layouts, rows, unreadable, timeless, zone, tuple(contents), own)
+    return Export(together, tuple(files), layouts, rows, unreadable, timeless, zone, tuple(contents), own, local)
 
 
 def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
-from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, clean, screen_of, steps
+from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, cells, clean, screen, screen_of, steps, write
 
 from pipeline.config.exports import ExportParams
 from pipeline.config.intervals import Interval
@@ -33,6 +34,15 @@ def test_a_time_is_left_out_however_it_is_written(text: str, tmp_path: Path) -> 
     rows = np.flatnonzero(found.code == Reason.LEFT_OUT)
     assert (rows[0], rows[-1]) == (100, 199)
     assert found.report.runs == 2
+
+
+@pytest.mark.parametrize("text", [DATES, DATES.replace(":00..", ":00+02:00..") + "+02:00", "600..1200"])
+def test_a_date_counts_in_the_zone_that_a_person_named(text: str, tmp_path: Path) -> None:
+    data = clean()
+    rows = [[datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M:%S"), *row] for t, *row in cells(data)]
+    found = screen(write(tmp_path / "export.csv", rows), time_zone="+02:00", leave_out=[text])
+    left_out = np.flatnonzero(found.code == Reason.LEFT_OUT)
+    assert (left_out[0], left_out[-1]) == (100, 199)
 
 
 def test_days_are_left_out_to_their_end_and_a_time_without_rows_is_said(tmp_path: Path) -> None:
