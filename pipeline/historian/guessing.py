@@ -227,7 +227,7 @@ def _counts(tag: str, plain: Array) -> bool:
         return False
     step = np.diff(plain)
     rises = bool((step >= 0).all()) and np.count_nonzero(step) > 1
-    return rises or np.array_equal(np.unique(plain), [0.0, 1.0]) or bool(LABEL.search(tag))
+    return bool(rises or np.array_equal(np.unique(plain), [0.0, 1.0]) or LABEL.search(tag))
 
 
 def seen_range(series: Series) -> tuple[float, float] | None:
