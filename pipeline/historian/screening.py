@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -164,7 +165,7 @@ def screened(
         longest_run_rows=int(lengths.max()),
         tags=reports,
         modes={t.tag: _mode_rows(grid, own[t.tag]) for t in tags if t.role == "mode"},
-        findings=merged(findings),
+        findings=merged(spelt(findings, tags)),
         verdict=verdict,
         zone=export.zone,
     )
@@ -200,6 +201,20 @@ def models_of(record: Record) -> dict[str, Linear | None]:
     """The quick linear model of each PV from all inputs."""
     u = [*record.mv.T, *record.dv.T]
     return {s.name: believed(y, u, record.run) for s, y in zip(record.pv_signals, record.pv.T, strict=True)}
+
+
+def spelt(findings: Sequence[Finding], tags: Sequence[Tag]) -> list[Finding]:
+    """The findings, each signal by its name, as the verdict, the step test and the controller call it."""
+    other = {t.tag: t.name for t in tags if t.name and t.name != t.tag}
+    if not other:
+        return list(findings)
+    longest = sorted(other, key=len, reverse=True)
+    found = re.compile(rf"(?<![\w.])(?:{'|'.join(map(re.escape, longest))})(?![\w])")
+
+    def named(text: str) -> str:
+        return found.sub(lambda match: other[match[0]], text)
+
+    return [Finding(f.kind, other.get(f.tag, f.tag), named(f.words), f.drops) for f in findings]
 
 
 def merged(findings: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -11,10 +11,12 @@ from dirty_plant import PERIOD_S, START_S, Clean, clean, screen_of
 from scipy.signal import lfilter
 
 from pipeline.commands.new_printed import sayings
-from pipeline.historian.findings import InputReport
+from pipeline.historian.findings import Finding, InputReport
 from pipeline.historian.loads import load_sd
+from pipeline.historian.screening import spelt
 from pipeline.historian.settled import certain, step_answer
 from pipeline.historian.step_test import GUESSED_H, LARGEST, LONGEST_H, MOST, UNKNOWN_PERIODS, planned
+from pipeline.historian.tags import Tag
 
 LOAD_SD, LAG, DEAD = 4.0, 20, 7
 
@@ -112,6 +114,13 @@ def test_the_load_is_that_within_a_window() -> None:
     assert load_sd(slow, run, 10_000) == pytest.approx(LOAD_SD, rel=0.25)
     assert load_sd(slow, run, 20) < 0.3 * LOAD_SD
     assert load_sd(np.full(100, np.nan), run[:100], 20) == 0.0
+
+
+def test_a_signal_has_one_spelling_in_findings_and_verdict(tmp_path: Path) -> None:
+    tags = (Tag("Kiln 3 Temp", "pv", name="Kiln_3_Temp"), Tag("Fuel flow", "mv", name="Fuel_flow"))
+    words = "takes about 2 h to settle after Fuel flow"
+    (said,) = spelt([Finding("period", "Kiln 3 Temp", words)], tags)
+    assert (said.tag, said.words) == ("Kiln_3_Temp", words.replace("Fuel flow", "Fuel_flow"))
 
 
 def test_every_pair_is_asked_for_where_nothing_is_clear(tmp_path: Path) -> None:
