@@ -57,9 +57,10 @@ def check_agreement(params: ExportParams, plant: PlantParams, tags: Sequence[Tag
 def check_period(params: ExportParams, plant: PlantParams, period_s: float) -> None:
     """ParamsError where the record has another sampling period than the plant."""
     if period_s != plant.period_s:
+        exact = repr(plant.period_s).removesuffix(".0")  # as it compares
         raise ParamsError(
             f"the record of exports.{params.case} has a period of {period_s:.9g} s, plants.{params.case} has "
-            f"{plant.period_s:.9g} s; write `period_s: {plant.period_s}` in exports.{params.case}, or "
+            f"{plant.period_s:.9g} s; write `period_s: {exact}` in exports.{params.case}, or "
             f"{_remedy(params.case)}"
         )
 

@@ -252,7 +252,7 @@ def test_parts_signals_and_numbers_that_cannot_be_are_refused() -> None:
         ({"jacket_low": 70.0, "jacket_high": 20.0}, "the lower one first"),
         ({"jacket_low": 30.0, "jacket_high": 30.0}, "the lower one first"),
         ({"jacket_low": np.nan}, "jacket_low is nan"),
-        ({"jacket_high": np.inf}, "jacket_high inf"),
+        ({"jacket_high": np.inf}, "jacket_high is inf"),
         ({"switch_penalty": -0.1}, r"switch_penalty is -0\.1; it must be 0 or above"),
         ({"switch_penalty": np.nan}, "switch_penalty is nan"),
     ],
@@ -267,7 +267,7 @@ def test_numbers_of_the_cascade_that_make_no_sense_are_refused(law: str, numbers
     [
         ("fuzzy_feedforward_pi", {"kc": -1.0}, r"kc is -1\.0"),
         ("fuzzy_feedforward_pi", {"kc": np.nan}, "kc is nan"),
-        ("fuzzy_feedforward_pi", {"ti_s": np.inf}, "ti_s inf"),
+        ("fuzzy_feedforward_pi", {"ti_s": np.inf}, "ti_s is inf"),
         ("fuzzy_feedforward_pi", {"approach": 0.0}, "no set point is ever approached"),
         ("fuzzy_feedforward_pi", {"k_jacket": 1.1}, r"k_jacket is 1\.1"),
         ("fuzzy_feedforward_observer", {"approach": 0.0}, "no set point is ever approached"),
