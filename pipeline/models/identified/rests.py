@@ -59,6 +59,7 @@ def rest_map(model: Dynamics, y: Array, v: Array, seed: int) -> tuple[Array, Arr
 
     Least squares over rests at inputs drawn from the rows v (N, n_v): where the model settles by itself, at its
     outputs and at outputs that loads have moved; where it does not (an integrator), at outputs of the rows y (N, n_y).
+    Zero, with the covariance of the data, where the model rests nowhere.
     """
     rng = np.random.default_rng(seed)
     rows = rng.integers(len(y), size=RESTS)
@@ -68,6 +69,8 @@ def rest_map(model: Dynamics, y: Array, v: Array, seed: int) -> tuple[Array, Arr
     at = np.where(still[:, None], x[:, :n_y] + moved, y[rows])
     found = hidden_rest(model, at, chosen, np.where(still[:, None], x, 0.0))
     good = np.all(np.isfinite(found), axis=1) & (np.abs(found).max(axis=1) < 50)
+    if not good.any():  # it rests nowhere: a rest may be anywhere among the data, whose variance is 1
+        return np.zeros((model.n_x, n_y + v.shape[1] + 1)), np.eye(model.n_x)
     design = np.column_stack([at, chosen, np.ones(RESTS)])[good]
     weak = 1e-6 * len(design) * np.eye(design.shape[1])
     table = np.linalg.solve(design.T @ design + weak, design.T @ found[good]).T

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.models.identified.dynamics import Dynamics
+from pipeline.models.identified.rests import rest_map
 from pipeline.models.identified.stability import stability_figures
 
 
@@ -35,6 +36,13 @@ def test_an_integrator_is_called_one() -> None:
     found = figures(linear(1.0))
     assert found["stable"] is True
     assert str(found["verdict"]).startswith("integrates")
+
+
+def test_a_model_without_a_rest_knows_of_none() -> None:
+    v = np.random.default_rng(0).uniform(-1, 1, (100, 1))
+    table, covariance = rest_map(linear(1.0), np.full((100, 1), 1e3), v, 0)
+    assert not table.any()
+    assert np.array_equal(covariance, np.eye(2))
 
 
 def test_growth_is_unstable() -> None:
