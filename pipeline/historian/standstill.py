@@ -29,8 +29,9 @@ MOSTLY = 0.5  # of a stop's rows
 def stops(own: Mapping[str, Series], tags: Sequence[Tag]) -> tuple[list[tuple[float, float]], list[Finding]]:
     """Spans [s] of time in which the plant stood still and warmed up again, and a finding for them.
 
-    A stop is a rest of all MVs, each at its lowest or highest value or at zero, in which several signals leave the band
-    where they work: a measured disturbance near zero and a PV, or else all PVs by more than MVs explain.
+    A stop is a rest of all MVs, each at zero or at an end of its stated range, in which several signals leave the band
+    where they work: a measured disturbance near zero and a PV, or else all PVs by more than MVs explain. The largest
+    move of a record is no end of a range: such rows say most of the plant.
     The warm-up lasts until each of them is back in its band.
     """
     groups = {r: [t.tag for t in tags if t.role == r and own[t.tag].good.any()] for r in ("pv", "mv", "dv")}
@@ -40,10 +41,11 @@ def stops(own: Mapping[str, Series], tags: Sequence[Tag]) -> tuple[list[tuple[fl
     time_s = np.unique(time_s[:: max(1, len(time_s) // SAMPLES)])
     value = {tag: _held(own[tag], time_s) for group in groups.values() for tag in group}
     resting = np.ones(len(time_s), dtype=bool)
+    stated = {t.tag: [end for end in (t.low, t.high) if end is not None] for t in tags}
     for tag in groups["mv"]:
         u = value[tag]
         near = AT_END * float(np.ptp(u))
-        resting &= np.min([np.abs(u - end) for end in (u.min(), u.max(), 0.0)], axis=0) <= near
+        resting &= np.min([np.abs(u - end) for end in (0.0, *stated[tag])], axis=0) <= near
     start, end = runs_of(resting)
     long = end - start >= SHORTEST
     rests = list(zip(start[long].tolist(), end[long].tolist(), strict=True))

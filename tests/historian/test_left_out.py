@@ -113,3 +113,14 @@ def test_a_closed_valve_and_a_large_load_are_no_stop(tmp_path: Path) -> None:
     assert not stopped(screen_of(data, tmp_path)).any()
     alone = screen_of(data, tmp_path, TAGS[:2])
     assert not stopped(alone).any()
+
+
+def test_the_largest_moves_of_a_record_are_no_stop(tmp_path: Path) -> None:
+    """A test by hand takes the MV higher than ever, and the PV, moved by a load too, farther than the MV explains."""
+    random, n = np.random.default_rng(6), 3000
+    mv, dv = 45 + steps(random, n, -5, 5), 500 + random.normal(0, 0.5, n)
+    mv[1500:1560] = 60.0
+    load = np.convolve(np.where((np.arange(n) >= 1480) & (np.arange(n) < 1570), 25.0, 0.0), np.full(20, 0.05))[:n]
+    pv = np.round(answer(mv, dv) + load + random.normal(0, 0.1, n), 3)
+    data = Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(dv, 2))
+    assert not stopped(screen_of(data, tmp_path)).any()
