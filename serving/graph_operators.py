@@ -1,4 +1,4 @@
-"""What each operator of a controller takes: how many inputs, which of them may be left out, and its attributes.
+"""Inputs and attributes of each operator of a controller: how many, which may be left out, and of which type.
 
 The counts and the attributes are ONNX's, opset 18 to 21. onnxruntime trusts them: where a variadic operator has an
 input without a name (``Max(pv, "")``), it reads through a null pointer and ends the process. So an input may be left

@@ -213,7 +213,7 @@ def _increasing(values: tuple[float, ...]) -> bool:
 
 # ---------------------------------------------------------------------- JSON, strictly
 def strictly(text: str) -> Any:
-    """What JSON says in which readers may not differ: no entry twice, no number that is none, nothing too deep.
+    """JSON in which readers may not differ: no entry twice, no number that is none, nothing too deep.
 
     Raises ArtifactError.
     """

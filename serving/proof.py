@@ -11,7 +11,7 @@ from serving.manifest import Manifest
 
 
 class Proof(Enum):
-    """What the evidence amounts to."""
+    """The verdict on the evidence of a file."""
 
     PROVEN = "proven"
     NONE = "no evidence"  # straight out of `design`, or of another maker

@@ -68,7 +68,7 @@ class Series:
 
 
 class Note(NamedTuple):
-    """What was assumed of a column of a file, for a person to confirm."""
+    """An assumption about a column of a file, for a person to confirm."""
 
     column: str
     words: str

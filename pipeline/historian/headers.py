@@ -1,4 +1,4 @@
-"""What a header of an export says: the tag and its unit in brackets; of the column of times, the unit of time."""
+"""The header of an export: a tag and its unit in brackets; the unit of time in the header of the times."""
 
 from __future__ import annotations
 

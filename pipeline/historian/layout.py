@@ -155,6 +155,6 @@ def _texts(cells: Sequence[Any]) -> list[str]:
 
 
 def _kind(cells: Sequence[Any]) -> str:
-    """What most cells of a column are: "number", "time", "text", or "empty"."""
+    """The kind of most cells of a column: "number", "time", "text", or "empty"."""
     kinds = [kind_of_cell(t) for t in _texts(cells) if t]
     return max(set(kinds), key=kinds.count) if kinds else "empty"

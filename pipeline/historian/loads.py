@@ -1,4 +1,4 @@
-"""What loads that nobody measures do to a PV, and the move of an MV whose answer stands out of them."""
+"""Unmeasured loads on a PV, and the move of an MV whose answer stands out of them."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def of_period(pace: Pace, period_s: float, step_s: float, *, given: bool) -> lis
 
 
 def _undecided(pace: Pace, step_s: float, *, given: bool) -> list[Finding]:
-    """That the export's step stays where no settling time is certain, and the plant may be slow beside it."""
+    """A finding where the export's step stays, as no settling time is certain, and the plant may be slow beside it."""
     slow = max(pace.uncertain, key=lambda a: a.settles_s, default=None)
     if given or slow is None or Pace((slow,)).suits(step_s):
         return []

@@ -207,7 +207,7 @@ def _read(
 
 
 def _of_zone(path: Path, local: LocalClock) -> list[Note]:
-    """What was made of local times; RecordError where some do not exist in their zone."""
+    """Notes on how local times were converted; RecordError where some do not exist in their zone."""
     if local.missing:
         stamp = datetime.fromtimestamp(local.missing[0], UTC_ZONE).strftime("%Y-%m-%d %H:%M:%S")
         raise RecordError(

@@ -69,7 +69,7 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
 
 
 def of_notes(export: Export) -> list[Finding]:
-    """What was assumed when the files were read: their times, qualities, sheets."""
+    """The assumptions made when the files were read: their times, qualities, sheets."""
     return [Finding("reading", note.column, note.words) for note in export.notes]
 
 

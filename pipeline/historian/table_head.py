@@ -30,7 +30,7 @@ class Head:
 
 
 def kind_of_cell(cell: str) -> str:
-    """What a cell is: "empty", "number", "time" or "text"."""
+    """The kind of a cell: "empty", "number", "time" or "text"."""
     if not cell:
         return "empty"
     if len(cell) > LARGEST:

@@ -75,7 +75,7 @@ class LocalClock:
         return out
 
     def _second_pass(self, local: Array, twice: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Of the readings in an hour that comes twice (m,), which are those after the clock was set back."""
+        """Where readings of an hour that comes twice (m,) lie after the clock was set back."""
         place = np.flatnonzero(twice)
         if not place.size:
             return np.zeros(0, dtype=bool)

@@ -17,7 +17,7 @@ BESIDE = ("", "-wal", "-shm")  # SQLite's files of one journal
 
 
 class Harm(Enum):
-    """What happened to a file that is open."""
+    """A change of a file that is open."""
 
     GONE = "was deleted"
     REPLACED = "was replaced by another file"

@@ -49,7 +49,7 @@ class Following:
         self.forget()
 
     def forget(self) -> None:
-        """What follows has nothing to do with what was."""
+        """Forget the past: the next scans have nothing to do with it."""
         n = self._n
         self._stood: list[float] | None = None  # r0
         self._from, self._last, self._rested = [0.0] * n, [0.0] * n, [0] * n

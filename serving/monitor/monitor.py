@@ -148,7 +148,7 @@ class Monitor:
             self._rest(time_s, errors, mv, saturated)
 
     def _follow(self, time_s: float, sample: Sample | None, command: Command) -> None:
-        """What became of the command before, in each mode that writes; a fault of any kind tells nothing of it."""
+        """Compare the read-back with the command before, in each mode that writes; a fault says nothing of it."""
         before, self._commanded = self._commanded, None
         if sample is None or sample.mv_applied is None or command.reason or not command.writes:
             self.following.forget()

@@ -65,7 +65,7 @@ class Found:
 
 
 class _Asked(NamedTuple):
-    """What the server says of one node."""
+    """The server's answers about one node."""
 
     at: ua.NodeId
     reading: Reading
@@ -131,7 +131,7 @@ async def _inspected(
 
 
 async def _asked(link: Link, server: Server, nodes: list[str]) -> dict[str, _Asked | str]:
-    """What the server says of each node, read all at once as each scan does; of an id that is none, why."""
+    """The server's answers about each node, read all at once as each scan does; of an id that is none, why."""
     ids: dict[str, ua.NodeId] = {}
     found: dict[str, _Asked | str] = {}
     for node in nodes:

@@ -40,7 +40,7 @@ class OperationLimits:
 
     @classmethod
     def told(cls, answers: Sequence[ua.DataValue]) -> OperationLimits:
-        """What the nodes ``LIMITS`` hold; a server that has none of them, or shows no number, tells no limit."""
+        """The values of the nodes ``LIMITS``; a server that has none of them, or shows no number, tells no limit."""
         given = [None if a.Value is None else a.Value.Value for a in answers]
         return cls(*(g if isinstance(g, int) and not isinstance(g, bool) and g > 0 else 0 for g in given))
 

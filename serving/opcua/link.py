@@ -243,7 +243,7 @@ class Link:
     async def browsed(
         self, nodes: Sequence[ua.NodeId], reference: ua.ObjectIds, timeout_s: float, *, inverse: bool = False
     ) -> list[list[ua.ReferenceDescription]]:
-        """What a kind of reference leads to from each node, or what leads there; empty where nothing does."""
+        """The nodes that a kind of reference leads to from each node, or comes from; empty where nothing does."""
         result = ua.BrowseResultMask.BrowseName | ua.BrowseResultMask.NodeClass
 
         async def ask(piece: Sequence[ua.NodeId], left_s: float) -> list[list[ua.ReferenceDescription]]:

@@ -1,4 +1,4 @@
-"""What a loop's nodes are: namespace, type, unit and range, held against what the first connection of a run found.
+"""The identity of a loop's nodes: namespace, type, unit and range, held against what a run's first connection found.
 
 A server that was started anew may number its namespaces otherwise, and an engineer may change a node under a loop that
 runs: the same id then means another signal, or another number. Neither is believed.
@@ -36,7 +36,7 @@ class Plate(NamedTuple):
 
 
 class Identity(NamedTuple):
-    """What a connection is to: the URI of each namespace that is used by its number, and the nodes it may write.
+    """The other end of a connection: the URI of each namespace that is used by its number, and the nodes it may write.
 
     ``writes`` has each by a key that is the same however host and id are spelt; empty where a server tells too little.
     """
@@ -46,7 +46,7 @@ class Identity(NamedTuple):
 
 
 class Nameplates:
-    """What the nodes were when the loop began. ``fault``: why a unit or a range is another one now; empty: none is.
+    """The nodes as they were when the loop began. ``fault``: why a unit or a range is another one now; empty: none is.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def by_name(text: str, uri: str) -> str:
 
 
 def renumbered(number: int, text: str, before: str, now: str) -> str:
-    """What is wrong with a number that stands for another namespace now."""
+    """The fault of a number that stands for another namespace now."""
     present = f"is {now} now and was {before}" if now else f"was {before} and is not there now"
     return f"namespace {number} {present}, so {text} would be another node; write {by_name(text, before)} in loop.toml"
 
@@ -213,7 +213,7 @@ def signal_of(manifest: Manifest, name: str) -> Signal | None:
 
 
 def other_unit(unit: str, point: Point, signal: Signal) -> str:
-    """What is wrong with the server's unit of a signal; empty where loop.toml explains it."""
+    """The fault of the server's unit of a signal; empty where loop.toml explains it."""
     converted = (point.scale, point.offset) != (1.0, 0.0)
     if unit in {UNKNOWN, point.unit} or (not point.unit and (converted or unit == signal.unit)):
         return ""

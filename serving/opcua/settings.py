@@ -14,7 +14,6 @@ from serving.fields import nearest
 from serving.manifest import Manifest, Signal
 
 NO_LEASE = "none"  # nodes.lease: none is looked for
-POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss", "None")
 
 
 @dataclass(frozen=True, slots=True)
