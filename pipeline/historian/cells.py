@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from pipeline.historian.character import runs_of
 from pipeline.metrics import Array
@@ -169,6 +168,8 @@ def outliers(values: Array) -> Where:
     """
     if len(values) < WINDOW:
         return np.zeros(len(values), dtype=bool)
+    from scipy.ndimage import median_filter  # half a second to load
+
     residual = np.abs(values - median_filter(values, WINDOW, mode="nearest"))
     sample = residual[:: max(1, len(residual) // SAMPLE)]
     low, high = core(values)

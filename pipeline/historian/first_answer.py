@@ -56,7 +56,7 @@ def first_answer(y: Array, u: Array, run: NDArray[np.int64]) -> FirstAnswer | No
     if not du.any() or not dy.any() or n < 4 * LONGEST:
         return None
     h = _answer(du, dy)[0]
-    white = _whitening(dy - fftconvolve(du, h)[LEAD : LEAD + n])
+    white = whitening(dy - fftconvolve(du, h)[LEAD : LEAD + n])
     du, dy = lfilter(white, [1.0], du), lfilter(white, [1.0], dy)
     h, z, size = _answer(du, dy)
     clearest = float(np.abs(z).max())
@@ -107,9 +107,9 @@ def _answer(du: Array, dy: Array) -> tuple[Array, Array, Array]:
     return h, added / np.sqrt(left), np.diag(factor)[::-1] / np.sqrt(left)
 
 
-def _whitening(e: Array) -> Array:
+def whitening(e: Array) -> Array:
     """1, -a_1 .. -a_COLOUR of e(k) = sum_i a_i e(k-i) + w(k), by Yule and Walker."""
     size = 1 << (len(e) + COLOUR).bit_length()
     own = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: COLOUR + 1]
-    own[0] *= 1.0 + 1e-9
+    own[0] = own[0] * (1.0 + 1e-9) + 1e-300  # nothing at all is white too
     return np.r_[1.0, -solve_toeplitz(own[:COLOUR], own[1:])]

@@ -8,13 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
+from pipeline.historian.first_answer import COLOUR, whitening
 from pipeline.historian.linear import blocks_of, least_squares
 from pipeline.metrics import Array
 
-COLOUR = 12  # rows that noise remembers
 WIDER = 1.25  # by which a block of lags is longer than the one before
 FOLLOWED = 2.0  # settling times, over which the answer is followed
 KNOWN = 0.06  # of the answer's end: its standard deviation, from which on it is not known where it settles
@@ -53,6 +51,8 @@ def step_answer(y: Array, u: Sequence[Array], run: NDArray[np.int64], i: int, le
     by least squares on both sides filtered by 1 - a(q). The noise has poles of its own, so that a load that comes and
     goes slowly does not make the answer seem slow; ``Linear`` has the same poles for both.
     """
+    from scipy.signal import lfilter  # half a second to load
+
     blocks = _blocks(length)
     keep = _rows(y, run, blocks[-1][1] + COLOUR)
     if len(keep) < ROWS_A_LAG * len(blocks) * len(u):
@@ -61,7 +61,7 @@ def step_answer(y: Array, u: Sequence[Array], run: NDArray[np.int64], i: int, le
     du = [np.nan_to_num(np.where(same, np.diff(c, prepend=c[:1]), 0.0)) for c in u]
     dy = np.nan_to_num(np.where(np.r_[same[1:], False], np.diff(y, append=y[-1:]), 0.0))
     theta, cov = _fit(dy, du, keep, blocks)
-    white = _whitening((dy - _answer(du, theta, keep, blocks))[keep])
+    white = whitening((dy - _answer(du, theta, keep, blocks))[keep])
     dy, du = lfilter(white, [1.0], dy), [lfilter(white, [1.0], c) for c in du]
     theta, cov = _fit(dy, du, keep, blocks)
     m = len(blocks)
@@ -112,11 +112,3 @@ def _answer(du: Sequence[Array], theta: Array, k: NDArray[np.int64], blocks: lis
     out = np.zeros(len(du[0]))
     out[k] = np.column_stack([blocks_of(c, k, tuple(blocks)) for c in du]) @ theta
     return out
-
-
-def _whitening(e: Array) -> Array:
-    """1, -a_1 .. -a_COLOUR of e(k) = sum_i a_i e(k-i) + w(k), by Yule and Walker."""
-    size = 1 << (len(e) + COLOUR).bit_length()
-    own = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: COLOUR + 1]
-    own[0] = own[0] * (1.0 + 1e-9) + 1e-300
-    return np.r_[1.0, -solve_toeplitz(own[:COLOUR], own[1:])]

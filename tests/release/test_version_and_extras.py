@@ -44,6 +44,15 @@ def test_every_package_that_the_sources_import_is_asked_for_by_an_extra() -> Non
     assert extra_of("pytest") is None  # the developers' own
 
 
+def test_what_takes_half_a_second_to_load_is_loaded_where_it_is_used() -> None:
+    """Every stage and command begins a process of its own, and few of them filter."""
+    slow, at_once = re.compile(r"^(?:from|import) scipy\.(signal|ndimage|stats)\b", re.MULTILINE), {}
+    for path in (ROOT / "pipeline").rglob("*.py"):
+        if found := slow.findall(path.read_text()):
+            at_once[path.name] = found
+    assert at_once == {}
+
+
 @pytest.mark.parametrize(
     ("words", "blocked", "extra"),
     [("simulate x.onnx", "casadi", "pipeline"), ("loop check", "asyncua", "plant"), ("laws", "torch", "pipeline")],

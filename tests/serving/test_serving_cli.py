@@ -98,7 +98,7 @@ def test_bench(pi_file: Path, capsys: Capture) -> None:
         p50, p99, p999, waited, _, alone, _, times, _ = row[22:].split()
         assert 0 < float(p50) <= float(p99) <= float(p999)
         assert 0 <= float(waited) <= 100
-        assert not float(alone) > float(p999)
+        assert not float(alone) <= 0  # nan where every step waited
         # Each of the three is rounded as it is printed.
         half = [0.51 * 10.0 ** -len(number.partition(".")[2]) for number in (alone, p50, times)]
         least, most = (
