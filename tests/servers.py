@@ -18,6 +18,7 @@ import requests
 from processes import within
 
 from pipeline.engine.lifeline import end_with_parent
+from pipeline.engine.start import STAGES
 
 ROOT = Path(__file__).parents[1]
 BUCKETS = ("mlflow", "dvc")
@@ -156,7 +157,11 @@ def _begun_mlflow(made: Servers, database: str, s3: str) -> int:
 
 DASK = (sys.executable, "-m", "dask")
 # The sources, and none of the files of a run.
-OF_DASK = {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__DAEMON": "True"}
+OF_DASK = {
+    "PYTHONPATH": str(ROOT),
+    "DASK_DISTRIBUTED__WORKER__DAEMON": "True",
+    STAGES: "excite,fit,design,validate",
+}
 
 
 def _begun_scheduler(made: Servers) -> int:

@@ -27,14 +27,18 @@ if TYPE_CHECKING:
 # What stages import late and for long, the longest last; one that is missing or broken costs time alone.
 LIBRARIES = (
     *("onnxruntime", "casadi", "scipy.signal", "jinja2", "pandas", "pyarrow.parquet", "matplotlib.figure"),
-    *("onnx", "onnx_ir", "sklearn.linear_model", "torch", "torch._dynamo", "torch.export._trace"),
+    *("sklearn.linear_model", "onnx", "onnx_ir", "torch", "torch._dynamo", "torch.export._trace"),
     *("torch.onnx._internal.exporter._compat", "onnxscript.optimizer", "onnxscript.function_libs.torch_lib.ops"),
 )
 # Of these, what stages of some kinds import. Those of a kind that is not named may need all; those without any run on
-# no worker. Models need nothing of the exporter and of scipy's signals, which take half of the time.
+# no worker. Models need nothing of the exporter, and trials none of torch: each takes half of the time.
+MODELS = ("casadi", "pandas", "pyarrow.parquet", "matplotlib.figure", "torch")
+TRIALS = ("onnxruntime", "casadi", "pyarrow.parquet", "onnx")
 OF_KIND = {
     "excite": ("casadi", "pandas", "pyarrow.parquet"),
-    "fit": ("casadi", "pandas", "pyarrow.parquet", "matplotlib.figure", "torch"),
+    "fit": MODELS,
+    "design": (*TRIALS, *LIBRARIES[LIBRARIES.index("onnx_ir") :]),
+    "validate": TRIALS,
     **dict.fromkeys(("code", "screen", "report", "overview", "publish"), ()),
 }
 IDLE_S = 0.05  # until a worker that has a task looks again whether it may go on importing

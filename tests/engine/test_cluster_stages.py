@@ -108,11 +108,20 @@ def test_a_mistake_is_one_line_and_leaves_what_was_there(address: str, plant: Pa
     assert made() == before
 
 
-def test_a_client_that_is_killed_leaves_nothing_half_written_and_idle_workers(address: str, plant: Path) -> None:
+def test_a_client_that_is_killed_leaves_nothing_half_written_and_idle_workers(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(ROOT / "dvc.yaml", tmp_path)
+    record = "reversible_cstr-aprbs"
+    params = yaml.safe_load((ROOT / "params.yaml").read_text())
+    params["records"] = {record: {**params["records"][record], "seeds": [0, 1]}}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump({**params, "models": {}, "controllers": {}}))
+    write_json(DATA, {})
     client = connected(address)
-    process = begin("design", "it-pid")
+    process = begin("excite", record)
     assert within(60, lambda: any(client.processing().values()))
     process.kill()
     process.communicate(timeout=20)
     assert within(60, lambda: not any(client.processing().values()))
-    assert made() == {}
+    assert read_files([Path("work/reversible_cstr")]) == {}

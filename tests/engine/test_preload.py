@@ -102,7 +102,7 @@ def imported(monkeypatch: pytest.MonkeyPatch, stages: str | None) -> list[str]:
     return list(preload.loading())
 
 
-@pytest.mark.parametrize("stages", [None, "", "fit,design", "validate", "bounds"])
+@pytest.mark.parametrize("stages", [None, "", "fit,bounds", "bounds"])
 def test_a_worker_for_anything_imports_everything(monkeypatch: pytest.MonkeyPatch, stages: str | None) -> None:
     names = imported(monkeypatch, stages)
     assert names[: len(preload.LIBRARIES)] == list(preload.LIBRARIES)
@@ -114,6 +114,13 @@ def test_a_worker_for_models_alone_imports_no_exporter(monkeypatch: pytest.Monke
     assert imported(monkeypatch, "screen,fit,overview") == [*libraries, "pipeline.stages.fit"]
     assert imported(monkeypatch, "excite") == [*libraries[:3], "pipeline.stages.excite"]
     assert imported(monkeypatch, "screen") == []
+
+
+def test_a_worker_for_controllers_imports_the_exporter_where_they_are_designed(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, designed = imported(monkeypatch, "validate,report"), imported(monkeypatch, "validate,design")
+    assert tried == ["onnxruntime", "casadi", "pyarrow.parquet", "onnx", "pipeline.stages.validate"]
+    assert {"torch", "torch.export._trace", "onnxscript.optimizer"} <= set(designed)
+    assert designed[-2:] == ["pipeline.stages.validate", "pipeline.stages.design"]
 
 
 def test_every_stage_that_needs_a_worker_is_known_to_need_something() -> None:

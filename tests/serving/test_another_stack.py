@@ -145,9 +145,20 @@ def test_a_wrong_password_is_one_line(
     assert "a guess" not in said
 
 
-def test_a_user_logs_on_by_a_certificate_once_the_server_trusts_it(
+def test_a_loop_from_the_shadow_through_a_fault_and_a_killed_server_that_trusts_a_user_by_then(
     settings: Path, server: NodeServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """The server looks as it starts for the certificates of users that its operator trusts."""
+    by_certificate = _refused_user(settings, server, capsys)
+    _fault_and_restart(settings, server)
+    assert main(["loop", "check", str(by_certificate)]) == 0
+    said = capsys.readouterr().out
+    assert "nothing would stop the loop" in said
+    assert f"certificate of the user: valid until {valid_until(server.folder / 'user.der')}" in said
+
+
+def _refused_user(settings: Path, server: NodeServer, capsys: pytest.CaptureFixture[str]) -> Path:
+    """The settings of a user by certificate, whom the server refuses until it starts anew."""
     user, key = server.folder / "user.der", server.folder / "user-key.pem"
     make(user, key)
     text = settings.read_text()
@@ -166,15 +177,11 @@ def test_a_user_logs_on_by_a_certificate_once_the_server_trusts_it(
     users = server.folder / "users"
     (rejected,) = (users / "rejected").iterdir()
     rejected.rename(users / "trusted" / "certs" / rejected.name)  # as its operator would
-    server.end()  # it looks there as it starts
-    server.start()
-    assert main(["loop", "check", str(by_certificate)]) == 0
-    said = capsys.readouterr().out
-    assert "nothing would stop the loop" in said
-    assert f"certificate of the user: valid until {valid_until(user)}" in said
+    return by_certificate
 
 
-def test_a_loop_from_the_shadow_through_a_fault_and_a_killed_server(settings: Path, server: NodeServer) -> None:
+def _fault_and_restart(settings: Path, server: NodeServer) -> None:
+    """A loop on the server from its first scan on."""
     loop = RunningLoop(settings)
     journal = loop.settings.journal.file
 
