@@ -60,7 +60,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Steps of an export's parity gate: a law that differs from its graph differs within some of them, and most tests export
 # for another reason. test_export.py takes all of them.
-STEPS_OF_GATE, gate.GATE_STEPS = gate.GATE_STEPS, 200
+STEPS_OF_GATE, gate.GATE_STEPS = gate.GATE_STEPS, 60
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
 QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import pytest
+from matplotlib.figure import Figure
+
+SCREENING = ("trends", "details", "readings", "inputs", "verdict")
 
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
-    """Build every picture, but give its panels no places and write an empty file."""
+    """Build every picture of a report, but give its panels no places and write an empty file; build none of a screening.
+
+    A screening's page is half of what ``loopwright new`` computes: up to 90 panels.
+    """
+    for name in SCREENING:
+        patch.setattr(f"pipeline.report.screening.{name}", lambda found: Figure())
     for module in ("pipeline.pictures.png", "pipeline.report.screening"):
         patch.setattr(f"{module}.png", lambda canvas: b"")
     patch.setattr("pipeline.pictures.drawing.lay_out", lambda canvas: None)

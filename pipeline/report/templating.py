@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,22 @@ REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 
 def render(name: str, content: Mapping[str, Any]) -> str:
     """A template filled in; text is escaped where it is HTML."""
+    return _environment(".html" in name).get_template(name).render(content)
+
+
+@cache
+def _environment(escapes: bool) -> Environment:
+    """The templates, each compiled once a process."""
     environment = Environment(
         loader=PackageLoader("pipeline.report"),
-        autoescape=".html" in name,
+        autoescape=escapes,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
     environment.filters |= {f.__name__: f for f in (figure, times, ratio, kilobytes, cell, sentence)}
-    return environment.get_template(name).render(content)
+    return environment
 
 
 def write_pages(out: Path, files: Mapping[str, str]) -> list[Path]:

@@ -105,7 +105,7 @@ def graphs(draw: Callable[..., Any]) -> onnx.ModelProto:
 
 
 @given(model=graphs())
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 def test_any_graph_stays_what_it_is(model: onnx.ModelProto) -> None:
     assert_equal(model, fused(model))
 

@@ -26,7 +26,7 @@ from pipeline.simulation.simulate import simulate_closed
 from serving.manifest import Signal
 
 PV, MV = 1000.0, 0.01  # K in mK, % in shares: factors of all PVs, and of all MVs that are not on or off
-HOLD = 25
+HOLD = 12
 # Stated parameters in units of their own: powers of the factors of the PV and of the MV.
 POWERS = {
     **dict.fromkeys(("penalty", "penalty_start", "penalty_low", "noise_variance"), (2, 0)),

@@ -33,9 +33,10 @@ def choose(choices: list[Choice], roots: list[Item]) -> float:
 
 def _sweep(account: Account, choices: list[Choice]) -> None:
     """One value after the other, latest first, again while that pays."""
+    latest_first = sorted((c for c in choices if len(c.forms) > 1), key=lambda c: c.order, reverse=True)
     for _ in range(SWEEPS):
         before = account.total
-        for choice in sorted(choices, key=lambda c: c.order, reverse=True):
+        for choice in latest_first:
             if choice.count:
                 _improve(account, choice)
         if account.total > before - LEAST_GAIN:
@@ -50,7 +51,8 @@ def _improve(account: Account, choice: Choice) -> None:
             account.choose(choice, kind)
             if account.total < least - LEAST_GAIN:
                 best, least = kind, account.total
-    account.choose(choice, best)
+    if choice.kind != best:
+        account.choose(choice, best)
 
 
 def _with(preference: tuple[str, ...], choices: list[Choice], roots: list[Item]) -> Account:
