@@ -18,9 +18,10 @@ from serving.errors import EndpointError, LoopError
 from serving.guard import Sample
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
+from serving.opcua.answers import LateError
 from serving.opcua.heartbeat import Heartbeat
 from serving.opcua.lease import LeaseRefusedError, NodeLease
-from serving.opcua.link import LateError, Link
+from serving.opcua.link import Link
 from serving.opcua.nameplates import Identity, Nameplates, identity
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import Sampling, Values

@@ -15,6 +15,7 @@ from asyncua import ua
 
 from serving.errors import EndpointError
 from serving.manifest import Manifest, Signal
+from serving.opcua.answers import unanswered
 from serving.opcua.link import Link, node_id
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point
@@ -46,7 +47,10 @@ class Identity(NamedTuple):
 
 
 class Nameplates:
-    """The nodes as they were when the loop began. ``fault``: why a unit or a range is another one now; empty: none is.
+    """The nodes as they were when the loop began.
+
+    ``fault`` says why a unit or a range is another one now; empty: none is. A fault lasts until the node is read with
+    what it had before: an answer that does not come, or tells nothing, ends none.
 
     Parameters
     ----------
@@ -63,6 +67,7 @@ class Nameplates:
         self.moved: ChangedNodeError | None = None  # what ``watch`` has found
         self._kinds: dict[str, ua.VariantType] = {}
         self._plates: dict[str, Plate] = {}
+        self._wrong: dict[tuple[str, str], str] = {}  # why, by row and what of it is wrong
 
     async def require_spaces(self, link: Link, timeout_s: float, *, anew: bool = False) -> None:
         """ChangedNodeError where a number stands for another namespace now."""
@@ -98,8 +103,9 @@ class Nameplates:
         """See which unit and range each node has now; EndpointError where nobody answers."""
         rows = plan.measuring()
         found = await plates(link, [node for _, _, node in rows], timeout_s)
-        wrong = [self._other(name, point, p) for (name, point, _), p in zip(rows, found, strict=True)]
-        self.fault = next(filter(None, wrong), "")
+        for (name, point, _), plate in zip(rows, found, strict=True):
+            self._compare(name, point, plate)
+        self.fault = next(iter(self._wrong.values()), "")
 
     async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
@@ -121,16 +127,26 @@ class Nameplates:
         self.require_types(plan, [answer.kind for answer in written])
         await self.look(link, plan, timeout_s)
 
-    def _other(self, name: str, point: Point, now: Plate) -> str:
-        """Why a unit or a range is another one; what the server does not tell is none."""
+    def _compare(self, name: str, point: Point, now: Plate) -> None:
+        """Begin or end the faults of a node's unit and range; what the server does not tell does neither."""
         before = self._plates.get(name, Plate())
         self._plates[name] = Plate(*(n if b == UNKNOWN else b for b, n in zip(before, now, strict=True)))
-        for what, was, is_now in zip(("unit", "range"), before, now, strict=True):
-            if UNKNOWN not in {was, is_now} and was != is_now:
-                return f"{name}: its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
         signal = signal_of(self.manifest, name)
-        misfit = "" if signal is None or name.startswith("SP ") else other_unit(now.unit, point, signal)
-        return f"{name}: {misfit}" if misfit else ""
+        for what, was, is_now in zip(("unit", "range"), before, now, strict=True):
+            if is_now == UNKNOWN:
+                continue
+            judged = what == "unit" and signal is not None and not name.startswith("SP ")
+            misfit = other_unit(is_now, point, signal) if judged and signal is not None else ""
+            if was not in {UNKNOWN, is_now}:
+                misfit = f"its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
+            self._judge(name, what, misfit)
+
+    def _judge(self, name: str, what: str, why: str) -> None:
+        """A row's fault begins, lasts, or is over (empty)."""
+        if why:
+            self._wrong[name, what] = f"{name}: {why}"
+        else:
+            self._wrong.pop((name, what), None)
 
 
 def numbers(ids: Iterable[str]) -> dict[int, str]:
@@ -180,7 +196,10 @@ def _whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
 
 
 async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> list[Plate]:
-    """Unit and range of nodes, in two requests; UNKNOWN where the server does not tell: they are its courtesy."""
+    """Unit and range of nodes, in two requests. They are a server's courtesy: UNKNOWN where it refuses to tell them.
+
+    EndpointError where it does not answer: what it would have told may be another unit.
+    """
     try:
         found = await link.browsed(nodes, ua.ObjectIds.HasProperty, timeout_s)
         asked = [
@@ -190,8 +209,8 @@ async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> li
             if r.BrowseName.Name in {"EngineeringUnits", "EURange"}
         ]
         answers = await link.values([ua.NodeId(n.Identifier, n.NamespaceIndex) for _, _, n in asked], timeout_s)
-    except EndpointError:
-        if link.gone:
+    except EndpointError as error:
+        if unanswered(error, link.gone):
             raise
         return [Plate() for _ in nodes]
     told: list[dict[str, str]] = [{} for _ in nodes]

@@ -16,6 +16,7 @@ from serving.errors import EndpointError
 from serving.journal import Journal
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
+from serving.opcua.answers import BusyError, LateError
 from serving.opcua.link import node_id
 from serving.opcua.nameplates import ChangedNodeError, Nameplates, identity
 from serving.opcua.plan import Plan
@@ -38,6 +39,7 @@ class MadeUpLink:
         self.kinds: dict[str, ua.VariantType] = {}
         self.units: dict[str, str] = {}
         self.ends: dict[str, float] = {}
+        self.fails: EndpointError | None = None  # how each browse ends
 
     async def namespaces(self, _: float, *, anew: bool = False) -> list[str]:
         return self.spaces
@@ -58,6 +60,8 @@ class MadeUpLink:
         self, nodes: Sequence[ua.NodeId], _: int, __: float, *, inverse: bool = False
     ) -> list[list[ua.ReferenceDescription]]:
         names = ("EngineeringUnits", "EURange")
+        if self.fails is not None:
+            raise self.fails
         return [
             [
                 ua.ReferenceDescription(
@@ -176,6 +180,31 @@ def test_another_unit_or_range_is_a_fault_while_it_is(manifest: Manifest) -> Non
         link.units, link.ends = {}, {}
         asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
         assert made.fault == valued(made, plan).fault == ""
+
+
+@pytest.mark.parametrize("told", [{"units": {"T": "degC"}}, {"ends": {"T": 200.0}}])
+def test_only_the_unit_or_range_itself_ends_its_fault(told: dict[str, Any], manifest: Manifest) -> None:
+    """One late answer, or a server that refused once, cleared the fault: the loop went on in AUTO on another unit."""
+    made, link = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
+    plan = connected(link, made)
+    for name, values in told.items():
+        setattr(link, name, values)
+    asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    fault = made.fault
+    for fails in (LateError("late"), BusyError("BadTimeout"), EndpointError("BadServiceUnsupported")):
+        link.fails = fails
+        if isinstance(fails, LateError | BusyError):
+            with pytest.raises(type(fails)):
+                asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+            with pytest.raises(type(fails)):
+                connected(link, made)
+        else:
+            asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+            connected(link, made)
+        assert made.fault == fault != ""
+    link.fails, link.units, link.ends = None, {}, {}
+    asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    assert made.fault == ""
 
 
 def test_a_unit_that_never_was_the_controllers_is_a_fault_of_the_first_connection(manifest: Manifest) -> None:

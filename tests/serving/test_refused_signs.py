@@ -12,8 +12,9 @@ from asyncua import ua
 from processes import within
 
 from serving import Controller, EndpointError
+from serving.opcua.answers import LateError
 from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.link import LateError, Link, node_id
+from serving.opcua.link import Link, node_id
 from serving.opcua.settings import Nodes, Server
 from serving.opcua.values import Reading
 
