@@ -123,7 +123,9 @@ async def _inspected(
         except EndpointError:  # an id that is none, which its own row says
             known = Identity({}, {})
         if not known.writes:
-            note = "the server does not tell its name or its start: a loop that spells its nodes otherwise is not found"
+            note = (
+                "the server does not tell its name or its start: a loop that spells its address otherwise is not found"
+            )
             found.append(Found("locks", "-", note=note))
         return Inspection([*found, *_certificates(link, server)], known)
     finally:

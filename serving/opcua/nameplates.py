@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from types import MappingProxyType
 from typing import NamedTuple
 
 from asyncua import ua
@@ -40,10 +41,13 @@ class Identity(NamedTuple):
     """The other end of a connection: the URI of each namespace that is used by its number, and the nodes it may write.
 
     ``writes`` has each by a key that is the same however host and id are spelt; empty where a server tells too little.
+    ``nodes`` has each by its id with its namespace's name, which is the same however the id is spelt. Both give the
+    spelling of loop.toml.
     """
 
     spaces: Mapping[int, str]
     writes: Mapping[str, str]
+    nodes: Mapping[str, str] = MappingProxyType({})
 
 
 class Nameplates:
@@ -179,15 +183,16 @@ def renumbered(number: int, text: str, before: str, now: str) -> str:
 async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s: float) -> Identity:
     """Which server this is, and which nodes of it the loop writes, however they are spelt.
 
-    Two servers may have one name, so a server is known by its name, its namespaces and the moment of its start.
+    Two servers may have one name, so a server is known by its name and the moment of its start. Its other namespaces
+    are no part of that: it may add some while it runs.
     """
     spaces, texts = await link.namespaces(timeout_s), [p.node for p in nodes.points("mv").values()]
     found = {n: uri_of(spaces, n) for n in numbers(nodes.ids())}
+    written = {_whole(node_id(t, spaces), spaces): t for t in texts}
     name = await link.server_uri(timeout_s)
     if not name or started_s is None:
-        return Identity(found, {})
-    at = f"{name} {started_s!r} {spaces}"
-    return Identity(found, {f"{at} {_whole(node_id(t, spaces), spaces)}": t for t in texts})
+        return Identity(found, {}, written)
+    return Identity(found, {f"{name} {started_s!r} {node}": t for node, t in written.items()}, written)
 
 
 def _whole(node: ua.NodeId, spaces: Sequence[str]) -> str:

@@ -230,5 +230,7 @@ def test_a_node_is_the_same_however_it_is_spelt_and_on_another_server_another_on
     assert keys(link, "nsu=urn:one", 1.5) == numbered
     assert keys(link, "ns=3", 1.5) != numbered
     assert keys(link, "ns=2", 2.5) != numbered  # of the same name and make, started at another time
-    assert keys(MadeUpLink("urn:one"), "ns=2", 1.5) != numbered
+    assert keys(MadeUpLink("urn:one", "urn:added"), "ns=2", 1.5) == numbered  # it may add some while it runs
     assert keys(link, "ns=2", None) == []  # one that does not tell when it started may be another one
+    found = asyncio.run(identity(link, nodes_of(manifest, "ns=2"), None, 1.0))  # type: ignore[arg-type]
+    assert found.nodes == {"nsu=urn:one;s=valve": "ns=2;s=valve"}
