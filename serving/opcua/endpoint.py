@@ -253,7 +253,8 @@ class OpcUaEndpoint:
                 await self.nameplates.look(link, plan, patience_s)
                 self.connections += 1
                 anew = await self._anew(link)
-                self._identified(await identity(link, self.nodes, self._started_s, patience_s))
+                found = await identity(link, self.nodes, self._started_s, patience_s)
+                self._identified(found._replace(spaces=dict(self.nameplates.spaces)))  # also what is not told now
                 if self._outbox:
                     self._outbox.clear()  # what was to be written then is too old now
                     self.unwritten = self.unwritten or "the connection was lost before the MV was sent"

@@ -157,7 +157,7 @@ def _namespaces(nodes: Nodes, now: list[str], before: Mapping[int, str]) -> list
     for number, text in sorted(numbers(nodes.ids()).items()):
         uri, name = uri_of(now, number), f"namespace {number}"
         if before.get(number, uri) != uri:
-            found.append(Found(name, uri or "-", wrong=renumbered(number, text, before[number], uri)))
+            found.append(Found(name, uri or "-", wrong=renumbered(number, text, before[number], now)))
         elif uri:
             note = f"it is {uri} now; write {by_name(text, uri)}, which stays right when the server numbers otherwise"
             found.append(Found(name, uri, note=note))

@@ -304,16 +304,18 @@ class Link:
 def node_id(text: str, spaces: Sequence[str]) -> ua.NodeId:
     """The id that ``text`` writes; ``spaces`` are the server's namespaces."""
     head, _, rest = text.partition(";")
-    if head.startswith("nsu="):
-        if head[4:] not in spaces:
-            raise EndpointError(f"the server has no namespace {head[4:]!r}; it has {', '.join(spaces)}")
-        text = f"ns={spaces.index(head[4:])};{rest}"
+    if head.startswith("nsu=") and head[4:] not in spaces:
+        raise EndpointError(f"the server has no namespace {head[4:]!r}; it has {', '.join(spaces)}")
+    number = spaces.index(head[4:]) if head.startswith("nsu=") else None
     try:
-        return ua.NodeId.from_string(text)
+        node = ua.NodeId.from_string(text if number is None else f"ns={number};{rest}")
     except Exception:
+        node = None
+    if node is None or number not in {None, int(node.NamespaceIndex)}:  # a second namespace behind the first one
         raise EndpointError(
             f"{text!r} is no node id; it is written as 'nsu=urn:plant;s=TIC101.PV' or 'nsu=urn:plant;i=1001'"
-        ) from None
+        )
+    return node
 
 
 def _texts(answer: ua.DataValue) -> list[str]:

@@ -66,7 +66,7 @@ class Nameplates:
 
     def __init__(self, nodes: Nodes, manifest: Manifest, spaces: Mapping[int, str] | None = None) -> None:
         self.nodes, self.manifest = nodes, manifest
-        self.spaces = dict(spaces or {})
+        self.spaces = {number: uri for number, uri in (spaces or {}).items() if uri}
         self.fault = ""
         self.moved: ChangedNodeError | None = None  # what ``watch`` has found
         self._kinds: dict[str, ua.VariantType] = {}
@@ -81,8 +81,8 @@ class Nameplates:
         now = await link.namespaces(timeout_s, anew=anew)
         for number, text in numbered.items():
             before, uri = self.spaces.get(number), uri_of(now, number)
-            if before is not None and uri != before:
-                raise ChangedNodeError(renumbered(number, text, before, uri))
+            if before and uri != before:
+                raise ChangedNodeError(renumbered(number, text, before, now))
             if uri:
                 self.spaces[number] = uri
 
@@ -171,13 +171,26 @@ def uri_of(spaces: Sequence[str], number: int) -> str:
 
 def by_name(text: str, uri: str) -> str:
     """An id that names its namespace by number, with the namespace's own name."""
-    return f"nsu={uri};" + ";".join(part for part in text.split(";") if not part.startswith("ns="))
+    return _named(node_id(text, []), uri)
 
 
-def renumbered(number: int, text: str, before: str, now: str) -> str:
-    """The fault of a number that stands for another namespace now."""
+def _named(node: ua.NodeId, uri: str) -> str:
+    return f"nsu={uri};" + str(node.to_string()).removeprefix(f"ns={int(node.NamespaceIndex)};")
+
+
+def renumbered(number: int, text: str, before: str, spaces: Sequence[str]) -> str:
+    """The fault of a number that stands for another namespace than ``before`` in the server's ``spaces``."""
+    if not spaces:
+        return f"namespace {number} was {before}, and the server does not say what it is now; so {text} is not believed"
+    now = uri_of(spaces, number)
     present = f"is {now} now and was {before}" if now else f"was {before} and is not there now"
-    return f"namespace {number} {present}, so {text} would be another node; write {by_name(text, before)} in loop.toml"
+    fault = f"namespace {number} {present}, so {text} would be another node"
+    if before in spaces:
+        return f"{fault}; write {by_name(text, before)} in loop.toml"
+    if now:
+        renamed = f"if {now} is the same plant under another name, write {by_name(text, now)} in loop.toml"
+        return f"{fault}; the server has no namespace {before} any more: {renamed}"
+    return f"{fault}; the server has the namespaces {', '.join(spaces)}"
 
 
 async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s: float) -> Identity:
@@ -187,7 +200,7 @@ async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s:
     are no part of that: it may add some while it runs.
     """
     spaces, texts = await link.namespaces(timeout_s), [p.node for p in nodes.points("mv").values()]
-    found = {n: uri_of(spaces, n) for n in numbers(nodes.ids())}
+    found = {n: uri for n in numbers(nodes.ids()) if (uri := uri_of(spaces, n))}
     written = {_whole(node_id(t, spaces), spaces): t for t in texts}
     name = await link.server_uri(timeout_s)
     if not name or started_s is None:
@@ -197,7 +210,7 @@ async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s:
 
 def _whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
     number = int(node.NamespaceIndex)
-    return by_name(node.to_string(), uri_of(spaces, number) or str(number))
+    return _named(node, uri_of(spaces, number) or str(number))
 
 
 async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> list[Plate]:

@@ -18,7 +18,7 @@ from serving.manifest import Manifest
 from serving.opcua.ages import Ages
 from serving.opcua.answers import BusyError, LateError
 from serving.opcua.link import node_id
-from serving.opcua.nameplates import ChangedNodeError, Nameplates, identity
+from serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import ModeNode, Nodes, Point, Server
@@ -109,8 +109,12 @@ def test_a_number_that_stands_for_another_namespace_is_no_node_of_this_loop(mani
     """A server that was started anew had its namespaces the other way round: the loop wrote another unit's valve."""
     made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
     connected(MadeUpLink("urn:one", "urn:two"), made)
-    for other in (("urn:two", "urn:one"), ("urn:two",), ()):
-        with pytest.raises(ChangedNodeError, match=r"write nsu=urn:one;s=level in loop\.toml"):
+    for other, advice in (
+        (("urn:two", "urn:one"), r"; write nsu=urn:one;s=level in loop\.toml"),
+        (("urn:two",), r"no namespace urn:one any more: if urn:two is .* write nsu=urn:two;s=level in loop\.toml"),
+        ((), "the server has the namespaces .*, urn:server$"),
+    ):
+        with pytest.raises(ChangedNodeError, match=advice):
             connected(MadeUpLink(*other), made)
     connected(MadeUpLink("urn:one", "urn:three"), made)  # it is there again, and what lies behind it is no matter
     by_name = Nameplates(nodes_of(manifest, "nsu=urn:one"), manifest)
@@ -118,6 +122,33 @@ def test_a_number_that_stands_for_another_namespace_is_no_node_of_this_loop(mani
     assert connected(MadeUpLink("urn:two", "urn:one"), by_name).asked[0].NamespaceIndex == 3
     with pytest.raises(EndpointError, match="no namespace 'urn:one'"):
         connected(MadeUpLink("urn:two"), by_name)
+
+
+def test_a_namespace_that_is_not_told_once_is_no_other_one(manifest: Manifest, tmp_path: Path) -> None:
+    """It was kept as a nameless one, and the loop refused its server for good, with "write nsu=;s=level"."""
+    made, silent = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
+    silent.spaces = []
+    connected(silent, made)
+    assert asyncio.run(identity(silent, made.nodes, 1.0, 1.0)).spaces == made.spaces == {}  # type: ignore[arg-type]
+    connected(MadeUpLink("urn:one"), made)
+    with pytest.raises(ChangedNodeError, match="the server does not say what it is now"):
+        connected(silent, made)
+    assert made.spaces == {2: "urn:one"}
+    journal = Journal(tmp_path / "loop.journal")
+    keep_namespaces(journal, "opc.tcp://localhost:4840", {2: "", 3: "urn:two"})  # of a release that kept it so
+    journal.close()
+    assert namespaces_before(journal.path, "opc.tcp://127.0.0.1:4840") == {3: "urn:two"}
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [("ns=2;s=A;ns=1;x", "nsu=u;s=A;ns=1;x"), ("i=5;ns=2", "nsu=u;i=5"), ("ns=2;s=TIC.PV", "nsu=u;s=TIC.PV")],
+)
+def test_an_id_by_its_namespaces_name_is_the_same_node(text: str, named: str) -> None:
+    assert by_name(text, "u") == named
+    assert node_id(named, ["", "", "u"]) == node_id(text, [])
+    with pytest.raises(EndpointError, match="is no node id"):
+        node_id("nsu=u;i=5;ns=1", ["", "", "u"])
 
 
 def test_what_a_number_stood_for_outlives_the_loop(manifest: Manifest, tmp_path: Path) -> None:
