@@ -20,14 +20,18 @@ from serving.opcua.answers import unanswered
 from serving.opcua.link import Link, node_id
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point
+from serving.opcua.values import FLOATS, INTEGERS
 
 LOOK_S = 60.0  # between two looks at what may change without a new connection
 UNKNOWN = "-"
 NULL = ua.VariantType.Null
+WRITTEN = ", written"  # of a row: the node that the loop writes, where the MV is read back from another one
+NUMBERS = {*FLOATS, *INTEGERS}
+ANY = {ua.ObjectIds.BaseDataType, ua.ObjectIds.Number, ua.ObjectIds.Integer, ua.ObjectIds.UInteger}
 
 
 class ChangedNodeError(EndpointError):
-    """A node is another one, or of another type, than the loop began with: nothing is written there."""
+    """A node is another one than the loop began with: nothing is read or written there."""
 
 
 class Plate(NamedTuple):
@@ -53,8 +57,10 @@ class Identity(NamedTuple):
 class Nameplates:
     """The nodes as they were when the loop began.
 
-    ``fault`` says why a unit or a range is another one now; empty: none is. A fault lasts until the node is read with
-    what it had before: an answer that does not come, or tells nothing, ends none.
+    ``fault`` says why a measured unit or range is another one now. ``unwritable`` says why that, or the type, of a node
+    is which the loop writes: it refuses the MV, not the sample. ``wrong`` has a reason by row. Empty: all is as it was.
+    What is wrong lasts until the node is read with what it had before: an answer that does not come, or tells nothing,
+    ends nothing.
 
     Parameters
     ----------
@@ -67,11 +73,13 @@ class Nameplates:
     def __init__(self, nodes: Nodes, manifest: Manifest, spaces: Mapping[int, str] | None = None) -> None:
         self.nodes, self.manifest = nodes, manifest
         self.spaces = {number: uri for number, uri in (spaces or {}).items() if uri}
-        self.fault = ""
+        self.fault = self.unwritable = ""
+        self.wrong: Mapping[str, str] = {}  # replaced as a whole: other threads read it
         self.moved: ChangedNodeError | None = None  # what ``watch`` has found
         self._kinds: dict[str, ua.VariantType] = {}
         self._plates: dict[str, Plate] = {}
         self._wrong: dict[tuple[str, str], str] = {}  # why, by row and what of it is wrong
+        self._any_number: set[str] = set()  # rows whose nodes are declared to hold numbers of any type
 
     async def require_spaces(self, link: Link, timeout_s: float, *, anew: bool = False) -> None:
         """ChangedNodeError where a number stands for another namespace now."""
@@ -92,24 +100,30 @@ class Nameplates:
             return ""
         assert kind is not None
         before = self._kinds.setdefault(name, kind)
-        if kind is before:
+        if kind is before or (name in self._any_number and {kind, before} <= NUMBERS):
             return ""
         return f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
 
-    def require_types(self, plan: Plan, kinds: Sequence[ua.VariantType | None]) -> None:
-        """ChangedNodeError where a node of an MV (n_mv,) has another type now than the loop began with."""
-        for name, kind in zip(plan.mv_names, kinds, strict=True):
-            changed = self.typed(f"MV {name}, written", kind)
-            if changed:
-                raise ChangedNodeError(changed)
+    async def look(self, link: Link, plan: Plan, written: Sequence[ua.VariantType | None], timeout_s: float) -> None:
+        """See which unit, range and type each node has now; ``written`` are the types of the MVs' nodes (n_mv,).
 
-    async def look(self, link: Link, plan: Plan, timeout_s: float) -> None:
-        """See which unit and range each node has now; EndpointError where nobody answers."""
+        EndpointError where nobody answers.
+        """
         rows = plan.measuring()
         found = await plates(link, [node for _, _, node in rows], timeout_s)
+        mode = [(n, p, at) for (n, p, _), at in zip(plan.points, plan.asked, strict=False) if n == "mode"]
+        declared = await any_number(link, [node for _, _, node in [*rows, *mode]], timeout_s)
         for (name, point, _), plate in zip(rows, found, strict=True):
             self._compare(name, point, plate)
-        self.fault = next(iter(self._wrong.values()), "")
+        for (name, _, _), free in zip([*rows, *mode], declared, strict=True):
+            if free is not None:
+                (self._any_number.add if free else self._any_number.discard)(name)
+        for name, kind in zip((f"MV {n}, written" for n in plan.mv_names), written, strict=True):
+            if kind not in {None, NULL}:
+                self._judge(name, "type", self.typed(name, kind))
+        self.wrong = {name: why for (name, _), why in reversed(self._wrong.items())}
+        self.fault = next((why for (name, _), why in self._wrong.items() if measured(name)), "")
+        self.unwritable = next((why for (name, _), why in self._wrong.items() if name.endswith(WRITTEN)), "")
 
     async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
@@ -128,8 +142,7 @@ class Nameplates:
         """All that may change without a new connection. ChangedNodeError, EndpointError."""
         await self.require_spaces(link, timeout_s, anew=True)
         written = await link.read([node for node, _ in plan.written], timeout_s)
-        self.require_types(plan, [answer.kind for answer in written])
-        await self.look(link, plan, timeout_s)
+        await self.look(link, plan, [answer.kind for answer in written], timeout_s)
 
     def _compare(self, name: str, point: Point, now: Plate) -> None:
         """Begin or end the faults of a node's unit and range; what the server does not tell does neither."""
@@ -143,12 +156,12 @@ class Nameplates:
             misfit = other_unit(is_now, point, signal) if judged and signal is not None else ""
             if was not in {UNKNOWN, is_now}:
                 misfit = f"its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
-            self._judge(name, what, misfit)
+            self._judge(name, what, f"{name}: {misfit}" if misfit else "")
 
     def _judge(self, name: str, what: str, why: str) -> None:
-        """A row's fault begins, lasts, or is over (empty)."""
+        """What is wrong with a row begins, lasts, or is over (empty)."""
         if why:
-            self._wrong[name, what] = f"{name}: {why}"
+            self._wrong[name, what] = why
         else:
             self._wrong.pop((name, what), None)
 
@@ -241,10 +254,30 @@ async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> li
     return [Plate(**plate) for plate in told]
 
 
+async def any_number(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> list[bool | None]:
+    """Whether each node is declared to hold numbers of any type (Number, Integer, UInteger) or anything at all.
+
+    None where the server does not tell. EndpointError where it does not answer.
+    """
+    try:
+        answers = await link.values(nodes, timeout_s, ua.AttributeIds.DataType)
+    except EndpointError as error:
+        if unanswered(error, link.gone):
+            raise
+        return [None for _ in nodes]
+    kinds = [None if a.Value is None else a.Value.Value for a in answers]
+    return [(k.NamespaceIndex == 0 and k.Identifier in ANY) if isinstance(k, ua.NodeId) else None for k in kinds]
+
+
+def measured(row: str) -> bool:
+    """Whether the loop computes with a row's number: neither a node that it writes, nor a wish of the plant's side."""
+    return not (row.endswith(WRITTEN) or row.startswith("SP ") or row == "mode")
+
+
 def signal_of(manifest: Manifest, name: str) -> Signal | None:
     """The signal of a row such as "PV T" or "MV T_j, written"; None for what is no signal."""
     group, _, rest = name.partition(" ")
-    rest = rest.removesuffix(", written")
+    rest = rest.removesuffix(WRITTEN)
     signals = {"PV": manifest.pv, "MV": manifest.mv, "DV": manifest.dv, "SP": manifest.sp}.get(group, ())
     return next((s for s in signals if s.name == rest), None)
 

@@ -241,6 +241,8 @@ class Station:
         if self.wishes.starts != starts and (self.settings.nodes.sp or self.settings.nodes.mode is not None):
             what = "the plant's server has, or may have, started anew: the set points and the mode that stand there"
             self.recorder.note("connection", "opcua", f"{what} are no wish of its operator until they change")
+        for why in self.wishes.refused(values):
+            self.recorder.note("change", "plant", f"refused: {why}")
         if changed:
             self._set_points(loop, changed)
         if mode:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from serving.journal import Journal
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
 from serving.opcua.answers import BusyError, LateError
+from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.link import node_id
 from serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity
 from serving.opcua.plan import Plan
@@ -24,11 +26,12 @@ from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import ModeNode, Nodes, Point, Server
 from serving.opcua.values import Reading
 from serving.station.beginning import keep_namespaces, namespaces_before
+from serving.station.wishes import Wishes
 
 pytest_plugins = ["small_laws"]
 UA_SPACE = "http://opcfoundation.org/UA/"
 DOUBLE, INT32, STRING = ua.VariantType.Double, ua.VariantType.Int32, ua.VariantType.String
-UNITS = {"level": "m", "T": "K", "inflow": "l/s", "valve": "%"}
+UNITS = {"SP": "m", "level": "m", "T": "K", "inflow": "l/s", "valve": "%"}
 
 
 class MadeUpLink:
@@ -39,6 +42,7 @@ class MadeUpLink:
         self.kinds: dict[str, ua.VariantType] = {}
         self.units: dict[str, str] = {}
         self.ends: dict[str, float] = {}
+        self.declared: dict[str, int] = {}  # DataType by node
         self.fails: EndpointError | None = None  # how each browse ends
 
     async def namespaces(self, _: float, *, anew: bool = False) -> list[str]:
@@ -72,8 +76,13 @@ class MadeUpLink:
             for n in nodes
         ]
 
-    async def values(self, nodes: Sequence[ua.NodeId], _: float) -> list[ua.DataValue]:
+    async def values(
+        self, nodes: Sequence[ua.NodeId], _: float, attribute: ua.AttributeIds = ua.AttributeIds.Value
+    ) -> list[ua.DataValue]:
         found = []
+        if attribute is ua.AttributeIds.DataType:
+            kinds = [self.declared.get(str(n.Identifier), ua.ObjectIds.Double) for n in nodes]
+            return [ua.DataValue(ua.Variant(ua.NodeId(k), ua.VariantType.NodeId)) for k in kinds]
         for node in nodes:
             of, _, what = str(node.Identifier).rpartition(" ")
             unit = ua.EUInformation(DisplayName=ua.LocalizedText(self.units.get(of, UNITS[of])))
@@ -84,7 +93,7 @@ class MadeUpLink:
 
 def nodes_of(m: Manifest, head: str) -> Nodes:
     groups: Any = {g: {s.name: f"{head};s={s.name}" for s in m.signals(g)} for g in ("pv", "mv", "dv")}
-    return Nodes(**groups, sp={"level": f"{head};s=level"}, mode=ModeNode(f"{head};s=mode", {"AUTO": 1.0}))
+    return Nodes(**groups, sp={"level": f"{head};s=SP"}, mode=ModeNode(f"{head};s=mode", {"AUTO": 1.0}))
 
 
 @pytest.fixture
@@ -98,8 +107,7 @@ def connected(link: Any, made: Nameplates) -> Plan:
     async def act() -> Plan:
         await made.require_spaces(link, 1.0)
         plan = await Plan.made(link, made.manifest, made.nodes, 1.0)
-        made.require_types(plan, [kind for _, kind in plan.written])
-        await made.look(link, plan, 1.0)
+        await made.look(link, plan, [kind for _, kind in plan.written], 1.0)
         return plan
 
     return asyncio.run(act())
@@ -175,27 +183,81 @@ def valued(made: Nameplates, plan: Plan, **kinds: ua.VariantType) -> Values:
 
 @pytest.mark.parametrize("name", ["PV level", "MV valve", "DV inflow", "SP level", "mode"])
 def test_a_node_of_another_type_is_a_fault_while_it_is(name: str, manifest: Manifest) -> None:
-    """A PV went on in AUTO when its Double became an integer. A value of the wrong type is no wish either."""
+    """A PV went on in AUTO when its Double became an integer.
+
+    A value of the wrong type is no wish either; but nothing is wrong with the sample then, which once was refused.
+    """
     made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
     plan = connected(MadeUpLink("urn:one"), made)
-    used = "dv" in manifest.inputs or not name.startswith("DV")
+    wish = name in {"SP level", "mode"}
+    used = not wish and ("dv" in manifest.inputs or not name.startswith("DV"))
     assert valued(made, plan).fault == ""
     other = valued(made, plan, **{name.replace(" ", "_"): INT32})
     assert other.fault.startswith(f"{name}: its type is Int32 now and was Double") is used
+    wishes = Wishes()
+    assert [len(wishes.refused(v)) for v in (other, other, valued(made, plan), other)] == [wish, 0, 0, wish]
     assert (other.asked_mode, bool(other.asked_sp)) == ("" if name == "mode" else "AUTO", name != "SP level")
     assert np.isnan(other.mv[0]) == (name == "MV valve")
     assert valued(made, plan).fault == ""
 
 
-def test_an_mv_whose_written_node_has_another_type_is_not_written(manifest: Manifest) -> None:
+def written_elsewhere(m: Manifest) -> Nodes:
+    """A valve that is read back from another node than the loop writes."""
+    nodes = nodes_of(m, "ns=2")
+    return replace(nodes, mv={"valve": Point("ns=2;s=to", read_back="ns=2;s=valve")})
+
+
+@pytest.mark.parametrize("told", [{"kinds": {"to": INT32}}, {"units": {"to": "m"}}, {"ends": {"to": 27_648.0}}])
+def test_an_mv_whose_written_node_is_another_one_is_not_written_and_its_sample_is_good(
+    told: dict[str, Any], manifest: Manifest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shadow, which writes nothing, was at fault at every scan."""
+    monkeypatch.setitem(UNITS, "to", "%")
+    made, link = Nameplates(written_elsewhere(manifest), manifest), MadeUpLink("urn:one")
+    plan = connected(link, made)
+    assert made.unwritable == ""
+    for name, values in told.items():
+        setattr(link, name, values)
+    for again in (lambda: connected(link, made), lambda: asyncio.run(made.again(link, plan, 1.0))):  # type: ignore[arg-type]
+        again()
+        assert made.unwritable.startswith("MV valve, written: ")
+        assert made.fault == valued(made, plan).fault == ""
+    server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
+    endpoint = OpcUaEndpoint(manifest, server, made.nodes, max_age_s=1.0)
+    endpoint.nameplates, endpoint._link, endpoint._told, endpoint._shown = made, link, 1, 1  # type: ignore[assignment]
+    with pytest.raises(EndpointError, match="MV valve, written: "):
+        endpoint.write(np.array([50.0]))
+    endpoint._outbox.append(np.array([50.0]))  # passed on before it was known
+    asyncio.run(endpoint._send(link, plan))  # type: ignore[arg-type]
+    assert endpoint.unwritten == made.unwritable
+    link.kinds, link.units, link.ends = {}, {}, {}
+    asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    assert made.unwritable == ""
+
+
+def test_a_set_point_whose_unit_is_another_one_is_no_wish(manifest: Manifest) -> None:
     made, link = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
     plan = connected(link, made)
-    link.kinds["valve"] = INT32
-    for again in (lambda: connected(link, made), lambda: asyncio.run(made.again(link, plan, 1.0))):  # type: ignore[arg-type]
-        with pytest.raises(ChangedNodeError, match="MV valve, written: its type is Int32 now and was Double"):
-            again()
-    link.kinds.clear()
+    link.units["SP"] = "mm"
     asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    values = valued(made, plan)
+    assert (values.fault, values.asked_sp, list(values.unheard)) == ("", {}, ["SP level"])
+
+
+@pytest.mark.parametrize("declared", [ua.ObjectIds.Number, ua.ObjectIds.BaseDataType])
+def test_a_node_that_is_declared_to_hold_any_number_may_hold_any(declared: int, manifest: Manifest) -> None:
+    """A whole number that somebody typed there is an Int64 on some servers; a truth value or a text is no number."""
+    link = MadeUpLink("urn:one")
+    link.declared = dict.fromkeys((*UNITS, "mode"), declared)
+    made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
+    plan = connected(link, made)
+    valued(made, plan)
+    whole = dict.fromkeys((name.replace(" ", "_") for name, _, _ in plan.points), INT32)
+    assert (valued(made, plan, **whole).fault, valued(made, plan, **whole).unheard) == ("", {})
+    assert valued(made, plan, PV_level=ua.VariantType.Boolean).fault.startswith("PV level: its type is Boolean now")
+    link.kinds["valve"] = INT32
+    connected(link, made)
+    assert made.unwritable == ""
 
 
 def test_another_unit_or_range_is_a_fault_while_it_is(manifest: Manifest) -> None:
