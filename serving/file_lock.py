@@ -26,16 +26,26 @@ def locked(path: Path) -> int:
         import fcntl
     except ModuleNotFoundError:
         raise LoopError("files are locked on Linux and macOS; on Windows run the loop in WSL") from None
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(handle, 100).decode(errors="replace")
+            os.close(handle)
+            raise LockTakenError(path, owner) from None
+        except OSError:
+            os.close(handle)
+            raise
+        if _is_at(path, handle):  # else its owner took the file away in the moment before: it keeps nobody out
+            os.truncate(handle, 0)
+            os.write(handle, str(os.getpid()).encode())
+            return handle
+        os.close(handle)
+
+
+def _is_at(path: Path, handle: int) -> bool:
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        owner = os.read(handle, 100).decode(errors="replace")
-        os.close(handle)
-        raise LockTakenError(path, owner) from None
-    except OSError:
-        os.close(handle)
-        raise
-    os.truncate(handle, 0)
-    os.write(handle, str(os.getpid()).encode())
-    return handle
+        return os.path.samestat(path.stat(), os.fstat(handle))
+    except FileNotFoundError:
+        return False

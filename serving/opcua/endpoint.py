@@ -18,9 +18,10 @@ from serving.errors import EndpointError, LoopError
 from serving.guard import Sample
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
+from serving.opcua.answers import LateError
 from serving.opcua.heartbeat import Heartbeat
 from serving.opcua.lease import LeaseRefusedError, NodeLease
-from serving.opcua.link import LateError, Link
+from serving.opcua.link import Link
 from serving.opcua.nameplates import Identity, Nameplates, identity
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import Sampling, Values
@@ -175,7 +176,7 @@ class OpcUaEndpoint:
         now, before, self._called = self._scans, self._called, self._scans
         if now - before > 1:
             self.unwritten = ""  # of a time after which nothing was written: it says nothing of now
-        refused = self.unwritten
+        refused = self.unwritten or self.nameplates.unwritable
         if self._link is None or self._shown == 0 or self._told != self._shown:
             unread = "where the MV stands has not been read yet"
             self._refuse(self.trouble or refused or ("not connected" if self._link is None else unread))
@@ -248,11 +249,11 @@ class OpcUaEndpoint:
                 patience_s = max(self.answer_s, self.server.connect_s)
                 await self.nameplates.require_spaces(link, patience_s)
                 plan = await Plan.made(link, self.manifest, self.nodes, patience_s)
-                self.nameplates.require_types(plan, [kind for _, kind in plan.written])
-                await self.nameplates.look(link, plan, patience_s)
+                await self.nameplates.look(link, plan, [kind for _, kind in plan.written], patience_s)
                 self.connections += 1
                 anew = await self._anew(link)
-                self._identified(await identity(link, self.nodes, self._started_s, patience_s))
+                found = await identity(link, self.nodes, self._started_s, patience_s)
+                self._identified(found._replace(spaces=dict(self.nameplates.spaces)))  # also what is not told now
                 if self._outbox:
                     self._outbox.clear()  # what was to be written then is too old now
                     self.unwritten = self.unwritten or "the connection was lost before the MV was sent"
@@ -360,6 +361,9 @@ class OpcUaEndpoint:
         if last is None:
             return
         handing = isinstance(last, str)
+        if not handing and self.nameplates.unwritable:  # since it was passed on
+            self._failed(self.nameplates.unwritable)
+            return
         try:
             rows = [plan.hand_back()] if isinstance(last, str) else plan.variants(last)
         except EndpointError as error:

@@ -123,7 +123,9 @@ async def _inspected(
         except EndpointError:  # an id that is none, which its own row says
             known = Identity({}, {})
         if not known.writes:
-            note = "the server does not tell its name or its start: a loop that spells its nodes otherwise is not found"
+            note = (
+                "the server does not tell its name or its start: a loop that spells its address otherwise is not found"
+            )
             found.append(Found("locks", "-", note=note))
         return Inspection([*found, *_certificates(link, server)], known)
     finally:
@@ -155,7 +157,7 @@ def _namespaces(nodes: Nodes, now: list[str], before: Mapping[int, str]) -> list
     for number, text in sorted(numbers(nodes.ids()).items()):
         uri, name = uri_of(now, number), f"namespace {number}"
         if before.get(number, uri) != uri:
-            found.append(Found(name, uri or "-", wrong=renumbered(number, text, before[number], uri)))
+            found.append(Found(name, uri or "-", wrong=renumbered(number, text, before[number], now)))
         elif uri:
             note = f"it is {uri} now; write {by_name(text, uri)}, which stays right when the server numbers otherwise"
             found.append(Found(name, uri, note=note))

@@ -5,40 +5,25 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import datetime
-from typing import Any, TypeVar
+from typing import Any
 
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
 
 from serving.errors import EndpointError, LoopError
+from serving.opcua.answers import BUSY, GONE, BusyError, LateError, in_time, reason
 from serving.opcua.certificates import APPLICATION, identity, require_valid
 from serving.opcua.limits import LIMITS, OperationLimits, TooManyError, in_pieces
 from serving.opcua.settings import Server
-from serving.opcua.values import EPOCH, Reading, reading, words
-from serving.words import named
-
-T = TypeVar("T")
+from serving.opcua.values import EPOCH, Reading, reading
 
 # How long a server is asked to keep a session of which it hears nothing: some periods, within these bounds.
 SESSION, LEAST_SESSION_S, MOST_SESSION_S = 3, 60.0, 3600.0
 KEPT = 2 / 3  # of the time that the server grants: after so long without a request one is made to keep the session
 KEPT_TRY = 1 / 6  # of it: so long such a request may take before the next one
-GONE = {
-    ua.StatusCodes.BadConnectionClosed,
-    ua.StatusCodes.BadSecureChannelClosed,
-    ua.StatusCodes.BadSecureChannelIdInvalid,
-    ua.StatusCodes.BadSecureChannelTokenUnknown,
-    ua.StatusCodes.BadSessionClosed,
-    ua.StatusCodes.BadSessionIdInvalid,
-    ua.StatusCodes.BadSessionNotActivated,
-}  # answers after which no other request has a chance
-
-
-class LateError(EndpointError):
-    """There was no answer in time."""
 
 
 class Link:
@@ -86,9 +71,9 @@ class Link:
             ) from None
         except Exception as error:
             link.abort()
-            reason = _reason(error)
-            hint = link._user_hint() if "User" in reason or "Identity" in reason else link._hint()
-            raise EndpointError(f"{server.endpoint} refuses: {reason}{hint}") from None
+            why = reason(error)
+            hint = link._user_hint() if "User" in why or "Identity" in why else link._hint()
+            raise EndpointError(f"{server.endpoint} refuses: {why}{hint}") from None
         except BaseException:
             link.abort()
             raise
@@ -164,7 +149,7 @@ class Link:
         """The library tries once: a channel that was not renewed then ends soon."""
         error = None if renewing.cancelled() else renewing.exception()
         if error is not None and not self._gone:
-            self._gone = f"the secure channel could not be renewed: {_reason(error)}"
+            self._gone = f"the secure channel could not be renewed: {reason(error)}"
             self.on_gone()
 
     async def _asked_limits(self, timeout_s: float) -> OperationLimits:
@@ -306,66 +291,34 @@ class Link:
         except Exception as error:
             code = getattr(error, "code", None) if isinstance(error, ua.UaStatusCodeError) else None
             if code in GONE:
-                self._gone = _reason(error)
+                self._gone = reason(error)
             if code == ua.StatusCodes.BadTooManyOperations:
-                raise TooManyError(f"{self.server.endpoint}: {_reason(error)}") from None
-            raise EndpointError(f"{self.server.endpoint}: {_reason(error)}") from None
+                raise TooManyError(f"{self.server.endpoint}: {reason(error)}") from None
+            if code in BUSY:
+                raise BusyError(f"{self.server.endpoint}: {reason(error)}") from None
+            raise EndpointError(f"{self.server.endpoint}: {reason(error)}") from None
         self._asked_s = max(self._asked_s, asked_s)
         return found
-
-
-async def in_time(doing: Awaitable[T], timeout_s: float) -> T:
-    """What ``doing`` gives. TimeoutError where it takes longer, ConnectionError where it was broken off.
-
-    It is a task of its own: asyncua waits by wait_for2, whose own kind of cancellation ``asyncio.timeout`` does not
-    take for its own when an answer comes in the moment of its deadline, and would let through to the thread's end.
-    """
-    task = asyncio.ensure_future(doing)
-    try:
-        await asyncio.wait({task}, timeout=timeout_s)
-        if not task.done():
-            raise TimeoutError
-        if task.cancelled():
-            raise ConnectionError("the connection was broken off")
-        return task.result()
-    finally:
-        if not task.done():
-            task.add_done_callback(_forgotten)
-            task.cancel()
-
-
-def _forgotten(task: asyncio.Future[T]) -> None:
-    """Nobody waits for it any more: what it raises is no news."""
-    if not task.cancelled():
-        task.exception()
 
 
 def node_id(text: str, spaces: Sequence[str]) -> ua.NodeId:
     """The id that ``text`` writes; ``spaces`` are the server's namespaces."""
     head, _, rest = text.partition(";")
-    if head.startswith("nsu="):
-        if head[4:] not in spaces:
-            raise EndpointError(f"the server has no namespace {head[4:]!r}; it has {', '.join(spaces)}")
-        text = f"ns={spaces.index(head[4:])};{rest}"
+    if head.startswith("nsu=") and head[4:] not in spaces:
+        raise EndpointError(f"the server has no namespace {head[4:]!r}; it has {', '.join(spaces)}")
+    number = spaces.index(head[4:]) if head.startswith("nsu=") else None
     try:
-        return ua.NodeId.from_string(text)
+        node = ua.NodeId.from_string(text if number is None else f"ns={number};{rest}")
     except Exception:
+        node = None
+    if node is None or number not in {None, int(node.NamespaceIndex)}:  # a second namespace behind the first one
         raise EndpointError(
             f"{text!r} is no node id; it is written as 'nsu=urn:plant;s=TIC101.PV' or 'nsu=urn:plant;i=1001'"
-        ) from None
+        )
+    return node
 
 
 def _texts(answer: ua.DataValue) -> list[str]:
     """A list of texts; empty where the server gives none."""
     given = None if answer.Value is None else answer.Value.Value
     return [str(text) for text in given] if isinstance(given, list) else []
-
-
-def _reason(error: BaseException) -> str:
-    """What refused, by OPC UA's own name where it has one."""
-    if isinstance(error, ConnectionRefusedError):
-        return "nothing listens there; is the server running?"
-    code = getattr(error, "code", None)
-    if isinstance(error, ua.UaStatusCodeError) and code is not None:
-        return words(code)
-    return named(error) if isinstance(error, Exception) else type(error).__name__

@@ -9,23 +9,29 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from types import MappingProxyType
 from typing import NamedTuple
 
 from asyncua import ua
 
 from serving.errors import EndpointError
 from serving.manifest import Manifest, Signal
+from serving.opcua.answers import unanswered
 from serving.opcua.link import Link, node_id
 from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point
+from serving.opcua.values import FLOATS, INTEGERS
 
 LOOK_S = 60.0  # between two looks at what may change without a new connection
 UNKNOWN = "-"
 NULL = ua.VariantType.Null
+WRITTEN = ", written"  # of a row: the node that the loop writes, where the MV is read back from another one
+NUMBERS = {*FLOATS, *INTEGERS}
+ANY = {ua.ObjectIds.BaseDataType, ua.ObjectIds.Number, ua.ObjectIds.Integer, ua.ObjectIds.UInteger}
 
 
 class ChangedNodeError(EndpointError):
-    """A node is another one, or of another type, than the loop began with: nothing is written there."""
+    """A node is another one than the loop began with: nothing is read or written there."""
 
 
 class Plate(NamedTuple):
@@ -39,14 +45,22 @@ class Identity(NamedTuple):
     """The other end of a connection: the URI of each namespace that is used by its number, and the nodes it may write.
 
     ``writes`` has each by a key that is the same however host and id are spelt; empty where a server tells too little.
+    ``nodes`` has each by its id with its namespace's name, which is the same however the id is spelt. Both give the
+    spelling of loop.toml.
     """
 
     spaces: Mapping[int, str]
     writes: Mapping[str, str]
+    nodes: Mapping[str, str] = MappingProxyType({})
 
 
 class Nameplates:
-    """The nodes as they were when the loop began. ``fault``: why a unit or a range is another one now; empty: none is.
+    """The nodes as they were when the loop began.
+
+    ``fault`` says why a measured unit or range is another one now. ``unwritable`` says why that, or the type, of a node
+    is which the loop writes: it refuses the MV, not the sample. ``wrong`` has a reason by row. Empty: all is as it was.
+    What is wrong lasts until the node is read with what it had before: an answer that does not come, or tells nothing,
+    ends nothing.
 
     Parameters
     ----------
@@ -58,11 +72,14 @@ class Nameplates:
 
     def __init__(self, nodes: Nodes, manifest: Manifest, spaces: Mapping[int, str] | None = None) -> None:
         self.nodes, self.manifest = nodes, manifest
-        self.spaces = dict(spaces or {})
-        self.fault = ""
+        self.spaces = {number: uri for number, uri in (spaces or {}).items() if uri}
+        self.fault = self.unwritable = ""
+        self.wrong: Mapping[str, str] = {}  # replaced as a whole: other threads read it
         self.moved: ChangedNodeError | None = None  # what ``watch`` has found
         self._kinds: dict[str, ua.VariantType] = {}
         self._plates: dict[str, Plate] = {}
+        self._wrong: dict[tuple[str, str], str] = {}  # why, by row and what of it is wrong
+        self._any_number: set[str] = set()  # rows whose nodes are declared to hold numbers of any type
 
     async def require_spaces(self, link: Link, timeout_s: float, *, anew: bool = False) -> None:
         """ChangedNodeError where a number stands for another namespace now."""
@@ -72,8 +89,8 @@ class Nameplates:
         now = await link.namespaces(timeout_s, anew=anew)
         for number, text in numbered.items():
             before, uri = self.spaces.get(number), uri_of(now, number)
-            if before is not None and uri != before:
-                raise ChangedNodeError(renumbered(number, text, before, uri))
+            if before and uri != before:
+                raise ChangedNodeError(renumbered(number, text, before, now))
             if uri:
                 self.spaces[number] = uri
 
@@ -83,23 +100,30 @@ class Nameplates:
             return ""
         assert kind is not None
         before = self._kinds.setdefault(name, kind)
-        if kind is before:
+        if kind is before or (name in self._any_number and {kind, before} <= NUMBERS):
             return ""
         return f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
 
-    def require_types(self, plan: Plan, kinds: Sequence[ua.VariantType | None]) -> None:
-        """ChangedNodeError where a node of an MV (n_mv,) has another type now than the loop began with."""
-        for name, kind in zip(plan.mv_names, kinds, strict=True):
-            changed = self.typed(f"MV {name}, written", kind)
-            if changed:
-                raise ChangedNodeError(changed)
+    async def look(self, link: Link, plan: Plan, written: Sequence[ua.VariantType | None], timeout_s: float) -> None:
+        """See which unit, range and type each node has now; ``written`` are the types of the MVs' nodes (n_mv,).
 
-    async def look(self, link: Link, plan: Plan, timeout_s: float) -> None:
-        """See which unit and range each node has now; EndpointError where nobody answers."""
+        EndpointError where nobody answers.
+        """
         rows = plan.measuring()
         found = await plates(link, [node for _, _, node in rows], timeout_s)
-        wrong = [self._other(name, point, p) for (name, point, _), p in zip(rows, found, strict=True)]
-        self.fault = next(filter(None, wrong), "")
+        mode = [(n, p, at) for (n, p, _), at in zip(plan.points, plan.asked, strict=False) if n == "mode"]
+        declared = await any_number(link, [node for _, _, node in [*rows, *mode]], timeout_s)
+        for (name, point, _), plate in zip(rows, found, strict=True):
+            self._compare(name, point, plate)
+        for (name, _, _), free in zip([*rows, *mode], declared, strict=True):
+            if free is not None:
+                (self._any_number.add if free else self._any_number.discard)(name)
+        for name, kind in zip((f"MV {n}, written" for n in plan.mv_names), written, strict=True):
+            if kind not in {None, NULL}:
+                self._judge(name, "type", self.typed(name, kind))
+        self.wrong = {name: why for (name, _), why in reversed(self._wrong.items())}
+        self.fault = next((why for (name, _), why in self._wrong.items() if measured(name)), "")
+        self.unwritable = next((why for (name, _), why in self._wrong.items() if name.endswith(WRITTEN)), "")
 
     async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
@@ -118,19 +142,28 @@ class Nameplates:
         """All that may change without a new connection. ChangedNodeError, EndpointError."""
         await self.require_spaces(link, timeout_s, anew=True)
         written = await link.read([node for node, _ in plan.written], timeout_s)
-        self.require_types(plan, [answer.kind for answer in written])
-        await self.look(link, plan, timeout_s)
+        await self.look(link, plan, [answer.kind for answer in written], timeout_s)
 
-    def _other(self, name: str, point: Point, now: Plate) -> str:
-        """Why a unit or a range is another one; what the server does not tell is none."""
+    def _compare(self, name: str, point: Point, now: Plate) -> None:
+        """Begin or end the faults of a node's unit and range; what the server does not tell does neither."""
         before = self._plates.get(name, Plate())
         self._plates[name] = Plate(*(n if b == UNKNOWN else b for b, n in zip(before, now, strict=True)))
-        for what, was, is_now in zip(("unit", "range"), before, now, strict=True):
-            if UNKNOWN not in {was, is_now} and was != is_now:
-                return f"{name}: its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
         signal = signal_of(self.manifest, name)
-        misfit = "" if signal is None or name.startswith("SP ") else other_unit(now.unit, point, signal)
-        return f"{name}: {misfit}" if misfit else ""
+        for what, was, is_now in zip(("unit", "range"), before, now, strict=True):
+            if is_now == UNKNOWN:
+                continue
+            judged = what == "unit" and signal is not None and not name.startswith("SP ")
+            misfit = other_unit(is_now, point, signal) if judged and signal is not None else ""
+            if was not in {UNKNOWN, is_now}:
+                misfit = f"its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
+            self._judge(name, what, f"{name}: {misfit}" if misfit else "")
+
+    def _judge(self, name: str, what: str, why: str) -> None:
+        """What is wrong with a row begins, lasts, or is over (empty)."""
+        if why:
+            self._wrong[name, what] = why
+        else:
+            self._wrong.pop((name, what), None)
 
 
 def numbers(ids: Iterable[str]) -> dict[int, str]:
@@ -151,36 +184,53 @@ def uri_of(spaces: Sequence[str], number: int) -> str:
 
 def by_name(text: str, uri: str) -> str:
     """An id that names its namespace by number, with the namespace's own name."""
-    return f"nsu={uri};" + ";".join(part for part in text.split(";") if not part.startswith("ns="))
+    return _named(node_id(text, []), uri)
 
 
-def renumbered(number: int, text: str, before: str, now: str) -> str:
-    """The fault of a number that stands for another namespace now."""
+def _named(node: ua.NodeId, uri: str) -> str:
+    return f"nsu={uri};" + str(node.to_string()).removeprefix(f"ns={int(node.NamespaceIndex)};")
+
+
+def renumbered(number: int, text: str, before: str, spaces: Sequence[str]) -> str:
+    """The fault of a number that stands for another namespace than ``before`` in the server's ``spaces``."""
+    if not spaces:
+        return f"namespace {number} was {before}, and the server does not say what it is now; so {text} is not believed"
+    now = uri_of(spaces, number)
     present = f"is {now} now and was {before}" if now else f"was {before} and is not there now"
-    return f"namespace {number} {present}, so {text} would be another node; write {by_name(text, before)} in loop.toml"
+    fault = f"namespace {number} {present}, so {text} would be another node"
+    if before in spaces:
+        return f"{fault}; write {by_name(text, before)} in loop.toml"
+    if now:
+        renamed = f"if {now} is the same plant under another name, write {by_name(text, now)} in loop.toml"
+        return f"{fault}; the server has no namespace {before} any more: {renamed}"
+    return f"{fault}; the server has the namespaces {', '.join(spaces)}"
 
 
 async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s: float) -> Identity:
     """Which server this is, and which nodes of it the loop writes, however they are spelt.
 
-    Two servers may have one name, so a server is known by its name, its namespaces and the moment of its start.
+    Two servers may have one name, so a server is known by its name and the moment of its start. Its other namespaces
+    are no part of that: it may add some while it runs.
     """
     spaces, texts = await link.namespaces(timeout_s), [p.node for p in nodes.points("mv").values()]
-    found = {n: uri_of(spaces, n) for n in numbers(nodes.ids())}
+    found = {n: uri for n in numbers(nodes.ids()) if (uri := uri_of(spaces, n))}
+    written = {_whole(node_id(t, spaces), spaces): t for t in texts}
     name = await link.server_uri(timeout_s)
     if not name or started_s is None:
-        return Identity(found, {})
-    at = f"{name} {started_s!r} {spaces}"
-    return Identity(found, {f"{at} {_whole(node_id(t, spaces), spaces)}": t for t in texts})
+        return Identity(found, {}, written)
+    return Identity(found, {f"{name} {started_s!r} {node}": t for node, t in written.items()}, written)
 
 
 def _whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
     number = int(node.NamespaceIndex)
-    return by_name(node.to_string(), uri_of(spaces, number) or str(number))
+    return _named(node, uri_of(spaces, number) or str(number))
 
 
 async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> list[Plate]:
-    """Unit and range of nodes, in two requests; UNKNOWN where the server does not tell: they are its courtesy."""
+    """Unit and range of nodes, in two requests. They are a server's courtesy: UNKNOWN where it refuses to tell them.
+
+    EndpointError where it does not answer: what it would have told may be another unit.
+    """
     try:
         found = await link.browsed(nodes, ua.ObjectIds.HasProperty, timeout_s)
         asked = [
@@ -190,8 +240,8 @@ async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> li
             if r.BrowseName.Name in {"EngineeringUnits", "EURange"}
         ]
         answers = await link.values([ua.NodeId(n.Identifier, n.NamespaceIndex) for _, _, n in asked], timeout_s)
-    except EndpointError:
-        if link.gone:
+    except EndpointError as error:
+        if unanswered(error, link.gone):
             raise
         return [Plate() for _ in nodes]
     told: list[dict[str, str]] = [{} for _ in nodes]
@@ -204,10 +254,30 @@ async def plates(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> li
     return [Plate(**plate) for plate in told]
 
 
+async def any_number(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -> list[bool | None]:
+    """Whether each node is declared to hold numbers of any type (Number, Integer, UInteger) or anything at all.
+
+    None where the server does not tell. EndpointError where it does not answer.
+    """
+    try:
+        answers = await link.values(nodes, timeout_s, ua.AttributeIds.DataType)
+    except EndpointError as error:
+        if unanswered(error, link.gone):
+            raise
+        return [None for _ in nodes]
+    kinds = [None if a.Value is None else a.Value.Value for a in answers]
+    return [(k.NamespaceIndex == 0 and k.Identifier in ANY) if isinstance(k, ua.NodeId) else None for k in kinds]
+
+
+def measured(row: str) -> bool:
+    """Whether the loop computes with a row's number: neither a node that it writes, nor a wish of the plant's side."""
+    return not (row.endswith(WRITTEN) or row.startswith("SP ") or row == "mode")
+
+
 def signal_of(manifest: Manifest, name: str) -> Signal | None:
     """The signal of a row such as "PV T" or "MV T_j, written"; None for what is no signal."""
     group, _, rest = name.partition(" ")
-    rest = rest.removesuffix(", written")
+    rest = rest.removesuffix(WRITTEN)
     signals = {"PV": manifest.pv, "MV": manifest.mv, "DV": manifest.dv, "SP": manifest.sp}.get(group, ())
     return next((s for s in signals if s.name == rest), None)
 

@@ -40,6 +40,7 @@ class Values:
     asked_mode: str = ""
     ages: Mapping[str, float] = field(default_factory=dict)  # [s] of each measured value, by name
     starts: int = 0  # how often the server has started anew since the endpoint did
+    unheard: Mapping[str, str] = field(default_factory=dict)  # why a set point or the mode is no wish, by name
 
 
 class Sampling:
@@ -55,18 +56,22 @@ class Sampling:
         self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, *, unbeaten: str, starts: int
     ) -> Values:
         """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
-        fault, typed, found = "", "", dict[str, float]()
+        fault, typed, found, unheard = "", "", dict[str, float](), dict[str, str]()
         for (name, point, judged), answer in zip(plan.points, answers, strict=False):
             usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
             # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
             # is a read-back, which says where the MV stands also while a PV is bad.
             told = usable or (judged and not name.startswith("MV "))
             found[name] = point.scale * answer.number + point.offset if told else np.nan
-            if usable and not answer.text and (judged or name == "mode" or name.startswith("SP ")):
+            wish = name == "mode" or name.startswith("SP ")
+            if usable and not answer.text and (judged or wish):
                 changed = self.nameplates.typed(name, answer.kind)
-                typed = typed or changed
+                changed = changed or (self.nameplates.wrong.get(name, "") if wish else "")
                 if changed:  # another number: no PV to be shown, no place of the MV, no wish
                     found[name] = np.nan
+                    if wish:
+                        unheard[name] = changed
+                    typed = typed or ("" if wish else changed)
             if fault or not judged:
                 continue
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
@@ -97,6 +102,7 @@ class Sampling:
             mode,
             {plan.points[i][0]: age for i, age in zip(plan.timed, timed, strict=True)},
             starts,
+            unheard,
         )
 
     def dead(self, watchdog: float) -> str:

@@ -18,6 +18,7 @@ from serving.guard import implausible
 from serving.journal import Journal, JournalReader
 from serving.manifest import Signal
 from serving.opcua.sampling import Values
+from serving.station.lease import address_of
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -62,12 +63,16 @@ def keep_namespaces(journal: Journal, endpoint: str, spaces: Mapping[int, str]) 
 
 
 def namespaces_before(journal: Path, endpoint: str) -> dict[int, str]:
-    """The namespaces by number that the last run found at this server; empty where a journal tells of none."""
+    """The namespaces by number that the last run found at this server; empty where a journal tells of none.
+
+    The server is the same one however its address is spelt.
+    """
     with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
         kept = json.loads(reader.learnt(NAMESPACES) or "{}")
-        spaces = kept.get("spaces") if isinstance(kept, dict) and kept.get("endpoint") == endpoint else None
-        if isinstance(spaces, dict):
-            return {int(number): uri for number, uri in spaces.items() if isinstance(uri, str)}
+        spaces, at = (kept.get("spaces"), kept.get("endpoint")) if isinstance(kept, dict) else (None, None)
+        same = isinstance(at, str) and (at == endpoint or address_of(at) == address_of(endpoint))
+        if same and isinstance(spaces, dict):
+            return {int(number): uri for number, uri in spaces.items() if isinstance(uri, str) and uri}
     return {}
 
 

@@ -191,7 +191,7 @@ def _check(options: argparse.Namespace) -> int:
     inspection = inspected(manifest, settings.server, settings.nodes, settings.guards.margin, before)
     rows = inspection.rows
     if not here.runs:
-        here.tried(lambda: require_free(settings, inspection.identity.writes))
+        here.tried(lambda: require_free(settings, inspection.identity))
     names = [f.name for f in fields(Found) if f.name not in {"wrong", "note", "passing"}]
     table = [names, *([getattr(row, name) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
@@ -271,7 +271,7 @@ def _misfits(settings: Settings, manifest: Manifest) -> list[str]:
     before = namespaces_before(settings.journal.file, settings.server.endpoint)
     with suppress(EndpointError):
         found = inspected(manifest, settings.server, settings.nodes, settings.guards.margin, before)
-        require_free(settings, found.identity.writes)
+        require_free(settings, found.identity)
         return found.lasting(writes=settings.start != "SHADOW")
     return []
 

@@ -17,7 +17,7 @@ from serving.file_lock import LockTakenError, locked
 from serving.station.places import runtime_folder
 from serving.words import first_line
 
-OPC_UA_PORT = 4840
+OPC_UA_PORT, DISCARD_PORT = 4840, 9
 
 
 class Lease:
@@ -27,7 +27,7 @@ class Lease:
     node that another loop has locked meanwhile is lost: ``lost`` says so, until ``tend`` has it back.
 
     The first locks are of the nodes as they are spelt. Once the server is known, ``claim`` locks them by what they are,
-    since a host and an id can be written in many ways.
+    since a host and an id can be written in many ways. Who writes claims; ``disclaim`` leaves them to the others.
 
     Raises LoopError that names the process which has one, OSError where a lock cannot be opened.
     """
@@ -35,8 +35,9 @@ class Lease:
     def __init__(self, endpoint: str, nodes: Iterable[str], folder: Path | None = None) -> None:
         self._folder, self._endpoint, self._address = folder, endpoint, address_of(endpoint)
         self._held: dict[str, int] = {}  # handles by node
-        self._lost: dict[str, str] = {}  # by node, who has it
+        self._lost: Mapping[str, str] = {}  # by node, who has it; replaced as a whole, as other threads read it
         self._claimed: dict[str, str] = {}  # how a node is spelt, by what the server calls it
+        self._claims = False  # whether those are to be had: a loop that writes nothing leaves them to the others
         self._tending = threading.Lock()
         try:
             for node in nodes:
@@ -45,30 +46,39 @@ class Lease:
             self.release()
             raise
 
-    def claim(self, nodes: Mapping[str, str]) -> None:
-        """Lock nodes by what the server calls them, in place of those claimed before; each is given with its spelling.
+    def claim(self, writes: Mapping[str, str], nodes: Mapping[str, str] | None = None) -> None:
+        """Lock nodes by what the server calls them, in place of those claimed before: all of them or none.
+
+        ``writes`` names them by the server's own name and start, which is known also where its address is spelt another
+        way; ``nodes`` by their namespaces alone, and they are locked at this address, which a server that starts anew
+        keeps: the loop that writes has them until it ends. Each is given with its spelling.
 
         One that another loop has is ``lost``.
         """
-        with self._tending, suppress(OSError):  # a lock that cannot be made says nothing of another loop
-            for key in [k for k in self._claimed if k not in nodes]:
-                self._lost.pop(key, None)
-                if key in self._held:
-                    os.close(self._held.pop(key))
-            self._claimed = dict(nodes)
-            for key in nodes:
-                with suppress(LoopError):  # ``lost`` says so
-                    self._tend(key)
+        wanted = {**{f"at {self._address} {name}": text for name, text in (nodes or {}).items()}, **writes}
+        with self._tending:
+            self._drop(key for key in self._claimed if key not in wanted)
+            self._lost = {key: who for key, who in self._lost.items() if key in wanted or key not in self._claimed}
+            self._claimed, self._claims = wanted, True
+            self._claim()
+
+    def disclaim(self) -> None:
+        """Nothing is written: whoever claims the nodes now has them. ``lost`` says still who had them."""
+        if self._claims:
+            with self._tending:
+                self._claims = False
+                self._drop(self._claimed)
 
     def tend(self) -> None:
-        """Keep all files. LoopError where one was removed and another loop has it now, OSError where one cannot be."""
+        """Keep all files. LoopError where another loop has a node, OSError where a file cannot be made or locked."""
         troubles: list[LoopError | OSError] = []
         with self._tending:
-            for node in {**self._held, **self._claimed}:
+            for node in [key for key in self._held if key not in self._claimed]:
                 try:
                     self._tend(node)
                 except (LoopError, OSError) as error:
                     troubles.append(error)
+            troubles += self._claim()
         if troubles:
             raise troubles[0]
 
@@ -76,6 +86,22 @@ class Lease:
     def lost(self) -> str:
         """Why this loop may not write, as far as it was looked at: another one has a node. Empty: it may."""
         return next(iter(self._lost.values()), "")
+
+    def _claim(self) -> list[LoopError | OSError]:
+        """Have the nodes by what the server calls them, all or none: of two loops that share some, one writes.
+
+        Where none are to be had, see whether those that others had are free now.
+        """
+        troubles: list[LoopError | OSError] = []
+        for key in self._claimed:
+            if self._claims or key in self._lost:
+                try:
+                    self._tend(key)
+                except (LoopError, OSError) as error:  # a lock that cannot be made says nothing of another loop
+                    troubles.append(error)
+        if not self._claims or any(isinstance(error, LoopError) for error in troubles):
+            self._drop(self._claimed)
+        return troubles
 
     def _tend(self, node: str) -> None:
         path, handle = self._path(node), self._held.get(node)
@@ -85,16 +111,25 @@ class Lease:
         try:
             self._held[node] = self._locked(node)
         except LoopError as error:
-            self._lost[node] = first_line(error)
+            self._lost = {**self._lost, node: first_line(error)}
             raise
         if handle is not None:
             os.close(handle)
-        self._lost.pop(node, None)
+        self._lost = {key: who for key, who in self._lost.items() if key != node}
 
     def release(self) -> None:
         """Let others have the nodes."""
-        while self._held:
-            os.close(self._held.popitem()[1])
+        self._drop(self._held)
+
+    def _drop(self, nodes: Iterable[str]) -> None:
+        """Close locks, and take their files away, which nobody would."""
+        for node in [key for key in nodes if key in self._held]:
+            handle = self._held.pop(node)
+            with suppress(LoopError, OSError):  # the file is gone already, or the folder is
+                path = self._path(node)
+                if os.path.samestat(path.stat(), os.fstat(handle)):
+                    path.unlink()
+            os.close(handle)
 
     def _path(self, node: str) -> Path:
         name = node if node in self._claimed else f"{self._address} {node}"
@@ -127,14 +162,22 @@ def address_of(endpoint: str) -> str:
 
 
 def _of_this_machine(address: str) -> bool:
-    """Whether an address is one of this machine: a socket can be bound to no other."""
-    at = ipaddress.ip_address(address.partition("%")[0])
-    at = (at.ipv4_mapped or at) if isinstance(at, ipaddress.IPv6Address) else at
+    """Whether an address is one of this machine: what is sent to it leaves from it.
+
+    A socket that can be bound to it is no sign: Linux may let it be bound to any (``net.ipv4.ip_nonlocal_bind``).
+    """
+    at = _plain(address)
     if at.is_loopback or at.is_unspecified:
         return True
     try:
         with socket.socket(socket.AF_INET6 if at.version == 6 else socket.AF_INET, socket.SOCK_DGRAM) as tried:
-            tried.bind((str(at), 0))
+            tried.connect((str(at), DISCARD_PORT))  # sends nothing
+            return _plain(str(tried.getsockname()[0])) == at
     except OSError:
         return False
-    return True
+
+
+def _plain(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """An address without its zone; one of IPv4 in an IPv6 coat as itself."""
+    at = ipaddress.ip_address(address.partition("%")[0])
+    return (at.ipv4_mapped or at) if isinstance(at, ipaddress.IPv6Address) else at

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +12,7 @@ from serving.controller import Controller
 from serving.errors import LoopError, LoopwrightError
 from serving.file_lock import LockTakenError, locked
 from serving.journal.file import lock_of, opened
+from serving.opcua.nameplates import Identity
 from serving.page.address import listening, require_usable
 from serving.station.lease import Lease
 from serving.station.making import control_loop
@@ -71,11 +72,12 @@ def _owner(journal: Path) -> str:
     return ""
 
 
-def require_free(settings: Settings, writes: Mapping[str, str] | None = None) -> None:
-    """LoopError where another loop writes one of the MVs, also as ``writes`` (see ``Lease.claim``) names them."""
+def require_free(settings: Settings, found: Identity | None = None) -> None:
+    """LoopError where another loop writes one of the MVs, also as the server that was ``found`` calls them."""
     lease = Lease(settings.server.endpoint, [p.node for p in settings.nodes.points("mv").values()])
     try:
-        lease.claim(writes or {})
+        if found is not None:
+            lease.claim(found.writes, found.nodes)
         if lease.lost:
             raise LoopError(lease.lost)
     finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -31,6 +31,7 @@ from serving.proof import judged
 from serving.station.beginning import another_before, begun_at, keep_namespaces, namespaces_before, near, usable
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
+from serving.station.locks import Locks
 from serving.station.making import control_loop
 from serving.station.recorder import Recorder
 from serving.station.requests import Change, Request, change, require_proven
@@ -96,6 +97,7 @@ class Station:
             raise
         self.recorder = Recorder(self.journal, tell, settings.speed)
         self.recorder.end_old_alarms()
+        self.locks = Locks(self.lease, self.recorder)
         self.watching = Watching(self.controller, self.recorder)
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
@@ -143,7 +145,7 @@ class Station:
                 stack.callback(held)
             control = Control(s.journal.file, self.answer)
             stack.callback(control.close)
-            stack.callback(Tending(lambda: self._tend(control), self._untended).close)
+            stack.callback(Tending(lambda: self._tend(control), self.locks.untended).close)
             self._serve(stack, control)
             stack.callback(self.watching.keep)
             stack.callback(self.endpoint.close)
@@ -172,13 +174,9 @@ class Station:
     def _tend(self, control: Control) -> None:
         """Keep the files that lie in a folder for temporary ones."""
         try:
-            self.lease.tend()
+            self.locks.tend()
         finally:
             control.tend()
-
-    def _untended(self, trouble: str) -> None:
-        what = trouble or "over: the locks of this loop are kept again"
-        self.recorder.note("fault", "loop", what, alarm="lease", raised=bool(trouble))
 
     def _serve(self, stack: ExitStack, control: Control) -> None:
         """The page, where one is asked for."""
@@ -225,7 +223,7 @@ class Station:
         values = self.endpoint.values
         if values is not None and self.scans:
             self._plant_side(self.loop, values)
-        self._let_go(self.loop)
+        self.locks.keep(self.loop)
 
     def _at_last(self, loop: ControlLoop) -> None:
         """A shadow that began without the plant begins at its PVs once it sees them, unless a set point was named."""
@@ -236,17 +234,6 @@ class Station:
                 loop.set_sp(near(values.pv[: len(sp)], sp))
                 self.recorder.note("change", "loop", f"set point {_shown(loop.sp, sp)}", "where the plant stands")
 
-    def _let_go(self, loop: ControlLoop) -> None:
-        """Write nothing while another loop has the lock of a node, whoever asks for it."""
-        if loop.mode is Mode.SHADOW or not self.lease.lost:
-            return
-        with suppress(LoopError, OSError):
-            self.lease.tend()  # the other loop may have ended since
-            self._untended("")
-        if self.lease.lost:
-            self.recorder.note("change", "loop", f"mode {loop.mode} -> {Mode.SHADOW}", self.lease.lost)
-            loop.set_mode(Mode.SHADOW)
-
     def _plant_side(self, loop: ControlLoop, values: Values) -> None:
         """Set points and mode, where the plant's own operator changed them."""
         starts = self.wishes.starts
@@ -254,6 +241,8 @@ class Station:
         if self.wishes.starts != starts and (self.settings.nodes.sp or self.settings.nodes.mode is not None):
             what = "the plant's server has, or may have, started anew: the set points and the mode that stand there"
             self.recorder.note("connection", "opcua", f"{what} are no wish of its operator until they change")
+        for why in self.wishes.refused(values):
+            self.recorder.note("change", "plant", f"refused: {why}")
         if changed:
             self._set_points(loop, changed)
         if mode:
@@ -362,10 +351,7 @@ class Station:
         """The server is known now: its namespaces are kept, and its nodes locked however others spell them."""
         if found.spaces:
             keep_namespaces(self.journal, self.settings.server.endpoint, found.spaces)
-        before = self.lease.lost
-        self.lease.claim(found.writes)
-        if self.lease.lost != before:
-            self._untended(self.lease.lost)
+        self.locks.identified(found, writes=self.loop is not None and self.loop.mode is not Mode.SHADOW)
 
     def _connection(self, what: str) -> None:
         up = what.startswith("connected")

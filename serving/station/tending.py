@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from serving.words import named
 
-EVERY_S = 3600.0  # systems clean what is days old
+EVERY_S = 60.0  # an alarm of another loop ends so long after that loop at most
 
 
 class Tending:

@@ -11,9 +11,10 @@ from processes import within
 
 from serving import Controller
 from serving.errors import EndpointError
+from serving.opcua.answers import in_time
 from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.limits import OperationLimits, Pieces, TooManyError, in_pieces
-from serving.opcua.link import Link, in_time
+from serving.opcua.link import Link
 from serving.opcua.settings import Nodes, Server
 
 pytest_plugins = ["small_laws"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,21 @@ from serving.errors import EndpointError
 from serving.journal import Journal
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
+from serving.opcua.answers import BusyError, LateError
+from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.link import node_id
-from serving.opcua.nameplates import ChangedNodeError, Nameplates, identity
+from serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import ModeNode, Nodes, Point, Server
 from serving.opcua.values import Reading
 from serving.station.beginning import keep_namespaces, namespaces_before
+from serving.station.wishes import Wishes
 
 pytest_plugins = ["small_laws"]
 UA_SPACE = "http://opcfoundation.org/UA/"
 DOUBLE, INT32, STRING = ua.VariantType.Double, ua.VariantType.Int32, ua.VariantType.String
-UNITS = {"level": "m", "T": "K", "inflow": "l/s", "valve": "%"}
+UNITS = {"SP": "m", "level": "m", "T": "K", "inflow": "l/s", "valve": "%"}
 
 
 class MadeUpLink:
@@ -38,6 +42,8 @@ class MadeUpLink:
         self.kinds: dict[str, ua.VariantType] = {}
         self.units: dict[str, str] = {}
         self.ends: dict[str, float] = {}
+        self.declared: dict[str, int] = {}  # DataType by node
+        self.fails: EndpointError | None = None  # how each browse ends
 
     async def namespaces(self, _: float, *, anew: bool = False) -> list[str]:
         return self.spaces
@@ -58,6 +64,8 @@ class MadeUpLink:
         self, nodes: Sequence[ua.NodeId], _: int, __: float, *, inverse: bool = False
     ) -> list[list[ua.ReferenceDescription]]:
         names = ("EngineeringUnits", "EURange")
+        if self.fails is not None:
+            raise self.fails
         return [
             [
                 ua.ReferenceDescription(
@@ -68,8 +76,13 @@ class MadeUpLink:
             for n in nodes
         ]
 
-    async def values(self, nodes: Sequence[ua.NodeId], _: float) -> list[ua.DataValue]:
+    async def values(
+        self, nodes: Sequence[ua.NodeId], _: float, attribute: ua.AttributeIds = ua.AttributeIds.Value
+    ) -> list[ua.DataValue]:
         found = []
+        if attribute is ua.AttributeIds.DataType:
+            kinds = [self.declared.get(str(n.Identifier), ua.ObjectIds.Double) for n in nodes]
+            return [ua.DataValue(ua.Variant(ua.NodeId(k), ua.VariantType.NodeId)) for k in kinds]
         for node in nodes:
             of, _, what = str(node.Identifier).rpartition(" ")
             unit = ua.EUInformation(DisplayName=ua.LocalizedText(self.units.get(of, UNITS[of])))
@@ -80,7 +93,7 @@ class MadeUpLink:
 
 def nodes_of(m: Manifest, head: str) -> Nodes:
     groups: Any = {g: {s.name: f"{head};s={s.name}" for s in m.signals(g)} for g in ("pv", "mv", "dv")}
-    return Nodes(**groups, sp={"level": f"{head};s=level"}, mode=ModeNode(f"{head};s=mode", {"AUTO": 1.0}))
+    return Nodes(**groups, sp={"level": f"{head};s=SP"}, mode=ModeNode(f"{head};s=mode", {"AUTO": 1.0}))
 
 
 @pytest.fixture
@@ -94,8 +107,7 @@ def connected(link: Any, made: Nameplates) -> Plan:
     async def act() -> Plan:
         await made.require_spaces(link, 1.0)
         plan = await Plan.made(link, made.manifest, made.nodes, 1.0)
-        made.require_types(plan, [kind for _, kind in plan.written])
-        await made.look(link, plan, 1.0)
+        await made.look(link, plan, [kind for _, kind in plan.written], 1.0)
         return plan
 
     return asyncio.run(act())
@@ -105,8 +117,12 @@ def test_a_number_that_stands_for_another_namespace_is_no_node_of_this_loop(mani
     """A server that was started anew had its namespaces the other way round: the loop wrote another unit's valve."""
     made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
     connected(MadeUpLink("urn:one", "urn:two"), made)
-    for other in (("urn:two", "urn:one"), ("urn:two",), ()):
-        with pytest.raises(ChangedNodeError, match=r"write nsu=urn:one;s=level in loop\.toml"):
+    for other, advice in (
+        (("urn:two", "urn:one"), r"; write nsu=urn:one;s=level in loop\.toml"),
+        (("urn:two",), r"no namespace urn:one any more: if urn:two is .* write nsu=urn:two;s=level in loop\.toml"),
+        ((), "the server has the namespaces .*, urn:server$"),
+    ):
+        with pytest.raises(ChangedNodeError, match=advice):
             connected(MadeUpLink(*other), made)
     connected(MadeUpLink("urn:one", "urn:three"), made)  # it is there again, and what lies behind it is no matter
     by_name = Nameplates(nodes_of(manifest, "nsu=urn:one"), manifest)
@@ -114,6 +130,33 @@ def test_a_number_that_stands_for_another_namespace_is_no_node_of_this_loop(mani
     assert connected(MadeUpLink("urn:two", "urn:one"), by_name).asked[0].NamespaceIndex == 3
     with pytest.raises(EndpointError, match="no namespace 'urn:one'"):
         connected(MadeUpLink("urn:two"), by_name)
+
+
+def test_a_namespace_that_is_not_told_once_is_no_other_one(manifest: Manifest, tmp_path: Path) -> None:
+    """It was kept as a nameless one, and the loop refused its server for good, with "write nsu=;s=level"."""
+    made, silent = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
+    silent.spaces = []
+    connected(silent, made)
+    assert asyncio.run(identity(silent, made.nodes, 1.0, 1.0)).spaces == made.spaces == {}  # type: ignore[arg-type]
+    connected(MadeUpLink("urn:one"), made)
+    with pytest.raises(ChangedNodeError, match="the server does not say what it is now"):
+        connected(silent, made)
+    assert made.spaces == {2: "urn:one"}
+    journal = Journal(tmp_path / "loop.journal")
+    keep_namespaces(journal, "opc.tcp://localhost:4840", {2: "", 3: "urn:two"})  # of a release that kept it so
+    journal.close()
+    assert namespaces_before(journal.path, "opc.tcp://127.0.0.1:4840") == {3: "urn:two"}
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [("ns=2;s=A;ns=1;x", "nsu=u;s=A;ns=1;x"), ("i=5;ns=2", "nsu=u;i=5"), ("ns=2;s=TIC.PV", "nsu=u;s=TIC.PV")],
+)
+def test_an_id_by_its_namespaces_name_is_the_same_node(text: str, named: str) -> None:
+    assert by_name(text, "u") == named
+    assert node_id(named, ["", "", "u"]) == node_id(text, [])
+    with pytest.raises(EndpointError, match="is no node id"):
+        node_id("nsu=u;i=5;ns=1", ["", "", "u"])
 
 
 def test_what_a_number_stood_for_outlives_the_loop(manifest: Manifest, tmp_path: Path) -> None:
@@ -140,27 +183,81 @@ def valued(made: Nameplates, plan: Plan, **kinds: ua.VariantType) -> Values:
 
 @pytest.mark.parametrize("name", ["PV level", "MV valve", "DV inflow", "SP level", "mode"])
 def test_a_node_of_another_type_is_a_fault_while_it_is(name: str, manifest: Manifest) -> None:
-    """A PV went on in AUTO when its Double became an integer. A value of the wrong type is no wish either."""
+    """A PV went on in AUTO when its Double became an integer.
+
+    A value of the wrong type is no wish either; but nothing is wrong with the sample then, which once was refused.
+    """
     made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
     plan = connected(MadeUpLink("urn:one"), made)
-    used = "dv" in manifest.inputs or not name.startswith("DV")
+    wish = name in {"SP level", "mode"}
+    used = not wish and ("dv" in manifest.inputs or not name.startswith("DV"))
     assert valued(made, plan).fault == ""
     other = valued(made, plan, **{name.replace(" ", "_"): INT32})
     assert other.fault.startswith(f"{name}: its type is Int32 now and was Double") is used
+    wishes = Wishes()
+    assert [len(wishes.refused(v)) for v in (other, other, valued(made, plan), other)] == [wish, 0, 0, wish]
     assert (other.asked_mode, bool(other.asked_sp)) == ("" if name == "mode" else "AUTO", name != "SP level")
     assert np.isnan(other.mv[0]) == (name == "MV valve")
     assert valued(made, plan).fault == ""
 
 
-def test_an_mv_whose_written_node_has_another_type_is_not_written(manifest: Manifest) -> None:
+def written_elsewhere(m: Manifest) -> Nodes:
+    """A valve that is read back from another node than the loop writes."""
+    nodes = nodes_of(m, "ns=2")
+    return replace(nodes, mv={"valve": Point("ns=2;s=to", read_back="ns=2;s=valve")})
+
+
+@pytest.mark.parametrize("told", [{"kinds": {"to": INT32}}, {"units": {"to": "m"}}, {"ends": {"to": 27_648.0}}])
+def test_an_mv_whose_written_node_is_another_one_is_not_written_and_its_sample_is_good(
+    told: dict[str, Any], manifest: Manifest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shadow, which writes nothing, was at fault at every scan."""
+    monkeypatch.setitem(UNITS, "to", "%")
+    made, link = Nameplates(written_elsewhere(manifest), manifest), MadeUpLink("urn:one")
+    plan = connected(link, made)
+    assert made.unwritable == ""
+    for name, values in told.items():
+        setattr(link, name, values)
+    for again in (lambda: connected(link, made), lambda: asyncio.run(made.again(link, plan, 1.0))):  # type: ignore[arg-type]
+        again()
+        assert made.unwritable.startswith("MV valve, written: ")
+        assert made.fault == valued(made, plan).fault == ""
+    server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
+    endpoint = OpcUaEndpoint(manifest, server, made.nodes, max_age_s=1.0)
+    endpoint.nameplates, endpoint._link, endpoint._told, endpoint._shown = made, link, 1, 1  # type: ignore[assignment]
+    with pytest.raises(EndpointError, match="MV valve, written: "):
+        endpoint.write(np.array([50.0]))
+    endpoint._outbox.append(np.array([50.0]))  # passed on before it was known
+    asyncio.run(endpoint._send(link, plan))  # type: ignore[arg-type]
+    assert endpoint.unwritten == made.unwritable
+    link.kinds, link.units, link.ends = {}, {}, {}
+    asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    assert made.unwritable == ""
+
+
+def test_a_set_point_whose_unit_is_another_one_is_no_wish(manifest: Manifest) -> None:
     made, link = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
     plan = connected(link, made)
-    link.kinds["valve"] = INT32
-    for again in (lambda: connected(link, made), lambda: asyncio.run(made.again(link, plan, 1.0))):  # type: ignore[arg-type]
-        with pytest.raises(ChangedNodeError, match="MV valve, written: its type is Int32 now and was Double"):
-            again()
-    link.kinds.clear()
+    link.units["SP"] = "mm"
     asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    values = valued(made, plan)
+    assert (values.fault, values.asked_sp, list(values.unheard)) == ("", {}, ["SP level"])
+
+
+@pytest.mark.parametrize("declared", [ua.ObjectIds.Number, ua.ObjectIds.BaseDataType])
+def test_a_node_that_is_declared_to_hold_any_number_may_hold_any(declared: int, manifest: Manifest) -> None:
+    """A whole number that somebody typed there is an Int64 on some servers; a truth value or a text is no number."""
+    link = MadeUpLink("urn:one")
+    link.declared = dict.fromkeys((*UNITS, "mode"), declared)
+    made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
+    plan = connected(link, made)
+    valued(made, plan)
+    whole = dict.fromkeys((name.replace(" ", "_") for name, _, _ in plan.points), INT32)
+    assert (valued(made, plan, **whole).fault, valued(made, plan, **whole).unheard) == ("", {})
+    assert valued(made, plan, PV_level=ua.VariantType.Boolean).fault.startswith("PV level: its type is Boolean now")
+    link.kinds["valve"] = INT32
+    connected(link, made)
+    assert made.unwritable == ""
 
 
 def test_another_unit_or_range_is_a_fault_while_it_is(manifest: Manifest) -> None:
@@ -176,6 +273,31 @@ def test_another_unit_or_range_is_a_fault_while_it_is(manifest: Manifest) -> Non
         link.units, link.ends = {}, {}
         asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
         assert made.fault == valued(made, plan).fault == ""
+
+
+@pytest.mark.parametrize("told", [{"units": {"T": "degC"}}, {"ends": {"T": 200.0}}])
+def test_only_the_unit_or_range_itself_ends_its_fault(told: dict[str, Any], manifest: Manifest) -> None:
+    """One late answer, or a server that refused once, cleared the fault: the loop went on in AUTO on another unit."""
+    made, link = Nameplates(nodes_of(manifest, "ns=2"), manifest), MadeUpLink("urn:one")
+    plan = connected(link, made)
+    for name, values in told.items():
+        setattr(link, name, values)
+    asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    fault = made.fault
+    for fails in (LateError("late"), BusyError("BadTimeout"), EndpointError("BadServiceUnsupported")):
+        link.fails = fails
+        if isinstance(fails, LateError | BusyError):
+            with pytest.raises(type(fails)):
+                asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+            with pytest.raises(type(fails)):
+                connected(link, made)
+        else:
+            asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+            connected(link, made)
+        assert made.fault == fault != ""
+    link.fails, link.units, link.ends = None, {}, {}
+    asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
+    assert made.fault == ""
 
 
 def test_a_unit_that_never_was_the_controllers_is_a_fault_of_the_first_connection(manifest: Manifest) -> None:
@@ -201,5 +323,7 @@ def test_a_node_is_the_same_however_it_is_spelt_and_on_another_server_another_on
     assert keys(link, "nsu=urn:one", 1.5) == numbered
     assert keys(link, "ns=3", 1.5) != numbered
     assert keys(link, "ns=2", 2.5) != numbered  # of the same name and make, started at another time
-    assert keys(MadeUpLink("urn:one"), "ns=2", 1.5) != numbered
+    assert keys(MadeUpLink("urn:one", "urn:added"), "ns=2", 1.5) == numbered  # it may add some while it runs
     assert keys(link, "ns=2", None) == []  # one that does not tell when it started may be another one
+    found = asyncio.run(identity(link, nodes_of(manifest, "ns=2"), None, 1.0))  # type: ignore[arg-type]
+    assert found.nodes == {"nsu=urn:one;s=valve": "ns=2;s=valve"}

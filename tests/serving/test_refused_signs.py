@@ -12,8 +12,9 @@ from asyncua import ua
 from processes import within
 
 from serving import Controller, EndpointError
+from serving.opcua.answers import LateError
 from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.link import LateError, Link, node_id
+from serving.opcua.link import Link, node_id
 from serving.opcua.settings import Nodes, Server
 from serving.opcua.values import Reading
 
@@ -59,7 +60,11 @@ class MadeUpLink:
             Reading(1.0, 0, None, self.kinds.get(n, ua.VariantType.Double), "", self.held.get(n, "")) for n in names
         ]
 
-    async def values(self, nodes: Sequence[ua.NodeId], _: float) -> list[ua.DataValue]:
+    async def values(
+        self, nodes: Sequence[ua.NodeId], _: float, attribute: ua.AttributeIds = ua.AttributeIds.Value
+    ) -> list[ua.DataValue]:
+        if attribute is not ua.AttributeIds.Value:
+            return [ua.DataValue() for _ in nodes]
         return [ua.DataValue(ua.Variant(self.held[n.to_string()])) for n in nodes]
 
     async def write(self, rows: Sequence[tuple[ua.NodeId, ua.Variant]], _: float) -> list[int]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,9 +23,11 @@ from pipeline.__main__ import main
 from serving import Mode
 from serving.errors import LoopError
 from serving.opcua.lease import SCANS, NodeLease
+from serving.opcua.nameplates import Identity
 from serving.station import station
 from serving.station.control import Control, ask, door
 from serving.station.lease import Lease, address_of
+from serving.station.locks import Locks
 from serving.station.tending import Tending
 
 SPEED = 2.0  # periods of .25 s: a loop counts as gone after five without a renewal
@@ -252,7 +255,7 @@ def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path, mo
     folder, journal = tmp_path / "a", loop.settings.journal.file
     try:
         locks = [path for path in folder.iterdir() if len(path.name) == 32]
-        assert len(locks) == 2  # of the MV as it is spelt, and as the server calls it
+        assert len(locks) == 1  # of the MV as it is spelt; a shadow leaves the others to the loop that writes
         for lock in locks:
             lock.unlink()
         door(journal).unlink()
@@ -326,3 +329,96 @@ def test_another_spelling_of_the_node_is_the_same_mv_once_the_server_is_known(tm
     assert one.lost
     for lease in (one, two):
         lease.release()
+
+
+NODE = "nsu=urn:plant;s=MV.u"
+
+
+def known(start: float, *nodes: str) -> tuple[dict[str, str], dict[str, str]]:
+    """What a loop claims at a server that started then."""
+    return {f"urn:server {start} {n}": n for n in nodes}, {n: n for n in nodes}
+
+
+def test_the_loop_that_writes_keeps_its_mv_when_the_server_starts_anew(tmp_path: Path) -> None:
+    """All lock its nodes anew then: a loop that wrote nothing came first, and the one that wrote went to SHADOW."""
+    folder, at = tmp_path / "locks", "opc.tcp://127.0.0.1:4841"
+    writes, waits = Lease(at, ["ns=2;s=MV.u"], folder), Lease(at, [NODE], folder)
+    writes.claim(*known(1.0, NODE))
+    waits.claim(*known(1.0, NODE))
+    assert waits.lost
+    waits.disclaim()
+    assert waits.lost
+    waits.claim(*known(2.0, NODE))  # somebody even asks it to write before the other is back
+    assert waits.lost
+    assert [key for key in waits._held if key != NODE] == []
+    waits.disclaim()
+    writes.claim(*known(2.0, NODE))
+    assert writes.lost == ""
+    writes.disclaim()
+    waits.tend()  # it only looks: the other one may claim again
+    assert waits.lost == ""
+    writes.claim(*known(2.0, NODE))
+    assert writes.lost == ""
+    writes.disclaim()
+    waits.claim(*known(2.0, NODE))
+    writes.claim(*known(2.0, NODE))
+    assert (waits.lost, bool(writes.lost)) == ("", True)
+    for lease in (writes, waits):
+        lease.release()
+    assert list(folder.iterdir()) == []
+
+
+def test_of_two_loops_that_share_an_mv_one_has_all_of_its_own(tmp_path: Path) -> None:
+    """Each had one MV of the other's, and neither wrote."""
+    folder, at = tmp_path / "locks", "opc.tcp://127.0.0.1:4841"
+    one, two = Lease(at, ["ns=2;s=a"], folder), Lease(at, ["ns=2;s=b"], folder)
+    one.claim(*known(1.0, "nsu=p;s=b"))
+    two.claim(*known(1.0, "nsu=p;s=a", "nsu=p;s=b"))
+    assert two.lost
+    three = Lease(at, ["ns=2;s=c"], folder)
+    three.claim(*known(1.0, "nsu=p;s=a"))
+    assert (one.lost, three.lost) == ("", "")
+    for lease in (one, two, three):
+        lease.release()
+
+
+def test_the_alarm_of_another_loop_ends_with_that_loop(tmp_path: Path) -> None:
+    """It was raised by whoever found out first, and ended by nobody."""
+    folder, at, noted = tmp_path / "locks", "opc.tcp://127.0.0.1:4841", list[tuple[str, bool]]()
+    recorder: Any = SimpleNamespace(
+        note=lambda kind, *_, raised=False, **__: noted.append((kind, raised)) if kind == "fault" else None
+    )
+    loop: Any = SimpleNamespace(mode=Mode.AUTO)
+    loop.set_mode = lambda mode: setattr(loop, "mode", mode)
+    other = Lease(at, ["ns=2;s=MV.u"], folder)
+    other.claim(*known(1.0, NODE))
+    lease = Lease(at, [NODE], folder)
+    locks = Locks(lease, recorder)
+    locks.identified(Identity({}, *known(1.0, NODE)), writes=True)
+    for _ in range(3):
+        locks.keep(loop)
+        locks.tend()
+    assert loop.mode is Mode.SHADOW
+    assert noted == [("fault", True)]
+    other.release()
+    locks.keep(loop)
+    locks.tend()
+    assert noted == [("fault", True), ("fault", False)]
+    locks.untended("PermissionError")  # of a file beside the locks
+    loop.mode = Mode.AUTO
+    locks.keep(loop)
+    locks.tend()
+    assert loop.mode is Mode.AUTO
+    assert noted[2:] == [("fault", True)]
+    locks.untended("")
+    assert noted[3:] == [("fault", False)]
+    lease.release()
+
+
+def test_an_address_to_which_linux_lets_a_socket_be_bound_is_no_address_of_this_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With net.ipv4.ip_nonlocal_bind = 1 it may be bound to any: all servers of the world were one."""
+    monkeypatch.setattr(socket.socket, "bind", lambda *_: None)
+    assert address_of("opc.tcp://192.0.2.7:4840") == "192.0.2.7:4840"
+    assert address_of("opc.tcp://127.0.0.1:4840") == "this machine:4840"
