@@ -255,9 +255,7 @@ def _run(options: argparse.Namespace) -> int:
         station.tell(_left(station.manifest, station.last[1]))
     station.tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
     lost = station.journal.lost
-    station.tell(
-        f"journal: {settings.journal.file}" + (f"; {lost} scans and events of this loop are lost" if lost else "")
-    )
+    station.tell(f"journal: {settings.journal.file}" + (f"; {lost} scans and events are lost" if lost else ""))
     return JOURNAL_LOST if lost else 0
 
 
