@@ -14,7 +14,8 @@ from pathlib import Path
 from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
 from pipeline.errors import PipelineError
 
-COMMAND = (sys.executable, "-m", "dvc")
+PYTHON = (sys.executable, "-P")  # no package comes from the folder in which somebody stands: a numpy.py there would run
+COMMAND = (*PYTHON, "-m", "dvc")
 DEPENDENCY = re.compile(r'"([^"]+)" -> "([^"]+)";')  # of a line of `dvc dag --dot`
 MARK = "\x1e"  # the ASCII record separator
 # One command of DVC after another, a mark after each: loading DVC takes longer than most of them. What it loads stays:
@@ -73,7 +74,7 @@ def ask(*arguments: str, finish: bool = False) -> str:
 
 def ask_in_turn(*commands: Sequence[str]) -> list[str]:
     """What ``dvc ARGUMENT...`` prints for each of some commands, as ``ask`` of each; DVC is loaded once."""
-    code, out, err = _done([sys.executable, "-c", IN_TURN, json.dumps(commands), MARK])
+    code, out, err = _done([*PYTHON, "-c", IN_TURN, json.dumps(commands), MARK])
     *found, rest = out.split(MARK)
     if code:
         raise PipelineError(f"dvc {commands[min(len(found), len(commands) - 1)][0]} failed: {_reason(err or rest)}")

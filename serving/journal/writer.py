@@ -47,8 +47,8 @@ class Journal:
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
     takes nothing, or does not answer, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are
     ``lost``, scans before events; what a run is stays. That is told once, and once the journal writes again, an alarm
-    in it says how many they were. A file that is deleted, replaced, cut or damaged meanwhile is made again, with the rows
-    that the open one still gives; an alarm says how many went, and they are ``lost`` (see ``recovery``).
+    in it says how many they were. A file that is deleted, replaced, cut or damaged meanwhile is made again, with the
+    rows that the open one still gives; an alarm says how many went, and they are ``lost`` (see ``recovery``).
 
     Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
