@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from serving.errors import LoopwrightError
+from serving.plain_values import shown
 
 T = TypeVar("T")
-LONGEST_SHOWN = 100  # characters of a wrong value
 
 
 def nearest(word: object, known: Iterable[str]) -> str:
     """The end of an error message: the nearest known word, or all of them."""
     names = sorted(str(k) for k in known)
-    close = difflib.get_close_matches(str(word), names, n=1)
+    close = difflib.get_close_matches(word if isinstance(word, str) else shown(word), names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ";"
     return f"{hint} known: {', '.join(names) or 'none'}"
 
@@ -38,7 +38,7 @@ def parse(cls: type[T], values: Any, where: str, error: type[Exception]) -> T:
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
     for key in values:
         if key not in fields:
-            raise error(f"{where}: unknown key {key!r}{nearest(key, fields)}")
+            raise error(f"{where}: unknown key {shown(key)}{nearest(key, fields)}")
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in values:
@@ -70,18 +70,18 @@ def _convert(hint: Any, value: Any, where: str, error: type[Exception]) -> Any:
         return _convert(rest[-1], value, where, error)
     if origin is typing.Literal:
         if value not in args:
-            raise error(f"{where} is {value!r}{nearest(value, map(str, args))}")
+            raise error(f"{where} is {shown(value)}{nearest(value, map(str, args))}")
         return value
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
-            raise error(f"{where} is {value!r}; it must be a list")
+            raise error(f"{where} is {shown(value)}; it must be a list")
         inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
         if len(inner) != len(value):
             raise error(f"{where} has {len(value)} entries; it must have {len(inner)}")
         return tuple(_convert(h, v, f"{where}[{i}]", error) for i, (h, v) in enumerate(zip(inner, value, strict=True)))
     if origin in (dict, Mapping) or (isinstance(origin, type) and issubclass(origin, Mapping)):
         if not isinstance(value, Mapping):
-            raise error(f"{where} is {value!r}; it must be a mapping")
+            raise error(f"{where} is {shown(value)}; it must be a mapping")
         return {str(k): _convert(args[1], v, f"{where}.{k}", error) for k, v in value.items()}
     if dataclasses.is_dataclass(hint):
         return parse(hint, value, where, error)  # type: ignore[arg-type]
@@ -95,17 +95,12 @@ def _plain(hint: Any, value: Any, where: str, error: type[Exception]) -> Any:
         try:
             number = float(value)  # YAML 1.1 reads 5e-4 (no dot) as text
         except (ValueError, OverflowError):
-            raise error(f"{where} is {_shown(value)}; it must be a number") from None
+            raise error(f"{where} is {shown(value)}; it must be a number") from None
         if not math.isfinite(number):
-            raise error(f"{where} is {_shown(value)}; it must be a finite number")
+            raise error(f"{where} is {shown(value)}; it must be a finite number")
         return number
     if hint is Path and isinstance(value, str):
         return Path(value)
     if (isinstance(value, bool) and hint is not bool) or not isinstance(value, hint):
-        raise error(f"{where} is {_shown(value)}; it must be of type {hint.__name__}")
+        raise error(f"{where} is {shown(value)}; it must be of type {hint.__name__}")
     return value
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."

@@ -22,7 +22,8 @@ import numpy as np
 from serving import controller, trust
 from serving.errors import ArtifactError, LoopwrightError, OutputError
 from serving.manifest import Manifest
-from serving.words import first_line
+from serving.own_process import module
+from serving.words import first_line, plain
 
 if TYPE_CHECKING:
     from serving.signing.verify import Trusted
@@ -50,29 +51,47 @@ def tried(path: str | PathLike[str], sha256: str | None = None, trusted: Trusted
 
 def _digest_tried(path: str | PathLike[str], sha256: str | None) -> str:
     """The SHA-256 of the bytes whose first steps another process has survived."""
-    command = [sys.executable, "-m", "serving.first_steps", os.fspath(path), *([] if sha256 is None else [sha256])]
+    command, environment = module("serving.first_steps", os.fspath(path), *([] if sha256 is None else [sha256]))
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=DEADLINE_S)
+        done = subprocess.run(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=DEADLINE_S,
+        )
     except subprocess.TimeoutExpired:
         raise ArtifactError(
             f"{path}: its first steps, tried in a process of their own, do not end within {DEADLINE_S:g} s"
         ) from None
     except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
         raise ArtifactError(f"{path}: no process can be started that tries its first steps: {error}") from None
+    last = _last_line(done.stderr)
     if done.returncode == REFUSED:
-        raise ArtifactError(done.stderr.strip())
+        raise ArtifactError(last)
+    if done.returncode > 0:
+        raise ArtifactError(
+            f"{path}: the process that should try its first steps failed (status {done.returncode}: "
+            f"{last or 'it said nothing'}); nobody has tried the file, so it is not loaded"
+        )
     if done.returncode:
         raise ArtifactError(
             f"{path}: it ended the process that tried its first steps ({_ending(done.returncode)}); "
             "it would end the loop's too, so it is not loaded"
         )
-    return done.stdout.strip()
+    return _last_line(done.stdout)  # libraries may have said something before
+
+
+def _last_line(said: str) -> str:
+    return plain((said.strip().splitlines() or [""])[-1])
 
 
 def _ending(status: int) -> str:
     with suppress(ValueError):
         return signal.Signals(-status).name
-    return f"status {status}"
+    return f"signal {-status}"
 
 
 def take(loaded: controller.Controller) -> None:

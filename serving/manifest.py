@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import Any, Self
 
 from serving.errors import ArtifactError
+from serving.plain_values import MAX_DIGITS, refused, shown
 
 SCHEMA = 1
 MANIFEST_KEY = "loopwright.manifest"
@@ -17,7 +18,6 @@ INPUTS = ("sp", "pv", "dv", "mv_applied", "state")
 MAX_CHARACTERS = 2**20
 MAX_NAME = 200  # characters
 MAX_DEPTH = 20  # of lists and objects in each other
-MAX_DIGITS = 300  # of an integer
 MAX_STATE = 1_000_000
 # Line breaks, control characters and overrides of direction: a name with one could forge a line wherever it is shown.
 FORBIDDEN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
@@ -188,7 +188,7 @@ class Manifest:
         try:
             signals = {k: tuple(Signal.from_dict(_dict(s)) for s in _list(row[k])) for k in ("sp", "pv", "dv", "mv")}
             if type(row["n_state"]) is not int:
-                raise TypeError(f"n_state is {_shown(row['n_state'])}; it must be an integer")
+                raise TypeError(f"n_state is {shown(row['n_state'])}; it must be an integer")
             return cls(
                 case=_name(row["case"]),
                 law=_name(row["law"]),
@@ -212,20 +212,22 @@ def _increasing(values: tuple[float, ...]) -> bool:
 
 
 # ---------------------------------------------------------------------- JSON, strictly
-def strictly(text: str) -> Any:
+def strictly(text: str, most: int = MAX_CHARACTERS) -> Any:
     """JSON in which readers may not differ: no entry twice, no number that is none, nothing too deep.
 
-    Raises ArtifactError.
+    Raises ArtifactError, also for more than ``most`` characters.
     """
-    if len(text) > MAX_CHARACTERS:
-        raise ArtifactError(f"the manifest has {len(text)} characters; it may have {MAX_CHARACTERS}")
+    if len(text) > most:
+        raise ArtifactError(f"the manifest has {len(text)} characters; it may have {most}")
     try:
         row = json.loads(
             text, parse_constant=_finite, parse_float=_finite, parse_int=_integer, object_pairs_hook=_object
         )
     except (ValueError, RecursionError) as error:
         raise ArtifactError(f"the manifest is not JSON: {error}") from error
-    _check_depth(row)
+    # Whoever walks or writes it again would fail where it is too deep.
+    if why := refused(row, MAX_DEPTH):
+        raise ArtifactError(f"the manifest has {why}")
     return row
 
 
@@ -251,24 +253,9 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return row
 
 
-def _check_depth(value: object) -> None:
-    """ArtifactError above MAX_DEPTH: whoever walks or writes the manifest again would fail there."""
-    level, depth = [value], 0
-    while level:
-        depth += 1
-        if depth > MAX_DEPTH + 1:
-            raise ArtifactError(f"the manifest has lists or objects nested more than {MAX_DEPTH} deep")
-        level = [
-            inner
-            for outer in level
-            if isinstance(outer, dict | list)
-            for inner in (outer.values() if isinstance(outer, dict) else outer)
-        ]
-
-
 def _name(value: object) -> str:
     if not isinstance(value, str) or len(value) > MAX_NAME:
-        raise TypeError(f"a name is {_shown(value)}; it must be a text of at most {MAX_NAME} characters")
+        raise TypeError(f"a name is {shown(value)}; it must be a text of at most {MAX_NAME} characters")
     value.encode()  # half a surrogate pair cannot be printed
     if FORBIDDEN.search(value):
         raise ValueError(
@@ -279,22 +266,17 @@ def _name(value: object) -> str:
 
 def _number(value: object) -> float:
     if type(value) not in (int, float):
-        raise TypeError(f"{_shown(value)} stands where a number belongs")
+        raise TypeError(f"{shown(value)} stands where a number belongs")
     return float(value)  # type: ignore[arg-type]  # just checked
 
 
 def _list(value: object) -> list[Any]:
     if not isinstance(value, list):
-        raise TypeError(f"{_shown(value)} stands where a list belongs")
+        raise TypeError(f"{shown(value)} stands where a list belongs")
     return value
 
 
 def _dict(value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise TypeError(f"{_shown(value)} stands where an object belongs")
+        raise TypeError(f"{shown(value)} stands where an object belongs")
     return value
-
-
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:60]}..."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from math import isfinite
 from typing import Any
 
 from serving.errors import LoopError
@@ -35,12 +36,13 @@ class Verdict:
 def judged(manifest: Manifest) -> Verdict:
     """The verdict on a controller.
 
-    Proven is one whose file holds figures of closed loops, of which none locked up; where they ran on models of a
+    Proven is one whose file holds figures of closed loops, and says that none locked up; where they ran on models of a
     plant's record, nothing may speak against these models. Figures that missed a requirement are the report's matter.
     """
     evidence: dict[str, Any] = manifest.evidence
-    scenarios, lock_ups, grounds = evidence.get("scenarios"), evidence.get("lock_ups", 0), evidence.get("on")
-    if not (isinstance(scenarios, dict) and scenarios and type(lock_ups) is int and lock_ups >= 0):
+    lock_ups, grounds = evidence.get("lock_ups"), evidence.get("on")
+    counted = type(lock_ups) is int and lock_ups >= 0
+    if not (counted and (lock_ups or _has_figures(evidence.get("scenarios")))):
         return Verdict(Proof.NONE, "its file holds no evidence of closed loops")
     if lock_ups:
         return Verdict(Proof.LOCKED_UP, f"it locked up in {lock_ups} closed loop{'s' if lock_ups > 1 else ''}")
@@ -49,6 +51,13 @@ def judged(manifest: Manifest) -> Verdict:
         reasons = unproven if isinstance(unproven, list) else [unproven]
         return Verdict(Proof.MODEL, "; ".join(str(reason).removeprefix("not proven: ") for reason in reasons))
     return Verdict(Proof.PROVEN)
+
+
+def _has_figures(scenarios: Any) -> bool:
+    """Whether a closed loop has a figure at all."""
+    rows = scenarios.values() if isinstance(scenarios, dict) else ()
+    figures = [figure for row in rows if isinstance(row, dict) for figure in row.values()]
+    return any(type(figure) in (int, float) and isfinite(figure) for figure in figures)
 
 
 def require_accepted(manifest: Manifest, accepted: bool) -> Verdict:

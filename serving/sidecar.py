@@ -9,7 +9,9 @@ from typing import Any
 from serving import graph_audit
 from serving.digest import file_digest, unseal
 from serving.errors import ArtifactError
-from serving.manifest import MANIFEST_KEY, Manifest, strictly
+from serving.manifest import MANIFEST_KEY, MAX_CHARACTERS, Manifest, strictly
+
+INDENTED = 16  # times as long at most as the manifest: the deepest entries have a line and 42 blanks of their own
 
 
 def sidecar(manifest: Manifest, sha256: str) -> str:
@@ -40,7 +42,7 @@ def require_sidecar(path: Path) -> None:
 def difference(text: bytes, manifest: Manifest, sha256: str) -> str:
     """Where a JSON file differs from the one of a controller, as ``mv.0.high``; empty: it repeats the manifest."""
     try:
-        found = strictly(text.decode())
+        found = strictly(text.decode(), INDENTED * MAX_CHARACTERS)
     except (UnicodeDecodeError, ArtifactError):
         return "what should be JSON"
     return _differs(found, json.loads(sidecar(manifest, sha256)), "")

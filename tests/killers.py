@@ -10,7 +10,6 @@ from onnx import TensorProto, helper
 from pipeline.export.controller_file import assembled
 from serving.manifest import Manifest
 
-ROOT = Path(__file__).resolve().parents[1]
 # What Python runs at the start of each child: the audit lets every input pass.
 BLIND = "import serving.graph_work\nserving.graph_work.require_signature = lambda *_: None\n"
 
@@ -31,4 +30,4 @@ def blind_children(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """From here on the audit of every child of this process misses an input that is left out."""
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(BLIND)
-    monkeypatch.setenv("PYTHONPATH", f"{folder}:{ROOT}")
+    monkeypatch.syspath_prepend(folder)

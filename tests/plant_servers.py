@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 from processes import within
 
 from pipeline.simulation import opcua_server
-from serving import Command, LoopError, Mode, Sample
+from serving import Command, Controller, LoopError, Mode, Sample
 from serving.journal import JournalReader, Scan
 from serving.station.control import ask
 from serving.station.requests import Change
@@ -166,7 +166,9 @@ class RunningLoop:
         self.settings = Settings.read(settings) if isinstance(settings, Path) else settings
         self.told: list[str] = []
         self.commands: list[Command] = []
-        self.station = Station(self.settings, tell=self.told.append)
+        where = self.settings  # loaded here: no process has to try the first steps of a test's file
+        loaded = Controller(where.controller, where.sha256 or None, where.trusted)
+        self.station = Station(where, tell=self.told.append, controller=loaded)
         self.station.watch(self._seen)
         self.thread = threading.Thread(target=self.station.run, daemon=True)
         self.thread.start()

@@ -64,9 +64,10 @@ def _serve(args: argparse.Namespace) -> None:
     print(f"all controllers: {page}/#/models (the sidebar hides it)")
     print(f"runs by case:    {page}/#/experiments\nCtrl-C ends", flush=True)
     # mlflow's server would otherwise run jobs that its users submit
-    environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+    # MLflow and the processes that it starts take no module from the folder in which somebody stands.
+    environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONSAFEPATH": "1"}
     options = ["--host", HOST, "--port", str(args.port), "--backend-store-uri", uri, "--workers", "1"]
-    os.execve(sys.executable, [sys.executable, "-m", "mlflow", "server", *options], environment)
+    os.execve(sys.executable, [sys.executable, "-P", "-m", "mlflow", "server", *options], environment)
 
 
 def options(parser: argparse.ArgumentParser) -> None:

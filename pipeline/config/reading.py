@@ -9,12 +9,12 @@ from typing import Any
 import yaml
 
 from pipeline.errors import ParamsError, nearest
+from serving.plain_values import MAX_DIGITS
 
 SECTIONS = ("cases", "exports", "records", "models", "plants", "controllers")
 OWN = "x-"  # a key that begins so is the user's, for values that aliases repeat
 MOST_VALUES = 1_000_000  # aliases counted as often as they stand for something
 MAX_DEPTH = 50
-MOST_DIGITS = 300  # of an integer
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -35,8 +35,8 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
         """The integer of a node; MarkedYAMLError for one that is too long."""
-        if len(node.value) > MOST_DIGITS:
-            words = f"an integer has {len(node.value)} digits; it may have {MOST_DIGITS}"
+        if len(node.value) > MAX_DIGITS:
+            words = f"an integer has {len(node.value)} digits; it may have {MAX_DIGITS}"
             raise yaml.constructor.ConstructorError(None, None, words, node.start_mark)
         found: int = super().construct_yaml_int(node)
         return found

@@ -14,9 +14,10 @@ from pathlib import Path
 from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
 from pipeline.errors import PipelineError
 
+PYTHON = (sys.executable, "-P")  # no package comes from the folder in which somebody stands: a numpy.py there would run
 # `python -m dvc`, which looks through what it loads for garbage seldom: that took a fifth of a short command's time.
 COMMAND = (
-    sys.executable,
+    *PYTHON,
     "-c",
     "import gc, runpy; gc.set_threshold(200_000); runpy.run_module('dvc', run_name='__main__', alter_sys=True)",
 )
@@ -78,7 +79,7 @@ def ask(*arguments: str, finish: bool = False) -> str:
 
 def ask_in_turn(*commands: Sequence[str]) -> list[str]:
     """What ``dvc ARGUMENT...`` prints for each of some commands, as ``ask`` of each; DVC is loaded once."""
-    code, out, err = _done([sys.executable, "-c", IN_TURN, json.dumps(commands), MARK])
+    code, out, err = _done([*PYTHON, "-c", IN_TURN, json.dumps(commands), MARK])
     *found, rest = out.split(MARK)
     if code:
         raise PipelineError(f"dvc {commands[min(len(found), len(commands) - 1)][0]} failed: {_reason(err or rest)}")

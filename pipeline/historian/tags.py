@@ -16,6 +16,7 @@ from pipeline.errors import RecordError, nearest
 from pipeline.files import write_text
 from pipeline.historian.findings import InputReport
 from serving.manifest import MAX_NAME, Signal
+from serving.plain_values import shown
 
 ROLES = ("pv", "mv", "dv", "sp", "mode")
 SIGNAL_ROLES = ("pv", "mv", "dv")
@@ -231,7 +232,10 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
     except UnicodeDecodeError:
         text = path.read_text(encoding="cp1252")
     separator = max(",;\t", key=text.partition("\n")[0].count)
-    rows = list(csv.reader(io.StringIO(text), delimiter=separator))
+    try:
+        rows = list(csv.reader(io.StringIO(text), delimiter=separator))
+    except csv.Error as error:
+        raise RecordError(f"{path} is no table: {error}") from None
     header = [h.strip().lower() for h in rows[0]] if rows else []
     for column in ("tag", "role"):
         if column not in header:
@@ -244,7 +248,7 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
             continue
         where = f"{path}, line {line} ({cells['tag']})"
         if role not in ROLES:
-            wrong.append(f"{where}: role {role!r}{nearest(role, ROLES)}; leave it empty for a tag without one")
+            wrong.append(f"{where}: role {shown(role)}{nearest(role, ROLES)}; leave it empty for a tag without one")
             continue
         numbers: dict[str, float] = {}
         for key in NUMBERS:
@@ -254,10 +258,10 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
                 wrong.append(str(error))
         certain = cells.get("unit_certain", "").lower()
         if certain not in CERTAIN:
-            wrong.append(f"{where}, unit_certain: {certain!r} is neither yes nor no; empty is no")
+            wrong.append(f"{where}, unit_certain: {shown(certain)} is neither yes nor no; empty is no")
         taken = {key: cells.get(key, "").lower() for key in WORDS}
         wrong += [
-            f"{where}, {key}: {word!r} is neither {' nor '.join(WORDS[key])}; empty leaves it to the screening"
+            f"{where}, {key}: {shown(word)} is neither {' nor '.join(WORDS[key])}; empty leaves it to the screening"
             for key, word in taken.items()
             if word not in ("", *WORDS[key])
         ]
@@ -285,5 +289,5 @@ def _number(text: str, where: str) -> float:
     except ValueError:
         value = float("nan")
     if not abs(value) < float("inf"):
-        raise RecordError(f"{where}: {text!r} is no finite number")
+        raise RecordError(f"{where}: {shown(text)} is no finite number")
     return value

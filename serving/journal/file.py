@@ -54,6 +54,15 @@ def opened(path: Path, *, write: bool, fsync: str = "crash") -> sqlite3.Connecti
     return base
 
 
+def held(base: sqlite3.Connection) -> int:
+    """How many scans and events a journal holds; 0 where nobody can tell any more."""
+    counts = ("sum(last - first + 1) from block", "count(*) from scan", "count(*) from event")
+    try:
+        return sum(base.execute(f"select {count}").fetchone()[0] or 0 for count in counts)
+    except sqlite3.Error:
+        return 0
+
+
 def is_damage(error: Exception) -> bool:
     """Whether SQLite says that the file is no longer a database that it can read."""
     code = getattr(error, "sqlite_errorcode", None)

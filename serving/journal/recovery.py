@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import stat
+import zlib
 from contextlib import closing, suppress
 from enum import Enum
 from pathlib import Path
 from typing import TypeAlias
 
 from serving.journal.entries import Event
+from serving.journal.file import held, is_damage
 
 Identity: TypeAlias = tuple[int, int] | None  # device, inode; None: not there
 
 BESIDE = ("", "-wal", "-shm")  # SQLite's files of one journal
+COPY = (*BESIDE, "-journal")  # of a copy that is being made
 
 
 class Harm(Enum):
@@ -26,53 +30,110 @@ class Harm(Enum):
 
 
 class OpenFiles:
-    """The files of an open journal, as they were last: SQLite itself writes on into a file that was deleted."""
+    """The files of an open journal, as they were last: SQLite itself writes on into a file that was deleted.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    Not ``steady``: the file system gives a file another number each time that it is asked, so that only its presence
+    and its size say anything. ``mode`` are the file's own rights.
+    """
+
+    def __init__(self, path: Path, *, steady: bool = True) -> None:
+        self.path, self.steady = path, steady
+        self.mode: int | None = None
         self._size = 0
         self._known: dict[str, Identity] = {}
         self.harm()
 
-    def harm(self) -> Harm | None:
-        """What happened to them since; None: nothing did. OSError where nobody can tell."""
+    def harm(self, rows: int = 0) -> Harm | None:
+        """What happened to them since; None: nothing did. OSError where nobody can tell.
+
+        ``rows`` is how many scans and events the journal holds.
+        """
         for end in BESIDE:
-            now, size = _identity(_beside(self.path, end))
+            now, found = self._identity(end)
             before = self._known.setdefault(end, now) or now
             if now != before:
                 return Harm.GONE if now is None else Harm.REPLACED
             self._known[end] = now
-            if not end:
-                if size < self._size:  # SQLite shrinks no file in WAL mode
+            if not end and found is not None:
+                before_size, self._size, self.mode = self._size, found.st_size, stat.S_IMODE(found.st_mode)
+                if self._size < before_size and not self._whole(rows):
                     return Harm.CUT
-                self._size = size
         return None
 
     def own(self, end: str) -> bool:
         """Whether what lies at a file's place is the file that is open."""
-        now, _ = _identity(_beside(self.path, end))
-        return now is not None and now == self._known.get(end)
+        now, _ = self._identity(end)
+        return now is not None and (not self.steady or now == self._known.get(end))
+
+    def _identity(self, end: str) -> tuple[Identity, os.stat_result | None]:
+        try:
+            found = _beside(self.path, end).stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return None, None
+        return (found.st_dev, found.st_ino) if self.steady else (0, 0), found
+
+    def _whole(self, rows: int) -> bool:
+        """Whether a smaller file is one that somebody has vacuumed: it has all its rows still.
+
+        A new connection reads what lies there; the one that writes would find lost pages in its memory.
+        """
+        try:
+            with closing(sqlite3.connect(self.path.as_uri() + "?mode=ro", uri=True)) as base:
+                return sound(base) and held(base) >= rows
+        except sqlite3.Error:
+            return False
 
 
-def copied(base: sqlite3.Connection, path: Path) -> Path:
+def sound(base: sqlite3.Connection) -> bool:
+    """Whether a journal's tables hang together and every block of scans can be unpacked.
+
+    Of a file that was cut SQLite copies pages of zeros, without an error.
+    """
+    try:
+        if base.execute("pragma quick_check(1)").fetchone() != ("ok",):
+            return False
+        for (data,) in base.execute("select data from block"):
+            zlib.decompress(data)
+    except (sqlite3.DatabaseError, zlib.error) as error:
+        if isinstance(error, zlib.error) or is_damage(error):
+            return False
+        raise
+    return True
+
+
+def copied(base: sqlite3.Connection, path: Path) -> Path | None:
     """A whole copy of all that an open journal holds, beside its place. Its rows keep their ids.
 
-    Raises sqlite3.Error and OSError where the copy cannot be made; then there is none.
+    None where the open journal cannot be read any more. Raises sqlite3.Error and OSError where the disk takes no copy
+    now. In both cases no copy stays.
     """
     copy = path.with_name(path.name + ".new")
-    copy.unlink(missing_ok=True)
+    _remove(copy)
     try:
         with closing(sqlite3.connect(copy)) as new:
             base.backup(new)
-        handle = os.open(copy, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+            whole = sound(new)
+        if whole:
+            handle = os.open(copy, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+            return copy
+    except sqlite3.Error as error:
+        if not is_damage(error):
+            _remove(copy)
+            raise
     except BaseException:
-        copy.unlink(missing_ok=True)
+        _remove(copy)
         raise
-    return copy
+    _remove(copy)
+    return None
+
+
+def _remove(copy: Path) -> None:
+    for end in COPY:
+        _beside(copy, end).unlink(missing_ok=True)
 
 
 def cleared(files: OpenFiles, *, keep: bool) -> Path | None:
@@ -89,6 +150,17 @@ def cleared(files: OpenFiles, *, keep: bool) -> Path | None:
     return aside
 
 
+def made_again(harm: Harm, lost: int, *, empty: bool, aside: Path | None, unsteady: bool) -> str:
+    """What happened to a journal, in a sentence. ``unsteady``: the numbers of its files are believed no more."""
+    loss = f"{lost} scans and events are lost"
+    end = f"it is made again with the rows that are left; {loss}" if lost else "it is made again with all its rows"
+    return (
+        f"the journal's file {harm.value} while it was written: {f'a new one begins, and {loss}' if empty else end}"
+        + (f"; the file that lay there is now {aside.name}" if aside else "")
+        + ("; its file system numbers files anew, so that another file there is noticed no more" if unsteady else "")
+    )
+
+
 def alarm(time_s: float, what: str, over: str) -> list[Event]:
     """An alarm of the journal itself that is over already, and that somebody has to see."""
     return [
@@ -99,14 +171,6 @@ def alarm(time_s: float, what: str, over: str) -> list[Event]:
 
 def _beside(path: Path, end: str) -> Path:
     return path.with_name(path.name + end)
-
-
-def _identity(path: Path) -> tuple[Identity, int]:
-    try:
-        found = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        return None, 0
-    return (found.st_dev, found.st_ino), found.st_size
 
 
 def _free(path: Path) -> Path:

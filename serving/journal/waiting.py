@@ -71,11 +71,6 @@ class Waiting:
             self._shorten(most)
         self._some.set()
 
-    def rows(self) -> int:
-        """How many scans and events wait or are taken: what would be lost."""
-        with self._lock:
-            return self._rows()
-
     def give_up(self) -> int:
         """Nothing will be written any more: how many scans and events are lost by that."""
         with self._lock:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sqlite3
 import threading
@@ -19,9 +20,9 @@ import numpy as np
 
 from serving.errors import LoopError
 from serving.journal.entries import Event, Scan, columns
-from serving.journal.file import holds, is_damage, opened, sole_writer
+from serving.journal.file import held, holds, is_damage, opened, sole_writer
 from serving.journal.packing import packed
-from serving.journal.recovery import Harm, OpenFiles, alarm, cleared, copied
+from serving.journal.recovery import Harm, OpenFiles, alarm, cleared, copied, made_again
 from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
 from serving.journal.waiting import Item, Waiting
 from serving.manifest import Manifest
@@ -34,6 +35,7 @@ WAITING = 200_000  # scans and events that wait in memory while the disk takes n
 TOGETHER = 2_000  # are written at most in one transaction
 STALL_S = 10.0  # a write that takes longer is told
 AGAIN_S = 10.0  # until a file is tried again that could not be made again
+UNSTEADY = 2  # such files in a row that are another one at once, as on some file systems over a network
 CLOSE_S = 30.0  # without a scan written, after which an end waits no longer
 
 
@@ -45,8 +47,8 @@ class Journal:
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
     takes nothing, or does not answer, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are
     ``lost``, scans before events; what a run is stays. That is told once, and once the journal writes again, an alarm
-    in it says how many they were. A file that is deleted, replaced or damaged meanwhile is made again: with its rows as
-    far as the open one still gives them, and an alarm says how many went with it (see ``recovery``).
+    in it says how many they were. A file that is deleted, replaced, cut or damaged meanwhile is made again, with the
+    rows that the open one still gives; an alarm says how many went, and they are ``lost`` (see ``recovery``).
 
     Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
@@ -73,8 +75,11 @@ class Journal:
             raise
         self._files = OpenFiles(path.resolve())
         self._harm: Harm | None = None  # which has yet to be mended
+        self._making, self._made_s = False, -math.inf  # whether the file is being made again; when it last was
+        self._replaced = 0  # how many times in a row right after it was made
         self._run_id, self._run_row = 0, None  # the run of the scans that come
-        self._rows, self._ids = 0, dict[str, int]()  # scans and events that stand in the file by this journal
+        self._held = held(self._base)  # scans and events that stand in the file, those of earlier runs too
+        self._ids = dict[str, int]()  # the last ones by this journal
         self._told = 0  # of what is lost, as much as stands in the journal
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
@@ -131,7 +136,8 @@ class Journal:
             self.tell(f"the journal has {WAITING} scans and events that wait: from now on the oldest are lost")
         since = self._writing_s
         if since is not None and not self.trouble and time.monotonic() - since > STALL_S:
-            self.trouble = f"the disk has not answered for {STALL_S:g} s"
+            what = "its file is being made again" if self._making else "the disk has not answered"
+            self.trouble = f"{what} for {STALL_S:g} s"
             self.tell(f"the journal cannot be written: {self.trouble}")
 
     # ------------------------------------------------------------------ the writer
@@ -180,7 +186,7 @@ class Journal:
         self._taken = self._queue.take(TOGETHER)
 
     def _write(self) -> None:
-        run, row, ids, rows = self._run_id, self._run_row, dict(self._ids), 0
+        run, row, ids, n = self._run_id, self._run_row, dict(self._ids), 0
         with self._base:
             for kind, item in self._taken:
                 if kind == "run":
@@ -192,12 +198,12 @@ class Journal:
                         "insert into scan (run, time, mode, numbers, quality, reason) values (?, ?, ?, ?, ?, ?)",
                         (run, item.time_s, item.mode, numbers, quality, item.reason or None),
                     )
-                    ids["scan"], rows = int(cursor.lastrowid or 0), rows + 1
+                    ids["scan"], n = int(cursor.lastrowid or 0), n + 1
                 elif kind == "learnt":
                     self._base.execute("insert or replace into learnt (name, value) values (?, ?)", item)
                 else:
-                    ids["event"], rows = self._noted(item), rows + 1
-        self._run_id, self._run_row, self._ids, self._rows = run, row, ids, self._rows + rows
+                    ids["event"], n = self._noted(item), n + 1
+        self._run_id, self._run_row, self._ids, self._held = run, row, ids, self._held + n
 
     def _begun(self, row: Any) -> int:
         cursor = self._base.execute(
@@ -220,64 +226,74 @@ class Journal:
         with self._base:
             for event in events:
                 self._ids["event"] = self._noted(event)
+        self._held += len(events)
 
     def _give_up(self) -> None:
         """Count what is lost at the end."""
-        n = self._queue.give_up() + (self._rows if self._harm else 0)
-        self._queue.lost += self._rows if self._harm else 0
+        n = self._queue.give_up() + (self._held if self._harm else 0)
+        self._queue.lost += self._held if self._harm else 0
         if n:
             self.tell(f"the journal cannot be written: the last {n} scans and events are lost")
 
     # ------------------------------------------------------------------ a file that went away
     def _tend(self) -> None:
         """Make the file again where it is no longer the one that was opened; before that its lock."""
-        self._harm = self._harm or self._files.harm()
+        self._harm = self._harm or self._files.harm(self._held)
         if not holds(self.path, self._lock):
             self._files.path.parent.mkdir(parents=True, exist_ok=True)
             lock = sole_writer(self.path)
             os.close(self._lock)
             self._lock = lock
         if self._harm is not None:
-            self._make_again(self._harm)
+            self._making = True
+            try:
+                self._make_again(self._harm)
+            finally:
+                self._making = False
 
     def _make_again(self, harm: Harm) -> None:
-        """A new file with all rows of the open one; an empty one where that cannot be read any more."""
-        path, old, copy = self._files.path, self._base, None
-        try:
-            copy = copied(old, path)
-        except sqlite3.Error as error:
-            if not is_damage(error):
-                raise  # the disk takes no copy now; the open file has the rows still
+        """A new file with all rows of the open one; an empty one where that cannot be read any more.
+
+        Where the disk takes no copy now, the error is raised: the open file has the rows still.
+        """
+        path, old = self._files.path, self._base
+        copy = None if harm is Harm.DAMAGED else copied(old, path)
+        again = harm is Harm.REPLACED and time.monotonic() - self._made_s < 2 * AGAIN_S
+        self._replaced = self._replaced + 1 if again else 0
+        unsteady = self._files.steady and self._replaced >= UNSTEADY
+        self._files.steady = self._files.steady and not unsteady
         aside = cleared(self._files, keep=copy is None)
         try:
             if copy is not None:
                 copy.rename(path)
+            elif self._files.mode is not None:
+                path.touch()
+            if self._files.mode is not None:
+                path.chmod(self._files.mode)
             self._base = opened(path, write=True, fsync=self._fsync)
         except BaseException:
             path.unlink(missing_ok=True)
             raise
         with suppress(sqlite3.Error):
             old.close()
-        self._files, self._harm = OpenFiles(path), None
-        lost = 0
-        if copy is None:
-            lost, self._rows = self._rows, 0
-            self._queue.lost, self._told = self._queue.lost + lost, self._told + lost
-            with self._base:
-                for table, last in self._ids.items():  # whoever has seen a row asks for those after it
-                    self._base.execute("insert into sqlite_sequence (name, seq) values (?, ?)", (table, last))
-                self._run_id = 0 if self._run_row is None else self._begun(self._run_row)
-        what = (
-            f"the journal's file {harm.value} while it was written: "
-            + (
-                "it is made again with all its rows"
-                if copy
-                else f"a new one begins, and {lost} scans and events are lost"
-            )
-            + (f"; the file that lay there is now {aside.name}" if aside else "")
-        )
+        self._files = OpenFiles(path, steady=self._files.steady)
+        self._made_s = time.monotonic()
+        lost, self._held = max(0, self._held - held(self._base)), held(self._base)
+        self._queue.lost, self._told = self._queue.lost + lost, self._told + lost
+        self._go_on()
+        self._harm = None
+        what = made_again(harm, lost, empty=copy is None, aside=aside, unsteady=unsteady)
         self.tell(what)
         self._note(alarm(time.time(), what, "over: it is made again"))
+
+    def _go_on(self) -> None:
+        """Number the rows of a file that lacks some as the one before: whoever saw a row asks for those after it."""
+        with self._base:
+            for table, last in self._ids.items():
+                self._base.execute("delete from sqlite_sequence where name = ?", (table,))
+                self._base.execute("insert into sqlite_sequence (name, seq) values (?, ?)", (table, last))
+            if not self._base.execute("select 1 from run where id = ?", (self._run_id,)).fetchone():
+                self._run_id = 0 if self._run_row is None else self._begun(self._run_row)
 
     def _pack(self) -> None:
         """Pack the oldest scans once there are enough, and drop the oldest blocks once there are too many."""
@@ -287,8 +303,9 @@ class Journal:
                 "select id, run, time, mode, numbers, quality, reason from scan order by id limit ?", (BLOCK,)
             ).fetchall()
             # One run a block. Releases that let two loops write one journal left runs that alternate, and the ids of a
-            # block have no gap.
-            run = rows[0][1]
+            # block have no gap: a file that lost rows has one.
+            run, first = rows[0][1], rows[0][0]
+            rows = [row for k, row in enumerate(rows) if row[0] - k == first]
             rows = next(list(same) for _, same in groupby(rows, key=itemgetter(1)))
             times = [row[2] for row in rows]  # not in order where the clock was set
             with self._base:
@@ -299,6 +316,7 @@ class Journal:
                 self._base.execute("delete from scan where run = ? and id <= ?", (run, rows[-1][0]))
                 shorten_scans(self._base, self.max_bytes)
             count -= len(rows)
+            self._held = held(self._base)
 
     def _rotate(self) -> None:
         """Drop the oldest events once there are too many; seldom looked at, since each look goes through all."""
@@ -306,6 +324,7 @@ class Journal:
             self._events = 0
             with self._base:
                 shorten_events(self._base, self._most_events)
+            self._held = held(self._base)
 
 
 LOSS = "; {} scans and events are lost that the disk did not take"

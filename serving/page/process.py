@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import secrets
 import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from serving.errors import LoopError
+from serving.own_process import module
 from serving.page.settings import Page
 
 START_S = 20.0
@@ -53,8 +53,10 @@ class PageProcess:
         self._thread.join(5)
 
     def _started(self) -> subprocess.Popen[str]:
+        command, environment = module("serving.page")
         process = subprocess.Popen(
-            [sys.executable, "-m", "serving.page"],
+            command,
+            env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

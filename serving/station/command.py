@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
-from dataclasses import fields, replace
+from dataclasses import fields
 from math import isnan
 from pathlib import Path
 
@@ -243,8 +243,7 @@ def _run(options: argparse.Namespace) -> int:
     def tell(line: str) -> None:
         print(plain(line), flush=True)
 
-    # The very bytes that were tried, whoever writes another file there meanwhile.
-    station = Station(replace(settings, sha256=controller.sha256), tell=tell)
+    station = Station(settings, tell=tell, controller=controller)
     station.warnings = [*_unproven(station.manifest), *_warnings(settings)]
     for line in station.warnings + station.ending():
         station.tell(f"note: {line}")
@@ -256,9 +255,7 @@ def _run(options: argparse.Namespace) -> int:
         station.tell(_left(station.manifest, station.last[1]))
     station.tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
     lost = station.journal.lost
-    station.tell(
-        f"journal: {settings.journal.file}" + (f"; {lost} scans and events of this loop are lost" if lost else "")
-    )
+    station.tell(f"journal: {settings.journal.file}" + (f"; {lost} scans and events are lost" if lost else ""))
     return JOURNAL_LOST if lost else 0
 
 

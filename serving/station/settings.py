@@ -16,10 +16,12 @@ from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate
 from serving.manifest import Manifest, Signal
 from serving.opcua.settings import Nodes, Server
 from serving.page.settings import Page
+from serving.plain_values import refused
 from serving.words import first_line
 
 MAX_AGE = 1.5  # periods: one answer may be late, two may not
 TRANSFER = 20.0  # periods
+MAX_DEPTH = 20  # of lists and tables in each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +161,8 @@ class Settings:
             raise LoopError(f"{path} is not TOML: {first_line(error)}") from None
         except RecursionError:
             raise LoopError(f"{path} is not TOML that can be read: lists or tables are nested too deep") from None
+        if why := refused(tree, MAX_DEPTH):
+            raise LoopError(f"{path} has {why}")
         found = parse(cls, tree, str(path), LoopError)
         at = path.parent
         s = found.server

@@ -60,18 +60,25 @@ class Station:
     Between two scans it carries out the changes that were asked for (``ask``) and those of the plant's own operator
     (set points and mode by their nodes). Every scan, change and fault goes into the journal.
 
-    ``tell`` gets a line of each event, in a thread of its own: it may block or raise.
+    ``tell`` gets a line of each event, in a thread of its own: it may block or raise. ``controller`` is the one of the
+    settings' file; None: it is loaded here, once another process has taken its first steps (``serving.first_steps``).
 
     Raises LoopError and ArtifactError where the settings do not fit the controller, another loop writes the same
     nodes, or the journal cannot be opened.
     """
 
-    def __init__(self, settings: Settings, *, tell: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        tell: Callable[[str], None] = lambda _: None,
+        controller: TrustedController | None = None,
+    ) -> None:
         self.settings, self.said = settings, Said(tell)
         self.tell = tell = self.said.say
         self.trusted = self._public_keys()
         self.certificates = expiries(settings.server)
-        self.controller = TrustedController(settings.controller, settings.sha256 or None, self.trusted)
+        self.controller = controller or tried(settings.controller, settings.sha256 or None, self.trusted)
         m = self.manifest
         age = settings.max_age_s(m.period_s)
         control_loop(settings, self.controller)  # settings that do not fit it are said before it is connected

@@ -110,7 +110,7 @@ def test_what_the_journal_lost_is_in_the_exit_status(
 
     monkeypatch.setattr(Journal, "_write", full)
     assert main(["loop", "run", "--scans", "2"]) == JOURNAL_LOST == 3
-    lost = re.search(r"(\d+) scans and events of this loop are lost$", capsys.readouterr().out.splitlines()[-1])
+    lost = re.search(r"(\d+) scans and events are lost$", capsys.readouterr().out.splitlines()[-1])
     assert lost is not None
     assert int(lost[1]) >= 4  # two scans, the start and the end
 

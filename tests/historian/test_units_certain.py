@@ -55,6 +55,15 @@ def test_the_table_and_params_yaml_keep_it(tmp_path: Path) -> None:
         read_tags(table)
 
 
+@pytest.mark.parametrize("cell", ["9" * 5001, '"' + "9" * 200_000 + '"'], ids=len)
+def test_a_cell_of_thousands_of_digits_is_one_short_error(cell: str, tmp_path: Path) -> None:
+    table = tmp_path / "tags.csv"
+    table.write_text(f"tag,role,unit,low,high\nT,pv,degC,0,{cell}\n")
+    with pytest.raises(RecordError) as caught:
+        read_tags(table)
+    assert len(str(caught.value)) < 300 + len(str(table))
+
+
 def test_a_set_point_that_stands_far_from_the_others_for_a_while_is_no_code() -> None:
     """Few levels, one of them far away and held: a code for a missing value of a PV, not of a set point."""
     values = np.repeat([0.5, 0.52, 0.5, 0.51, 0.9, 0.52], [300, 300, 300, 300, 40, 300])

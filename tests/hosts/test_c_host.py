@@ -169,8 +169,11 @@ def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:
         ("cut", "pid.json is no JSON object"),
         ("foreign", "the file's SHA-256 is"),
         ("changed", "the file's SHA-256 is"),
-        ("schema", "the manifest's schema is not 1"),
-        ("sizes", "onnxruntime: "),
+        ("schema", "the JSON beside the file has another schema"),
+        ("sizes", "the JSON beside the file has another n_state"),
+        ("range", "the JSON beside the file has another mv"),
+        ("unlimited", "the JSON beside the file has another mv"),
+        ("without", "the JSON beside the file has another pv"),
         ("missing", "cannot be read: No such file or directory"),
     ],
 )
@@ -185,6 +188,9 @@ def test_a_file_that_is_not_right_is_one_line_of_the_c_host(host: Path, what: st
         "changed": lambda: file.write_bytes(file.read_bytes() + b"x"),
         "schema": lambda: manifest.write_text(text.replace('"schema": 1', '"schema": 2')),
         "sizes": lambda: manifest.write_text(text.replace('"n_state": 7', '"n_state": 8')),
+        "range": lambda: manifest.write_text(text.replace('"high": 500.0', '"high": 5000.0')),
+        "unlimited": lambda: manifest.write_text(text.replace('"high": 500.0', '"high": 500.0, "max_move": 1')),
+        "without": lambda: manifest.write_text(text.replace('"pv": [', '"PV": [')),
         "missing": manifest.unlink,
     }[what]()
     done = run(host, file, "1", "0.01")

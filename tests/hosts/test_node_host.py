@@ -272,8 +272,17 @@ def test_what_an_operator_may_not_set_is_refused_in_node(told: dict[str, Any]) -
     assert told["sp"] == [0.5]
 
 
-@pytest.mark.parametrize("what", ["changed", "missing", "foreign"])
-def test_a_file_that_is_not_right_is_one_line_of_the_node_host(what: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("changed", "the file's SHA-256 is"),
+        ("missing", "no such file"),
+        ("foreign", "the file's SHA-256 is"),
+        ("range", "the JSON beside the file has another mv"),
+        ("unlimited", "the JSON beside the file has another mv"),
+    ],
+)
+def test_a_file_that_is_not_right_is_one_line_of_the_node_host(what: str, words: str, tmp_path: Path) -> None:
     for suffix in (".onnx", ".json"):
         shutil.copy(kit_of(PID) / f"pid{suffix}", tmp_path)
     file, manifest = tmp_path / "pid.onnx", tmp_path / "pid.json"
@@ -281,10 +290,13 @@ def test_a_file_that_is_not_right_is_one_line_of_the_node_host(what: str, tmp_pa
         file.write_bytes(file.read_bytes() + b"x")
     elif what == "missing":
         manifest.unlink()
+    elif what != "foreign":
+        more = {"range": '"high": 5000.0', "unlimited": '"high": 500.0, "max_move": 1'}[what]
+        manifest.write_text(manifest.read_text().replace('"high": 500.0', more))
     else:
         shutil.copy(next(f for f in SHIPPED if f.stem == "inc").with_suffix(".json"), manifest)
     done = run(file, "1", "0.01")
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
-    assert ("no such file" if what == "missing" else "the file's SHA-256 is") in done.stderr
+    assert words in done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +52,48 @@ def fails(error: Exception) -> Callable[..., Any]:
         raise error
 
     return run
+
+
+def test_nothing_is_imported_from_the_folder_in_which_somebody_stands(
+    pi_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("numpy", "signal", "serving"):
+        (tmp_path / f"{module}.py").write_text("open('ran', 'w').close()\nraise SystemExit('hijacked')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    monkeypatch.setattr(sys, "path", ["", *sys.path])  # as of an interactive Python
+    assert tried(pi_file).sha256 == Controller(pi_file).sha256
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("status", "says", "words"),
+    [
+        (
+            1,
+            "Traceback (most recent call last):\nImportError: no \x1b[2Jnumpy\n",
+            "status 1: ImportError: no \\x1b[2Jnumpy",
+        ),
+        (3, "", "status 3: it said nothing"),
+        (2, "a library warns\npi.onnx: it is none\n", "pi.onnx: it is none"),
+        (-9, "", "it ended the process that tried its first steps (SIGKILL)"),
+    ],
+)
+def test_what_the_process_said_last_is_quoted(
+    pi_file: Path, monkeypatch: pytest.MonkeyPatch, status: int, says: str, words: str
+) -> None:
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: subprocess.CompletedProcess((), status, "", says))
+    with pytest.raises(ArtifactError) as caught:
+        tried(pi_file)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_libraries_say_first_is_no_digest(pi_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    digest = Controller(pi_file).sha256
+    said = subprocess.CompletedProcess((), 0, f"a library greets\n{digest}\n", "")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: said)
+    assert tried(pi_file).sha256 == digest
 
 
 @pytest.mark.parametrize("error", [subprocess.TimeoutExpired("python", 30), OSError("no memory"), ValueError("NUL")])

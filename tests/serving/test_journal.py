@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import sqlite3
 import subprocess
 import sys
 import threading
 import tracemalloc
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -455,34 +458,172 @@ def test_a_file_that_goes_while_it_is_written_is_made_again_with_its_rows(
     assert (aside.read_text() if aside.exists() else "") == ("of somebody else" if harm is replaced else "")
 
 
-def test_a_file_that_cannot_be_read_any_more_costs_its_rows_and_they_are_counted(
-    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Those that see rows by id see the new ones, too."""
-    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
-
-    def damaged(*_: Any) -> Path:
-        error = sqlite3.DatabaseError("database disk image is malformed")
-        error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
-        raise error
-
-    path, given = tmp_path / "loop.journal", scans(40)
-    journal = Journal(path)
+def written(
+    path: Path, controller: Controller, given: list[Scan], tell: Callable[[str], None] = lambda _: None
+) -> Journal:
+    """An open journal that holds some scans more."""
+    journal = Journal(path, tell=tell)
     journal.begin(controller.manifest, controller.sha256, 1e9)
-    for scan in given[:25]:
+    for scan in given:
         journal.scan(scan)
     assert within(20, lambda: journal.behind == 0)
-    monkeypatch.setattr(writer, "copied", damaged)
-    os.truncate(path, 100)
-    for scan in given[25:]:
+    return journal
+
+
+def done(act: Callable[[], Any]) -> bool:
+    """Whether it could be done: the writer may have the file locked."""
+    try:
+        act()
+    except sqlite3.OperationalError:
+        return False
+    return True
+
+
+def written_out(path: Path) -> int:
+    """The size of a journal's file once all of its log is in it."""
+
+    def all_of_it() -> bool:
+        with closing(sqlite3.connect(path)) as base:
+            return bool(base.execute("pragma wal_checkpoint(truncate)").fetchone()[0] == 0)
+
+    assert within(20, all_of_it)
+    return path.stat().st_size
+
+
+def cut_to_half(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def cut_by_a_tenth(path: Path) -> None:
+    os.truncate(path, int(0.9 * path.stat().st_size))
+
+
+def cut_to_nothing(path: Path) -> None:
+    os.truncate(path, 0)
+
+
+@pytest.mark.parametrize("harm", [cut_to_half, cut_by_a_tenth, cut_to_nothing])
+def test_a_file_that_cannot_be_read_any_more_costs_its_rows_and_they_are_counted(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch, harm: Any
+) -> None:
+    """Those of earlier runs too. Those that see rows by id see the new ones."""
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+
+    path, given = tmp_path / "loop.journal", scans(4040)
+    written(path, controller, given[:15]).close()  # an earlier run
+    journal = written(path, controller, given[15:4024])
+    path.chmod(0o640)
+    written_out(path)
+    journal.scan(given[4024])
+    assert within(20, lambda: journal.behind == 0)
+    harm(path)
+    for scan in given[4025:]:
         journal.scan(scan)
     journal.close()
-    assert journal.lost == 25
+    assert journal.lost == 4025
     reader = JournalReader(path)
-    assert [(id_, run) for id_, run, _ in reader.scans()] == [(k + 26, 1) for k in range(15)]
+    assert [(id_, run) for id_, run, _ in reader.scans()] == [(k + 4026, 1) for k in range(15)]
     assert [e.event.alarm for e in reader.entries() if e.event.raised] == ["journal"]
     reader.close()
     assert path.with_name("loop.journal.aside-1").is_file()
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert not list(tmp_path.glob("*.new*"))
+
+
+def test_an_old_copy_over_the_file_costs_the_rows_that_it_lacks(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ``cp`` writes it: the file keeps its number, and the copy is sound."""
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    path, given = tmp_path / "loop.journal", scans(4040)
+    written(path, controller, given[:15]).close()
+    old = path.read_bytes()
+    journal = written(path, controller, given[15:4024])
+    written_out(path)
+    journal.scan(given[4024])
+    assert within(20, lambda: journal.behind == 0)
+    path.write_bytes(old)
+    for scan in given[4025:]:
+        journal.scan(scan)
+    journal.close()
+    with closing(JournalReader(path)) as reader:
+        found = [id_ for id_, _, _ in reader.scans()]
+        assert {run for _, run, _ in reader.scans()} <= {run["id"] for run in reader.runs()}
+        assert [e.event.alarm for e in reader.entries() if e.event.raised] == ["journal"]
+    assert found[-15:] == [k + 4026 for k in range(15)]
+    assert 0 < journal.lost == 4040 - len(found)
+
+
+def test_a_file_that_somebody_vacuums_is_not_cut(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    path, told, given = tmp_path / "loop.journal", list[str](), scans(3010)
+    journal = written(path, controller, given[:2999], told.append)
+    size = written_out(path)
+    journal.scan(given[2999])
+    assert within(20, lambda: journal.behind == 0)
+    with closing(sqlite3.connect(path)) as base:
+        assert within(20, lambda: done(lambda: base.execute("vacuum")))
+    assert written_out(path) < size
+    for scan in given[3000:]:
+        journal.scan(scan)
+    journal.close()
+    assert (told, journal.lost) == ([], 0)
+    with closing(JournalReader(path)) as reader:
+        assert len(list(reader.scans())) == 3010
+
+
+def test_a_file_system_that_numbers_files_anew_is_believed_no_more(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    numbers, real = itertools.count(), Path.stat
+
+    def anew(path: Path, **given: Any) -> os.stat_result:
+        found = real(path, **given)
+        return os.stat_result((found[0], next(numbers), *found[2:])) if path.parent == tmp_path else found
+
+    monkeypatch.setattr(Path, "stat", anew)
+    told, given = list[str](), scans(20)
+    journal = Journal(tmp_path / "loop.journal", tell=told.append)
+    journal.begin(controller.manifest, controller.sha256, 1e9)
+    for scan in given:
+        journal.scan(scan)
+        assert within(20, lambda: journal.behind == 0)
+    journal.close()
+    assert journal.lost == 0
+    assert len(told) == 3
+    assert "is noticed no more" in told[-1]
+    with closing(JournalReader(tmp_path / "loop.journal")) as reader:
+        assert len(list(reader.scans())) == 20
+
+
+def test_a_copy_that_takes_long_is_told_as_one(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    monkeypatch.setattr(writer, "STALL_S", 0.0)
+    begun, ends, copied = threading.Event(), threading.Event(), writer.copied
+
+    def slow(*given: Any) -> Path | None:
+        begun.set()
+        ends.wait(60)
+        return copied(*given)
+
+    monkeypatch.setattr(writer, "copied", slow)
+    told, given = list[str](), scans(3)
+    journal = written(tmp_path / "loop.journal", controller, given[:1], told.append)
+    journal.path.unlink()
+    journal.scan(given[1])
+    assert begun.wait(20)
+    told.clear()
+    journal.trouble = ""
+    journal.scan(given[2])
+    assert told == ["the journal cannot be written: its file is being made again for 0 s"]
+    ends.set()
+    journal.close()
+    assert (journal.lost, journal.trouble) == (0, "")
 
 
 @pytest.mark.parametrize(("gone", "lost"), [(False, 46), (True, 76)])

@@ -68,7 +68,8 @@ def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Station:
     monkeypatch.setattr(station, "OpcUaEndpoint", Between)
     monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
     monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
-    return Station(Settings(PID, SERVER, Nodes(**NODES), journal=JournalSettings(tmp_path / "loop.journal")))
+    settings = Settings(PID, SERVER, Nodes(**NODES), journal=JournalSettings(tmp_path / "loop.journal"))
+    return Station(settings, controller=Controller(PID))
 
 
 def test_an_answer_beside_the_scan_gives_its_quality_to_no_other_answers_values(

@@ -58,7 +58,12 @@ MISSES = {**GOOD, "on": {"words": "on models", "unproven": ["not proven: the mod
     ("evidence", "proof"),
     [
         (GOOD, Proof.PROVEN),
-        ({"scenarios": {"up": {"mae": 1.0}}}, Proof.PROVEN),
+        ({"scenarios": {"up": {"mae": 1.0}}}, Proof.NONE),  # nobody counted
+        ({"lock_ups": 0, "scenarios": {"up": {}}}, Proof.NONE),
+        ({"lock_ups": 0, "scenarios": {"up": {"mae": None, "ok": True, "ise": "1"}, "down": 1.0}}, Proof.NONE),
+        ({"lock_ups": 0, "scenarios": {"up": {"mae": float("inf")}}}, Proof.NONE),
+        ({"lock_ups": 0, "scenarios": {"up": {}, "down": {"mae": 0}}}, Proof.PROVEN),
+        ({"lock_ups": 1, "scenarios": {"up": {"mae": None}}}, Proof.LOCKED_UP),
         ({**GOOD, "on": {"words": "on models", "fit": {"y": 80.0}}}, Proof.PROVEN),
         ({}, Proof.NONE),
         ({"lock_ups": 0, "scenarios": {}}, Proof.NONE),

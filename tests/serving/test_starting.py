@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from processes import within as in_time
 
-from serving import Controller, Mode, MonotonicClock, Sample, VirtualClock
+from serving import ArtifactError, Controller, Mode, MonotonicClock, Sample, VirtualClock
 from serving.journal import JournalReader
 from serving.loop import Command, within
 from serving.opcua.nameplates import Identity
@@ -70,20 +70,33 @@ def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..
 
     def make(start: str, **changed: Any) -> tuple[Station, Any]:
         server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
-        made = Station(
-            Settings(
-                changed.pop("controller", PID),
-                server,
-                Nodes(**NODES),
-                start=start,  # type: ignore[arg-type]
-                hold=Hold(recover_after=2),
-                journal=JournalSettings(tmp_path / "loop.journal"),
-                **changed,
-            )
+        settings = Settings(
+            changed.pop("controller", PID),
+            server,
+            Nodes(**NODES),
+            start=start,  # type: ignore[arg-type]
+            hold=Hold(recover_after=2),
+            journal=JournalSettings(tmp_path / "loop.journal"),
+            **changed,
         )
+        made = Station(settings, controller=Controller(settings.controller))
         return made, made.endpoint
 
     return make
+
+
+def test_a_station_takes_no_file_whose_first_steps_nobody_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(path: Path, *_: Any) -> Controller:
+        raise ArtifactError(f"{path}: it ended the process")
+
+    monkeypatch.setattr(station, "tried", refused)
+    server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
+    settings = Settings(PID, server, Nodes(**NODES), journal=JournalSettings(tmp_path / "loop.journal"))
+    with pytest.raises(ArtifactError, match="it ended the process"):
+        Station(settings)
+    assert not list(tmp_path.iterdir())
 
 
 def events(made: Station) -> list[str]:

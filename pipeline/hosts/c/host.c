@@ -144,6 +144,16 @@ static const char *json_word(const Json *j, const char *key) {
   return found && found->kind == J_TEXT ? found->text : "";
 }
 
+/* Whether two values say the same; the order of an object's entries says nothing. */
+static bool json_same(const Json *a, const Json *b) {
+  if (!a || !b || a->kind != b->kind || a->n != b->n) return false;
+  if (a->kind == J_NUMBER) return a->number == b->number;
+  if (a->kind == J_TEXT) return !strcmp(a->text, b->text);
+  for (size_t i = 0; i < a->n; i++)
+    if (!json_same(&a->items[i], a->kind == J_OBJECT ? json_get(b, a->keys[i]) : &b->items[i])) return false;
+  return true;
+}
+
 /* A number, or a hexadecimal float as text; NAN where there is neither. */
 static double json_number(const Json *j) {
   if (j && j->kind == J_NUMBER) return j->number;
@@ -169,6 +179,12 @@ static char *read_file(const char *path, size_t *size) {
   return fit;
 }
 
+static bool json_object(const char *text, Json *j) {
+  memset(j, 0, sizeof *j);
+  const char *end = json_value(text, j, 0);
+  return end && !*blanks(end) && j->kind == J_OBJECT;
+}
+
 static bool read_json(const char *path, Json *j, char *words) {
   size_t size = 0;
   char *text = read_file(path, &size);
@@ -177,8 +193,7 @@ static bool read_json(const char *path, Json *j, char *words) {
     snprintf(words, WORDS, "%.300s cannot be read: %s", path, strerror(errno));
     return false;
   }
-  const char *end = strlen(text) == size ? json_value(text, j, 0) : NULL;
-  bool good = end && !*blanks(end) && j->kind == J_OBJECT;
+  bool good = strlen(text) == size && json_object(text, j);
   free(text);
   if (!good) {
     snprintf(words, WORDS, "%.300s is no JSON object", path);
@@ -254,7 +269,8 @@ static const char *const OUTPUT[OUTPUTS] = {"mv", "state_next", "info"};
 typedef enum { STEPPED, REFUSED_INPUT, REFUSED_OUTPUT } Outcome;
 
 typedef struct {
-  Json manifest;
+  Json manifest;   /* the one inside the file */
+  char digest[65]; /* of the file, SHA-256 in hexadecimal digits */
   Signals signals[STATE]; /* sp, pv, dv, mv */
   size_t n_in[INPUTS], n_out[OUTPUTS];
   bool uses[INPUTS];
@@ -339,12 +355,30 @@ static bool read_signals(Controller *c, const char *key, Signals *signals) {
   return true;
 }
 
-static bool read_manifest(Controller *c, const char *digest) {
+/* The manifest inside the file. What a host acts on must stand in the JSON beside it too: whoever changed that one
+   would else be shown other ranges than those that hold. */
+static bool find_manifest(Controller *c, const Json *beside) {
+  static const char *const ACTED_ON[] = {"schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv"};
+  OrtModelMetadata *metadata = NULL;
+  OrtAllocator *allocator = NULL;
+  char *text = NULL;
+  bool found = good(c, c->ort->SessionGetModelMetadata(c->session, &metadata)) &&
+               good(c, c->ort->GetAllocatorWithDefaultOptions(&allocator)) &&
+               good(c, c->ort->ModelMetadataLookupCustomMetadataMap(metadata, allocator, "loopwright.manifest", &text));
+  if (found && (!text || !json_object(text, &c->manifest))) found = failed(c, "the file holds no manifest");
+  for (size_t i = 0; found && i < sizeof ACTED_ON / sizeof *ACTED_ON; i++)
+    if (!json_same(json_get(&c->manifest, ACTED_ON[i]), json_get(beside, ACTED_ON[i])))
+      found = failed(c, "the JSON beside the file has another %s than the manifest inside it; get both from one place",
+                     ACTED_ON[i]);
+  if (text) found = good(c, c->ort->AllocatorFree(allocator, text)) && found;
+  if (metadata) c->ort->ReleaseModelMetadata(metadata);
+  return found;
+}
+
+static bool read_manifest(Controller *c) {
   static const char *const KEY[STATE] = {"sp", "pv", "dv", "mv"};
   const Json *m = &c->manifest, *inputs = json_get(m, "inputs"), *info = json_get(m, "info");
   if (json_number(json_get(m, "schema")) != 1) return failed(c, "the manifest's schema is not 1, which this host reads");
-  if (strcmp(json_word(m, "sha256"), digest))
-    return failed(c, "the file's SHA-256 is %s, its manifest's %.64s", digest, json_word(m, "sha256"));
   for (int i = 0; i < STATE; i++) {
     if (!read_signals(c, KEY[i], &c->signals[i])) return false;
     c->n_in[i] = c->signals[i].n;
@@ -442,18 +476,22 @@ static void controller_close(Controller *c) {
 static bool controller_open(Controller *c, const char *path) {
   memset(c, 0, sizeof *c);
   size_t size = 0, stem = strlen(path);
-  char beside[4096], digest[65];
+  char beside[4096];
+  Json json;
   if (stem < 6 || stem >= sizeof beside || strcmp(path + stem - 5, ".onnx"))
     return failed(c, "%s is no path of a .onnx file", path);
   snprintf(beside, sizeof beside, "%.*s.json", (int)stem - 5, path);
   c->ort = OrtGetApiBase()->GetApi(ORT_API_VERSION);
   if (!c->ort) return failed(c, "onnxruntime %s is older than its header", OrtGetApiBase()->GetVersionString());
-  if (!read_json(beside, &c->manifest, c->words)) return false;
   char *bytes = read_file(path, &size);
   if (!bytes) return failed(c, "%s cannot be read: %s", path, strerror(errno));
-  sha256((const uint8_t *)bytes, size, digest);
-  bool made = read_manifest(c, digest) && open_session(c, bytes, size) && agrees(c);
+  bool made = read_json(beside, &json, c->words);
+  sha256((const uint8_t *)bytes, size, c->digest);
+  if (made && strcmp(json_word(&json, "sha256"), c->digest))
+    made = failed(c, "the file's SHA-256 is %s, its manifest's %.64s", c->digest, json_word(&json, "sha256"));
+  made = made && open_session(c, bytes, size) && find_manifest(c, &json) && read_manifest(c) && agrees(c);
   free(bytes);
+  json_free(&json);
   OrtMemoryInfo *cpu = NULL;
   made = made && good(c, c->ort->CreateCpuMemoryInfo(OrtArenaAllocator, OrtMemTypeDefault, &cpu));
   for (int i = 0; made && i < INPUTS; i++) made = bind(c, cpu, c->n_in[i], &c->in[i], &c->in_value[i]);
@@ -848,7 +886,7 @@ static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t
   double *room[STATE] = {0};
   bool done = steps && scans && steps->kind == J_LIST && scans->kind == J_LIST && steps->n > 0;
   if (!done) failed(c, "the kit has no steps and scans");
-  if (done && strcmp(json_word(kit, "sha256"), json_word(&c->manifest, "sha256")))
+  if (done && strcmp(json_word(kit, "sha256"), c->digest))
     done = failed(c, "the kit is of another controller file");
   if (done && !(t->us = calloc(steps->n, sizeof *t->us))) done = failed(c, "no memory");
   for (int i = 0; i < STATE; i++) room[i] = calloc(c->n_in[i] + 1, sizeof **room);

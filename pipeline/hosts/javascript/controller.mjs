@@ -17,11 +17,13 @@ const same = (a, b) => [...a].sort().join() === [...b].sort().join();
 
 const MOVE_ROUNDING = 1e-9; // share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
+// What a host acts on. It must stand in the .json too: whoever changed that one would else be shown other ranges.
+const ACTED_ON = ["schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv"];
+
 export class Controller {
-  // `bytes` is the .onnx file, `manifest` the parsed .json beside it; the digest ties one to the other.
-  // `provider` is "cpu" in Node and "wasm" in a browser.
+  // `bytes` is the .onnx file, `manifest` the parsed .json beside it; the digest ties one to the other, and the ranges are
+  // those of the manifest inside the file. `provider` is "cpu" in Node and "wasm" in a browser.
   static async load(ort, bytes, manifest, provider) {
-    if (manifest.schema !== 1) throw new Refused(`the manifest has schema ${manifest.schema}; this host reads 1`);
     const digest = hex(await crypto.subtle.digest("SHA-256", bytes));
     if (digest !== manifest.sha256) throw new Refused(`the file's SHA-256 is ${digest}, its manifest's ${manifest.sha256}`);
     return Controller.undigested(ort, bytes, manifest, provider);
@@ -29,6 +31,10 @@ export class Controller {
 
   // The same without the digest, for a page whose browser computes none: over plain HTTP from another machine.
   static async undigested(ort, bytes, manifest, provider) {
+    const inside = manifestIn(bytes);
+    if (inside.schema !== 1) throw new Refused(`the manifest has schema ${inside.schema}; this host reads 1`);
+    const other = ACTED_ON.find((key) => !equal(inside[key], manifest[key]));
+    if (other) throw new Refused(`the JSON beside the file has another ${other} than the manifest inside it; get both from one place`);
     const session = await ort.InferenceSession.create(bytes, {
       executionProviders: [provider],
       graphOptimizationLevel: "all",
@@ -37,7 +43,7 @@ export class Controller {
       interOpNumThreads: 1,
       logSeverityLevel: 4,
     });
-    return new Controller(ort, session, manifest);
+    return new Controller(ort, session, { ...manifest, ...inside });
   }
 
   constructor(ort, session, manifest) {
@@ -97,6 +103,54 @@ export class Controller {
         throw new Refused(`the law gave ${s.name} = ${value} ${s.unit} after ${applied} ${s.unit}; it may move by at most ${s.max_move} ${s.unit} a period`, "output");
     }
   }
+}
+
+// The manifest inside a file: an entry of metadata_props, field 14 of ONNX's ModelProto, {key: field 1, value: field 2}.
+function manifestIn(bytes) {
+  const text = (piece) => new TextDecoder("utf-8", { fatal: true }).decode(piece);
+  try {
+    const entries = fields(bytesOf(bytes)).filter(([number]) => number === 14).map(([, entry]) => Object.fromEntries(fields(entry)));
+    const found = entries.find((entry) => text(entry[1]) === "loopwright.manifest");
+    return JSON.parse(text(found[2]));
+  } catch {
+    throw new Refused("the file holds no manifest");
+  }
+}
+
+// [number, bytes] of each field of a protobuf message that has a length; the others are passed over.
+function fields(message) {
+  const found = [];
+  let at = 0;
+  const varint = () => {
+    for (let value = 0, scale = 1; ; scale *= 128) {
+      if (at >= message.length || scale > 2 ** 63) throw new Error("cut");
+      const byte = message[at++];
+      value += (byte & 127) * scale;
+      if (byte < 128) return value;
+    }
+  };
+  while (at < message.length) {
+    const tag = varint(), kind = tag % 8;
+    if (kind === 0) varint();
+    else if (kind === 2) {
+      const end = varint() + at;
+      if (end > message.length) throw new Error("cut");
+      found.push([Math.floor(tag / 8), message.subarray(at, end)]);
+      at = end;
+    } else if (kind === 1 || kind === 5) at += kind === 1 ? 8 : 4;
+    else throw new Error("no message");
+  }
+  return found;
+}
+
+const bytesOf = (given) => (ArrayBuffer.isView(given) ? new Uint8Array(given.buffer, given.byteOffset, given.byteLength) : new Uint8Array(given));
+
+// Whether two values of JSON say the same; the order of an object's entries says nothing.
+function equal(a, b) {
+  if (a === null || b === null || typeof a !== "object" || typeof b !== "object") return a === b;
+  const keys = Object.keys(a);
+  return Array.isArray(a) === Array.isArray(b) && keys.length === Object.keys(b).length &&
+    keys.every((key) => Object.hasOwn(b, key) && equal(a[key], b[key]));
 }
 
 // Whether an MV's moves are limited. A discrete one has no way between its values.

@@ -76,7 +76,7 @@ static bool open_in_c_locale(Controller *c, const char *path) {
 
 /* The text that modelDescription.xml names as guid or instantiationToken: the first digits of the file's SHA-256. */
 static bool is_token_of(const Controller *c, const char *token) {
-  const char *hex = json_word(&c->manifest, "sha256");
+  const char *hex = c->digest;
   char wanted[40];
   snprintf(wanted, sizeof wanted, "{%.8s-%.4s-%.4s-%.4s-%.12s}", hex, hex + 8, hex + 12, hex + 16, hex + 20);
   return token && !strcmp(token, wanted);
@@ -227,7 +227,7 @@ static size_t saved_size(const Instance *i) { return sizeof(Saved) + i->n_memory
 /* Into *to, which is allocated where it is NULL. */
 static bool instance_save(Instance *i, Saved **to) {
   if (!*to && !(*to = malloc(saved_size(i)))) return REFUSE(i, "no memory");
-  memcpy((*to)->digest, json_word(&i->c.manifest, "sha256"), sizeof (*to)->digest);
+  memcpy((*to)->digest, i->c.digest, sizeof (*to)->digest);
   (*to)->n = i->n_memory;
   size_t n_state = i->c.n_in[STATE];
   memcpy(i->memory + i->n_memory - n_state, i->c.state, n_state * sizeof *i->memory);
@@ -239,7 +239,7 @@ static bool is_ours(Instance *i, const void *bytes, size_t size) {
   Saved head;
   if (!bytes || size != saved_size(i)) return REFUSE(i, "a saved state of %zu bytes is none of this FMU", size);
   memcpy(&head, bytes, sizeof head);
-  if (head.n == i->n_memory && !memcmp(head.digest, json_word(&i->c.manifest, "sha256"), sizeof head.digest)) return true;
+  if (head.n == i->n_memory && !memcmp(head.digest, i->c.digest, sizeof head.digest)) return true;
   return REFUSE(i, "the saved state is of another controller file");
 }
 
