@@ -15,6 +15,7 @@ from pipeline.errors import RecordError
 from pipeline.historian.file_kinds import head_of
 from pipeline.historian.headers import split_header
 from pipeline.historian.numbers import plain
+from pipeline.historian.quality import is_quality_name
 from pipeline.historian.table_head import NUMBER, Head, head_of_table, kind_of_cell
 
 SAMPLE_BYTES = 1 << 18
@@ -98,7 +99,7 @@ def names_of(path: Path, header: Sequence[str]) -> tuple[str, ...]:
     names = [" ".join(name.split()) or f"column {i + 1}" for i, name in enumerate(header)]
     twice = {name for name, times in Counter(names).items() if times > 1}
     for i, name in enumerate(names):
-        if name in twice and i and split_header(name)[0].lower() in QUALITIES and names[i - 1] not in twice:
+        if name in twice and i and is_quality_name(split_header(name)[0]) and names[i - 1] not in twice:
             names[i] = f"{split_header(names[i - 1])[0]} {name}"
     twice = {name for name, times in Counter(names).items() if times > 1}
     if twice:
@@ -108,21 +109,6 @@ def names_of(path: Path, header: Sequence[str]) -> tuple[str, ...]:
         )
         raise RecordError(f"{path}: column {first!r} stands twice in the header; rename or remove one of them{pairs}")
     return tuple(names)
-
-
-QUALITIES = {
-    "quality",
-    "qual",
-    "status",
-    "stat",
-    "q",
-    "opcquality",
-    "statuscode",
-    "qualität",
-    "good",
-    "isgood",
-    "valid",
-}
 
 
 def _head(path: Path, kind: str) -> bytes:

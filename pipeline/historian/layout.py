@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 from pipeline.errors import RecordError
 from pipeline.historian.export import Note
 from pipeline.historian.headers import split_header, tags_of
-from pipeline.historian.quality import QUALITY, is_quality
+from pipeline.historian.quality import QUALITY, is_quality, is_sure
 from pipeline.historian.table_head import kind_of_cell
 from pipeline.historian.time_column import TimeColumn, time_column_of
 
@@ -38,7 +39,7 @@ class Layout:
     kind: str
     time: TimeColumn
     values: tuple[str, ...]
-    quality: Mapping[str, str]  # value column -> its quality's column
+    quality: Mapping[str, tuple[str, ...]]  # value column -> the columns of its quality
     tags: Mapping[str, str]  # value column -> tag
     tag: str = ""
     notes: tuple[Note, ...] = ()  # what was assumed
@@ -52,59 +53,54 @@ def layout_of(
     time_format: str = "",
     units: Mapping[str, str] | None = None,
     spread: Callable[[str], Sequence[Any]] | None = None,
+    counted: Callable[[str], Mapping[str, int]] | None = None,
 ) -> Layout:
     """The layout by the header and the first rows; RecordError where no column is time.
 
-    ``units`` stand below the header; ``spread`` gives cells from all over a column, where the first ones do not do.
+    ``units`` stand below the header. Where the first cells do not do, ``spread`` gives cells from all over a column,
+    and ``counted`` each text of a column and how often it stands there.
     """
     more = spread or (lambda column: sample.get(column, ()))
+    whole = counted or (lambda column: Counter(_texts(sample.get(column, ()))))
     time = time_column_of(path, header, sample, time_column, time_format, units or {}, more)
     notes = [Note(time.name, words) for words in (time.left, time.clock.says) if words]
     others = [h for h in header if h not in time.columns]
     tag, value = _tag_and_value(others, sample, time)
     if tag and value:
-        quality = next((h for h in others if h not in {tag, value} and _quality_word(h, sample) is not None), "")
-        qualities = {value: quality} if quality else {}
-        return Layout("long", time, (value,), qualities, tags_of(header), tag, tuple(notes))
-    qualities, whole = {}, ""
+        found = tuple(h for h in others if h not in {tag, value} and _is_quality(h, sample))
+        return Layout("long", time, (value,), {value: found} if found else {}, tags_of(header), tag, tuple(notes))
+    qualities = dict[str, tuple[str, ...]]()
+    of_all = list[str]()
     for h in others:
-        found = _quality_word(h, sample, more)
-        if found is None:
+        match = QUALITY.match(h)
+        if match is None:
             continue
-        own = [o for o in others if o != h and split_header(o)[0] in {found, found.rstrip(" ._:/-")}] if found else []
-        if own:
-            qualities[own[0]] = h
-        elif not found and not whole:
-            whole = h
-    flags = {*qualities.values(), *([whole] if whole else [])}
+        own = [o for o in others if o != h and match["tag"] and split_header(o)[0] in _tags_before(match["tag"])]
+        if own and _is_quality(h, sample):
+            qualities[own[0]] = (*qualities.get(own[0], ()), h)
+        elif not match["tag"] and is_quality(h, whole(h), beside=False):
+            of_all.append(h)
+        elif own or is_sure(h):
+            of_whom = own[0] if own else "all tags"
+            notes.append(Note(h, f"has the name of a quality of {of_whom}, and other cells: it is read as a tag"))
+    flags = {*of_all, *(h for columns in qualities.values() for h in columns)}
     values = tuple(h for h in others if h not in flags)
-    if whole:
-        qualities |= {v: whole for v in values if v not in qualities}
-        notes.append(Note(whole, "is the quality of every tag in its row"))
+    if of_all:
+        qualities = {v: (*qualities.get(v, ()), *of_all) for v in values}
+        notes += [Note(h, "is the quality of every tag in its row") for h in of_all]
     if not values:
         raise RecordError(f"{path}: there is no column beside the time {time.name!r}; export the tags too")
     return Layout("wide", time, values, qualities, tags_of(header), notes=tuple(notes))
 
 
-def _quality_word(
-    column: str,
-    sample: Mapping[str, Sequence[Any]],
-    spread: Callable[[str], Sequence[Any]] | None = None,
-) -> str | None:
-    """The tag in front of a word of quality ("" for the word alone); None where the column is no quality.
+def _tags_before(text: str) -> set[str]:
+    """The tags that may stand in front of a word of quality."""
+    return {text.strip(), text.strip().rstrip(" ._:/-")}
 
-    ``spread`` where a row has several readings, so that the word alone needs words or codes of quality below it: the
-    first rows may all be good, so that the whole column counts. It is read for such a column only.
-    """
-    match = QUALITY.match(column)
-    if match is None:
-        return None
-    word, tag = match["word"], match["tag"].strip()
-    alone = not tag and spread is not None
-    found = is_quality(word, _texts(sample.get(column, ())), beside=not alone)
-    if not found and alone and spread is not None:
-        found = is_quality(word, _texts(spread(column)), beside=False)
-    return tag if found else None
+
+def _is_quality(column: str, sample: Mapping[str, Sequence[Any]]) -> bool:
+    """Whether a column beside a tag, or in a row that is one reading, holds qualities, by its first cells."""
+    return is_quality(column, Counter(_texts(sample.get(column, ()))), beside=True)
 
 
 def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], time: TimeColumn) -> tuple[str, str]:
@@ -115,7 +111,7 @@ def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], t
     if len(others) + len(time.columns) > LONG_COLUMNS:
         return "", ""
     kinds = {h: _kind(sample.get(h, ())) for h in others}
-    flags = {h for h in others if _quality_word(h, sample) is not None}
+    flags = {h for h in others if _is_quality(h, sample)}
     numbers = [h for h in others if kinds[h] in {"number", "empty"} and h not in flags]
     words = [h for h in others if kinds[h] == "text" and h not in flags]
     tags = [h for h in others if _plain(h) in TAG_NAMES and h not in flags]

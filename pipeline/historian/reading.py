@@ -24,6 +24,7 @@ from pipeline.historian.file_kinds import kind_of
 from pipeline.historian.gathering import Gathered
 from pipeline.historian.headers import split_header, tag_named, tags_of
 from pipeline.historian.layout import Layout, layout_of
+from pipeline.historian.quality import MOST_QUALITIES
 from pipeline.historian.sent_again import drop_repeated_rows
 from pipeline.historian.times import UNSTATED, UTC, zone_of
 from pipeline.historian.workbook import sheet_of, text_of
@@ -49,6 +50,11 @@ class Opened:
     unreadable: Counter[str]  # "rows": lines of another length than the header's
     notes: tuple[Note, ...] = ()
 
+    def layout(self, time_column: str = "", time_format: str = "") -> Layout:
+        """Which column is what; ``time_column`` and ``time_format`` are what a person said, "" for nothing."""
+        return layout_of(self.path, self.header, self.sample, time_column, time_format, self.units,
+                         self.spread, self.counted)  # fmt: skip
+
     def spread(self, column: str) -> list[Any]:
         """Cells from all over a column."""
         cells = list[Any]()
@@ -57,6 +63,17 @@ class Opened:
             cells += own.take(pa.array(range(0, len(own), max(1, len(own) // SPREAD)))).to_pylist()
         self.unreadable.clear()
         return cells
+
+    def counted(self, column: str) -> Counter[str]:
+        """Each text of a column, and how often it stands there; of one with very many, those of the first blocks."""
+        found = Counter[str]()
+        for block in self.blocks([column]):
+            for row in pc.value_counts(block.column(0)).to_pylist():
+                found["" if row["values"] is None else str(row["values"]).strip()] += row["counts"]
+            if len(found) > MOST_QUALITIES:
+                break
+        self.unreadable.clear()
+        return found
 
 
 def opened(path: Path) -> Opened:
@@ -97,7 +114,7 @@ def read_export(
     columns = {column: tag for source in sources for column, tag in tags_of(source.header).items()}
     tags, modes = [tag_named(t, columns) for t in tags], [tag_named(t, columns) for t in modes]
     for path, source in zip(paths, sources, strict=True):
-        layout = layout_of(path, source.header, source.sample, time_column, time_format, source.units, source.spread)
+        layout = source.layout(time_column, time_format)
         zone = zone_of(layout.time.clock, source.sample[layout.time.columns[0]])
         clock = LocalClock(time_zone, local) if local is not None and zone == UNSTATED else None
         found, counts, more = _read(source, layout, set(tags) | set(modes), set(modes), clock)
@@ -156,7 +173,7 @@ def tags_in(paths: Sequence[Path]) -> set[str]:
     for source in map(opened, paths):
         found |= {*tags_of(source.header).values(), *source.header}
         try:
-            layout = layout_of(source.path, source.header, source.sample, units=source.units, spread=source.spread)
+            layout = source.layout()
         except RecordError:  # the same file is refused when it is read
             continue
         found |= {str(c).strip() for c in source.sample.get(layout.tag, ())}
@@ -174,7 +191,8 @@ def _read(
     }
     qualities = {v: layout.quality[v] for v in values if v in layout.quality}
     time, midnights = layout.time, Midnights()
-    names = [n for n in dict.fromkeys((*time.columns, layout.tag, *values, *qualities.values())) if n]
+    flags = (flag for columns in qualities.values() for flag in columns)
+    names = [n for n in dict.fromkeys((*time.columns, layout.tag, *values, *flags)) if n]
     try:
         for block in source.blocks(names):
             counts["rows_read"] += block.num_rows
@@ -188,8 +206,7 @@ def _read(
                 block, seconds = block.filter(pa.array(timed)), seconds[timed]
             if layout.kind == "wide":
                 for v, name in values.items():
-                    own = qualities.get(v, "")
-                    gather.add(name, seconds, block.column(v), block.column(own) if own else None, own)
+                    gather.add(name, seconds, block.column(v), {q: block.column(q) for q in qualities.get(v, ())})
             else:
                 _long_block(gather, layout, block, seconds, wanted)
     except (pa.ArrowException, OSError, UnicodeError, EOFError) as error:
@@ -256,13 +273,13 @@ def _long_block(gather: Gathered, layout: Layout, block: Any, seconds: Any, want
     tags = tags.combine_chunks() if isinstance(tags, pa.ChunkedArray) else tags
     index = np.asarray(tags.indices.fill_null(-1).to_numpy(zero_copy_only=False))
     (value,) = layout.values
-    quality = layout.quality.get(value, "")
+    flags = layout.quality.get(value, ())
     for i, name in enumerate(tags.dictionary.to_pylist()):
         name = str(name).strip()
         rows = np.flatnonzero(index == i)
         if rows.size and (not wanted or name in wanted):
             part = block.take(pa.array(rows))
-            gather.add(name, seconds[rows], part.column(value), part.column(quality) if quality else None, quality)
+            gather.add(name, seconds[rows], part.column(value), {flag: part.column(flag) for flag in flags})
 
 
 # ---------------------------------------------------------------------- formats
