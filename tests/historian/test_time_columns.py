@@ -40,7 +40,7 @@ UNITS = {
     1e-9: ["ns", "nsec", "nanoseconds"], 1e-6: ["us", "µs", "μs", "usec", "microseconds"],
     1e-3: ["ms", "msec", "millis", "milliseconds", "Millisekunden"],
     1.0: ["s", "S", "sec", "secs", "seconds", "Sekunden"],
-    60.0: ["min", "MIN", "mins", "minute", "minutes", "Minuten"], 3600.0: ["h", "hr", "hrs", "hours", "Stunden", "std"],
+    60.0: ["min", "MIN", "mins", "minute", "minutes", "Minuten"], 3600.0: ["h", "hr", "hrs", "hours", "Stunden"],
     86_400.0: ["d", "day", "days", "Tage"],
 }  # fmt: skip
 FORMS = ["Time [{}]", "time ({})", "Zeit({})", "elapsed {{{}}}", "time_{}", "Time {}", "t/{}", "Time in {}", "TIME, {}"]
@@ -56,10 +56,21 @@ def test_every_spelling_of_a_unit_of_time(factor: float, form: str) -> None:
 
 
 @pytest.mark.parametrize(("header", "factor"), [("Time (min)", 60), ("t [hr]", 3600), ("t_ms", 1e-3), ("TimeMin", 60),
-                                                ("minutes", 60), ("Elapsed Time, h", 3600)])  # fmt: skip
+                                                ("minutes", 60), ("Elapsed Time, h", 3600), ("Zeit Std", 3600),
+                                                ("Zeit [Tag]", 86_400), ("Time (Std.)", 3600),
+                                                ("Time (min) since start", 60), ("t [min] rel", 60),
+                                                ("Time min since start", 60), ("Minutes elapsed", 60),
+                                                ("Time <min>", 60), ("Time (decimal hours)", 3600)])  # fmt: skip
 def test_times_in_a_unit_are_read_as_seconds(header: str, factor: float, tmp_path: Path) -> None:
     stamps = [f"{t / factor:.9g}" for t in STEP_S * np.arange(N)]
     np.testing.assert_allclose(times_of(tmp_path, header, stamps), STEP_S * np.arange(N), atol=1e-6)
+
+
+@pytest.mark.parametrize("header", ["TimeTag", "Time Tag", "Time_Tag", "Time Std", "TS_STD", "Timestamp W",
+                                    "Fecha hora", "Time D1", "Time US Central"])  # fmt: skip
+def test_a_word_that_is_no_unit_of_time(header: str, tmp_path: Path) -> None:
+    assert time_header(header).factor is None
+    np.testing.assert_allclose(times_of(tmp_path, header, [f"{t:.0f}" for t in TIME_S]), TIME_S)
 
 
 def test_what_is_written_beside_the_unit(tmp_path: Path) -> None:
