@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from pipeline.errors import RecordError, nearest
 from pipeline.files import sha256
+from pipeline.historian.day_counts import DAY_S
 from pipeline.historian.dialect import Dialect, sniff
 from pipeline.historian.export import Contents, Export, Note, Series, joined
 from pipeline.historian.file_kinds import kind_of
@@ -34,7 +35,6 @@ BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17
 SPREAD = 1_000  # cells of a block
 PARQUET = {".parquet", ".pq"}
-DAY_S, HALF_DAY_S = 86_400.0, 43_200.0
 
 
 @dataclass(slots=True)
@@ -248,7 +248,7 @@ class Midnights:
         if not known.size:
             return seconds
         own = seconds[known]
-        falls = np.diff(np.r_[own[0] if np.isnan(self.last_s) else self.last_s, own]) < -HALF_DAY_S
+        falls = np.diff(np.r_[own[0] if np.isnan(self.last_s) else self.last_s, own]) < -DAY_S / 2
         days = self.days + np.cumsum(falls)
         self.last_s, self.days = float(own[-1]), int(days[-1])
         out = seconds.copy()

@@ -12,9 +12,11 @@ import pyarrow as pa
 
 from pipeline.errors import RecordError, nearest
 from pipeline.historian.date_forms import HOUR, HOUR_DIGITS
+from pipeline.historian.day_counts import DAY_S, UnclearCountError
 from pipeline.historian.headers import split_header, time_header
 from pipeline.historian.table_head import kind_of_cell
 from pipeline.historian.times import SINCE_1970_S, Clock, clock_of, given_clock
+from pipeline.metrics import Array
 
 SAMPLE = 200  # cells of a column
 RISES = 0.9  # share of the steps that go one way
@@ -49,7 +51,8 @@ class Candidate:
     @property
     def order(self) -> tuple[bool, int, bool, int]:
         """The least one is the time: dates, then numbers since 1970, then others; what rises; the better name."""
-        kind = 0 if self.clock.dates else 1 if self.first_s >= SINCE_1970_S else 2 if not self.clock.says else 3
+        since_start = 2 if self.clock.certain and self.clock.kind != "elapsed" else 3
+        kind = 0 if self.clock.dates else 1 if self.first_s >= SINCE_1970_S else since_start
         return self.stands, kind, not self.rises, self.rank
 
 
@@ -76,22 +79,18 @@ def time_column_of(
         return TimeColumn(_fitting(path, header, sample, clock), clock)
     found, refused = list[Candidate](), list[tuple[int, RecordError]]()
     for column in header:
-        where = f"{path}: column {column!r}"
         try:
-            candidate = _candidate(column, sample.get(column, ())[:SAMPLE], where, units.get(column, ""))
+            candidate = _candidate(path, column, sample.get(column, ())[:SAMPLE], units.get(column, ""), spread)
         except RecordError as error:
-            try:
-                candidate = _candidate(column, spread(column), where, units.get(column, ""))
-            except RecordError:
-                refused.append((time_header(column).rank, error))
-                continue
+            refused.append((time_header(column).rank, error))
+            continue
         if candidate is not None:
             found.append(candidate)
     best = min(found, key=lambda c: c.order, default=None)
     pair = _day_and_hour(header, sample)
     if pair and (best is None or best.column in pair or not best.clock.dates):
         return _paired(path, sample, *pair, spread)
-    if refused and (best is None or best.clock.says):
+    if refused and (best is None or not best.clock.certain):
         raise min(refused, key=lambda r: r[0])[1]
     if best is None:
         first = min(header, key=lambda h: time_header(h).rank)
@@ -100,31 +99,42 @@ def time_column_of(
             f"{path}: no column holds times that can be read ({first!r} begins with {shown!r}); name the column with "
             "--time, its form with --time-format, for example '%d.%m.%Y %H:%M:%S'"
         )
-    others = [c.column for c in found if c is not best and not c.stands and c.rank < 3]
+    others = [c.column for c in found if c is not best and not c.stands and (c.rank < 3 or (c.clock.dates and c.rises))]
     left = f"is the time; {', '.join(others)} could be too, --time names another" if others else ""
     return TimeColumn(best.column, best.clock, left=left)
 
 
-def _candidate(column: str, cells: Sequence[Any], where: str, unit: str) -> Candidate | None:
+def _candidate(
+    path: Path, column: str, cells: Sequence[Any], unit: str, spread: Callable[[str], Sequence[Any]]
+) -> Candidate | None:
     """The column as one of times; None where it holds none, or its name is vague and it does not rise."""
     header = time_header(column)
+    where = f"{path}: column {column!r}"
     try:
         clock = clock_of(column, cells, where, unit)
-    except RecordError:
-        if header.rank >= 2 and not any(kind_of_cell(str(c).strip()) == "time" for c in cells):  # a temperature T (°C)
+    except RecordError as error:
+        dates = any(kind_of_cell(str(c).strip()) == "time" for c in cells)
+        if header.rank >= 2 and not dates and not isinstance(error, UnclearCountError):  # a temperature T (°C)
             return None
-        raise
+        clock = _clock_by_all(column, cells, where, unit, lambda: spread(column))
     if clock is None:
         return None
     seconds = _seconds(clock, cells)
-    seconds = seconds[np.isfinite(seconds)]
-    steps = np.diff(seconds)
-    way = max(np.count_nonzero(steps > 0), np.count_nonzero(steps < 0))
-    rises = bool(way >= RISES * np.count_nonzero(steps)) if len(steps) else True
-    stands = bool(len(steps)) and not steps.any()
+    rises, stands = _way(seconds)
+    if stands and clock.dates and header.named and np.any(seconds % DAY_S):  # to the minute, and many rows in each
+        rises, stands = _way(_seconds(clock, spread(column)))
     if not clock.dates and header.rank >= 2 and (not rises or stands):
         return None
-    return Candidate(column, clock, header.rank, rises, stands, float(seconds[0]) if len(seconds) else 0.0)
+    first_s = float(seconds[np.isfinite(seconds)][0]) if np.isfinite(seconds).any() else 0.0
+    return Candidate(column, clock, header.rank, rises, stands, first_s)
+
+
+def _way(seconds: Array) -> tuple[bool, bool]:
+    """Whether times (n,) rise or fall, and whether they stand."""
+    steps = np.diff(seconds[np.isfinite(seconds)])
+    way = max(np.count_nonzero(steps > 0), np.count_nonzero(steps < 0))
+    rises = bool(way >= RISES * np.count_nonzero(steps)) if len(steps) else True
+    return rises, bool(len(steps)) and not steps.any()
 
 
 def _seconds(clock: Clock, cells: Sequence[Any]) -> Any:
@@ -209,12 +219,12 @@ def _quiet(column: str, cells: Sequence[str]) -> Clock | None:
 def _clock_by_all(
     name: str, cells: Sequence[Any], where: str, unit: str, more: Callable[[], Sequence[Any]]
 ) -> Clock | None:
-    """The clock by the first cells, or by more of them where these do not tell day and month apart."""
+    """The clock by the first cells, or by more of them where these cannot be told to be one thing or another."""
     try:
         return clock_of(name, cells, where, unit)
     except RecordError as error:
         try:
-            return clock_of(name, more(), where, unit)
+            return clock_of(name, more(), where, unit, everywhere=True)
         except RecordError:
             raise error from None
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
+from pipeline.historian.day_counts import DAY_S
 from pipeline.metrics import Array
 
 OFFSET = re.compile(r"^(?:UTC|GMT)?(?P<sign>[+-])(?P<hours>\d{1,2})(?::?(?P<minutes>\d\d))?$", re.IGNORECASE)
@@ -62,7 +63,7 @@ class LocalClock:
             steps = np.diff(local)
             self.falls = bool(np.count_nonzero(steps < 0) > np.count_nonzero(steps > 0))
         changes = self._changes(float(local.min()), float(local.max()))
-        offset = np.full(len(local), self._offset(datetime.fromtimestamp(float(local.min()) - 86_400, UTC)))
+        offset = np.full(len(local), self._offset(datetime.fromtimestamp(float(local.min()) - DAY_S, UTC)))
         for at, before, after in changes:
             offset[local >= at + max(before, after)] = after
             skipped = (local >= at + before) & (local < at + after)
@@ -103,7 +104,7 @@ class LocalClock:
     def _changes(self, first_s: float, last_s: float) -> Array:
         """Rows (time UTC, offset before, offset after) [s] of each change of the clock near some local times."""
         found = []
-        days = np.arange(first_s - 2 * 86_400, last_s + 2 * 86_400, 86_400.0)
+        days = np.arange(first_s - 2 * DAY_S, last_s + 2 * DAY_S, DAY_S)
         if len(days) > 100_000:
             raise RecordError("the times of the export cover more than 270 years; check --time and --time-format")
         offsets = [self._offset(datetime.fromtimestamp(float(d), UTC)) for d in days]
