@@ -12,20 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import RecordError
+from pipeline.historian.decimal_sign import Sign, decimal_sign
 from pipeline.historian.file_kinds import head_of
 from pipeline.historian.headers import split_header
-from pipeline.historian.numbers import plain
 from pipeline.historian.quality import is_quality_name
-from pipeline.historian.table_head import NUMBER, Head, head_of_table, kind_of_cell
+from pipeline.historian.table_head import Head, head_of_table
 
 SAMPLE_BYTES = 1 << 18
 SAMPLE_LINES = 200
 SEPARATORS = ("\t", ";", "|", ",")  # a comma last: it may be the decimal sign
-COMMA_DECIMAL = re.compile(r"^\s*[+-]?(\d{1,3}(\.\d{3})+|\d*),\d+([eE][+-]?\d+)?\s*$")
-POINT_DECIMAL = re.compile(r"^\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*$")
-COMMA_THOUSANDS = re.compile(r"^[+-]?\d{1,3}(,\d{3})*(,\d{3}\.\d*|,\d{3},\d{3})$")
-EITHER = re.compile(r"^[+-]?[1-9]\d{0,2}(?P<sign>[.,])\d{3}$")  # 1,234 is 1.234 or 1234
-SMALL = re.compile(r"^[+-]?\d{1,3}$")
 LONGEST_HEADER = 6  # lines of one header, with line breaks in quoted names
 
 
@@ -35,7 +30,7 @@ class Dialect:
 
     encoding: str
     separator: str
-    decimal: str  # "." or ","
+    sign: Sign  # of decimals, by the first rows
     first_line: int  # lines before the first row of values
     header: tuple[str, ...]  # of every column, "column 3" where none is written
     units: tuple[str, ...]  # below the header, "" where none is written
@@ -43,9 +38,9 @@ class Dialect:
     unused: frozenset[str]  # columns without a name and a value, as of rows that end with a separator
 
     @property
-    def thousands(self) -> str:
-        """The sign between thousands."""
-        return "." if self.decimal == "," else ","
+    def decimal(self) -> str:
+        """The point or the comma; empty where the first rows do not tell it."""
+        return self.sign.decimal
 
 
 def sniff(path: Path, kind: str = "text") -> Dialect:
@@ -73,7 +68,9 @@ def sniff(path: Path, kind: str = "text") -> Dialect:
     header = names_of(path, found.header)
     unused = frozenset(n for i, n in enumerate(header) if not found.header[i] and not any(r[i] for r in found.rows))
     first = after[found.first - 1]
-    return Dialect(encoding, separator, _decimal(found.rows, separator), first, header, found.units, found.rows, unused)
+    columns = dict(zip(header, zip(*found.rows, strict=True), strict=True))
+    sign = decimal_sign(columns, separator, str(path))
+    return Dialect(encoding, separator, sign, first, header, found.units, found.rows, unused)
 
 
 def encoding_of(raw: bytes) -> str:
@@ -138,25 +135,3 @@ def _split(lines: Sequence[str], separator: str) -> tuple[list[list[str]], list[
         k += n
         after.append(k)
     return rows, after
-
-
-def _decimal(rows: Sequence[Sequence[str]], separator: str) -> str:
-    """The sign that most numbers show.
-
-    Where all are like 1,234 the comma is between thousands if smaller numbers have none, or if it separates cells.
-    """
-    cells = [
-        [c if NUMBER.match(c) else plain(c) for c in column if kind_of_cell(c) == "number"]
-        for column in zip(*rows, strict=True)
-    ]
-    every = [c for column in cells for c in column]
-    comma = sum(bool(COMMA_DECIMAL.match(c)) and not EITHER.match(c) for c in every)
-    point = sum(bool(POINT_DECIMAL.match(c)) and not EITHER.match(c) for c in every)
-    if comma or point:
-        return "," if comma > point else "."
-    if any(COMMA_THOUSANDS.match(c) for c in every):
-        return "."
-    either = [column for column in cells if any((m := EITHER.match(c)) and m["sign"] == "," for c in column)]
-    if not either or any((m := EITHER.match(c)) and m["sign"] == "." for c in every):
-        return "."
-    return "." if separator == "," or all(any(SMALL.match(c) for c in column) for column in either) else ","

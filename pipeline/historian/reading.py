@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from pipeline.errors import RecordError, nearest
 from pipeline.files import sha256
 from pipeline.historian.day_counts import DAY_S
+from pipeline.historian.decimal_sign import Sign, decimal_sign, whole_files_sign
 from pipeline.historian.dialect import Dialect, sniff
 from pipeline.historian.export import Contents, Export, Note, Series, joined
 from pipeline.historian.file_kinds import kind_of
@@ -45,7 +46,8 @@ class Opened:
     header: tuple[str, ...]
     sample: Mapping[str, Sequence[Any]]
     units: Mapping[str, str]
-    decimal: str
+    sign: Sign  # of decimals, by the first rows
+    separator: str  # of cells, "" where they are typed
     blocks: Callable[[Sequence[str]], Iterator[Any]]
     unreadable: Counter[str]  # "rows": lines of another length than the header's
     notes: tuple[Note, ...] = ()
@@ -74,6 +76,21 @@ class Opened:
                 break
         self.unreadable.clear()
         return found
+
+    def decimal(self) -> tuple[str, list[Note]]:
+        """The decimal sign, by the whole file where the first rows do not tell it; and a note where nothing does."""
+
+        def blocks(names: Sequence[str]) -> Iterator[Mapping[str, list[str]]]:
+            for block in self.blocks(names):
+                some = pa.array(range(0, len(block), max(1, len(block) // SPREAD)))
+                yield {n: [text_of(c) for c in block.column(n).take(some).to_pylist()] for n in names}
+
+        sign = whole_files_sign(self.sign, blocks, self.separator, str(self.path))
+        self.unreadable.clear()
+        if not sign.unclear or (sign.decimal == "." and self.separator != ";"):
+            return sign.decimal, []
+        words = f"numbers such as {sign.example} are read with three decimals; export thousands without a sign"
+        return sign.decimal, [Note(sign.unclear[0], words)]
 
 
 def opened(path: Path) -> Opened:
@@ -184,7 +201,8 @@ def tags_in(paths: Sequence[Path]) -> set[str]:
 def _read(
     source: Opened, layout: Layout, wanted: set[str], modes: set[str], local: LocalClock | None
 ) -> tuple[dict[str, Series], Counter[str], list[Note]]:
-    gather = Gathered(modes, source.decimal, wide=layout.kind == "wide")
+    decimal, of_sign = source.decimal()
+    gather = Gathered(modes, decimal, wide=layout.kind == "wide")
     counts: Counter[str] = Counter()
     values = {
         v: layout.tags[v] for v in layout.values if not wanted or layout.tags[v] in wanted or layout.kind == "long"
@@ -219,7 +237,7 @@ def _read(
             "--time-format"
         )
     series = gather.series()
-    notes = [Note(column, words) for column, words in gather.says.items() if words]
+    notes = of_sign + [Note(column, words) for column, words in gather.says.items() if words]
     return series, counts, notes + (_of_zone(source.path, local) if local else [])
 
 
@@ -294,7 +312,8 @@ def _parquet(path: Path) -> Opened:
     def blocks(names: Sequence[str]) -> Iterator[Any]:
         return pq.ParquetFile(path).iter_batches(batch_size=BLOCK_ROWS, columns=list(names))
 
-    return Opened(path, header, sample, {n: split_header(n)[1] for n in header}, ".", blocks, Counter())
+    return Opened(path, header, sample, {n: split_header(n)[1] for n in header}, _sign_of_texts(sample, path),
+                  "", blocks, Counter())  # fmt: skip
 
 
 def _workbook(path: Path) -> Opened:
@@ -304,7 +323,13 @@ def _workbook(path: Path) -> Opened:
     units = {n: unit or split_header(n)[1] for n, unit in zip(sheet.header, sheet.units, strict=True)}
     left = f"; the sheets {', '.join(sheet.others)} were not read" if sheet.others else ""
     notes = (Note(str(path), f"the sheet {sheet.name!r} was read{left}"),) if left else ()
-    return Opened(path, tuple(used), sample, units, ".", sheet.blocks, Counter(), notes)
+    sign = _sign_of_texts({n: [row[i] for row in sheet.rows] for i, n in enumerate(sheet.header)}, path)
+    return Opened(path, tuple(used), sample, units, sign, "", sheet.blocks, Counter(), notes)
+
+
+def _sign_of_texts(sample: Mapping[str, Sequence[Any]], path: Path) -> Sign:
+    """The decimal sign of numbers that stand as texts in a file of typed cells."""
+    return decimal_sign({n: [c for c in cells if isinstance(c, str)] for n, cells in sample.items()}, "", str(path))
 
 
 def _text(path: Path, dialect: Dialect, kind: str) -> Opened:
@@ -335,4 +360,4 @@ def _text(path: Path, dialect: Dialect, kind: str) -> Opened:
         )
 
     units = {n: unit or split_header(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
-    return Opened(path, used, sample, units, dialect.decimal, blocks, unreadable)
+    return Opened(path, used, sample, units, dialect.sign, dialect.separator, blocks, unreadable)

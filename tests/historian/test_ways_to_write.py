@@ -104,12 +104,44 @@ def test_what_may_be_two_numbers_is_none(column: list[str], decimal: str, expect
         ("time;a;b\n0;0,234;5\n1;1,250;5\n2;998;6\n", ","),
         ('time,a,b\n0,"1,5","2,5"\n1,"2,5","3,25"\n2,"2,5","3,5"\n', ","),
         ("time;a;b\n0;1'234,5;5\n1;1'250,5;5\n2;\u221212,5;6\n", ","),
+        ("time;a;b\n0;1.234;5\n1;1.250;5\n2;998;6\n", ","),
+        ("time;a;b\n0;1.234;5\n1;1.250;5\n2;1.260;6\n", "."),
+        ("time;a;b\n0;45.125;5\n1;99.250;5\n2;100;6\n", "."),
+        ("time;a;b\n0;45,125;5\n1;99,250;5\n2;100;6\n", ","),
+        ("time;a;b\n0;1.234;5\n1;1.250;5\n2;999;6\n3;0;6\n", "."),
+        ("time;a;b\n0;1.234.567;5\n1;998;5\n", ","),
     ],
 )
-def test_the_comma_between_thousands_is_no_decimal_sign(content: str, decimal: str, tmp_path: Path) -> None:
+def test_the_sign_between_thousands_is_no_decimal_sign(content: str, decimal: str, tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_text(content, encoding="utf-8")
     assert sniff(path).decimal == decimal
+
+
+@pytest.mark.parametrize("sign", [".", ","])
+def test_a_small_number_far_below_tells_thousands(sign: str, tmp_path: Path) -> None:
+    values = [1000 + k for k in range(300)] + [998]
+    own = [[str(1_709_532_000 + 10 * k), f"{v:,d}".replace(",", sign)] for k, v in enumerate(values)]
+    path = write(tmp_path / "x.csv", own, ("time", "a"), sep=";")
+    np.testing.assert_allclose(read_export([path]).series["a"].value, values)
+
+
+def test_three_digits_behind_both_signs_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("time;a;b\n0;1,234;1.234\n1;1,250;1.250\n")
+    with pytest.raises(RecordError, match=r"1,250 and 1\.250 may be decimals or thousands; export numbers without"):
+        read_export([path])
+
+
+@pytest.mark.parametrize("kind", ["xlsx", "parquet"])
+def test_texts_with_a_decimal_comma_in_typed_cells(kind: str, tmp_path: Path) -> None:
+    values = [f"{60 + k / 1000:.3f}".replace(".", ",") for k in range(N)]
+    path = tmp_path / f"x.{kind}"
+    if kind == "xlsx":
+        workbook(path, ["Time", "a"], list(zip(map(datetime.fromisoformat, STAMPS), values, strict=True)))
+    else:
+        pq.write_table(pa.table({"Time": STAMPS, "a": values}), path)
+    np.testing.assert_allclose(read_export([path]).series["a"].value, 60 + np.arange(N) / 1000)
 
 
 @pytest.mark.parametrize(
