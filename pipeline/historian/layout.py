@@ -9,12 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.errors import RecordError
 from pipeline.historian.export import Note
 from pipeline.historian.headers import split_header, tags_of
 from pipeline.historian.quality import QUALITY, is_quality, is_sure
-from pipeline.historian.table_head import kind_of_cell
-from pipeline.historian.time_column import TimeColumn, time_column_of
+from pipeline.historian.table_head import UNIT_WORDS, kind_of_cell
+from pipeline.historian.time_column import TimeColumn, seconds_of, time_column_of
+from pipeline.metrics import Array
 
 TAG_NAMES = {
     "tag", "tagname", "tagid", "name", "point", "pointname", "pointid", "signal", "signalname", "variable", "varname",
@@ -22,12 +25,13 @@ TAG_NAMES = {
     "channelname", "parameter", "parametername", "metric", "field", "measurand", "series", "id", "key", "object",
     "messstelle", "messstellenname", "kanal", "bezeichnung", "datenpunkt", "größe", "groesse", "kennung", "messgröße",
     "étiquette", "repère", "nom", "etiqueta", "punto", "nombre", "señal", "measurement", "desc", "description",
-    "beschreibung", "kks",
+    "beschreibung", "kks", "tagpath", "path", "messpunkt", "webid", "identifier", "attributename", "historiantag",
 }  # fmt: skip
 VALUE_NAMES = {
     "value", "val", "wert", "messwert", "reading", "measurement", "tagvalue", "data", "result", "valeur", "valor",
     "valore", "avg", "average", "mean", "numericvalue", "floatvalue", "doublevalue", "realvalue", "zahlenwert",
-    "istwert", "v", "vvalue", "pointvalue", "numeric", "analogvalue",
+    "istwert", "v", "vvalue", "pointvalue", "numeric", "analogvalue", "varvalue",
+    "attrvalue", "attributevalue", "eventvalue",
 }  # fmt: skip
 LONG_COLUMNS = 8  # more make a wide file
 
@@ -42,6 +46,7 @@ class Layout:
     quality: Mapping[str, tuple[str, ...]]  # value column -> the columns of its quality
     tags: Mapping[str, str]  # value column -> tag
     tag: str = ""
+    unit: str = ""  # the column of a reading's unit, of a long file
     notes: tuple[Note, ...] = ()  # what was assumed
 
 
@@ -65,11 +70,13 @@ def layout_of(
     time = time_column_of(path, header, sample, time_column, time_format, units or {}, more)
     notes = [Note(time.name, words) for words in (time.left, time.clock.says) if words]
     others = [h for h in header if h not in time.columns]
-    tag, value = _tag_and_value(others, sample, time)
+    tag, value = _tag_and_value(others, sample, time, more)
     if tag and value:
         found = tuple(h for h in others if h not in {tag, value} and _is_quality(h, sample))
-        return Layout("long", time, (value,), {value: found} if found else {}, tags_of(header), tag, tuple(notes))
-    qualities = dict[str, tuple[str, ...]]()
+        qualities = {value: found} if found else {}
+        unit = next((h for h in others if h.strip().lower() in UNIT_WORDS and _kind(sample.get(h, ())) == "text"), "")
+        return Layout("long", time, (value,), qualities, tags_of(header), tag, unit, tuple(notes))
+    qualities = {}
     of_all = list[str]()
     for h in others:
         match = QUALITY.match(h)
@@ -103,10 +110,16 @@ def _is_quality(column: str, sample: Mapping[str, Sequence[Any]]) -> bool:
     return is_quality(column, Counter(_texts(sample.get(column, ()))), beside=True)
 
 
-def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], time: TimeColumn) -> tuple[str, str]:
+def _tag_and_value(
+    others: Sequence[str],
+    sample: Mapping[str, Sequence[Any]],
+    time: TimeColumn,
+    spread: Callable[[str], Sequence[Any]],
+) -> tuple[str, str]:
     """The columns of the tag and of the value where a row is a reading; "" twice where it is not.
 
-    By their names; or by content: a column of words beside one of numbers, where each time has several words.
+    By their names; or by content: a column of words beside one of numbers, where each time has several words, or where
+    the times begin anew with another word.
     """
     if len(others) + len(time.columns) > LONG_COLUMNS:
         return "", ""
@@ -122,8 +135,9 @@ def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], t
         return tag, value
     if tag in words and len([n for n in numbers if n != tag]) == 1:
         value = next(n for n in numbers if n != tag)
-        if len(set(_texts(sample[tag]))) > 1:
+        if len(set(_texts(sample[tag]))) > 1 or len(set(_texts(spread(tag)))) > 1:
             return tag, value
+    numbers = [n for n in numbers if not _counts(sample.get(n, ()))] or numbers
     if len(numbers) == 1:
         stamps = [_texts(sample.get(c, ())) for c in time.columns]
         rows = list(zip(*stamps, strict=False))
@@ -132,7 +146,28 @@ def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], t
             together = set(zip(rows, cells, strict=False))
             if 1 < len(set(cells)) <= len(cells) // 2 and len(together) > 1.5 * len(set(rows)):
                 return h, numbers[0]
+        for h in words:
+            if not time.date and _begins_anew(_texts(spread(h)), seconds_of(time.clock, spread(time.name))):
+                return h, numbers[0]
     return "", ""
+
+
+def _counts(cells: Sequence[Any]) -> bool:
+    """Whether a column of numbers stands, or counts the rows, so that it is no value of several tags."""
+    try:
+        steps = np.diff([float(t.replace(",", ".")) for t in _texts(cells) if t])
+    except ValueError:
+        return False
+    return bool(len(steps)) and bool(np.all(steps >= 0))
+
+
+def _begins_anew(words: Sequence[str], seconds: Array) -> bool:
+    """Whether the times go back where another word begins, and nowhere else: a file sorted by tag."""
+    turns = np.array(words[1:]) != np.array(words[:-1])
+    steps = np.diff(seconds)
+    back = steps < 0 if 2 * np.count_nonzero(steps > 0) > len(steps) else steps > 0
+    times = np.count_nonzero(back)
+    return bool(times and not np.any(back & ~turns) and 2 * times >= np.count_nonzero(turns))
 
 
 def _numbered(cells: Sequence[Any], numbers: Sequence[str]) -> bool:

@@ -68,6 +68,15 @@ class Opened:
         self.unreadable.clear()
         return found
 
+    def pairs(self, one: str, other: str) -> set[tuple[str, str]]:
+        """The different pairs of texts in two columns."""
+        found = set[tuple[str, str]]()
+        for block in self.blocks([one, other]):
+            texts = ([text_of(c) for c in block.column(n).to_pylist()] for n in (one, other))
+            found |= set(zip(*texts, strict=True))
+        self.unreadable.clear()
+        return found
+
     def decimal(self) -> tuple[str, list[Note]]:
         """The decimal sign, by the whole file where the first rows do not tell it; and a note where nothing does."""
 

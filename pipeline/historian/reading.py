@@ -94,12 +94,20 @@ def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
 
 
 def units_of(paths: Sequence[Path]) -> dict[str, str]:
-    """Tag -> the unit that a row below the header or brackets in the header name."""
+    """Tag -> the unit that a row below the header, brackets in the header, or a column beside a reading name."""
     found: dict[str, str] = {}
     for path in paths:
         source = opened(path)
         tags = tags_of(source.header)
         found |= {tags[k]: v for k, v in source.units.items() if v}
+        try:
+            layout = source.layout()
+        except RecordError:  # the times need a person's word, the units of headers none
+            continue
+        if layout.unit:
+            pairs = source.pairs(layout.tag, layout.unit)
+            times = Counter(tag for tag, _ in pairs)
+            found |= {tag: unit for tag, unit in pairs if unit and times[tag] == 1}
     return found
 
 

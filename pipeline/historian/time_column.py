@@ -119,10 +119,10 @@ def _candidate(
         clock = _clock_by_all(column, cells, where, unit, lambda: spread(column))
     if clock is None:
         return None
-    seconds = _seconds(clock, cells)
+    seconds = seconds_of(clock, cells)
     rises, stands = _way(seconds)
     if stands and clock.dates and header.named and np.any(seconds % DAY_S):  # to the minute, and many rows in each
-        rises, stands = _way(_seconds(clock, spread(column)))
+        rises, stands = _way(seconds_of(clock, spread(column)))
     if not clock.dates and header.rank >= 2 and (not rises or stands):
         return None
     first_s = float(seconds[np.isfinite(seconds)][0]) if np.isfinite(seconds).any() else 0.0
@@ -137,7 +137,8 @@ def _way(seconds: Array) -> tuple[bool, bool]:
     return rises, bool(len(steps)) and not steps.any()
 
 
-def _seconds(clock: Clock, cells: Sequence[Any]) -> Any:
+def seconds_of(clock: Clock, cells: Sequence[Any]) -> Array:
+    """Seconds (n,) of cells (n,) by a clock; NaN where one cannot be read."""
     try:
         return clock.seconds(pa.array(list(cells)))
     except (pa.ArrowException, ValueError, TypeError):
@@ -178,7 +179,7 @@ def _fitting(path: Path, header: Sequence[str], sample: Mapping[str, Sequence[An
         cells = [c for c in sample.get(column, ())[:SAMPLE] if c is not None and str(c).strip()]
         rank = time_header(column).rank
         if cells and (clock.dates or rank < 3 or len(header) == 1):
-            found.append((rank, -float(np.mean(np.isfinite(_seconds(clock, cells)))), column))
+            found.append((rank, -float(np.mean(np.isfinite(seconds_of(clock, cells)))), column))
     fits = [f for f in found if f[1] < -0.5]
     if fits:
         return min(fits)[2]

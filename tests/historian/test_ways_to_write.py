@@ -372,12 +372,13 @@ LONG = [
     ("variable", "datetime", "val", "qual"), ("Messstelle", "Zeitstempel", "Wert", "Qualität"),
     ("NodeId", "SourceTimestamp", "Value", "StatusCode"), ("Bezeichnung", "Zeit", "Messwert", "Status"),
     ("what", "when", "how much", "Status"), ("Sensor ID", "Logged at", "Value (SI)", "IsGood"),
+    ("VarName", "TimeString", "VarValue", "Validity"), ("tagpath", "t_stamp", "floatvalue", "dataintegrity"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("names", LONG)
 def test_a_row_a_reading_under_many_names(names: tuple[str, ...], tmp_path: Path) -> None:
-    good = {"StatusCode": "0x00000000", "IsGood": "True"}.get(names[3], "Good")
+    good = {"StatusCode": "0x00000000", "IsGood": "True", "Validity": "1", "dataintegrity": "192"}.get(names[3], "Good")
     own = [[tag, row[0], value, good] for row in rows() for tag, value in zip(NAMES, row[1:], strict=True)]
     path = write(tmp_path / "x.csv", own, names)
     check(path)
@@ -385,9 +386,35 @@ def test_a_row_a_reading_under_many_names(names: tuple[str, ...], tmp_path: Path
     assert set(NAMES) <= tags_in([path])
 
 
+@pytest.mark.parametrize("header", [("Loop", "Time", "X", "RowNo"), ("Messpunkt", "Zeit", "Wert", "Unit")])
+def test_a_number_of_the_row_and_a_unit_beside_a_reading(header: tuple[str, ...], tmp_path: Path) -> None:
+    units = dict(zip(NAMES, ("degC", "%", "kg/h"), strict=True))
+    own = [[t, r[0], v, units[t] if header[3] == "Unit" else str(k)]
+           for k, r in enumerate(rows()) for t, v in zip(NAMES, r[1:], strict=True)]  # fmt: skip
+    path = write(tmp_path / "x.csv", own, header)
+    check(path)
+    assert units_of([path]) == (units if header[3] == "Unit" else {})
+
+
+@pytest.mark.parametrize("header", [("Loop", "Time", "X"), ("Path", "Time", "Reading")])
+def test_a_file_sorted_by_tag(header: tuple[str, ...], tmp_path: Path) -> None:
+    data = clean(700)
+    table = cells(data)
+    own = [[t, r[0], r[j]] for j, t in enumerate(NAMES, 1) for r in table]
+    export = read_export([write(tmp_path / "x.csv", own, header)])
+    for name, values in zip(NAMES, (data.pv, data.mv, data.dv), strict=True):
+        np.testing.assert_allclose(export.series[name].value, values)
+
+
 def test_tags_that_are_numbers_in_rows_of_readings(tmp_path: Path) -> None:
     own = [[t, row[0], v] for row in rows() for t, v in zip(("101", "102", "103"), row[1:], strict=True)]
     check(write(tmp_path / "x.csv", own, ("TagID", "Time", "Value")), ["101", "102", "103"])
+
+
+def test_a_label_beside_an_mv_that_rests_is_not_taken_for_a_tag(tmp_path: Path) -> None:
+    own = [[r[0], r[1], "50", f"batch {k // 20}"] for k, r in enumerate(rows())]
+    export = read_export([write(tmp_path / "x.csv", own, ("time", "PV", "OP", "name"))])
+    assert (export.layout, {*export.series}) == ("wide", {"PV", "OP", "name"})
 
 
 @pytest.mark.parametrize("extra", ["MODE", "name", "id"])
