@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import gzip
 import re
 import zlib
 from collections import Counter
@@ -13,7 +14,7 @@ from pathlib import Path
 
 from pipeline.errors import RecordError
 from pipeline.historian.decimal_sign import Sign, decimal_sign
-from pipeline.historian.file_kinds import head_of
+from pipeline.historian.file_kinds import head_of, kind_of
 from pipeline.historian.headers import split_header
 from pipeline.historian.quality import is_quality_name
 from pipeline.historian.table_head import Head, head_of_table
@@ -43,12 +44,12 @@ class Dialect:
         return self.sign.decimal
 
 
-def sniff(path: Path, kind: str = "text") -> Dialect:
-    """The dialect of a text file, gzipped or not; RecordError where it holds no table."""
+def sniff(path: Path, kind: str = "text", encoding: str = "") -> Dialect:
+    """The dialect of a text file, gzipped or not; RecordError where it holds no table. ``encoding`` "" is found."""
     raw = _head(path, kind)
     if not raw.strip():
         raise RecordError(f"{path}: the file is empty; give an export with a header and rows")
-    encoding = encoding_of(raw)
+    encoding = encoding or encoding_of(raw)
     text = codecs.getincrementaldecoder(encoding)(errors="replace").decode(raw)
     lines = re.split(r"\r\n|\n|\r", text)
     lines = lines[: SAMPLE_LINES if len(raw) < SAMPLE_BYTES else min(SAMPLE_LINES, len(lines) - 1)]
@@ -86,6 +87,20 @@ def encoding_of(raw: bytes) -> str:
     except UnicodeDecodeError:
         return "cp1252"
     return "utf-8"
+
+
+def is_utf8(path: Path) -> bool:
+    """Whether a whole file, unpacked, is a text in UTF-8."""
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        with gzip.open(path, "rb") if kind_of(path) == "gzip" else path.open("rb") as file:
+            while part := file.read(SAMPLE_BYTES):
+                decoder.decode(part)
+    except UnicodeDecodeError:
+        return False
+    except (OSError, EOFError, zlib.error):  # cut off, and said so elsewhere
+        return True
+    return True
 
 
 def names_of(path: Path, header: Sequence[str]) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +98,31 @@ def layout_of(
     if not values:
         raise RecordError(f"{path}: there is no column beside the time {time.name!r}; export the tags too")
     return Layout("wide", time, values, qualities, tags_of(header), notes=tuple(notes))
+
+
+def clocks_apart(layout: Layout, header: Sequence[str]) -> tuple[Layout, ...]:
+    """A layout a clock, where each tag of a wide file has its own column of dates before or behind it; else the one."""
+    clocks = dict(((layout.time.name, layout.time.clock), *layout.time.others))
+    flags = {flag for columns in layout.quality.values() for flag in columns}
+    order = [h for h in header if h not in flags]
+    kinds = [h in clocks for h in order]
+    if (
+        layout.kind != "wide"
+        or len(clocks) < 2
+        or kinds not in ([True, False] * len(clocks), [False, True] * len(clocks))
+    ):
+        return (layout,)
+    first = 0 if kinds[0] else 1
+    times, values = order[first::2], order[1 - first :: 2]
+    own = "; ".join(f"{v} by {t}" for t, v in zip(times, values, strict=True))
+    notes = (
+        *(n for n in layout.notes if n.words != layout.time.left),
+        Note(layout.time.name, f"each tag has times: {own}"),
+    )
+    return tuple(
+        replace(layout, time=TimeColumn(t, clocks[t]), values=(v,), notes=notes)
+        for t, v in zip(times, values, strict=True)
+    )
 
 
 def _tags_before(text: str) -> set[str]:

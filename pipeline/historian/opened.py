@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from pipeline.errors import RecordError
 from pipeline.historian.decimal_sign import Sign, decimal_sign, whole_files_sign
-from pipeline.historian.dialect import Dialect, sniff
+from pipeline.historian.dialect import Dialect, is_utf8, sniff
 from pipeline.historian.export import Note
 from pipeline.historian.file_kinds import kind_of
 from pipeline.historian.headers import split_header
@@ -29,6 +29,12 @@ SPREAD = 1_000  # cells of a block
 PARQUET = {".parquet", ".pq"}
 
 
+class EncodingError(RecordError):
+    """A text that is no UTF-8, which its first part did not show; it is to be opened in ``encoding``."""
+
+    encoding = "cp1252"
+
+
 @dataclass(slots=True)
 class Opened:
     """One file: its columns, its first rows, and its blocks of chosen columns."""
@@ -39,9 +45,22 @@ class Opened:
     units: Mapping[str, str]
     sign: Sign  # of decimals, by the first rows
     separator: str  # of cells, "" where they are typed
-    blocks: Callable[[Sequence[str]], Iterator[Any]]
+    all_blocks: Callable[[Sequence[str]], Iterator[Any]]
     unreadable: Counter[str]  # "rows": lines of another length than the header's
     notes: tuple[Note, ...] = ()
+
+    encoding: str = ""  # of a text
+
+    def blocks(self, names: Sequence[str]) -> Iterator[Any]:
+        """The rows of some columns, as Arrow batches; RecordError where they cannot be read, EncodingError too."""
+        try:
+            yield from self.all_blocks(names)
+        except (pa.ArrowException, OSError, UnicodeError, EOFError) as error:
+            if self.encoding.startswith("utf-8") and not is_utf8(self.path):
+                raise EncodingError(f"{self.path} is no UTF-8") from None
+            raise RecordError(
+                f"{self.path} cannot be read: {str(error).splitlines()[0]}; export the file again"
+            ) from None
 
     def layout(self, time_column: str = "", time_format: str = "") -> Layout:
         """Which column is what; ``time_column`` and ``time_format`` are what a person said, "" for nothing."""
@@ -93,8 +112,11 @@ class Opened:
         return sign.decimal, [Note(sign.unclear[0], words)]
 
 
-def opened(path: Path) -> Opened:
-    """The file's header and first rows; RecordError where it cannot be read as a table."""
+def opened(path: Path, encoding: str = "") -> Opened:
+    """The file's header and first rows; RecordError where it cannot be read as a table.
+
+    ``encoding`` is that of a text; "" finds it in the first part.
+    """
     if path.is_dir():
         raise RecordError(f"{path} is a folder; give the files in it, as in {path}/*.csv")
     if not path.exists():
@@ -103,7 +125,7 @@ def opened(path: Path) -> Opened:
         kind = kind_of(path)
         if kind == "parquet" or path.suffix.lower() in PARQUET:
             return _parquet(path)
-        return _workbook(path) if kind == "workbook" else _text(path, sniff(path, kind), kind)
+        return _workbook(path) if kind == "workbook" else _text(path, sniff(path, kind, encoding), kind)
     except (pa.ArrowException, OSError, UnicodeError, LookupError, EOFError) as error:
         raise RecordError(f"{path} cannot be read: {str(error).splitlines()[0]}; export the file again") from None
 
@@ -167,4 +189,5 @@ def _text(path: Path, dialect: Dialect, kind: str) -> Opened:
         )
 
     units = {n: unit or split_header(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
-    return Opened(path, used, sample, units, dialect.sign, dialect.separator, blocks, unreadable)
+    return Opened(path, used, sample, units, dialect.sign, dialect.separator, blocks, unreadable,
+                  encoding=dialect.encoding)  # fmt: skip

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC as UTC_ZONE
-from datetime import datetime
+from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,8 @@ from pipeline.historian.day_counts import DAY_S
 from pipeline.historian.export import Contents, Export, Note, Series, joined
 from pipeline.historian.gathering import Gathered
 from pipeline.historian.headers import tag_named, tags_of
-from pipeline.historian.layout import Layout
-from pipeline.historian.opened import Opened, opened
+from pipeline.historian.layout import Layout, clocks_apart
+from pipeline.historian.opened import EncodingError, Opened, opened
 from pipeline.historian.sent_again import drop_repeated_rows
 from pipeline.historian.times import UNSTATED, UTC, zone_of
 from pipeline.historian.zones import LocalClock, zone_named
@@ -42,46 +42,93 @@ def read_export(
     """
     if not paths:
         raise RecordError("no file is named; give one or more exports")
-    local = zone_named(time_zone) if time_zone else None
-    parts: dict[str, list[Series]] = {}
-    files, kinds, zones, totals, contents = [], [], list[str](), Counter[str](), list[Contents]()
-    known, notes = set[str](), list[Note]()
+    times = Times(time_column, time_format, time_zone, zone_named(time_zone) if time_zone else None)
     sources = [opened(path) for path in paths]
     columns = {column: tag for source in sources for column, tag in tags_of(source.header).items()}
     tags, modes = [tag_named(t, columns) for t in tags], [tag_named(t, columns) for t in modes]
-    for path, source in zip(paths, sources, strict=True):
-        layout = source.layout(time_column, time_format)
-        zone = zone_of(layout.time.clock, source.sample[layout.time.columns[0]])
-        clock = LocalClock(time_zone, local) if local is not None and zone == UNSTATED else None
-        found, counts, more = _read(source, layout, set(tags) | set(modes), set(modes), clock)
-        notes += [*source.notes, *layout.notes, *more]
-        zones.append(UTC if clock else zone)
-        drop_repeated_rows(found)
-        contents.append(_contents(path, found, counts["rows_read"]))
-        for name, series in found.items():
-            parts.setdefault(name, []).append(series)
-        pa.default_memory_pool().release_unused()
-        totals += counts + source.unreadable
-        kinds.append(layout.kind)
-        files.append((str(path), sha256(path)))
-        known |= set(found) if layout.kind == "long" else {layout.tags[v] for v in layout.values}
-    absent = [f"no tag {tag!r}{nearest(tag, known)}" for tag in (*tags, *modes) if tag not in parts]
+    read = [_of_file(source, times, {*tags, *modes}, set(modes)) for source in sources]
+    together: dict[str, list[Series]] = {}
+    for one in read:
+        for name, series in one.series.items():
+            together.setdefault(name, []).append(series)
+    named, known = ", ".join(map(str, paths)), set[str]().union(*(one.known for one in read))
+    absent = [f"no tag {tag!r}{nearest(tag, known)}" for tag in (*tags, *modes) if tag not in together]
     if absent:
-        raise RecordError(f"{', '.join(map(str, paths))}: {'; '.join(absent)}")
+        raise RecordError(f"{named}: {'; '.join(absent)}")
+    totals = sum((one.counts for one in read), Counter[str]())
     if not totals["rows_read"]:
-        raise RecordError(f"{', '.join(map(str, paths))}: no row of data; export a longer time")
-    together = {name: joined(p) for name, p in parts.items()}
-    layouts = " and ".join(dict.fromkeys(kinds))
-    zone = zones[0] if len(set(zones)) == 1 else ""  # of files that count differently no date is known
-    rows = totals["rows_read"] + totals["rows"]
-    unreadable, timeless = totals["rows"], totals["timeless"]
+        raise RecordError(f"{named}: no row of data; export a longer time")
+    zones = {zone for one in read for zone in one.zones}
+    rows, unreadable, timeless = totals["rows_read"] + totals["rows"], totals["rows"], totals["timeless"]
+    notes = [note for one in read for note in one.notes]
     if unreadable or timeless:
         words = f"{unreadable} have another number of cells than the header, {timeless} no time that can be read"
         notes.append(Note(f"{rows} rows of the export", f"{words}: they are left out"))
-    if time_zone and not any(n.column == time_zone for n in notes):
+    if time_zone and not any(one.local for one in read):
         raise RecordError(f"--time-zone {time_zone}: no file has dates without a zone of their own; leave it out")
-    own = tuple(dict.fromkeys(notes))
-    return Export(together, tuple(files), layouts, rows, unreadable, timeless, zone, tuple(contents), own, local)
+    return Export(
+        {name: joined(p) for name, p in together.items()},
+        tuple((str(path), sha256(path)) for path in paths),
+        " and ".join(dict.fromkeys(one.kind for one in read)),
+        rows,
+        unreadable,
+        timeless,
+        zones.pop() if len(zones) == 1 else "",  # of files that count differently no date is known
+        tuple(one.contents for one in read),
+        tuple(dict.fromkeys(notes)),
+        times.zone,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """What a person said of the times: their column, their form, their zone; "" and None where nothing was said."""
+
+    column: str
+    form: str
+    zone_name: str
+    zone: tzinfo | None
+
+
+@dataclass(slots=True)
+class FileRead:
+    """What one file holds."""
+
+    kind: str  # of its layout
+    contents: Contents
+    series: dict[str, Series]
+    counts: Counter[str]
+    notes: list[Note]
+    zones: list[str]
+    known: set[str]  # its tags
+    local: bool  # some of its times were converted from the zone that a person named
+
+
+def _of_file(source: Opened, times: Times, wanted: set[str], modes: set[str]) -> FileRead:
+    try:
+        return _of_opened(source, times, wanted, modes)
+    except EncodingError as error:
+        return _of_opened(opened(source.path, error.encoding), times, wanted, modes)
+
+
+def _of_opened(source: Opened, times: Times, wanted: set[str], modes: set[str]) -> FileRead:
+    layout = source.layout(times.column, times.form)
+    apart = clocks_apart(layout, source.header)
+    found, counts, notes, zones, local = dict[str, Series](), Counter[str](), [*source.notes], list[str](), False
+    for own in apart:
+        zone = zone_of(own.time.clock, source.sample[own.time.columns[0]])
+        clock = LocalClock(times.zone_name, times.zone) if times.zone is not None and zone == UNSTATED else None
+        series, of_rows, more = _read(source, own, wanted, modes, clock)
+        found |= series
+        counts = of_rows if len(apart) == 1 else Counter({"rows_read": of_rows["rows_read"]})
+        notes += [*own.notes, *more]
+        zones.append(UTC if clock else zone)
+        local |= clock is not None
+    drop_repeated_rows(found)
+    pa.default_memory_pool().release_unused()
+    known = set(found) if layout.kind == "long" else {own.tags[v] for own in apart for v in own.values}
+    contents = _contents(source.path, found, counts["rows_read"])
+    return FileRead(layout.kind, contents, found, counts + source.unreadable, notes, zones, known, local)
 
 
 def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
@@ -154,7 +201,7 @@ def _read(
                     gather.add(name, seconds, block.column(v), {q: block.column(q) for q in qualities.get(v, ())})
             else:
                 _long_block(gather, layout, block, seconds, wanted)
-    except (pa.ArrowException, OSError, UnicodeError, EOFError) as error:
+    except (pa.ArrowException, UnicodeError) as error:  # a cell of another kind than the first ones
         raise RecordError(
             f"{source.path} cannot be read: {str(error).splitlines()[0]}; export the file again"
         ) from None

@@ -30,6 +30,7 @@ class TimeColumn:
     clock: Clock
     date: str = ""
     left: str = ""  # for a person: which others could have been it
+    others: tuple[tuple[str, Clock], ...] = ()  # further columns of dates that rise
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -99,9 +100,11 @@ def time_column_of(
             f"{path}: no column holds times that can be read ({first!r} begins with {shown!r}); name the column with "
             "--time, its form with --time-format, for example '%d.%m.%Y %H:%M:%S'"
         )
-    others = [c.column for c in found if c is not best and not c.stands and (c.rank < 3 or (c.clock.dates and c.rises))]
-    left = f"is the time; {', '.join(others)} could be too, --time names another" if others else ""
-    return TimeColumn(best.column, best.clock, left=left)
+    others = [c for c in found if c is not best and not c.stands and (c.rank < 3 or (c.clock.dates and c.rises))]
+    names = ", ".join(c.column for c in others)
+    left = f"is the time; {names} could be too, --time names another" if others else ""
+    dates = tuple((c.column, c.clock) for c in others if best.clock.dates and c.clock.dates and c.rises)
+    return TimeColumn(best.column, best.clock, left=left, others=dates)
 
 
 def _candidate(

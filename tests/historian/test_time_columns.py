@@ -283,6 +283,21 @@ def test_newest_rows_first(tmp_path: Path) -> None:
     np.testing.assert_allclose(export.series["TIC.PV"].value, [float(v) for v in VALUES])
 
 
+@pytest.mark.parametrize(
+    "header", [("Time PV", "TIC.PV", "Time OP", "TIC.OP"), ("TIC.PV", "Time", "TIC.OP", "Time OP")]
+)
+def test_each_tag_has_the_times_beside_it(header: tuple[str, ...], tmp_path: Path) -> None:
+    later = stamped("%Y-%m-%d %H:%M:%S", TIME_S + 3600)
+    later[-1], values = "", [*VALUES[:-1], ""]
+    columns = [DATES, VALUES, later, values] if header[0] == "Time PV" else [VALUES, DATES, values, later]
+    path = write(tmp_path / "x.csv", list(zip(*columns, strict=True)), header)
+    export = read_export([path])
+    assert {*export.series} == {"TIC.PV", "TIC.OP"}
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, TIME_S)
+    np.testing.assert_allclose(export.series["TIC.OP"].time_s, TIME_S[:-1] + 3600)
+    assert (export.rows, export.timeless_rows) == (N, 0)
+
+
 # ---------------------------------------------------------------------- zones
 @pytest.mark.parametrize("newest_first", [False, True])
 @pytest.mark.parametrize("day", ["2024-10-26 18:00", "2024-03-30 18:00", "2024-07-01"])
