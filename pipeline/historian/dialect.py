@@ -132,12 +132,23 @@ def _head(path: Path, kind: str) -> bytes:
         raise RecordError(f"{path} cannot be read: {error}; export the file again") from None
 
 
+def _ends_in_quotes(text: str, separator: str) -> bool:
+    """Whether a quoted cell goes on behind the text; a quote within a cell, as of 3" valve, opens none."""
+    quoted = False
+    begins = True  # a cell
+    for sign in text:
+        if sign == '"' and (quoted or begins):
+            quoted = not quoted
+        begins = not quoted and (sign in (separator, "\n") or (begins and sign == " "))
+    return quoted
+
+
 def _split(lines: Sequence[str], separator: str) -> tuple[list[list[str]], list[int]]:
     """Rows of cells, and the number of lines up to each row's end: a quoted name may hold line breaks."""
     rows, after, k = list[list[str]](), list[int](), 0
     while k < len(lines):
         n = 1
-        while lines[k : k + n] and '"' in lines[k] and "".join(lines[k : k + n]).count('"') % 2:
+        while '"' in lines[k] and _ends_in_quotes("\n".join(lines[k : k + n]), separator):
             n += 1
             if n > LONGEST_HEADER or k + n > len(lines):
                 n = 1

@@ -172,7 +172,7 @@ def _tag_and_value(
             if 1 < len(set(cells)) <= len(cells) // 2 and len(together) > 1.5 * len(set(rows)):
                 return h, numbers[0]
         for h in words:
-            if not time.date and _begins_anew(_texts(spread(h)), seconds_of(time.clock, spread(time.name))):
+            if not time.before and _begins_anew(_texts(spread(h)), seconds_of(time.clock, spread(time.name))):
                 return h, numbers[0]
     return "", ""
 

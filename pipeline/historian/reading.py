@@ -249,8 +249,8 @@ class Midnights:
 
 
 def _stamps(block: Any, layout: Layout) -> Any:
-    """The column of times, put together where day and hour stand apart."""
-    if not layout.time.date:
+    """The column of times, put together where its parts stand apart."""
+    if not layout.time.before:
         return block.column(layout.time.name)
     parts = [pc.utf8_trim_whitespace(pc.cast(block.column(c), pa.string())) for c in layout.time.columns]
     if "%H%M%S" in layout.time.clock.format:

@@ -24,18 +24,18 @@ RISES = 0.9  # share of the steps that go one way
 
 @dataclass(frozen=True, slots=True)
 class TimeColumn:
-    """The column of times and how it writes them; ``date`` is that of the day, where ``name`` holds the hour alone."""
+    """The column of times and how it writes them; ``before`` it stand those of the day, or of year to minute."""
 
     name: str
     clock: Clock
-    date: str = ""
+    before: tuple[str, ...] = ()
     left: str = ""  # for a person: which others could have been it
     others: tuple[tuple[str, Clock], ...] = ()  # further columns of dates that rise
 
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns that make the time."""
-        return tuple(filter(None, (self.date, self.name)))
+        return (*self.before, self.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def time_column_of(
     if time_format:
         clock = given_clock(time_format)
         if pair := _day_and_hour(header, sample):
-            return TimeColumn(pair[1], clock, pair[0])
+            return TimeColumn(pair[1], clock, pair[:1])
         return TimeColumn(_fitting(path, header, sample, clock), clock)
     found, refused = list[Candidate](), list[tuple[int, RecordError]]()
     for column in header:
@@ -88,6 +88,8 @@ def time_column_of(
         if candidate is not None:
             found.append(candidate)
     best = min(found, key=lambda c: c.order, default=None)
+    if (best is None or not best.clock.dates) and (parts := _year_to_second(header, sample)):
+        return TimeColumn(parts[-1], Clock("format", format=" ".join(FORMS[: len(parts)])), parts[:-1])
     pair = _day_and_hour(header, sample)
     if pair and (best is None or best.column in pair or not best.clock.dates):
         return _paired(path, sample, *pair, spread)
@@ -160,8 +162,13 @@ def _named(
     column = next((h for h in header if named in {h, split_header(h)[0]}), "")
     if not column:
         raise RecordError(f"{path}: no column {named!r} for --time{nearest(named, header)}")
+    pair = _day_and_hour(header, sample)
+    pair = pair if pair and column in pair else None
     if time_format:
-        return TimeColumn(column, given_clock(time_format))
+        given = given_clock(time_format)
+        return TimeColumn(pair[1], given, pair[:1]) if pair and given.dates else TimeColumn(column, given)
+    if pair:
+        return _paired(path, sample, *pair, spread)
     where, cells = f"{path}: column {column!r}", sample.get(column, ())[:SAMPLE]
     unit = split_header(column)[1] or units.get(column, "")
     name = column if time_header(column).named else f"time [{unit}]" if unit else "time"
@@ -190,6 +197,29 @@ def _fitting(path: Path, header: Sequence[str], sample: Mapping[str, Sequence[An
     if named:  # the whole column is tried, and refused with its first cells
         return min(named)[2]
     raise RecordError(f"{path}: no column has times of the form that --time-format gives; name one with --time")
+
+
+YEAR_TO_SECOND = (
+    {"year", "yyyy", "jahr", "année", "annee", "año"}, {"month", "monat", "mois", "mes"},
+    {"day", "tag", "jour", "día", "dia"}, {"hour", "hours", "stunde", "heure", "hora"},
+    {"minute", "minutes", "min", "minuto"},
+    {"second", "seconds", "sec", "sekunde", "seconde", "segundo"},
+)  # fmt: skip
+FORMS = ("%Y", "%m", "%d", "%H", "%M", "%S")
+
+
+def _year_to_second(header: Sequence[str], sample: Mapping[str, Sequence[Any]]) -> tuple[str, ...]:
+    """The columns of year, month, day, hour, minute and, where there is one, second; () where one is missing."""
+    found = list[str]()
+    for words in YEAR_TO_SECOND:
+        column = next((h for h in header if split_header(h)[0].strip().lower() in words), "")
+        if not column:
+            break
+        found.append(column)
+    if len(found) < len(FORMS) - 1:
+        return ()
+    years = [str(c).strip() for c in sample.get(found[0], ()) if c is not None and str(c).strip()]
+    return tuple(found) if years and all(len(y.removesuffix(".0")) == 4 for y in years) else ()
 
 
 def _day_and_hour(header: Sequence[str], sample: Mapping[str, Sequence[Any]]) -> tuple[str, str] | None:
@@ -253,4 +283,4 @@ def _paired(
             f"{path}: {both[0]!r} of the columns {date!r} and {time!r} is no time that can be read; give its form "
             "with --time-format, for example '%d.%m.%Y %H:%M:%S'"
         )
-    return TimeColumn(time, clock, date)
+    return TimeColumn(time, clock, (date,))

@@ -228,6 +228,26 @@ def test_hours_of_the_day_count_over_midnight(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, times)
 
 
+@pytest.mark.parametrize("names", ["Year Month Day Hour Minute Second", "Jahr Monat Tag Stunde Minute"])
+def test_year_to_second_in_columns_of_their_own(names: str, tmp_path: Path) -> None:
+    times = TIME_S if "Second" in names else START_S + 60.0 * np.arange(N)
+    parts = list(zip(*(s.split() for s in stamped("%Y %m %d %H %M %S", times)), strict=True))
+    header = names.split()
+    export = read(tmp_path, (*header, "TIC.PV"), *([str(int(c)) for c in p] for p in parts[: len(header)]), VALUES)
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, times)
+    assert {*export.series} == {"TIC.PV"}
+
+
+@pytest.mark.parametrize("named", ["Day", "Hour"])
+def test_a_person_may_name_the_day_or_the_hour_of_two_columns(named: str, tmp_path: Path) -> None:
+    days, hours = zip(*(s.split() for s in stamped("%Y-%m-%d %H:%M:%S")), strict=True)
+    found = read(tmp_path, ("Day", "Hour", "TIC.PV"), days, hours, VALUES, time_column=named)
+    np.testing.assert_allclose(found.series["TIC.PV"].time_s, TIME_S)
+    found = read(tmp_path, ("Day", "Hour", "TIC.PV"), days, hours, VALUES, time_column=named,
+                 time_format="%Y-%m-%d %H:%M:%S")  # fmt: skip
+    np.testing.assert_allclose(found.series["TIC.PV"].time_s, TIME_S)
+
+
 DATES = stamped("%Y-%m-%d %H:%M:%S")
 
 

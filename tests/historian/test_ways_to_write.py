@@ -336,6 +336,10 @@ HEADS = {
     "tags are numbers below a title": (text(NUMBERED, above=["Report;;;"]), NUMBERED[1:]),
     "line break in a quoted name": (text(("Time", "TIC-101\n.PV", *NAMES[1:])), ["TIC-101 .PV", *NAMES[1:]]),
     "an inch in a title": (text(HEADER, above=['valve of 5" size;;;']), NAMES),
+    "inches in a title and in the header": (
+        text(("Time", *NAMES), above=['valve of 5" size;;;']).replace("FI-7", '3" FI-7'),
+        [*NAMES[:2], '3" FI-7'],
+    ),
     "comma separated": (text(HEADER, ",", end=",", above=["Report,,,,"]), NAMES),
     "tabs": (text(HEADER, "\t", above=["Report\t\t\t"]), NAMES),
     "no-break blanks in names": (text(("Time", "TIC-101.PV\u00a0[degC]", *NAMES[1:])), NAMES),
@@ -437,10 +441,12 @@ BRACKETED = ["Unit/TIC[1].PV", "Unit/TIC[1]", "Unit/TIC[2]"]
         ("Unit/TIC[2]=0..1", BRACKETED[2], "", 0.0),
         ("TIC.PV[degC]=0..120", "TIC.PV", "degC", 0.0),
         ("ns=2;s=TIC.PV[degC]=0..120", "ns=2;s=TIC.PV", "degC", 0.0),
+        ("FI=3..4", "FI=3..4", "", None),
     ],
 )
 def test_tags_with_brackets_and_slashes(option: str, tag: str, unit: str, low: float | None, tmp_path: Path) -> None:
-    path = write(tmp_path / "x.csv", rows(), ("time", "Unit/TIC[1].PV [degC]", *BRACKETED[1:]))
+    own = [[*row, "1"] for row in rows()]
+    path = write(tmp_path / "x.csv", own, ("time", "Unit/TIC[1].PV [degC]", *BRACKETED[1:], "FI=3..4"))
     found = parse_tag(option, "pv", lambda: tags_in([path]))
     assert (found.tag, found.unit, found.low) == (tag, unit, low)
     check(path, BRACKETED)
@@ -523,6 +529,8 @@ KINDS = [
     (b"SQLite format 3\x00" + bytes(600), "an SQLite database"),
     (b"\x89HDF\r\n\x1a\n" + bytes(600), "an HDF5 file"),
     (b"MATLAB 5.0 MAT-file, Platform" + bytes(600), "a MATLAB file"),
+    (gzip.compress(b"PAR1" + bytes(600)), "a Parquet file, gzipped; unpack it"),
+    (gzip.compress(zipped(["xl/workbook.xml"])), "gzipped; unpack it"),
 ]
 
 
