@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.errors import RecordError
-from pipeline.historian.date_forms import ELAPSED, calendar_digits, form_of, other_forms, plain_date
+from pipeline.historian.date_forms import ELAPSED, MIDNIGHT, calendar_digits, form_of, other_forms, plain_date
 from pipeline.historian.day_counts import DAY_S, DAYS, SERIAL, UnclearCountError, days_of
 from pipeline.historian.headers import NO_UNITS, SPELLINGS, TIME_UNITS, TimeHeader, time_header
 from pipeline.metrics import Array
@@ -182,6 +182,11 @@ def _formatted(column: Any, form: str) -> Array:
             plain = plain[again.isna()]
             if plain.empty:
                 break
+    ends = text[stamps.isna()].dropna()
+    ends = ends[ends.str.contains(MIDNIGHT)]
+    if len(ends):  # 24:00 is the next day's 00:00
+        days = pd.to_datetime(ends.str.replace(MIDNIGHT, "00", regex=True), format=form, errors="coerce", utc=utc)
+        stamps = stamps.fillna(days + pd.Timedelta(days=1))
     stamps = stamps.dt.tz_localize(None) if utc else stamps
     return _of_timestamps(pa.array(stamps.dt.as_unit("us")))
 
@@ -196,7 +201,10 @@ def _iso(column: Any) -> Array:
         import pandas as pd  # slower, and it takes what Arrow does not: a decimal comma, a missing minute, nonsense
 
         words = text.to_pandas().str.replace(",", ".", regex=False)
+        ends = words.str.contains(MIDNIGHT).fillna(False).astype(bool)  # 24:00 is the next day's 00:00
+        words = words.where(~ends, words.str.replace(MIDNIGHT, "00", regex=True))
         stamps = pd.to_datetime(words, format="ISO8601", errors="coerce", utc=True)
+        stamps += pd.to_timedelta(ends.astype(int), "D")
         return _of_timestamps(pa.array(stamps.dt.tz_localize(None).dt.as_unit("us")))
 
 
@@ -217,8 +225,10 @@ def _number(cell: str | None) -> float:
 
 
 def _elapsed(cell: str | None) -> float:
-    """Seconds of 26:03:10.5."""
+    """Seconds of 26:03:10.5, or of 06:03:10 PM."""
     if not cell or not ELAPSED.match(cell.strip()):
         return float("nan")
-    hours, minutes, seconds = cell.strip().replace(",", ".").split(":")
-    return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
+    clock = cell.strip().lower().replace(",", ".")
+    hours, minutes, seconds = clock.rstrip(" apm").split(":")
+    hour = int(hours) % 12 + 12 * (clock[-2] == "p") if clock.endswith("m") else int(hours)
+    return 3600.0 * hour + 60.0 * int(minutes) + float(seconds)

@@ -81,6 +81,9 @@ class LocalClock:
         if not place.size:
             return np.zeros(0, dtype=bool)
         self.told += int(place.size)
+        steps = np.diff(local) * (-1.0 if self.falls else 1.0)
+        usual_s = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+        stamps_repeat = bool(np.any(np.delete(steps, np.minimum(place, len(steps) - 1)) == 0)) if len(steps) else True
         before = np.r_[self.last_s, local[:-1]][place]
         own = local[place]
         entered = np.r_[place[0] == 0 or not twice[place[0] - 1], np.diff(place) > 1]
@@ -89,13 +92,23 @@ class LocalClock:
         out = np.zeros(len(place), dtype=bool)
         second = self.second
         for i in range(len(place)):
+            back_s = (before[i] - own[i]) * (-1.0 if self.falls else 1.0)
             if entered[i]:
-                second = bool(self.falls)
-            elif (before[i] - own[i]) * (-1.0 if self.falls else 1.0) > SET_BACK_S:
+                least_s = 0.0 if stamps_repeat else np.nextafter(0, 1)
+                second = bool(self.falls) or self._begins_second(local, int(place[i]), twice, usual_s, least_s)
+            elif back_s > SET_BACK_S or (back_s == 0 and usual_s >= HOUR_S and not stamps_repeat):
                 second = not self.falls
             out[i] = second
         self.second = second
         return out
+
+    def _begins_second(self, local: Array, k: int, twice: NDArray[np.bool_], usual_s: float, least_s: float) -> bool:
+        """Whether the file begins in the second pass: it goes on beyond the hour without a gap, and never back."""
+        if k or np.isfinite(self.last_s) or self.falls:
+            return False
+        end = int(np.argmin(twice)) if not twice.all() else len(local)
+        steps = np.diff(local[: end + 1])
+        return end < len(local) and bool(np.all(steps >= least_s)) and float(steps[-1]) < usual_s + HOUR_S / 2
 
     def _offset(self, utc: datetime) -> float:
         offset = utc.astimezone(self.zone).utcoffset()

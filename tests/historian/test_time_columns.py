@@ -198,6 +198,39 @@ def test_forms_of_dates(form: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(times_of(tmp_path, "x", stamped(form)), TIME_S, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("form", "hours"),
+    [("%Y-%m-%d %H:%M:%S EST", -5), ("%d.%m.%Y %H:%M:%S CDT", -5), ("%a %b %d %H:%M:%S CET %Y", 1),
+     ("%a %b %d %H:%M:%S GMT+02:00 %Y", 2), ("%Y-%m-%d %H:%M:%S GMT+02", 2), ("%d.%m.%Y %H:%M:%S UTC-3", -3),
+     ("%a %b %d %H:%M:%S %Y", 0)],
+)  # fmt: skip
+def test_zones_in_words_and_dates_of_java(form: str, hours: int, tmp_path: Path) -> None:
+    found = times_of(tmp_path, "x", stamped(form, TIME_S + 3600 * hours))
+    np.testing.assert_allclose(found, TIME_S)
+
+
+@pytest.mark.parametrize("form", ["%d.%m.%Y %H:%M:%S", "%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M", "%Y-%m-%dT%H:%M:%SZ"])
+def test_24_hours_are_the_end_of_a_day(form: str, tmp_path: Path) -> None:
+    times = pd.Timestamp("2024-01-30 18:00").timestamp() + 3600.0 * np.arange(N)
+    stamps = [
+        stamped(form, [t - 86_400])[0].replace("00:00", "24:00", 1) if t % 86_400 == 0 else stamped(form, [t])[0]
+        for t in times
+    ]
+    np.testing.assert_allclose(times_of(tmp_path, "x", stamps), times)
+
+
+def test_hours_of_half_a_day_without_a_date(tmp_path: Path) -> None:
+    times = 11 * 3600 + 3000 + STEP_S * np.arange(N)
+    np.testing.assert_allclose(times_of(tmp_path, "Time", stamped("%I:%M:%S %p", times)), times)
+
+
+@pytest.mark.parametrize(("month", "number"), [("fev", 2), ("mrt", 3), ("mei", 5), ("out", 10), ("dez", 12)])
+def test_months_of_more_languages(month: str, number: int, tmp_path: Path) -> None:
+    times = pd.Timestamp(f"2024-{number:02d}-04 06:00").timestamp() + STEP_S * np.arange(N)
+    stamps = [s.replace("#", month) for s in stamped("%d-#-%Y %H:%M:%S", times)]
+    np.testing.assert_allclose(times_of(tmp_path, "x", stamps), times)
+
+
 def test_german_months_midnight_and_whole_minutes(tmp_path: Path) -> None:
     for month, number in (("Mrz", 3), ("Mai", 5), ("Okt", 10), ("Dez", 12)):
         times = pd.Timestamp(f"2024-{number:02d}-04 06:00").timestamp() + STEP_S * np.arange(N)
@@ -331,6 +364,16 @@ def test_local_times_of_a_zone_become_utc(day: str, newest_first: bool, tmp_path
     np.testing.assert_allclose(export.series["TIC.PV"].value, np.arange(100))
     assert export.series["TIC.PV"].counts() == {"good": 100}
     assert export.zone == "UTC"
+
+
+@pytest.mark.parametrize("hours", [0.25, 0.5, 1.0])
+@pytest.mark.parametrize("first", ["2024-10-26 18:00", "2024-10-27 00:00", "2024-10-27 01:00"])
+def test_an_hour_that_comes_twice_in_few_rows_and_at_the_start(first: str, hours: float, tmp_path: Path) -> None:
+    utc = pd.date_range(first, periods=60, freq=pd.Timedelta(hours=hours), tz="UTC")
+    stamps = [t.strftime("%d.%m.%Y %H:%M:%S") for t in utc.tz_convert("Europe/Berlin")]
+    series = read(tmp_path, ("Zeit", "TIC.PV"), stamps, [str(k) for k in range(60)], time_zone="Europe/Berlin").series
+    np.testing.assert_allclose(series["TIC.PV"].time_s, utc.as_unit("s").asi8)
+    assert series["TIC.PV"].good.all()
 
 
 def test_an_offset_is_a_zone(tmp_path: Path) -> None:

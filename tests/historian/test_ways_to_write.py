@@ -118,6 +118,22 @@ def test_the_sign_between_thousands_is_no_decimal_sign(content: str, decimal: st
     assert sniff(path).decimal == decimal
 
 
+@pytest.mark.parametrize(
+    ("column", "expected"),
+    [
+        (["60.3 %", "61.5 %", "", "Bad"], [60.3, 61.5, None, None]),
+        (["60.3%", "7%"], [60.3, 7]),
+        (["-3.5 °C", "1,234.5 °C"], [-3.5, 1234.5]),
+        (["60.3 %", "61.5 kg"], [None, None]),
+        (["60.3 %", "61.5"], [None, 61.5]),
+        (["5A", "7A"], [None, None]),
+    ],
+)
+def test_a_unit_behind_every_number(column: list[str], expected: list[float | None]) -> None:
+    values, _, _ = numbers(pa.array(column))
+    np.testing.assert_allclose(values, [np.nan if v is None else v for v in expected])
+
+
 @pytest.mark.parametrize("sign", [".", ","])
 def test_a_small_number_far_below_tells_thousands(sign: str, tmp_path: Path) -> None:
     values = [1000 + k for k in range(300)] + [998]
