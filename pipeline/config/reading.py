@@ -53,10 +53,12 @@ def tree_of(text: str, path: Path) -> dict[str, Any]:
     try:
         _require_shallow(text, path)
         tree = yaml.load(text, Loader=_Loader)
+    except yaml.constructor.ConstructorError as error:
+        raise ParamsError(f"{path} holds a value that cannot be read: {' '.join(str(error).split())}") from None
     except yaml.YAMLError as error:
         raise ParamsError(f"{path} is not YAML in UTF-8: {' '.join(str(error).split())}") from None
-    except ValueError as error:  # a date that is none
-        raise ParamsError(f"{path} holds a value that cannot be read: {str(error)[:200]}") from None
+    except (ValueError, LookupError, AttributeError, OverflowError, TypeError) as error:  # of a tag, as !!bool "abc"
+        raise ParamsError(f"{path} holds a value that cannot be read: {error!r:.200}") from None
     if tree is None:
         tree = {}
     if not isinstance(tree, dict):

@@ -19,20 +19,35 @@ REST = re.compile(
 )
 HOUR = re.compile(r"^\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?$")
 HOUR_DIGITS = re.compile(r"^([01]?\d|2[0-3])[0-5]\d[0-5]\d$")  # 060054, or 60054 where a program dropped the zero
-ELAPSED = re.compile(r"^\d{1,5}:\d\d:\d\d([.,]\d+)?$")
+ELAPSED = re.compile(r"^\d{1,5}:\d\d:\d\d([.,]\d+)?( ?[AaPp][Mm])?$")
+MIDNIGHT = re.compile(r"(?<!\d)24(?=[:.]00(?:[:.]00(?:[.,]0+)?)?(?!\d))")  # the end of a day
 MONTHS = (
-    "jan januar january janvier enero ene gennaio gen", "feb februar february février fevrier fév febrero febbraio",
-    "mar mär mrz märz march mars marzo", "apr april avril avr abril abr aprile", "may mai mayo maggio mag",
-    "jun juni june juin junio giugno giu", "jul juli july juillet juil julio luglio lug",
-    "aug august août aout agosto ago", "sep sept september septembre septiembre settembre set",
-    "oct okt oktober october octobre octubre ottobre ott", "nov november novembre noviembre",
-    "dec dez dezember december décembre déc diciembre dic dicembre",
+    "jan januar january janvier enero ene gennaio gen januari janeiro",
+    "feb februar february février fevrier fév febrero febbraio fev februari fevereiro",
+    "mar mär mrz märz march mars marzo mrt maart março marco", "apr april avril avr abril abr aprile",
+    "may mai mayo maggio mag mei maj maio", "jun juni june juin junio giugno giu junho",
+    "jul juli july juillet juil julio luglio lug julho", "aug august août aout agosto ago augustus",
+    "sep sept september septembre septiembre settembre set setembro",
+    "oct okt oktober october octobre octubre ottobre ott out outubro",
+    "nov november novembre noviembre novembro",
+    "dec dez dezember december décembre déc diciembre dic dicembre des dezembro",
 )  # fmt: skip
 MONTH = {word: number for number, words in enumerate(MONTHS, 1) for word in words.split()}
 WORD = re.compile(r"[^\W\d_]{3,9}\.?")
 WEEKDAY = re.compile(r"^[^\W\d_]{2,10}[.,]*\s+(?=\d)")
-PLAIN_ENDS = re.compile(r"(?:([AaPp])\.\s?[Mm]\.|\s*(UTC|GMT|CET|MEZ|CEST|MESZ))$")
-OFFSETS = {"UTC": "+0000", "GMT": "+0000", "CET": "+0100", "MEZ": "+0100", "CEST": "+0200", "MESZ": "+0200"}
+# The zones of words that mean one thing in all countries: CST is of Chicago and of China.
+OFFSETS = {
+    "UTC": "+0000", "GMT": "+0000", "CET": "+0100", "MEZ": "+0100", "CEST": "+0200", "MESZ": "+0200", "EET": "+0200",
+    "EEST": "+0300", "EST": "-0500", "EDT": "-0400", "CDT": "-0500", "MST": "-0700", "MDT": "-0600", "PST": "-0800",
+    "PDT": "-0700", "AKST": "-0900", "AKDT": "-0800", "AEST": "+1000", "AEDT": "+1100",
+}  # fmt: skip
+HALF_WITH_POINTS = re.compile(r"([AaPp])\.\s?[Mm]\.")
+ZONE_WORD = re.compile(
+    rf"\s*\b(?P<word>{'|'.join(OFFSETS)})(?:\s?(?P<sign>[+-])(?P<hours>\d{{1,2}}):?(?P<minutes>\d\d)?)?(?=$|\s\d{{4}}$)"
+)
+JAVA = re.compile(
+    r"^(?P<month>[^\W\d_]{3,9}) (?P<day>\d{1,2}) (?P<clock>\d\d:\d\d:\d\d) ?(?P<zone>[+-]\d{4})? (?P<year>\d{4})$"
+)
 SOME = 0.05  # of the dates, whose form counts
 LEAST_YEAR, MOST_YEAR = 1990, 2100
 ORDERS = {"dmy": ("%d", "%m", "%y"), "mdy": ("%m", "%d", "%y"), "ymd": ("%y", "%m", "%d")}
@@ -65,12 +80,27 @@ def form_of(texts: Sequence[str], where: str) -> str:
 
 def plain_date(text: str) -> str:
     """The date as strptime reads it: no day of the week, a month's number for its name, +0100 for CET, pm for p.m."""
-    text = PLAIN_ENDS.sub(lambda m: f"{m[1]}m" if m[1] else OFFSETS[m[2]], text)
+    text = ZONE_WORD.sub(_offset, HALF_WITH_POINTS.sub(r"\1m", text))
+    if (java := JAVA.match(_without_weekday(text))) is not None and (number := MONTH.get(java["month"].lower())):
+        return f"{java['day']} {number:02d} {java['year']} {java['clock']}{java['zone'] or ''}"
     american = re.match(r"^([^\W\d_]{3,9})\.? (\d{1,2}),? (\d{4})(.*)$", text)
     if american and american[1].lower() in MONTH:
         return f"{american[2]} {MONTH[american[1].lower()]:02d} {american[3]}{american[4]}"
     text = WEEKDAY.sub("", text)
     return WORD.sub(lambda m: f"{MONTH[w]:02d}" if (w := m[0].lower().rstrip(".")) in MONTH else m[0], text)
+
+
+def _offset(match: re.Match[str]) -> str:
+    """The offset of CET, or of GMT+2."""
+    if not match["sign"] or match["word"] not in {"UTC", "GMT"}:
+        return OFFSETS[match["word"]] + (match[0][match.end("word") - match.start() :])
+    return f"{match['sign']}{int(match['hours']):02d}{match['minutes'] or '00'}"
+
+
+def _without_weekday(text: str) -> str:
+    """Mon Mar 04 ... without its first word."""
+    first, _, rest = text.partition(" ")
+    return rest if first.isalpha() and rest[:1].isalpha() else text
 
 
 def other_forms(form: str) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import gzip
 import re
 import zlib
 from collections import Counter
@@ -12,19 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import RecordError
-from pipeline.historian.file_kinds import head_of
+from pipeline.historian.decimal_sign import Sign, decimal_sign
+from pipeline.historian.file_kinds import head_of, kind_of
 from pipeline.historian.headers import split_header
-from pipeline.historian.numbers import plain
-from pipeline.historian.table_head import NUMBER, Head, head_of_table, kind_of_cell
+from pipeline.historian.quality import is_quality_name
+from pipeline.historian.table_head import Head, head_of_table
 
 SAMPLE_BYTES = 1 << 18
 SAMPLE_LINES = 200
 SEPARATORS = ("\t", ";", "|", ",")  # a comma last: it may be the decimal sign
-COMMA_DECIMAL = re.compile(r"^\s*[+-]?(\d{1,3}(\.\d{3})+|\d*),\d+([eE][+-]?\d+)?\s*$")
-POINT_DECIMAL = re.compile(r"^\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*$")
-COMMA_THOUSANDS = re.compile(r"^[+-]?\d{1,3}(,\d{3})*(,\d{3}\.\d*|,\d{3},\d{3})$")
-EITHER = re.compile(r"^[+-]?[1-9]\d{0,2}(?P<sign>[.,])\d{3}$")  # 1,234 is 1.234 or 1234
-SMALL = re.compile(r"^[+-]?\d{1,3}$")
 LONGEST_HEADER = 6  # lines of one header, with line breaks in quoted names
 
 
@@ -34,7 +31,7 @@ class Dialect:
 
     encoding: str
     separator: str
-    decimal: str  # "." or ","
+    sign: Sign  # of decimals, by the first rows
     first_line: int  # lines before the first row of values
     header: tuple[str, ...]  # of every column, "column 3" where none is written
     units: tuple[str, ...]  # below the header, "" where none is written
@@ -42,17 +39,17 @@ class Dialect:
     unused: frozenset[str]  # columns without a name and a value, as of rows that end with a separator
 
     @property
-    def thousands(self) -> str:
-        """The sign between thousands."""
-        return "." if self.decimal == "," else ","
+    def decimal(self) -> str:
+        """The point or the comma; empty where the first rows do not tell it."""
+        return self.sign.decimal
 
 
-def sniff(path: Path, kind: str = "text") -> Dialect:
-    """The dialect of a text file, gzipped or not; RecordError where it holds no table."""
+def sniff(path: Path, kind: str = "text", encoding: str = "") -> Dialect:
+    """The dialect of a text file, gzipped or not; RecordError where it holds no table. ``encoding`` "" is found."""
     raw = _head(path, kind)
     if not raw.strip():
         raise RecordError(f"{path}: the file is empty; give an export with a header and rows")
-    encoding = encoding_of(raw)
+    encoding = encoding or encoding_of(raw)
     text = codecs.getincrementaldecoder(encoding)(errors="replace").decode(raw)
     lines = re.split(r"\r\n|\n|\r", text)
     lines = lines[: SAMPLE_LINES if len(raw) < SAMPLE_BYTES else min(SAMPLE_LINES, len(lines) - 1)]
@@ -72,7 +69,9 @@ def sniff(path: Path, kind: str = "text") -> Dialect:
     header = names_of(path, found.header)
     unused = frozenset(n for i, n in enumerate(header) if not found.header[i] and not any(r[i] for r in found.rows))
     first = after[found.first - 1]
-    return Dialect(encoding, separator, _decimal(found.rows, separator), first, header, found.units, found.rows, unused)
+    columns = dict(zip(header, zip(*found.rows, strict=True), strict=True))
+    sign = decimal_sign(columns, separator, str(path))
+    return Dialect(encoding, separator, sign, first, header, found.units, found.rows, unused)
 
 
 def encoding_of(raw: bytes) -> str:
@@ -90,6 +89,20 @@ def encoding_of(raw: bytes) -> str:
     return "utf-8"
 
 
+def is_utf8(path: Path) -> bool:
+    """Whether a whole file, unpacked, is a text in UTF-8."""
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        with gzip.open(path, "rb") if kind_of(path) == "gzip" else path.open("rb") as file:
+            while part := file.read(SAMPLE_BYTES):
+                decoder.decode(part)
+    except UnicodeDecodeError:
+        return False
+    except (OSError, EOFError, zlib.error):  # cut off, and said so elsewhere
+        return True
+    return True
+
+
 def names_of(path: Path, header: Sequence[str]) -> tuple[str, ...]:
     """A name for each column: a quality that stands beside every tag under one name gets its tag's too.
 
@@ -98,7 +111,7 @@ def names_of(path: Path, header: Sequence[str]) -> tuple[str, ...]:
     names = [" ".join(name.split()) or f"column {i + 1}" for i, name in enumerate(header)]
     twice = {name for name, times in Counter(names).items() if times > 1}
     for i, name in enumerate(names):
-        if name in twice and i and split_header(name)[0].lower() in QUALITIES and names[i - 1] not in twice:
+        if name in twice and i and is_quality_name(split_header(name)[0]) and names[i - 1] not in twice:
             names[i] = f"{split_header(names[i - 1])[0]} {name}"
     twice = {name for name, times in Counter(names).items() if times > 1}
     if twice:
@@ -110,21 +123,6 @@ def names_of(path: Path, header: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-QUALITIES = {
-    "quality",
-    "qual",
-    "status",
-    "stat",
-    "q",
-    "opcquality",
-    "statuscode",
-    "qualität",
-    "good",
-    "isgood",
-    "valid",
-}
-
-
 def _head(path: Path, kind: str) -> bytes:
     try:
         return head_of(path, kind, SAMPLE_BYTES)
@@ -134,12 +132,23 @@ def _head(path: Path, kind: str) -> bytes:
         raise RecordError(f"{path} cannot be read: {error}; export the file again") from None
 
 
+def _ends_in_quotes(text: str, separator: str) -> bool:
+    """Whether a quoted cell goes on behind the text; a quote within a cell, as of 3" valve, opens none."""
+    quoted = False
+    begins = True  # a cell
+    for sign in text:
+        if sign == '"' and (quoted or begins):
+            quoted = not quoted
+        begins = not quoted and (sign in (separator, "\n") or (begins and sign == " "))
+    return quoted
+
+
 def _split(lines: Sequence[str], separator: str) -> tuple[list[list[str]], list[int]]:
     """Rows of cells, and the number of lines up to each row's end: a quoted name may hold line breaks."""
     rows, after, k = list[list[str]](), list[int](), 0
     while k < len(lines):
         n = 1
-        while lines[k : k + n] and '"' in lines[k] and "".join(lines[k : k + n]).count('"') % 2:
+        while '"' in lines[k] and _ends_in_quotes("\n".join(lines[k : k + n]), separator):
             n += 1
             if n > LONGEST_HEADER or k + n > len(lines):
                 n = 1
@@ -152,25 +161,3 @@ def _split(lines: Sequence[str], separator: str) -> tuple[list[list[str]], list[
         k += n
         after.append(k)
     return rows, after
-
-
-def _decimal(rows: Sequence[Sequence[str]], separator: str) -> str:
-    """The sign that most numbers show.
-
-    Where all are like 1,234 the comma is between thousands if smaller numbers have none, or if it separates cells.
-    """
-    cells = [
-        [c if NUMBER.match(c) else plain(c) for c in column if kind_of_cell(c) == "number"]
-        for column in zip(*rows, strict=True)
-    ]
-    every = [c for column in cells for c in column]
-    comma = sum(bool(COMMA_DECIMAL.match(c)) and not EITHER.match(c) for c in every)
-    point = sum(bool(POINT_DECIMAL.match(c)) and not EITHER.match(c) for c in every)
-    if comma or point:
-        return "," if comma > point else "."
-    if any(COMMA_THOUSANDS.match(c) for c in every):
-        return "."
-    either = [column for column in cells if any((m := EITHER.match(c)) and m["sign"] == "," for c in column)]
-    if not either or any((m := EITHER.match(c)) and m["sign"] == "." for c in every):
-        return "."
-    return "." if separator == "," or all(any(SMALL.match(c) for c in column) for column in either) else ","

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import zipfile
+import zlib
 from pathlib import Path
 
 from pipeline.errors import RecordError
@@ -38,7 +39,7 @@ def kind_of(path: Path) -> str:
     if first.startswith(PARQUET):
         return "parquet"
     if first.startswith(GZIP):
-        return "gzip"
+        return _gzipped(path)
     if first.startswith(ZIP):
         return _zipped(path)
     for mark, what, remedy in OTHERS:
@@ -51,6 +52,18 @@ def kind_of(path: Path) -> str:
     if begin.startswith((b'{"', b"{\n", b"{\r", b"[{", b"[\n", b"[[", b"{ ")):
         raise RecordError(f"{path} is a JSON file; write its table as .csv or .parquet")
     return "text"
+
+
+def _gzipped(path: Path) -> str:
+    try:
+        first = head_of(path, "gzip", 512)
+    except (OSError, EOFError, zlib.error):
+        return "gzip"  # cut off, and said so where it is read
+    kinds = (PARQUET, "a Parquet file"), (ZIP, "a workbook or a zip archive"), *((m, w) for m, w, _ in OTHERS)
+    for mark, what in kinds:
+        if first.startswith(mark):
+            raise RecordError(f"{path} is {what}, gzipped; unpack it and give the file in it")
+    return "gzip"
 
 
 def _zipped(path: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,9 @@ import pyarrow.compute as pc
 from pipeline.errors import RecordError
 from pipeline.historian.export import Series
 from pipeline.historian.numbers import numbers
-from pipeline.historian.quality import meaning_of
+from pipeline.historian.quality import MOST_QUALITIES, meaning_of
 from pipeline.historian.reason import Reason
 
-MOST_QUALITIES = 1_000  # more are the values of a tag
 GROWTH = 1.1  # of an array that is full: what is spare takes memory too
 
 
@@ -29,13 +29,13 @@ class Gathered:
         self.code: dict[str, Growing] = {}
         self.texts: dict[str, Counter[str]] = {}
         self.names: dict[str, dict[str, int]] = {}
-        self.flag: dict[str, Growing] = {}  # of a tag: index of each reading's quality among the words of its column
-        self.quality: dict[str, str] = {}  # tag -> the column of its quality
+        # Of a tag and a column of its quality: the index of each reading's quality among the words of the column.
+        self.flag: dict[tuple[str, str], Growing] = {}
         self.words: dict[str, Counter[str]] = {}  # of each column of quality, in the order of their index
         self.says: dict[str, str] = {}  # column of quality -> how it was understood
 
-    def add(self, name: str, seconds: Any, column: Any, quality: Any, quality_column: str = "") -> None:
-        """A block of readings of one tag: seconds (m,), its Arrow column, and the column of its quality or None."""
+    def add(self, name: str, seconds: Any, column: Any, qualities: Mapping[str, Any]) -> None:
+        """A block of readings of one tag: seconds (m,), its Arrow column, and those of its qualities by their names."""
         if name in self.modes:
             known = self.names.setdefault(name, {})
             index, cells = _categories(column)
@@ -45,8 +45,8 @@ class Gathered:
         else:
             values, codes, texts = numbers(column, self.decimal)
             self.texts.setdefault(name, Counter()).update(texts)
-        if quality is not None:
-            self._add_quality(name, quality, quality_column)
+        for header, quality in qualities.items():
+            self._add_quality(name, quality, header)
         if not self.wide or name == next(iter(self.value), name):
             self.time.setdefault("" if self.wide else name, Growing(np.float64)).append(seconds)
         self.value.setdefault(name, Growing(np.float64)).append(values)
@@ -55,15 +55,22 @@ class Gathered:
     def series(self) -> dict[str, Series]:
         """The series of each tag; nothing may be added afterwards."""
         code = {name: grown.whole() for name, grown in self.code.items()}
-        good = {}
+        good, lost = {}, dict[str, list[str]]()
         for column, words in self.words.items():
             meaning = meaning_of(column, words)
             good[column] = None if meaning.good is None else np.array([w in meaning.good for w in words])
-            self.says[column] = "says nothing of quality, and is not used" if meaning.good is None else meaning.says
-        for name, column in self.quality.items():
+            self.says[column] = meaning.says
+        for (name, column), flag in self.flag.items():
             if (known := good[column]) is not None:
-                bad = ~known[self.flag[name].whole()]
+                bad = ~known[flag.whole()]
+                if bad.all() and bad.size:
+                    lost.setdefault(column, []).append(name)
                 code[name][bad & (code[name] == Reason.GOOD)] = Reason.QUALITY
+        for column, names in lost.items():  # its only note
+            shown = ", ".join(t.strip() or "an empty cell" for t, _ in self.words[column].most_common(3))
+            self.says[column] = (
+                f"calls every reading of {', '.join(names[:3])} bad, by {shown}; remove it if it is wrong"
+            )
         times = {name: grown.whole() for name, grown in self.time.items()}
         return {
             name: Series(
@@ -79,7 +86,6 @@ class Gathered:
 
     def _add_quality(self, name: str, column: Any, header: str) -> None:
         """Keep the quality (m,) of a block: what it means is known from all of them."""
-        self.quality[name] = header
         words = self.words.setdefault(header, Counter())
         place = {word: i for i, word in enumerate(words)}
         index, cells = _categories(pc.cast(column, pa.string()) if not pa.types.is_dictionary(column.type) else column)
@@ -91,7 +97,7 @@ class Gathered:
             words.setdefault(word, 0)
         for i, times in enumerate(np.bincount(np.where(index < 0, len(cells) - 1, index), minlength=len(cells))):
             words[cells[i]] += int(times)
-        self.flag.setdefault(name, Growing(np.uint16)).append(own[index].astype(np.uint16))
+        self.flag.setdefault((name, header), Growing(np.uint16)).append(own[index].astype(np.uint16))
 
 
 class Growing:

@@ -28,6 +28,11 @@ SPELLINGS = {
     "weeks": (604_800.0, "w wk wks week weeks woche wochen"),
 }
 TIME_UNITS = {word: factor for factor, words in SPELLINGS.values() for word in words.split()}  # to seconds
+# Words that mean another thing behind a name, as in Time Tag, TS_STD or Fecha hora; in brackets they are units.
+IN_BRACKETS = {"tag", "std", "w", "wk", "ore", "dia", "día", "hora", "heure", "jour"}
+AFTER_ZEIT = {"tag", "std"}
+GERMAN = {"zeit", "laufzeit"}
+AMONG_WORDS = {w for w in TIME_UNITS if len(w) > 1} - IN_BRACKETS - {"us"}
 ALONE = {word for word in TIME_UNITS if len(word) > 3 or word == "sec"} - {"days", "tage"}  # a header by itself
 NO_UNITS = {"", "utc", "gmt", "z", "local", "local time", "lokal", "epoch", "unix", "posix", "unix time", "-"}
 
@@ -44,6 +49,7 @@ LAST_WORDS = {"time", "timestamp", "datetime", "zeit", "zeitstempel", "seconds",
 VAGUE = {"t", "index", "tempo", "temps", "hora", "heure"}  # may be a temperature, or the number of a row
 DATES = {"date", "datum", "datetime", "timestamp", "fecha", "zeitstempel", "horodatage", "zeitpunkt"}
 BRACKET = re.compile(r"^(?P<name>.*?)\s*[\[({]\s*(?P<unit>[^\[\](){}]*?)\s*[\])}]\s*$")
+INNER = re.compile(r"[\[({<]\s*(?P<unit>[^\W\d_]+)\.?\s*[\])}>]")  # of Time (min) since start
 TAIL = re.compile(r"^(?P<name>.*?)(?:\s*[_\s./,:-]\s*|\s+in\s+)(?P<unit>[^\W\d_]+)\.?$")
 
 
@@ -102,14 +108,20 @@ def time_header(column: str) -> TimeHeader:
     if (match := BRACKET.match(text)) is not None:
         inner = match["unit"].lower().rstrip(".")
         name, factor = match["name"], TIME_UNITS.get(inner, TIME_UNITS.get(inner.partition(" ")[0]))  # s since start
+        factor = _among(_words(inner)) if factor is None and not re.search(r"\d", inner) else factor
         unknown = "" if factor is not None or inner in NO_UNITS else match["unit"]
+    words = _words(name)
     if factor is None and not unknown:
         parts = TAIL.match(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name))
-        if parts is not None and parts["unit"].lower() in TIME_UNITS:
+        if parts is not None and _is_unit_behind(parts["name"], parts["unit"]):
             name, factor = parts["name"], TIME_UNITS[parts["unit"].lower()]
         elif name.lower() in ALONE:
             return TimeHeader(TIME_UNITS[name.lower()], unknown, 2, date=False)
-    words = [w for w in re.split(r"[\W_\d]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if w]
+        elif units := {TIME_UNITS[w] for u in INNER.findall(name) if (w := u.lower()) in TIME_UNITS}:
+            factor = units.pop() if len(units) == 1 else None
+        elif len(words) > 1:
+            factor = _among(words)
+        words = _words(name)
     lower = name.strip().lower()
     vague = lower in VAGUE
     if (lower in NAMES or whole in NAMES) and not vague:
@@ -121,3 +133,20 @@ def time_header(column: str) -> TimeHeader:
     else:
         rank = 3
     return TimeHeader(factor, unknown, rank, bool(words) and bool({words[0], words[-1]} & DATES))
+
+
+def _words(name: str) -> list[str]:
+    return [w for w in re.split(r"[\W_\d]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if w]
+
+
+def _is_unit_behind(name: str, word: str) -> bool:
+    """Whether the last word of a header is a unit of time."""
+    word = word.lower()
+    known = word not in IN_BRACKETS or (word in AFTER_ZEIT and name.strip(" _./,:-").lower() in GERMAN)
+    return word in TIME_UNITS and known
+
+
+def _among(words: Sequence[str]) -> float | None:
+    """The unit that stands among several words, as in Minutes elapsed; None for none or several."""
+    found = {TIME_UNITS[w] for w in words if w in AMONG_WORDS}
+    return found.pop() if len(found) == 1 else None

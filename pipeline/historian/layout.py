@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pipeline.errors import RecordError
 from pipeline.historian.export import Note
 from pipeline.historian.headers import split_header, tags_of
-from pipeline.historian.quality import QUALITY, is_quality
-from pipeline.historian.table_head import kind_of_cell
-from pipeline.historian.time_column import TimeColumn, time_column_of
+from pipeline.historian.quality import QUALITY, is_quality, is_sure
+from pipeline.historian.table_head import UNIT_WORDS, kind_of_cell
+from pipeline.historian.time_column import TimeColumn, seconds_of, time_column_of
+from pipeline.metrics import Array
 
 TAG_NAMES = {
     "tag", "tagname", "tagid", "name", "point", "pointname", "pointid", "signal", "signalname", "variable", "varname",
@@ -21,12 +25,13 @@ TAG_NAMES = {
     "channelname", "parameter", "parametername", "metric", "field", "measurand", "series", "id", "key", "object",
     "messstelle", "messstellenname", "kanal", "bezeichnung", "datenpunkt", "größe", "groesse", "kennung", "messgröße",
     "étiquette", "repère", "nom", "etiqueta", "punto", "nombre", "señal", "measurement", "desc", "description",
-    "beschreibung", "kks",
+    "beschreibung", "kks", "tagpath", "path", "messpunkt", "webid", "identifier", "attributename", "historiantag",
 }  # fmt: skip
 VALUE_NAMES = {
     "value", "val", "wert", "messwert", "reading", "measurement", "tagvalue", "data", "result", "valeur", "valor",
     "valore", "avg", "average", "mean", "numericvalue", "floatvalue", "doublevalue", "realvalue", "zahlenwert",
-    "istwert", "v", "vvalue", "pointvalue", "numeric", "analogvalue",
+    "istwert", "v", "vvalue", "pointvalue", "numeric", "analogvalue", "varvalue",
+    "attrvalue", "attributevalue", "eventvalue",
 }  # fmt: skip
 LONG_COLUMNS = 8  # more make a wide file
 
@@ -38,9 +43,10 @@ class Layout:
     kind: str
     time: TimeColumn
     values: tuple[str, ...]
-    quality: Mapping[str, str]  # value column -> its quality's column
+    quality: Mapping[str, tuple[str, ...]]  # value column -> the columns of its quality
     tags: Mapping[str, str]  # value column -> tag
     tag: str = ""
+    unit: str = ""  # the column of a reading's unit, of a long file
     notes: tuple[Note, ...] = ()  # what was assumed
 
 
@@ -52,70 +58,98 @@ def layout_of(
     time_format: str = "",
     units: Mapping[str, str] | None = None,
     spread: Callable[[str], Sequence[Any]] | None = None,
+    counted: Callable[[str], Mapping[str, int]] | None = None,
 ) -> Layout:
     """The layout by the header and the first rows; RecordError where no column is time.
 
-    ``units`` stand below the header; ``spread`` gives cells from all over a column, where the first ones do not do.
+    ``units`` stand below the header. Where the first cells do not do, ``spread`` gives cells from all over a column,
+    and ``counted`` each text of a column and how often it stands there.
     """
     more = spread or (lambda column: sample.get(column, ()))
+    whole = counted or (lambda column: Counter(_texts(sample.get(column, ()))))
     time = time_column_of(path, header, sample, time_column, time_format, units or {}, more)
     notes = [Note(time.name, words) for words in (time.left, time.clock.says) if words]
     others = [h for h in header if h not in time.columns]
-    tag, value = _tag_and_value(others, sample, time)
+    tag, value = _tag_and_value(others, sample, time, more)
     if tag and value:
-        quality = next((h for h in others if h not in {tag, value} and _quality_word(h, sample) is not None), "")
-        qualities = {value: quality} if quality else {}
-        return Layout("long", time, (value,), qualities, tags_of(header), tag, tuple(notes))
-    qualities, whole = {}, ""
+        found = tuple(h for h in others if h not in {tag, value} and _is_quality(h, sample))
+        qualities = {value: found} if found else {}
+        unit = next((h for h in others if h.strip().lower() in UNIT_WORDS and _kind(sample.get(h, ())) == "text"), "")
+        return Layout("long", time, (value,), qualities, tags_of(header), tag, unit, tuple(notes))
+    qualities = {}
+    of_all = list[str]()
     for h in others:
-        found = _quality_word(h, sample, more)
-        if found is None:
+        match = QUALITY.match(h)
+        if match is None:
             continue
-        own = [o for o in others if o != h and split_header(o)[0] in {found, found.rstrip(" ._:/-")}] if found else []
-        if own:
-            qualities[own[0]] = h
-        elif not found and not whole:
-            whole = h
-    flags = {*qualities.values(), *([whole] if whole else [])}
+        own = [o for o in others if o != h and match["tag"] and split_header(o)[0] in _tags_before(match["tag"])]
+        if own and _is_quality(h, sample):
+            qualities[own[0]] = (*qualities.get(own[0], ()), h)
+        elif not match["tag"] and is_quality(h, whole(h), beside=False):
+            of_all.append(h)
+        elif own or is_sure(h):
+            of_whom = own[0] if own else "all tags"
+            notes.append(Note(h, f"has the name of a quality of {of_whom}, and other cells: it is read as a tag"))
+    flags = {*of_all, *(h for columns in qualities.values() for h in columns)}
     values = tuple(h for h in others if h not in flags)
-    if whole:
-        qualities |= {v: whole for v in values if v not in qualities}
-        notes.append(Note(whole, "is the quality of every tag in its row"))
+    if of_all:
+        qualities = {v: (*qualities.get(v, ()), *of_all) for v in values}
+        notes += [Note(h, "is the quality of every tag in its row") for h in of_all]
     if not values:
         raise RecordError(f"{path}: there is no column beside the time {time.name!r}; export the tags too")
     return Layout("wide", time, values, qualities, tags_of(header), notes=tuple(notes))
 
 
-def _quality_word(
-    column: str,
+def clocks_apart(layout: Layout, header: Sequence[str]) -> tuple[Layout, ...]:
+    """A layout a clock, where each tag of a wide file has its own column of dates before or behind it; else the one."""
+    clocks = dict(((layout.time.name, layout.time.clock), *layout.time.others))
+    flags = {flag for columns in layout.quality.values() for flag in columns}
+    order = [h for h in header if h not in flags]
+    kinds = [h in clocks for h in order]
+    if (
+        layout.kind != "wide"
+        or len(clocks) < 2
+        or kinds not in ([True, False] * len(clocks), [False, True] * len(clocks))
+    ):
+        return (layout,)
+    first = 0 if kinds[0] else 1
+    times, values = order[first::2], order[1 - first :: 2]
+    own = "; ".join(f"{v} by {t}" for t, v in zip(times, values, strict=True))
+    notes = (
+        *(n for n in layout.notes if n.words != layout.time.left),
+        Note(layout.time.name, f"each tag has times: {own}"),
+    )
+    return tuple(
+        replace(layout, time=TimeColumn(t, clocks[t]), values=(v,), notes=notes)
+        for t, v in zip(times, values, strict=True)
+    )
+
+
+def _tags_before(text: str) -> set[str]:
+    """The tags that may stand in front of a word of quality."""
+    return {text.strip(), text.strip().rstrip(" ._:/-")}
+
+
+def _is_quality(column: str, sample: Mapping[str, Sequence[Any]]) -> bool:
+    """Whether a column beside a tag, or in a row that is one reading, holds qualities, by its first cells."""
+    return is_quality(column, Counter(_texts(sample.get(column, ()))), beside=True)
+
+
+def _tag_and_value(
+    others: Sequence[str],
     sample: Mapping[str, Sequence[Any]],
-    spread: Callable[[str], Sequence[Any]] | None = None,
-) -> str | None:
-    """The tag in front of a word of quality ("" for the word alone); None where the column is no quality.
-
-    ``spread`` where a row has several readings, so that the word alone needs words or codes of quality below it: the
-    first rows may all be good, so that the whole column counts. It is read for such a column only.
-    """
-    match = QUALITY.match(column)
-    if match is None:
-        return None
-    word, tag = match["word"], match["tag"].strip()
-    alone = not tag and spread is not None
-    found = is_quality(word, _texts(sample.get(column, ())), beside=not alone)
-    if not found and alone and spread is not None:
-        found = is_quality(word, _texts(spread(column)), beside=False)
-    return tag if found else None
-
-
-def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], time: TimeColumn) -> tuple[str, str]:
+    time: TimeColumn,
+    spread: Callable[[str], Sequence[Any]],
+) -> tuple[str, str]:
     """The columns of the tag and of the value where a row is a reading; "" twice where it is not.
 
-    By their names; or by content: a column of words beside one of numbers, where each time has several words.
+    By their names; or by content: a column of words beside one of numbers, where each time has several words, or where
+    the times begin anew with another word.
     """
     if len(others) + len(time.columns) > LONG_COLUMNS:
         return "", ""
     kinds = {h: _kind(sample.get(h, ())) for h in others}
-    flags = {h for h in others if _quality_word(h, sample) is not None}
+    flags = {h for h in others if _is_quality(h, sample)}
     numbers = [h for h in others if kinds[h] in {"number", "empty"} and h not in flags]
     words = [h for h in others if kinds[h] == "text" and h not in flags]
     tags = [h for h in others if _plain(h) in TAG_NAMES and h not in flags]
@@ -126,8 +160,9 @@ def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], t
         return tag, value
     if tag in words and len([n for n in numbers if n != tag]) == 1:
         value = next(n for n in numbers if n != tag)
-        if len(set(_texts(sample[tag]))) > 1:
+        if len(set(_texts(sample[tag]))) > 1 or len(set(_texts(spread(tag)))) > 1:
             return tag, value
+    numbers = [n for n in numbers if not _counts(sample.get(n, ()))] or numbers
     if len(numbers) == 1:
         stamps = [_texts(sample.get(c, ())) for c in time.columns]
         rows = list(zip(*stamps, strict=False))
@@ -136,7 +171,28 @@ def _tag_and_value(others: Sequence[str], sample: Mapping[str, Sequence[Any]], t
             together = set(zip(rows, cells, strict=False))
             if 1 < len(set(cells)) <= len(cells) // 2 and len(together) > 1.5 * len(set(rows)):
                 return h, numbers[0]
+        for h in words:
+            if not time.before and _begins_anew(_texts(spread(h)), seconds_of(time.clock, spread(time.name))):
+                return h, numbers[0]
     return "", ""
+
+
+def _counts(cells: Sequence[Any]) -> bool:
+    """Whether a column of numbers stands, or counts the rows, so that it is no value of several tags."""
+    try:
+        steps = np.diff([float(t.replace(",", ".")) for t in _texts(cells) if t])
+    except ValueError:
+        return False
+    return bool(len(steps)) and bool(np.all(steps >= 0))
+
+
+def _begins_anew(words: Sequence[str], seconds: Array) -> bool:
+    """Whether the times go back where another word begins, and nowhere else: a file sorted by tag."""
+    turns = np.array(words[1:]) != np.array(words[:-1])
+    steps = np.diff(seconds)
+    back = steps < 0 if 2 * np.count_nonzero(steps > 0) > len(steps) else steps > 0
+    times = np.count_nonzero(back)
+    return bool(times and not np.any(back & ~turns) and 2 * times >= np.count_nonzero(turns))
 
 
 def _numbered(cells: Sequence[Any], numbers: Sequence[str]) -> bool:

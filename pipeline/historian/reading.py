@@ -3,75 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC as UTC_ZONE
-from datetime import datetime
+from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
 
 from pipeline.errors import RecordError, nearest
 from pipeline.files import sha256
-from pipeline.historian.dialect import Dialect, sniff
+from pipeline.historian.day_counts import DAY_S
 from pipeline.historian.export import Contents, Export, Note, Series, joined
-from pipeline.historian.file_kinds import kind_of
 from pipeline.historian.gathering import Gathered
-from pipeline.historian.headers import split_header, tag_named, tags_of
-from pipeline.historian.layout import Layout, layout_of
+from pipeline.historian.headers import tag_named, tags_of
+from pipeline.historian.layout import Layout, clocks_apart
+from pipeline.historian.opened import EncodingError, Opened, opened
 from pipeline.historian.sent_again import drop_repeated_rows
 from pipeline.historian.times import UNSTATED, UTC, zone_of
-from pipeline.historian.workbook import sheet_of, text_of
 from pipeline.historian.zones import LocalClock, zone_named
-
-BLOCK_BYTES = 1 << 24
-BLOCK_ROWS = 1 << 17
-SPREAD = 1_000  # cells of a block
-PARQUET = {".parquet", ".pq"}
-DAY_S, HALF_DAY_S = 86_400.0, 43_200.0
-
-
-@dataclass(slots=True)
-class Opened:
-    """One file: its columns, its first rows, and its blocks of chosen columns."""
-
-    path: Path
-    header: tuple[str, ...]
-    sample: Mapping[str, Sequence[Any]]
-    units: Mapping[str, str]
-    decimal: str
-    blocks: Callable[[Sequence[str]], Iterator[Any]]
-    unreadable: Counter[str]  # "rows": lines of another length than the header's
-    notes: tuple[Note, ...] = ()
-
-    def spread(self, column: str) -> list[Any]:
-        """Cells from all over a column."""
-        cells = list[Any]()
-        for block in self.blocks([column]):
-            own = block.column(0)
-            cells += own.take(pa.array(range(0, len(own), max(1, len(own) // SPREAD)))).to_pylist()
-        self.unreadable.clear()
-        return cells
-
-
-def opened(path: Path) -> Opened:
-    """The file's header and first rows; RecordError where it cannot be read as a table."""
-    if path.is_dir():
-        raise RecordError(f"{path} is a folder; give the files in it, as in {path}/*.csv")
-    if not path.exists():
-        raise RecordError(f"{path}: no such file; give the path of an export")
-    try:
-        kind = kind_of(path)
-        if kind == "parquet" or path.suffix.lower() in PARQUET:
-            return _parquet(path)
-        return _workbook(path) if kind == "workbook" else _text(path, sniff(path, kind), kind)
-    except (pa.ArrowException, OSError, UnicodeError, LookupError, EOFError) as error:
-        raise RecordError(f"{path} cannot be read: {str(error).splitlines()[0]}; export the file again") from None
 
 
 def read_export(
@@ -89,46 +42,93 @@ def read_export(
     """
     if not paths:
         raise RecordError("no file is named; give one or more exports")
-    local = zone_named(time_zone) if time_zone else None
-    parts: dict[str, list[Series]] = {}
-    files, kinds, zones, totals, contents = [], [], list[str](), Counter[str](), list[Contents]()
-    known, notes = set[str](), list[Note]()
+    times = Times(time_column, time_format, time_zone, zone_named(time_zone) if time_zone else None)
     sources = [opened(path) for path in paths]
     columns = {column: tag for source in sources for column, tag in tags_of(source.header).items()}
     tags, modes = [tag_named(t, columns) for t in tags], [tag_named(t, columns) for t in modes]
-    for path, source in zip(paths, sources, strict=True):
-        layout = layout_of(path, source.header, source.sample, time_column, time_format, source.units, source.spread)
-        zone = zone_of(layout.time.clock, source.sample[layout.time.columns[0]])
-        clock = LocalClock(time_zone, local) if local is not None and zone == UNSTATED else None
-        found, counts, more = _read(source, layout, set(tags) | set(modes), set(modes), clock)
-        notes += [*source.notes, *layout.notes, *more]
-        zones.append(UTC if clock else zone)
-        drop_repeated_rows(found)
-        contents.append(_contents(path, found, counts["rows_read"]))
-        for name, series in found.items():
-            parts.setdefault(name, []).append(series)
-        pa.default_memory_pool().release_unused()
-        totals += counts + source.unreadable
-        kinds.append(layout.kind)
-        files.append((str(path), sha256(path)))
-        known |= set(found) if layout.kind == "long" else {layout.tags[v] for v in layout.values}
-    absent = [f"no tag {tag!r}{nearest(tag, known)}" for tag in (*tags, *modes) if tag not in parts]
+    read = [_of_file(source, times, {*tags, *modes}, set(modes)) for source in sources]
+    together: dict[str, list[Series]] = {}
+    for one in read:
+        for name, series in one.series.items():
+            together.setdefault(name, []).append(series)
+    named, known = ", ".join(map(str, paths)), set[str]().union(*(one.known for one in read))
+    absent = [f"no tag {tag!r}{nearest(tag, known)}" for tag in (*tags, *modes) if tag not in together]
     if absent:
-        raise RecordError(f"{', '.join(map(str, paths))}: {'; '.join(absent)}")
+        raise RecordError(f"{named}: {'; '.join(absent)}")
+    totals = sum((one.counts for one in read), Counter[str]())
     if not totals["rows_read"]:
-        raise RecordError(f"{', '.join(map(str, paths))}: no row of data; export a longer time")
-    together = {name: joined(p) for name, p in parts.items()}
-    layouts = " and ".join(dict.fromkeys(kinds))
-    zone = zones[0] if len(set(zones)) == 1 else ""  # of files that count differently no date is known
-    rows = totals["rows_read"] + totals["rows"]
-    unreadable, timeless = totals["rows"], totals["timeless"]
+        raise RecordError(f"{named}: no row of data; export a longer time")
+    zones = {zone for one in read for zone in one.zones}
+    rows, unreadable, timeless = totals["rows_read"] + totals["rows"], totals["rows"], totals["timeless"]
+    notes = [note for one in read for note in one.notes]
     if unreadable or timeless:
         words = f"{unreadable} have another number of cells than the header, {timeless} no time that can be read"
         notes.append(Note(f"{rows} rows of the export", f"{words}: they are left out"))
-    if time_zone and not any(n.column == time_zone for n in notes):
+    if time_zone and not any(one.local for one in read):
         raise RecordError(f"--time-zone {time_zone}: no file has dates without a zone of their own; leave it out")
-    own = tuple(dict.fromkeys(notes))
-    return Export(together, tuple(files), layouts, rows, unreadable, timeless, zone, tuple(contents), own, local)
+    return Export(
+        {name: joined(p) for name, p in together.items()},
+        tuple((str(path), sha256(path)) for path in paths),
+        " and ".join(dict.fromkeys(one.kind for one in read)),
+        rows,
+        unreadable,
+        timeless,
+        zones.pop() if len(zones) == 1 else "",  # of files that count differently no date is known
+        tuple(one.contents for one in read),
+        tuple(dict.fromkeys(notes)),
+        times.zone,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """What a person said of the times: their column, their form, their zone; "" and None where nothing was said."""
+
+    column: str
+    form: str
+    zone_name: str
+    zone: tzinfo | None
+
+
+@dataclass(slots=True)
+class FileRead:
+    """What one file holds."""
+
+    kind: str  # of its layout
+    contents: Contents
+    series: dict[str, Series]
+    counts: Counter[str]
+    notes: list[Note]
+    zones: list[str]
+    known: set[str]  # its tags
+    local: bool  # some of its times were converted from the zone that a person named
+
+
+def _of_file(source: Opened, times: Times, wanted: set[str], modes: set[str]) -> FileRead:
+    try:
+        return _of_opened(source, times, wanted, modes)
+    except EncodingError as error:
+        return _of_opened(opened(source.path, error.encoding), times, wanted, modes)
+
+
+def _of_opened(source: Opened, times: Times, wanted: set[str], modes: set[str]) -> FileRead:
+    layout = source.layout(times.column, times.form)
+    apart = clocks_apart(layout, source.header)
+    found, counts, notes, zones, local = dict[str, Series](), Counter[str](), [*source.notes], list[str](), False
+    for own in apart:
+        zone = zone_of(own.time.clock, source.sample[own.time.columns[0]])
+        clock = LocalClock(times.zone_name, times.zone) if times.zone is not None and zone == UNSTATED else None
+        series, of_rows, more = _read(source, own, wanted, modes, clock)
+        found |= series
+        counts = of_rows if len(apart) == 1 else Counter({"rows_read": of_rows["rows_read"]})
+        notes += [*own.notes, *more]
+        zones.append(UTC if clock else zone)
+        local |= clock is not None
+    drop_repeated_rows(found)
+    pa.default_memory_pool().release_unused()
+    known = set(found) if layout.kind == "long" else {own.tags[v] for own in apart for v in own.values}
+    contents = _contents(source.path, found, counts["rows_read"])
+    return FileRead(layout.kind, contents, found, counts + source.unreadable, notes, zones, known, local)
 
 
 def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
@@ -141,12 +141,20 @@ def _contents(path: Path, found: Mapping[str, Series], rows: int) -> Contents:
 
 
 def units_of(paths: Sequence[Path]) -> dict[str, str]:
-    """Tag -> the unit that a row below the header or brackets in the header name."""
+    """Tag -> the unit that a row below the header, brackets in the header, or a column beside a reading name."""
     found: dict[str, str] = {}
     for path in paths:
         source = opened(path)
         tags = tags_of(source.header)
         found |= {tags[k]: v for k, v in source.units.items() if v}
+        try:
+            layout = source.layout()
+        except RecordError:  # the times need a person's word, the units of headers none
+            continue
+        if layout.unit:
+            pairs = source.pairs(layout.tag, layout.unit)
+            times = Counter(tag for tag, _ in pairs)
+            found |= {tag: unit for tag, unit in pairs if unit and times[tag] == 1}
     return found
 
 
@@ -156,7 +164,7 @@ def tags_in(paths: Sequence[Path]) -> set[str]:
     for source in map(opened, paths):
         found |= {*tags_of(source.header).values(), *source.header}
         try:
-            layout = layout_of(source.path, source.header, source.sample, units=source.units, spread=source.spread)
+            layout = source.layout()
         except RecordError:  # the same file is refused when it is read
             continue
         found |= {str(c).strip() for c in source.sample.get(layout.tag, ())}
@@ -167,14 +175,16 @@ def tags_in(paths: Sequence[Path]) -> set[str]:
 def _read(
     source: Opened, layout: Layout, wanted: set[str], modes: set[str], local: LocalClock | None
 ) -> tuple[dict[str, Series], Counter[str], list[Note]]:
-    gather = Gathered(modes, source.decimal, wide=layout.kind == "wide")
+    decimal, of_sign = source.decimal()
+    gather = Gathered(modes, decimal, wide=layout.kind == "wide")
     counts: Counter[str] = Counter()
     values = {
         v: layout.tags[v] for v in layout.values if not wanted or layout.tags[v] in wanted or layout.kind == "long"
     }
     qualities = {v: layout.quality[v] for v in values if v in layout.quality}
     time, midnights = layout.time, Midnights()
-    names = [n for n in dict.fromkeys((*time.columns, layout.tag, *values, *qualities.values())) if n]
+    flags = (flag for columns in qualities.values() for flag in columns)
+    names = [n for n in dict.fromkeys((*time.columns, layout.tag, *values, *flags)) if n]
     try:
         for block in source.blocks(names):
             counts["rows_read"] += block.num_rows
@@ -188,11 +198,10 @@ def _read(
                 block, seconds = block.filter(pa.array(timed)), seconds[timed]
             if layout.kind == "wide":
                 for v, name in values.items():
-                    own = qualities.get(v, "")
-                    gather.add(name, seconds, block.column(v), block.column(own) if own else None, own)
+                    gather.add(name, seconds, block.column(v), {q: block.column(q) for q in qualities.get(v, ())})
             else:
                 _long_block(gather, layout, block, seconds, wanted)
-    except (pa.ArrowException, OSError, UnicodeError, EOFError) as error:
+    except (pa.ArrowException, UnicodeError) as error:  # a cell of another kind than the first ones
         raise RecordError(
             f"{source.path} cannot be read: {str(error).splitlines()[0]}; export the file again"
         ) from None
@@ -202,7 +211,7 @@ def _read(
             "--time-format"
         )
     series = gather.series()
-    notes = [Note(column, words) for column, words in gather.says.items() if words]
+    notes = of_sign + [Note(column, words) for column, words in gather.says.items() if words]
     return series, counts, notes + (_of_zone(source.path, local) if local else [])
 
 
@@ -231,7 +240,7 @@ class Midnights:
         if not known.size:
             return seconds
         own = seconds[known]
-        falls = np.diff(np.r_[own[0] if np.isnan(self.last_s) else self.last_s, own]) < -HALF_DAY_S
+        falls = np.diff(np.r_[own[0] if np.isnan(self.last_s) else self.last_s, own]) < -DAY_S / 2
         days = self.days + np.cumsum(falls)
         self.last_s, self.days = float(own[-1]), int(days[-1])
         out = seconds.copy()
@@ -240,8 +249,8 @@ class Midnights:
 
 
 def _stamps(block: Any, layout: Layout) -> Any:
-    """The column of times, put together where day and hour stand apart."""
-    if not layout.time.date:
+    """The column of times, put together where its parts stand apart."""
+    if not layout.time.before:
         return block.column(layout.time.name)
     parts = [pc.utf8_trim_whitespace(pc.cast(block.column(c), pa.string())) for c in layout.time.columns]
     if "%H%M%S" in layout.time.clock.format:
@@ -256,66 +265,10 @@ def _long_block(gather: Gathered, layout: Layout, block: Any, seconds: Any, want
     tags = tags.combine_chunks() if isinstance(tags, pa.ChunkedArray) else tags
     index = np.asarray(tags.indices.fill_null(-1).to_numpy(zero_copy_only=False))
     (value,) = layout.values
-    quality = layout.quality.get(value, "")
+    flags = layout.quality.get(value, ())
     for i, name in enumerate(tags.dictionary.to_pylist()):
         name = str(name).strip()
         rows = np.flatnonzero(index == i)
         if rows.size and (not wanted or name in wanted):
             part = block.take(pa.array(rows))
-            gather.add(name, seconds[rows], part.column(value), part.column(quality) if quality else None, quality)
-
-
-# ---------------------------------------------------------------------- formats
-def _parquet(path: Path) -> Opened:
-    file = pq.ParquetFile(path)
-    header = tuple(file.schema_arrow.names)
-    if not header:
-        raise RecordError(f"{path}: the file has no columns")
-    first = next(file.iter_batches(batch_size=200), None)
-    sample = {n: first.column(i).to_pylist() if first is not None else [] for i, n in enumerate(header)}
-
-    def blocks(names: Sequence[str]) -> Iterator[Any]:
-        return pq.ParquetFile(path).iter_batches(batch_size=BLOCK_ROWS, columns=list(names))
-
-    return Opened(path, header, sample, {n: split_header(n)[1] for n in header}, ".", blocks, Counter())
-
-
-def _workbook(path: Path) -> Opened:
-    sheet = sheet_of(path)
-    used = [n for i, n in enumerate(sheet.header) if any(row[i] is not None for row in sheet.rows)]
-    sample = {n: [text_of(row[i]) for row in sheet.rows] for i, n in enumerate(sheet.header)}
-    units = {n: unit or split_header(n)[1] for n, unit in zip(sheet.header, sheet.units, strict=True)}
-    left = f"; the sheets {', '.join(sheet.others)} were not read" if sheet.others else ""
-    notes = (Note(str(path), f"the sheet {sheet.name!r} was read{left}"),) if left else ()
-    return Opened(path, tuple(used), sample, units, ".", sheet.blocks, Counter(), notes)
-
-
-def _text(path: Path, dialect: Dialect, kind: str) -> Opened:
-    used = tuple(n for n in dialect.header if n not in dialect.unused)
-    sample = {n: [row[i] for row in dialect.rows] for i, n in enumerate(dialect.header)}
-    unreadable: Counter[str] = Counter()
-
-    def skip(_row: Any) -> str:
-        unreadable["rows"] += 1
-        return "skip"
-
-    def blocks(names: Sequence[str]) -> Iterator[Any]:
-        stream = pa.input_stream(str(path), compression="gzip" if kind == "gzip" else None)
-        encoding = "utf8" if dialect.encoding in {"utf-8", "utf-8-sig"} else dialect.encoding
-        yield from pa_csv.open_csv(
-            stream,
-            read_options=pa_csv.ReadOptions(
-                block_size=BLOCK_BYTES,
-                column_names=list(dialect.header),
-                skip_rows=dialect.first_line,
-                encoding=encoding,
-                use_threads=False,
-            ),
-            parse_options=pa_csv.ParseOptions(delimiter=dialect.separator, invalid_row_handler=skip),
-            convert_options=pa_csv.ConvertOptions(
-                column_types=dict.fromkeys(names, pa.string()), include_columns=list(names), strings_can_be_null=False
-            ),
-        )
-
-    units = {n: unit or split_header(n)[1] for n, unit in zip(dialect.header, dialect.units, strict=True)}
-    return Opened(path, used, sample, units, dialect.decimal, blocks, unreadable)
+            gather.add(name, seconds[rows], part.column(value), {flag: part.column(flag) for flag in flags})

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
 from pipeline.historian.cells import MV_CONVERSIONS, outliers, unit_slips, usual
-from pipeline.historian.dialect import COMMA_DECIMAL, POINT_DECIMAL
+from pipeline.historian.decimal_sign import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding, Verdict
 from pipeline.historian.missing_codes import sentinels

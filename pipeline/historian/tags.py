@@ -129,7 +129,9 @@ def parse_tag(text: str, role: str, known: Callable[[], Collection[str]] = froze
         )
     low, high = (_number(match[key], f"--{role} {text}") if match[key] else None for key in ("low", "high"))
     name, unit = match["tag"].strip(), (match["unit"] or "").strip()
-    if match["unit"] is not None:
+    if "=" in text and (whole := text.strip()) in known():  # FI=3..4
+        name, unit, low, high = whole, "", None, None
+    elif match["unit"] is not None:
         whole = text.strip()[: match.end("unit") + 1]
         tags = known()
         if whole in tags or (name not in tags and unit.isdecimal()):

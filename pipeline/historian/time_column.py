@@ -12,9 +12,11 @@ import pyarrow as pa
 
 from pipeline.errors import RecordError, nearest
 from pipeline.historian.date_forms import HOUR, HOUR_DIGITS
+from pipeline.historian.day_counts import DAY_S, UnclearCountError
 from pipeline.historian.headers import split_header, time_header
 from pipeline.historian.table_head import kind_of_cell
 from pipeline.historian.times import SINCE_1970_S, Clock, clock_of, given_clock
+from pipeline.metrics import Array
 
 SAMPLE = 200  # cells of a column
 RISES = 0.9  # share of the steps that go one way
@@ -22,17 +24,18 @@ RISES = 0.9  # share of the steps that go one way
 
 @dataclass(frozen=True, slots=True)
 class TimeColumn:
-    """The column of times and how it writes them; ``date`` is that of the day, where ``name`` holds the hour alone."""
+    """The column of times and how it writes them; ``before`` it stand those of the day, or of year to minute."""
 
     name: str
     clock: Clock
-    date: str = ""
+    before: tuple[str, ...] = ()
     left: str = ""  # for a person: which others could have been it
+    others: tuple[tuple[str, Clock], ...] = ()  # further columns of dates that rise
 
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns that make the time."""
-        return tuple(filter(None, (self.date, self.name)))
+        return (*self.before, self.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +52,8 @@ class Candidate:
     @property
     def order(self) -> tuple[bool, int, bool, int]:
         """The least one is the time: dates, then numbers since 1970, then others; what rises; the better name."""
-        kind = 0 if self.clock.dates else 1 if self.first_s >= SINCE_1970_S else 2 if not self.clock.says else 3
+        since_start = 2 if self.clock.certain and self.clock.kind != "elapsed" else 3
+        kind = 0 if self.clock.dates else 1 if self.first_s >= SINCE_1970_S else since_start
         return self.stands, kind, not self.rises, self.rank
 
 
@@ -72,26 +76,24 @@ def time_column_of(
     if time_format:
         clock = given_clock(time_format)
         if pair := _day_and_hour(header, sample):
-            return TimeColumn(pair[1], clock, pair[0])
+            return TimeColumn(pair[1], clock, pair[:1])
         return TimeColumn(_fitting(path, header, sample, clock), clock)
     found, refused = list[Candidate](), list[tuple[int, RecordError]]()
     for column in header:
-        where = f"{path}: column {column!r}"
         try:
-            candidate = _candidate(column, sample.get(column, ())[:SAMPLE], where, units.get(column, ""))
+            candidate = _candidate(path, column, sample.get(column, ())[:SAMPLE], units.get(column, ""), spread)
         except RecordError as error:
-            try:
-                candidate = _candidate(column, spread(column), where, units.get(column, ""))
-            except RecordError:
-                refused.append((time_header(column).rank, error))
-                continue
+            refused.append((time_header(column).rank, error))
+            continue
         if candidate is not None:
             found.append(candidate)
     best = min(found, key=lambda c: c.order, default=None)
+    if (best is None or not best.clock.dates) and (parts := _year_to_second(header, sample)):
+        return TimeColumn(parts[-1], Clock("format", format=" ".join(FORMS[: len(parts)])), parts[:-1])
     pair = _day_and_hour(header, sample)
     if pair and (best is None or best.column in pair or not best.clock.dates):
         return _paired(path, sample, *pair, spread)
-    if refused and (best is None or best.clock.says):
+    if refused and (best is None or not best.clock.certain):
         raise min(refused, key=lambda r: r[0])[1]
     if best is None:
         first = min(header, key=lambda h: time_header(h).rank)
@@ -100,34 +102,48 @@ def time_column_of(
             f"{path}: no column holds times that can be read ({first!r} begins with {shown!r}); name the column with "
             "--time, its form with --time-format, for example '%d.%m.%Y %H:%M:%S'"
         )
-    others = [c.column for c in found if c is not best and not c.stands and c.rank < 3]
-    left = f"is the time; {', '.join(others)} could be too, --time names another" if others else ""
-    return TimeColumn(best.column, best.clock, left=left)
+    others = [c for c in found if c is not best and not c.stands and (c.rank < 3 or (c.clock.dates and c.rises))]
+    names = ", ".join(c.column for c in others)
+    left = f"is the time; {names} could be too, --time names another" if others else ""
+    dates = tuple((c.column, c.clock) for c in others if best.clock.dates and c.clock.dates and c.rises)
+    return TimeColumn(best.column, best.clock, left=left, others=dates)
 
 
-def _candidate(column: str, cells: Sequence[Any], where: str, unit: str) -> Candidate | None:
+def _candidate(
+    path: Path, column: str, cells: Sequence[Any], unit: str, spread: Callable[[str], Sequence[Any]]
+) -> Candidate | None:
     """The column as one of times; None where it holds none, or its name is vague and it does not rise."""
     header = time_header(column)
+    where = f"{path}: column {column!r}"
     try:
         clock = clock_of(column, cells, where, unit)
-    except RecordError:
-        if header.rank >= 2 and not any(kind_of_cell(str(c).strip()) == "time" for c in cells):  # a temperature T (°C)
+    except RecordError as error:
+        dates = any(kind_of_cell(str(c).strip()) == "time" for c in cells)
+        if header.rank >= 2 and not dates and not isinstance(error, UnclearCountError):  # a temperature T (°C)
             return None
-        raise
+        clock = _clock_by_all(column, cells, where, unit, lambda: spread(column))
     if clock is None:
         return None
-    seconds = _seconds(clock, cells)
-    seconds = seconds[np.isfinite(seconds)]
-    steps = np.diff(seconds)
-    way = max(np.count_nonzero(steps > 0), np.count_nonzero(steps < 0))
-    rises = bool(way >= RISES * np.count_nonzero(steps)) if len(steps) else True
-    stands = bool(len(steps)) and not steps.any()
+    seconds = seconds_of(clock, cells)
+    rises, stands = _way(seconds)
+    if stands and clock.dates and header.named and np.any(seconds % DAY_S):  # to the minute, and many rows in each
+        rises, stands = _way(seconds_of(clock, spread(column)))
     if not clock.dates and header.rank >= 2 and (not rises or stands):
         return None
-    return Candidate(column, clock, header.rank, rises, stands, float(seconds[0]) if len(seconds) else 0.0)
+    first_s = float(seconds[np.isfinite(seconds)][0]) if np.isfinite(seconds).any() else 0.0
+    return Candidate(column, clock, header.rank, rises, stands, first_s)
 
 
-def _seconds(clock: Clock, cells: Sequence[Any]) -> Any:
+def _way(seconds: Array) -> tuple[bool, bool]:
+    """Whether times (n,) rise or fall, and whether they stand."""
+    steps = np.diff(seconds[np.isfinite(seconds)])
+    way = max(np.count_nonzero(steps > 0), np.count_nonzero(steps < 0))
+    rises = bool(way >= RISES * np.count_nonzero(steps)) if len(steps) else True
+    return rises, bool(len(steps)) and not steps.any()
+
+
+def seconds_of(clock: Clock, cells: Sequence[Any]) -> Array:
+    """Seconds (n,) of cells (n,) by a clock; NaN where one cannot be read."""
     try:
         return clock.seconds(pa.array(list(cells)))
     except (pa.ArrowException, ValueError, TypeError):
@@ -146,8 +162,13 @@ def _named(
     column = next((h for h in header if named in {h, split_header(h)[0]}), "")
     if not column:
         raise RecordError(f"{path}: no column {named!r} for --time{nearest(named, header)}")
+    pair = _day_and_hour(header, sample)
+    pair = pair if pair and column in pair else None
     if time_format:
-        return TimeColumn(column, given_clock(time_format))
+        given = given_clock(time_format)
+        return TimeColumn(pair[1], given, pair[:1]) if pair and given.dates else TimeColumn(column, given)
+    if pair:
+        return _paired(path, sample, *pair, spread)
     where, cells = f"{path}: column {column!r}", sample.get(column, ())[:SAMPLE]
     unit = split_header(column)[1] or units.get(column, "")
     name = column if time_header(column).named else f"time [{unit}]" if unit else "time"
@@ -168,7 +189,7 @@ def _fitting(path: Path, header: Sequence[str], sample: Mapping[str, Sequence[An
         cells = [c for c in sample.get(column, ())[:SAMPLE] if c is not None and str(c).strip()]
         rank = time_header(column).rank
         if cells and (clock.dates or rank < 3 or len(header) == 1):
-            found.append((rank, -float(np.mean(np.isfinite(_seconds(clock, cells)))), column))
+            found.append((rank, -float(np.mean(np.isfinite(seconds_of(clock, cells)))), column))
     fits = [f for f in found if f[1] < -0.5]
     if fits:
         return min(fits)[2]
@@ -176,6 +197,29 @@ def _fitting(path: Path, header: Sequence[str], sample: Mapping[str, Sequence[An
     if named:  # the whole column is tried, and refused with its first cells
         return min(named)[2]
     raise RecordError(f"{path}: no column has times of the form that --time-format gives; name one with --time")
+
+
+YEAR_TO_SECOND = (
+    {"year", "yyyy", "jahr", "année", "annee", "año"}, {"month", "monat", "mois", "mes"},
+    {"day", "tag", "jour", "día", "dia"}, {"hour", "hours", "stunde", "heure", "hora"},
+    {"minute", "minutes", "min", "minuto"},
+    {"second", "seconds", "sec", "sekunde", "seconde", "segundo"},
+)  # fmt: skip
+FORMS = ("%Y", "%m", "%d", "%H", "%M", "%S")
+
+
+def _year_to_second(header: Sequence[str], sample: Mapping[str, Sequence[Any]]) -> tuple[str, ...]:
+    """The columns of year, month, day, hour, minute and, where there is one, second; () where one is missing."""
+    found = list[str]()
+    for words in YEAR_TO_SECOND:
+        column = next((h for h in header if split_header(h)[0].strip().lower() in words), "")
+        if not column:
+            break
+        found.append(column)
+    if len(found) < len(FORMS) - 1:
+        return ()
+    years = [str(c).strip() for c in sample.get(found[0], ()) if c is not None and str(c).strip()]
+    return tuple(found) if years and all(len(y.removesuffix(".0")) == 4 for y in years) else ()
 
 
 def _day_and_hour(header: Sequence[str], sample: Mapping[str, Sequence[Any]]) -> tuple[str, str] | None:
@@ -209,12 +253,12 @@ def _quiet(column: str, cells: Sequence[str]) -> Clock | None:
 def _clock_by_all(
     name: str, cells: Sequence[Any], where: str, unit: str, more: Callable[[], Sequence[Any]]
 ) -> Clock | None:
-    """The clock by the first cells, or by more of them where these do not tell day and month apart."""
+    """The clock by the first cells, or by more of them where these cannot be told to be one thing or another."""
     try:
         return clock_of(name, cells, where, unit)
     except RecordError as error:
         try:
-            return clock_of(name, more(), where, unit)
+            return clock_of(name, more(), where, unit, everywhere=True)
         except RecordError:
             raise error from None
 
@@ -239,4 +283,4 @@ def _paired(
             f"{path}: {both[0]!r} of the columns {date!r} and {time!r} is no time that can be read; give its form "
             "with --time-format, for example '%d.%m.%Y %H:%M:%S'"
         )
-    return TimeColumn(time, clock, date)
+    return TimeColumn(time, clock, (date,))

@@ -13,48 +13,30 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.errors import RecordError
-from pipeline.historian.date_forms import ELAPSED, calendar_digits, form_of, other_forms, plain_date
+from pipeline.historian.date_forms import ELAPSED, MIDNIGHT, calendar_digits, form_of, other_forms, plain_date
+from pipeline.historian.day_counts import DAY_S, DAYS, SERIAL, UnclearCountError, days_of
 from pipeline.historian.headers import NO_UNITS, SPELLINGS, TIME_UNITS, TimeHeader, time_header
 from pipeline.metrics import Array
 
 ISO = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?\s*(Z|[+-]\d\d:?(\d\d)?)?$", re.IGNORECASE)
 ZONE = re.compile(r"\d\s*(Z|[+-]\d\d:?(\d\d)?)$", re.IGNORECASE)
 NUMERIC = re.compile(r"^[+-]?\d+([.,]\d+)?([eE][+-]?\d+)?$")
-DAY_S = 86_400.0
 SINCE_1970_S = 1e8  # numbers of seconds from here on (1973) count from 1970; smaller ones from some start
 UTC, UNSTATED = "UTC", "the export states no zone"
 
 
-@dataclass(frozen=True, slots=True)
-class Days:
-    """A count of days that programs write: which numbers are such, and where it has 1970."""
-
-    words: str
-    low: float
-    high: float
-    at_1970: float
-
-
-# Numbers of a spreadsheet are days since 1899-12-30: these are years 1968 to 2077. With the other origin of some old
-# workbooks, 1904, the same numbers are four years later; they cannot be told apart, and the steps are the same.
-SERIAL = Days("dates of a spreadsheet, in days since 1899-12-30", 25_000.0, 65_000.0, 25_569.0)
-DAYS = (
-    SERIAL,
-    Days("dates of MATLAB, in days since the year 0", 700_000.0, 770_000.0, 719_529.0),
-    Days("Julian dates, in days", 2.43e6, 2.49e6, 2_440_587.5),
-)
 # Ticks of 100 ns: of .NET since the year 1, of Windows since 1601.
 TICKS = ((6.2e17, 6.6e17, 62_135_596_800.0), (1.25e17, 1.45e17, 11_644_473_600.0))
 STARTS = {d.at_1970 * DAY_S for d in DAYS}
 SERIAL_UNIT = "serial"
-FEW_DAYS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
     """How one column writes time: ``iso``, ``number`` (seconds = scale x value - start_s), ``elapsed`` or a ``format``.
 
-    ``elapsed`` is 26:03:10 since some start. ``says`` is what was assumed, for a person; empty where all is written.
+    ``elapsed`` is 26:03:10 since some start. ``says`` is what was taken for granted, for a person; empty where all is
+    written. ``certain`` is False where only the want of a unit makes numbers seconds.
     """
 
     kind: str
@@ -62,6 +44,7 @@ class Clock:
     start_s: float = 0.0
     format: str = ""
     says: str = ""
+    certain: bool = True
 
     @property
     def dates(self) -> bool:
@@ -87,11 +70,12 @@ class Clock:
         return _iso(column) if self.kind == "iso" else _formatted(column, self.format)
 
 
-def clock_of(name: str, sample: Sequence[Any], where: str, unit: str = "") -> Clock | None:
+def clock_of(name: str, sample: Sequence[Any], where: str, unit: str = "", *, everywhere: bool = False) -> Clock | None:
     """The clock of a column by its name and first cells (texts or numbers); None where they are no times.
 
-    ``unit`` is what a row below the header says. RecordError for a date whose day and month cannot be told apart, and
-    for numbers in an unknown unit.
+    ``unit`` is what a row below the header says. Cells from ``everywhere`` in a column are no neighbours. RecordError
+    for a date whose day and month cannot be told apart, and for numbers in an unknown unit; UnclearCountError for
+    numbers that may be seconds or dates.
     """
     cells = [c for c in sample if c is not None and str(c).strip() != ""]
     if not cells:
@@ -100,11 +84,8 @@ def clock_of(name: str, sample: Sequence[Any], where: str, unit: str = "") -> Cl
     header = time_header(name)
     numbers = all(isinstance(c, int | float) and not isinstance(c, bool) for c in cells)
     if numbers or all(NUMERIC.match(t) for t in texts):
-        return (
-            _numeric(header, np.array([float(t.replace(",", ".")) for t in texts]), where, unit)
-            if header.named
-            else None
-        )
+        values = np.array([float(t.replace(",", ".")) for t in texts])
+        return _numeric(header, values, where, unit, everywhere=everywhere) if header.named else None
     if _most(texts, ISO):
         return Clock("iso")
     if form := form_of(texts, where):
@@ -151,7 +132,7 @@ def _most(texts: Sequence[str], pattern: re.Pattern[str]) -> bool:
     return 2 * sum(bool(pattern.match(t)) for t in texts) > len(texts)
 
 
-def _numeric(header: TimeHeader, values: Array, where: str, unit: str) -> Clock:
+def _numeric(header: TimeHeader, values: Array, where: str, unit: str, *, everywhere: bool) -> Clock:
     factor, unit = header.factor, "" if unit.strip().lower() in NO_UNITS else unit
     if factor is None and unit:
         factor = TIME_UNITS.get(unit.strip().lower().rstrip("."))
@@ -162,7 +143,15 @@ def _numeric(header: TimeHeader, values: Array, where: str, unit: str) -> Clock:
             "header, or give --time-format with one of them"
         )
     size = float(np.median(np.abs(values)))
-    if factor in {None, DAY_S} and (days := _days(header, values, factor)) is not None:
+    dated, counter = factor == DAY_S or header.date, header.rank >= 2
+    try:
+        days = days_of(values, dated=dated, counter=counter, everywhere=everywhere) if factor in {None, DAY_S} else None
+    except UnclearCountError as number:
+        raise UnclearCountError(
+            f"{where}: numbers such as {number} may be seconds or dates of a spreadsheet; give --time-format s or "
+            f"--time-format {SERIAL_UNIT}"
+        ) from None
+    if days is not None:
         return Clock("number", DAY_S, days.at_1970 * DAY_S, says=f"numbers are {days.words}")
     if factor is not None and factor != 1.0:
         return Clock("number", factor)
@@ -175,23 +164,7 @@ def _numeric(header: TimeHeader, values: Array, where: str, unit: str) -> Clock:
     scale = 1.0 if size < 1e11 else 1e-3 if size < 1e14 else 1e-6 if size < 1e17 else 1e-9
     assumed = factor is None and size < SINCE_1970_S
     says = "numbers are taken as seconds, no unit is written; --time-format names another, as in --time-format min"
-    return Clock("number", scale, says=says if assumed else "")
-
-
-def _days(header: TimeHeader, values: Array, factor: float | None) -> Days | None:
-    """The count of days that numbers are, by their size, their digits and the header; None where they are seconds.
-
-    Seconds since a start, in the middle of a long record, have few digits. So have few dates: those of eighths of a
-    day. Whole numbers are days only under the name of a date.
-    """
-    own = next((d for d in DAYS if np.all((values > d.low) & (values < d.high))), None)
-    if own is None or factor == DAY_S or header.date:
-        return own
-    if not np.any(values % 1):
-        return None
-    digits = bool(np.any(np.abs(values * 1000 - np.round(values * 1000)) > 1e-6))
-    eighths = bool(np.all(values * 8 == np.round(values * 8)))
-    return own if digits or eighths or np.ptp(values) < FEW_DAYS else None
+    return Clock("number", scale, says=says if assumed else "", certain=not assumed)
 
 
 def _formatted(column: Any, form: str) -> Array:
@@ -209,6 +182,11 @@ def _formatted(column: Any, form: str) -> Array:
             plain = plain[again.isna()]
             if plain.empty:
                 break
+    ends = text[stamps.isna()].dropna()
+    ends = ends[ends.str.contains(MIDNIGHT)]
+    if len(ends):  # 24:00 is the next day's 00:00
+        days = pd.to_datetime(ends.str.replace(MIDNIGHT, "00", regex=True), format=form, errors="coerce", utc=utc)
+        stamps = stamps.fillna(days + pd.Timedelta(days=1))
     stamps = stamps.dt.tz_localize(None) if utc else stamps
     return _of_timestamps(pa.array(stamps.dt.as_unit("us")))
 
@@ -223,7 +201,10 @@ def _iso(column: Any) -> Array:
         import pandas as pd  # slower, and it takes what Arrow does not: a decimal comma, a missing minute, nonsense
 
         words = text.to_pandas().str.replace(",", ".", regex=False)
+        ends = words.str.contains(MIDNIGHT).fillna(False).astype(bool)  # 24:00 is the next day's 00:00
+        words = words.where(~ends, words.str.replace(MIDNIGHT, "00", regex=True))
         stamps = pd.to_datetime(words, format="ISO8601", errors="coerce", utc=True)
+        stamps += pd.to_timedelta(ends.astype(int), "D")
         return _of_timestamps(pa.array(stamps.dt.tz_localize(None).dt.as_unit("us")))
 
 
@@ -244,8 +225,10 @@ def _number(cell: str | None) -> float:
 
 
 def _elapsed(cell: str | None) -> float:
-    """Seconds of 26:03:10.5."""
+    """Seconds of 26:03:10.5, or of 06:03:10 PM."""
     if not cell or not ELAPSED.match(cell.strip()):
         return float("nan")
-    hours, minutes, seconds = cell.strip().replace(",", ".").split(":")
-    return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)
+    clock = cell.strip().lower().replace(",", ".")
+    hours, minutes, seconds = clock.rstrip(" apm").split(":")
+    hour = int(hours) % 12 + 12 * (clock[-2] == "p") if clock.endswith("m") else int(hours)
+    return 3600.0 * hour + 60.0 * int(minutes) + float(seconds)

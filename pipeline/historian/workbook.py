@@ -17,7 +17,6 @@ from pipeline.historian.dialect import SAMPLE_LINES, names_of
 from pipeline.historian.table_head import Head, head_of_table
 
 BLOCK = 1 << 15  # rows
-DAY_S = 86_400
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
+from pipeline.historian.day_counts import DAY_S
 from pipeline.metrics import Array
 
 OFFSET = re.compile(r"^(?:UTC|GMT)?(?P<sign>[+-])(?P<hours>\d{1,2})(?::?(?P<minutes>\d\d))?$", re.IGNORECASE)
@@ -62,7 +63,7 @@ class LocalClock:
             steps = np.diff(local)
             self.falls = bool(np.count_nonzero(steps < 0) > np.count_nonzero(steps > 0))
         changes = self._changes(float(local.min()), float(local.max()))
-        offset = np.full(len(local), self._offset(datetime.fromtimestamp(float(local.min()) - 86_400, UTC)))
+        offset = np.full(len(local), self._offset(datetime.fromtimestamp(float(local.min()) - DAY_S, UTC)))
         for at, before, after in changes:
             offset[local >= at + max(before, after)] = after
             skipped = (local >= at + before) & (local < at + after)
@@ -80,6 +81,9 @@ class LocalClock:
         if not place.size:
             return np.zeros(0, dtype=bool)
         self.told += int(place.size)
+        steps = np.diff(local) * (-1.0 if self.falls else 1.0)
+        usual_s = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+        stamps_repeat = bool(np.any(np.delete(steps, np.minimum(place, len(steps) - 1)) == 0)) if len(steps) else True
         before = np.r_[self.last_s, local[:-1]][place]
         own = local[place]
         entered = np.r_[place[0] == 0 or not twice[place[0] - 1], np.diff(place) > 1]
@@ -88,13 +92,23 @@ class LocalClock:
         out = np.zeros(len(place), dtype=bool)
         second = self.second
         for i in range(len(place)):
+            back_s = (before[i] - own[i]) * (-1.0 if self.falls else 1.0)
             if entered[i]:
-                second = bool(self.falls)
-            elif (before[i] - own[i]) * (-1.0 if self.falls else 1.0) > SET_BACK_S:
+                least_s = 0.0 if stamps_repeat else np.nextafter(0, 1)
+                second = bool(self.falls) or self._begins_second(local, int(place[i]), twice, usual_s, least_s)
+            elif back_s > SET_BACK_S or (back_s == 0 and usual_s >= HOUR_S and not stamps_repeat):
                 second = not self.falls
             out[i] = second
         self.second = second
         return out
+
+    def _begins_second(self, local: Array, k: int, twice: NDArray[np.bool_], usual_s: float, least_s: float) -> bool:
+        """Whether the file begins in the second pass: it goes on beyond the hour without a gap, and never back."""
+        if k or np.isfinite(self.last_s) or self.falls:
+            return False
+        end = int(np.argmin(twice)) if not twice.all() else len(local)
+        steps = np.diff(local[: end + 1])
+        return end < len(local) and bool(np.all(steps >= least_s)) and float(steps[-1]) < usual_s + HOUR_S / 2
 
     def _offset(self, utc: datetime) -> float:
         offset = utc.astimezone(self.zone).utcoffset()
@@ -103,7 +117,7 @@ class LocalClock:
     def _changes(self, first_s: float, last_s: float) -> Array:
         """Rows (time UTC, offset before, offset after) [s] of each change of the clock near some local times."""
         found = []
-        days = np.arange(first_s - 2 * 86_400, last_s + 2 * 86_400, 86_400.0)
+        days = np.arange(first_s - 2 * DAY_S, last_s + 2 * DAY_S, DAY_S)
         if len(days) > 100_000:
             raise RecordError("the times of the export cover more than 270 years; check --time and --time-format")
         offsets = [self._offset(datetime.fromtimestamp(float(d), UTC)) for d in days]

@@ -203,7 +203,11 @@ LAUGHS = "x-a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
         ("- cases", "holds no mapping"),
         ("cases", "holds no mapping"),
         ("", "has no 'cases'"),
-        ("cases: !!python/object/apply:os.system [ls]", "is not YAML in UTF-8"),
+        ("cases: !!python/object/apply:os.system [ls]", "holds a value that cannot be read"),
+        ('cases: !!bool "abc"', "holds a value that cannot be read"),
+        ('cases: !!timestamp "x"', "holds a value that cannot be read"),
+        ('cases: !!int ""', "holds a value that cannot be read"),
+        ("cases: 1" + ":59" * 5000 + ".5", "holds a value that cannot be read"),
     ],
 )
 def test_whatever_spoils_the_file_is_one_line(text: str, says: str, tmp_path: Path) -> None:

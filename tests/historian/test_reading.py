@@ -97,6 +97,16 @@ def test_dialects(encoding: str, sep: str, decimal: str, tmp_path: Path) -> None
     assert units_of([path]) == {"Dämpfe": "kg/h"}
 
 
+def test_a_letter_of_another_encoding_far_below(tmp_path: Path) -> None:
+    rows = [[f"{START_S + 10 * k:.0f}", "1.5", "ok" * 12] for k in range(8000)] + [["1800000000", "2.5", "Störung"]]
+    path = tmp_path / "x.csv"
+    path.write_bytes("\n".join(map(",".join, [("time", "a", "Text"), *rows])).encode("cp1252"))
+    export = read_export([path])
+    assert export.rows == 8001
+    assert export.series["Text"].texts["Störung"] == 1
+    assert export.series["a"].good.all()
+
+
 def test_crlf_preamble_units_quotes_and_blank_lines(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     lines = text().splitlines()

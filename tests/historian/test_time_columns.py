@@ -40,7 +40,7 @@ UNITS = {
     1e-9: ["ns", "nsec", "nanoseconds"], 1e-6: ["us", "µs", "μs", "usec", "microseconds"],
     1e-3: ["ms", "msec", "millis", "milliseconds", "Millisekunden"],
     1.0: ["s", "S", "sec", "secs", "seconds", "Sekunden"],
-    60.0: ["min", "MIN", "mins", "minute", "minutes", "Minuten"], 3600.0: ["h", "hr", "hrs", "hours", "Stunden", "std"],
+    60.0: ["min", "MIN", "mins", "minute", "minutes", "Minuten"], 3600.0: ["h", "hr", "hrs", "hours", "Stunden"],
     86_400.0: ["d", "day", "days", "Tage"],
 }  # fmt: skip
 FORMS = ["Time [{}]", "time ({})", "Zeit({})", "elapsed {{{}}}", "time_{}", "Time {}", "t/{}", "Time in {}", "TIME, {}"]
@@ -56,10 +56,21 @@ def test_every_spelling_of_a_unit_of_time(factor: float, form: str) -> None:
 
 
 @pytest.mark.parametrize(("header", "factor"), [("Time (min)", 60), ("t [hr]", 3600), ("t_ms", 1e-3), ("TimeMin", 60),
-                                                ("minutes", 60), ("Elapsed Time, h", 3600)])  # fmt: skip
+                                                ("minutes", 60), ("Elapsed Time, h", 3600), ("Zeit Std", 3600),
+                                                ("Zeit [Tag]", 86_400), ("Time (Std.)", 3600),
+                                                ("Time (min) since start", 60), ("t [min] rel", 60),
+                                                ("Time min since start", 60), ("Minutes elapsed", 60),
+                                                ("Time <min>", 60), ("Time (decimal hours)", 3600)])  # fmt: skip
 def test_times_in_a_unit_are_read_as_seconds(header: str, factor: float, tmp_path: Path) -> None:
     stamps = [f"{t / factor:.9g}" for t in STEP_S * np.arange(N)]
     np.testing.assert_allclose(times_of(tmp_path, header, stamps), STEP_S * np.arange(N), atol=1e-6)
+
+
+@pytest.mark.parametrize("header", ["TimeTag", "Time Tag", "Time_Tag", "Time Std", "TS_STD", "Timestamp W",
+                                    "Fecha hora", "Time D1", "Time US Central"])  # fmt: skip
+def test_a_word_that_is_no_unit_of_time(header: str, tmp_path: Path) -> None:
+    assert time_header(header).factor is None
+    np.testing.assert_allclose(times_of(tmp_path, header, [f"{t:.0f}" for t in TIME_S]), TIME_S)
 
 
 def test_what_is_written_beside_the_unit(tmp_path: Path) -> None:
@@ -107,16 +118,55 @@ def test_numbers_without_a_unit_are_seconds_and_said(tmp_path: Path) -> None:
 def test_dates_of_a_spreadsheet_are_days_whatever_their_step(step_s: float, digits: int, tmp_path: Path) -> None:
     times = 1_709_510_400.0 + step_s * np.arange(N)
     stamps = [f"{25_569 + t / 86_400:.{digits}f}" for t in times]
-    found = times_of(tmp_path, "Date", stamps)
-    np.testing.assert_allclose(found, times, atol=86_400 * 10.0**-digits)
-    if step_s < 86_400 or digits == 0:  # a day has no fraction that tells it from seconds, but for the name
-        np.testing.assert_allclose(times_of(tmp_path, "Time", stamps), times, atol=86_400 * 10.0**-digits)
+    for name, form in (("Date", ""), ("Time", "serial" if step_s > 3600 else "")):
+        found = times_of(tmp_path, name, stamps, **{"time_format": form} if form else {})
+        np.testing.assert_allclose(found, times, atol=86_400 * 10.0**-digits)
 
 
-@pytest.mark.parametrize("step", [0.1, 1.0, 5.0])
-def test_seconds_in_the_middle_of_a_record_are_no_dates(step: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("digits", [2, 5])
+def test_hours_of_the_day_in_few_digits_are_dates(digits: int, tmp_path: Path) -> None:
+    times = 1_709_510_400.0 + 3600 * np.arange(N)
+    stamps = [f"{25_569 + t / 86_400:.{digits}f}" for t in times]
+    np.testing.assert_allclose(times_of(tmp_path, "Zeit", stamps), times, atol=0.51 * 86_400 * 10.0**-digits)
+
+
+@pytest.mark.parametrize(("name", "step"), [("Time", 0.125), ("Time", 0.5), ("Zeit", 0.25), ("t", 0.5), ("Zeit", 1)])
+def test_numbers_that_may_be_seconds_or_dates_are_asked_for(name: str, step: float, tmp_path: Path) -> None:
     stamps = [f"{45_000 + step * k:g}" for k in range(N)]
-    np.testing.assert_allclose(times_of(tmp_path, "time", stamps), 45_000 + step * np.arange(N))
+    with pytest.raises(RecordError, match=r"such as 45000 may be seconds or dates .* --time-format s or"):
+        times_of(tmp_path, name, stamps)
+    values = np.array(stamps, float)
+    np.testing.assert_allclose(times_of(tmp_path, name, stamps, time_format="s"), values)
+    np.testing.assert_allclose(
+        times_of(tmp_path, name, stamps, time_format="serial"), 86_400 * (values - 25_569), atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("step", [0.1, 0.04, 1.0001, 1 / 64, 5.0])
+def test_seconds_in_the_middle_of_a_record_are_no_dates(step: float, tmp_path: Path) -> None:
+    stamps = [f"{45_000 + step * k:.9g}" for k in range(N)]
+    np.testing.assert_allclose(times_of(tmp_path, "time", stamps), 45_000 + step * np.arange(N), atol=1e-4)
+
+
+@pytest.mark.parametrize(("first", "n"), [(30_000, N), (45_000, 23_000)])
+def test_numbers_that_no_dates_of_a_record_could_be_are_seconds(first: int, n: int, tmp_path: Path) -> None:
+    stamps = [f"{first + 0.5 * k:.1f}" for k in range(n)]
+    path = write(tmp_path / "x.csv", [[s, "1.5"] for s in stamps], ("Time", "TIC.PV"))
+    np.testing.assert_allclose(read_export([path]).series["TIC.PV"].time_s, first + 0.5 * np.arange(n))
+
+
+def test_a_column_that_cannot_be_read_beside_dates_of_a_spreadsheet_does_no_harm(tmp_path: Path) -> None:
+    stamps = [f"{25_569 + t / 86_400:.8f}" for t in TIME_S]
+    export = read(tmp_path, ("Time", "Time left [%]", "TIC.PV"), stamps, [str(N - k) for k in range(N)], VALUES)
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, TIME_S, atol=1e-2)
+
+
+@pytest.mark.parametrize("names", [("LocalTime", "UTCTime"), ("Start", "End")])
+def test_other_columns_of_dates_are_named(names: tuple[str, str], tmp_path: Path) -> None:
+    later = stamped("%Y-%m-%d %H:%M:%S", TIME_S + 3600)
+    export = read(tmp_path, (*names, "TIC.PV"), DATES, later, VALUES)
+    assert [n.column for n in export.notes] == [names[0]]
+    assert names[1] in export.notes[0].words
 
 
 @pytest.mark.parametrize(
@@ -146,6 +196,39 @@ FORMS_OF_DATES = [
 @pytest.mark.parametrize("form", FORMS_OF_DATES)
 def test_forms_of_dates(form: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(times_of(tmp_path, "x", stamped(form)), TIME_S, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("form", "hours"),
+    [("%Y-%m-%d %H:%M:%S EST", -5), ("%d.%m.%Y %H:%M:%S CDT", -5), ("%a %b %d %H:%M:%S CET %Y", 1),
+     ("%a %b %d %H:%M:%S GMT+02:00 %Y", 2), ("%Y-%m-%d %H:%M:%S GMT+02", 2), ("%d.%m.%Y %H:%M:%S UTC-3", -3),
+     ("%a %b %d %H:%M:%S %Y", 0)],
+)  # fmt: skip
+def test_zones_in_words_and_dates_of_java(form: str, hours: int, tmp_path: Path) -> None:
+    found = times_of(tmp_path, "x", stamped(form, TIME_S + 3600 * hours))
+    np.testing.assert_allclose(found, TIME_S)
+
+
+@pytest.mark.parametrize("form", ["%d.%m.%Y %H:%M:%S", "%Y-%m-%d %H:%M:%S", "%d.%m.%Y %H:%M", "%Y-%m-%dT%H:%M:%SZ"])
+def test_24_hours_are_the_end_of_a_day(form: str, tmp_path: Path) -> None:
+    times = pd.Timestamp("2024-01-30 18:00").timestamp() + 3600.0 * np.arange(N)
+    stamps = [
+        stamped(form, [t - 86_400])[0].replace("00:00", "24:00", 1) if t % 86_400 == 0 else stamped(form, [t])[0]
+        for t in times
+    ]
+    np.testing.assert_allclose(times_of(tmp_path, "x", stamps), times)
+
+
+def test_hours_of_half_a_day_without_a_date(tmp_path: Path) -> None:
+    times = 11 * 3600 + 3000 + STEP_S * np.arange(N)
+    np.testing.assert_allclose(times_of(tmp_path, "Time", stamped("%I:%M:%S %p", times)), times)
+
+
+@pytest.mark.parametrize(("month", "number"), [("fev", 2), ("mrt", 3), ("mei", 5), ("out", 10), ("dez", 12)])
+def test_months_of_more_languages(month: str, number: int, tmp_path: Path) -> None:
+    times = pd.Timestamp(f"2024-{number:02d}-04 06:00").timestamp() + STEP_S * np.arange(N)
+    stamps = [s.replace("#", month) for s in stamped("%d-#-%Y %H:%M:%S", times)]
+    np.testing.assert_allclose(times_of(tmp_path, "x", stamps), times)
 
 
 def test_german_months_midnight_and_whole_minutes(tmp_path: Path) -> None:
@@ -178,6 +261,26 @@ def test_hours_of_the_day_count_over_midnight(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, times)
 
 
+@pytest.mark.parametrize("names", ["Year Month Day Hour Minute Second", "Jahr Monat Tag Stunde Minute"])
+def test_year_to_second_in_columns_of_their_own(names: str, tmp_path: Path) -> None:
+    times = TIME_S if "Second" in names else START_S + 60.0 * np.arange(N)
+    parts = list(zip(*(s.split() for s in stamped("%Y %m %d %H %M %S", times)), strict=True))
+    header = names.split()
+    export = read(tmp_path, (*header, "TIC.PV"), *([str(int(c)) for c in p] for p in parts[: len(header)]), VALUES)
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, times)
+    assert {*export.series} == {"TIC.PV"}
+
+
+@pytest.mark.parametrize("named", ["Day", "Hour"])
+def test_a_person_may_name_the_day_or_the_hour_of_two_columns(named: str, tmp_path: Path) -> None:
+    days, hours = zip(*(s.split() for s in stamped("%Y-%m-%d %H:%M:%S")), strict=True)
+    found = read(tmp_path, ("Day", "Hour", "TIC.PV"), days, hours, VALUES, time_column=named)
+    np.testing.assert_allclose(found.series["TIC.PV"].time_s, TIME_S)
+    found = read(tmp_path, ("Day", "Hour", "TIC.PV"), days, hours, VALUES, time_column=named,
+                 time_format="%Y-%m-%d %H:%M:%S")  # fmt: skip
+    np.testing.assert_allclose(found.series["TIC.PV"].time_s, TIME_S)
+
+
 DATES = stamped("%Y-%m-%d %H:%M:%S")
 
 
@@ -204,6 +307,23 @@ def test_dates_that_rise_are_the_time(name: str, other: list[str], first: bool, 
     assert bool(said) == (name in {"index", "time", "epoch"})
 
 
+def test_dates_that_stand_in_the_first_rows_only_are_the_time(tmp_path: Path) -> None:
+    n = 1500
+    stamps = stamped("%Y-%m-%d %H:%M", START_S + 0.1 * np.arange(n))
+    path = write(
+        tmp_path / "x.csv", [[s, str(k), "1.5"] for k, s in enumerate(stamps)], ("Timestamp", "Index", "TIC.PV")
+    )
+    export = read_export([path])
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, START_S + 0.1 * np.arange(n), atol=1e-3)
+    assert [n.column for n in export.notes] == ["Timestamp"]
+
+
+def test_a_day_beside_minutes_since_the_start_is_not_the_time(tmp_path: Path) -> None:
+    rows = [[f"2024-03-{4 + k // 1000:02d}", str(k), "1.5"] for k in range(1500)]
+    export = read_export([write(tmp_path / "x.csv", rows, ("Date", "Minute", "TIC.PV"))])
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, 60.0 * np.arange(1500))
+
+
 def test_a_temperature_alone_is_no_time(tmp_path: Path) -> None:
     for name in ("T", "T_s", "T (°C)"):
         with pytest.raises(RecordError, match="no column holds times"):
@@ -214,6 +334,21 @@ def test_newest_rows_first(tmp_path: Path) -> None:
     export = read(tmp_path, ("T", "Datum", "TIC.PV"), VALUES, DATES[::-1], VALUES[::-1])
     np.testing.assert_allclose(export.series["TIC.PV"].time_s, TIME_S)
     np.testing.assert_allclose(export.series["TIC.PV"].value, [float(v) for v in VALUES])
+
+
+@pytest.mark.parametrize(
+    "header", [("Time PV", "TIC.PV", "Time OP", "TIC.OP"), ("TIC.PV", "Time", "TIC.OP", "Time OP")]
+)
+def test_each_tag_has_the_times_beside_it(header: tuple[str, ...], tmp_path: Path) -> None:
+    later = stamped("%Y-%m-%d %H:%M:%S", TIME_S + 3600)
+    later[-1], values = "", [*VALUES[:-1], ""]
+    columns = [DATES, VALUES, later, values] if header[0] == "Time PV" else [VALUES, DATES, values, later]
+    path = write(tmp_path / "x.csv", list(zip(*columns, strict=True)), header)
+    export = read_export([path])
+    assert {*export.series} == {"TIC.PV", "TIC.OP"}
+    np.testing.assert_allclose(export.series["TIC.PV"].time_s, TIME_S)
+    np.testing.assert_allclose(export.series["TIC.OP"].time_s, TIME_S[:-1] + 3600)
+    assert (export.rows, export.timeless_rows) == (N, 0)
 
 
 # ---------------------------------------------------------------------- zones
@@ -229,6 +364,16 @@ def test_local_times_of_a_zone_become_utc(day: str, newest_first: bool, tmp_path
     np.testing.assert_allclose(export.series["TIC.PV"].value, np.arange(100))
     assert export.series["TIC.PV"].counts() == {"good": 100}
     assert export.zone == "UTC"
+
+
+@pytest.mark.parametrize("hours", [0.25, 0.5, 1.0])
+@pytest.mark.parametrize("first", ["2024-10-26 18:00", "2024-10-27 00:00", "2024-10-27 01:00"])
+def test_an_hour_that_comes_twice_in_few_rows_and_at_the_start(first: str, hours: float, tmp_path: Path) -> None:
+    utc = pd.date_range(first, periods=60, freq=pd.Timedelta(hours=hours), tz="UTC")
+    stamps = [t.strftime("%d.%m.%Y %H:%M:%S") for t in utc.tz_convert("Europe/Berlin")]
+    series = read(tmp_path, ("Zeit", "TIC.PV"), stamps, [str(k) for k in range(60)], time_zone="Europe/Berlin").series
+    np.testing.assert_allclose(series["TIC.PV"].time_s, utc.as_unit("s").asi8)
+    assert series["TIC.PV"].good.all()
 
 
 def test_an_offset_is_a_zone(tmp_path: Path) -> None:

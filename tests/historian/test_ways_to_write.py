@@ -104,12 +104,60 @@ def test_what_may_be_two_numbers_is_none(column: list[str], decimal: str, expect
         ("time;a;b\n0;0,234;5\n1;1,250;5\n2;998;6\n", ","),
         ('time,a,b\n0,"1,5","2,5"\n1,"2,5","3,25"\n2,"2,5","3,5"\n', ","),
         ("time;a;b\n0;1'234,5;5\n1;1'250,5;5\n2;\u221212,5;6\n", ","),
+        ("time;a;b\n0;1.234;5\n1;1.250;5\n2;998;6\n", ","),
+        ("time;a;b\n0;1.234;5\n1;1.250;5\n2;1.260;6\n", "."),
+        ("time;a;b\n0;45.125;5\n1;99.250;5\n2;100;6\n", "."),
+        ("time;a;b\n0;45,125;5\n1;99,250;5\n2;100;6\n", ","),
+        ("time;a;b\n0;1.234;5\n1;1.250;5\n2;999;6\n3;0;6\n", "."),
+        ("time;a;b\n0;1.234.567;5\n1;998;5\n", ","),
     ],
 )
-def test_the_comma_between_thousands_is_no_decimal_sign(content: str, decimal: str, tmp_path: Path) -> None:
+def test_the_sign_between_thousands_is_no_decimal_sign(content: str, decimal: str, tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_text(content, encoding="utf-8")
     assert sniff(path).decimal == decimal
+
+
+@pytest.mark.parametrize(
+    ("column", "expected"),
+    [
+        (["60.3 %", "61.5 %", "", "Bad"], [60.3, 61.5, None, None]),
+        (["60.3%", "7%"], [60.3, 7]),
+        (["-3.5 °C", "1,234.5 °C"], [-3.5, 1234.5]),
+        (["60.3 %", "61.5 kg"], [None, None]),
+        (["60.3 %", "61.5"], [None, 61.5]),
+        (["5A", "7A"], [None, None]),
+    ],
+)
+def test_a_unit_behind_every_number(column: list[str], expected: list[float | None]) -> None:
+    values, _, _ = numbers(pa.array(column))
+    np.testing.assert_allclose(values, [np.nan if v is None else v for v in expected])
+
+
+@pytest.mark.parametrize("sign", [".", ","])
+def test_a_small_number_far_below_tells_thousands(sign: str, tmp_path: Path) -> None:
+    values = [1000 + k for k in range(300)] + [998]
+    own = [[str(1_709_532_000 + 10 * k), f"{v:,d}".replace(",", sign)] for k, v in enumerate(values)]
+    path = write(tmp_path / "x.csv", own, ("time", "a"), sep=";")
+    np.testing.assert_allclose(read_export([path]).series["a"].value, values)
+
+
+def test_three_digits_behind_both_signs_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("time;a;b\n0;1,234;1.234\n1;1,250;1.250\n")
+    with pytest.raises(RecordError, match=r"1,250 and 1\.250 may be decimals or thousands; export numbers without"):
+        read_export([path])
+
+
+@pytest.mark.parametrize("kind", ["xlsx", "parquet"])
+def test_texts_with_a_decimal_comma_in_typed_cells(kind: str, tmp_path: Path) -> None:
+    values = [f"{60 + k / 1000:.3f}".replace(".", ",") for k in range(N)]
+    path = tmp_path / f"x.{kind}"
+    if kind == "xlsx":
+        workbook(path, ["Time", "a"], list(zip(map(datetime.fromisoformat, STAMPS), values, strict=True)))
+    else:
+        pq.write_table(pa.table({"Time": STAMPS, "a": values}), path)
+    np.testing.assert_allclose(read_export([path]).series["a"].value, 60 + np.arange(N) / 1000)
 
 
 @pytest.mark.parametrize(
@@ -167,6 +215,18 @@ QUALITIES = [
     ("quality", {"1": 90, "0": 5}, {"1"}),
     ("quality", {"": 90, "Bad": 5}, {""}),
     ("Qualität", {"Gut": 5, "Schlecht": 9}, {"Gut"}),
+    ("quality", {"0": 98, "133": 2}, {"0"}),
+    ("quality", {"0": 98, "65": 2}, {"0"}),
+    ("quality", {"128": 98, "0": 2}, {"128"}),
+    ("quality", {"C0": 8, "00": 2}, {"C0"}),
+    ("quality", {"N": 98, "B": 2}, {"N"}),
+    ("quality", {"WAHR": 5, "FALSCH": 9}, {"WAHR"}),
+    ("quality", {"Oui": 5, "Non": 9}, {"Oui"}),
+    ("quality", {"Y": 5, "N": 9}, {"Y"}),
+    ("quality", {"-": 98, "*": 2}, {"-"}),
+    ("status", {"Run": 98, "Bad Input": 2}, {"Run"}),
+    ("TIC.PV.CONF", {"100": 98, "0": 2}, {"100"}),
+    ("TIC.PV fault", {"0": 5, "1": 9}, {"0"}),
 ]  # fmt: skip
 
 
@@ -177,6 +237,9 @@ def test_which_qualities_are_good(column: str, counts: dict[str, int], good: set
 
 def test_words_that_say_nothing_of_quality() -> None:
     assert meaning_of("status", {"RUN": 3, "STOP": 4}).good is None
+    assert meaning_of("Pump Status", {"0": 3, "1": 4}).good is None  # a state: no value has most rows
+    assert meaning_of("Tank Status", {"200": 3, "300": 4}).good is None
+    assert meaning_of("quality", {"95": 3, "96": 4, "100": 1}).good is None
 
 
 @pytest.mark.parametrize(
@@ -199,6 +262,51 @@ def test_columns_of_quality(header: str, flags: tuple[str, str], bad: bool, tmp_
     assert export.series[NAMES[1]].good.all() == (header != "Quality")
 
 
+LONE: list[tuple[str, Callable[[int], object]]] = [
+    ("Q", lambda k: 180 + k % 50), ("Q", lambda k: 192 if k < 300 else 200), ("Q", lambda k: 575 + k % 420),
+    ("Good", lambda k: 5 + k % 30), ("Bad", lambda k: k % 5), ("Status", lambda k: 200 if k % 2 else 300),
+    ("Status", lambda k: 512 + k % 2), ("Quality", lambda k: 90 + k % 10), ("Valid", lambda k: k % 101),
+    ("Status", lambda k: ["Run", "Stop", "Error"][k % 3]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("header", "cell"), LONE)
+def test_a_tag_with_the_name_of_a_quality_costs_no_row(
+    header: str, cell: Callable[[int], object], tmp_path: Path
+) -> None:
+    data = clean(400)
+    own = [[*row, str(cell(k))] for k, row in enumerate(cells(data))]
+    series = read_export([write(tmp_path / "x.csv", own, ("timestamp", *NAMES, header))]).series
+    assert all(series[n].good.all() for n in NAMES)
+    assert header in series
+
+
+FLAGS = ("Status", ("Good", "Good")), ("Questionable", ("False", "True"))
+
+
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("layout", ["wide", "long"])
+def test_a_reading_is_good_if_all_its_qualities_say_so(layout: str, way: int, tmp_path: Path) -> None:
+    names, flags = zip(*FLAGS[::way], strict=True)
+    own = [[*r[:2], *(f[k % 7 == 3] for f in flags), *r[2:]] for k, r in enumerate(rows())]
+    header = ("time", NAMES[0], *(f"{NAMES[0]}.{n}" for n in names), *NAMES[1:])
+    if layout == "long":
+        own = [[tag, row[0], v, *row[2:4]] for row in own for tag, v in zip(NAMES[:2], row[1:], strict=False)]
+        header = ("tag", "time", "value", *names)
+    export = read_export([write(tmp_path / "x.csv", own, header)], NAMES[:1])
+    assert export.layout == layout
+    np.testing.assert_array_equal(np.flatnonzero(~export.series[NAMES[0]].good), np.arange(3, N, 7))
+
+
+def test_a_quality_that_cannot_be_told_and_one_that_calls_all_bad_are_noted(tmp_path: Path) -> None:
+    header = ("time", NAMES[0], f"{NAMES[0]}.Status", *NAMES[1:], f"{NAMES[1]} Quality")
+    own = [[*r[:2], "RUN" if k % 2 else "STOP", *r[2:], "Bad"] for k, r in enumerate(rows())]
+    export = read_export([write(tmp_path / "x.csv", own, header)])
+    assert {n.column for n in export.notes} == {header[2], header[-1]}
+    assert export.series[header[2]].tag == header[2]
+    assert not export.series[NAMES[1]].good.any()
+
+
 @pytest.mark.parametrize("header", ["TIC-101.PV Status", "TIC-101.PV Quality", "Status", "Quality"])
 def test_a_quality_that_is_bad_far_below_only(header: str, tmp_path: Path) -> None:
     data = clean(900)
@@ -207,9 +315,10 @@ def test_a_quality_that_is_bad_far_below_only(header: str, tmp_path: Path) -> No
     np.testing.assert_array_equal(np.flatnonzero(~series.good), np.arange(701, 900))
 
 
-def test_a_quality_beside_every_tag_under_one_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize("word", ["Status", "Qualité"])
+def test_a_quality_beside_every_tag_under_one_name(word: str, tmp_path: Path) -> None:
     own = [[r[0], r[1], "Good", r[2], "Bad" if k == 5 else "Good", r[3], "Good"] for k, r in enumerate(rows())]
-    header = ("time", NAMES[0], "Status", NAMES[1], "Status", NAMES[2], "Status")
+    header = ("time", NAMES[0], word, NAMES[1], word, NAMES[2], word)
     export = read_export([write(tmp_path / "x.csv", own, header)], NAMES)
     assert [int((~export.series[n].good).sum()) for n in NAMES] == [0, 1, 0]
 
@@ -243,6 +352,10 @@ HEADS = {
     "tags are numbers below a title": (text(NUMBERED, above=["Report;;;"]), NUMBERED[1:]),
     "line break in a quoted name": (text(("Time", "TIC-101\n.PV", *NAMES[1:])), ["TIC-101 .PV", *NAMES[1:]]),
     "an inch in a title": (text(HEADER, above=['valve of 5" size;;;']), NAMES),
+    "inches in a title and in the header": (
+        text(("Time", *NAMES), above=['valve of 5" size;;;']).replace("FI-7", '3" FI-7'),
+        [*NAMES[:2], '3" FI-7'],
+    ),
     "comma separated": (text(HEADER, ",", end=",", above=["Report,,,,"]), NAMES),
     "tabs": (text(HEADER, "\t", above=["Report\t\t\t"]), NAMES),
     "no-break blanks in names": (text(("Time", "TIC-101.PV\u00a0[degC]", *NAMES[1:])), NAMES),
@@ -279,12 +392,13 @@ LONG = [
     ("variable", "datetime", "val", "qual"), ("Messstelle", "Zeitstempel", "Wert", "Qualität"),
     ("NodeId", "SourceTimestamp", "Value", "StatusCode"), ("Bezeichnung", "Zeit", "Messwert", "Status"),
     ("what", "when", "how much", "Status"), ("Sensor ID", "Logged at", "Value (SI)", "IsGood"),
+    ("VarName", "TimeString", "VarValue", "Validity"), ("tagpath", "t_stamp", "floatvalue", "dataintegrity"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("names", LONG)
 def test_a_row_a_reading_under_many_names(names: tuple[str, ...], tmp_path: Path) -> None:
-    good = {"StatusCode": "0x00000000", "IsGood": "True"}.get(names[3], "Good")
+    good = {"StatusCode": "0x00000000", "IsGood": "True", "Validity": "1", "dataintegrity": "192"}.get(names[3], "Good")
     own = [[tag, row[0], value, good] for row in rows() for tag, value in zip(NAMES, row[1:], strict=True)]
     path = write(tmp_path / "x.csv", own, names)
     check(path)
@@ -292,9 +406,35 @@ def test_a_row_a_reading_under_many_names(names: tuple[str, ...], tmp_path: Path
     assert set(NAMES) <= tags_in([path])
 
 
+@pytest.mark.parametrize("header", [("Loop", "Time", "X", "RowNo"), ("Messpunkt", "Zeit", "Wert", "Unit")])
+def test_a_number_of_the_row_and_a_unit_beside_a_reading(header: tuple[str, ...], tmp_path: Path) -> None:
+    units = dict(zip(NAMES, ("degC", "%", "kg/h"), strict=True))
+    own = [[t, r[0], v, units[t] if header[3] == "Unit" else str(k)]
+           for k, r in enumerate(rows()) for t, v in zip(NAMES, r[1:], strict=True)]  # fmt: skip
+    path = write(tmp_path / "x.csv", own, header)
+    check(path)
+    assert units_of([path]) == (units if header[3] == "Unit" else {})
+
+
+@pytest.mark.parametrize("header", [("Loop", "Time", "X"), ("Path", "Time", "Reading")])
+def test_a_file_sorted_by_tag(header: tuple[str, ...], tmp_path: Path) -> None:
+    data = clean(700)
+    table = cells(data)
+    own = [[t, r[0], r[j]] for j, t in enumerate(NAMES, 1) for r in table]
+    export = read_export([write(tmp_path / "x.csv", own, header)])
+    for name, values in zip(NAMES, (data.pv, data.mv, data.dv), strict=True):
+        np.testing.assert_allclose(export.series[name].value, values)
+
+
 def test_tags_that_are_numbers_in_rows_of_readings(tmp_path: Path) -> None:
     own = [[t, row[0], v] for row in rows() for t, v in zip(("101", "102", "103"), row[1:], strict=True)]
     check(write(tmp_path / "x.csv", own, ("TagID", "Time", "Value")), ["101", "102", "103"])
+
+
+def test_a_label_beside_an_mv_that_rests_is_not_taken_for_a_tag(tmp_path: Path) -> None:
+    own = [[r[0], r[1], "50", f"batch {k // 20}"] for k, r in enumerate(rows())]
+    export = read_export([write(tmp_path / "x.csv", own, ("time", "PV", "OP", "name"))])
+    assert (export.layout, {*export.series}) == ("wide", {"PV", "OP", "name"})
 
 
 @pytest.mark.parametrize("extra", ["MODE", "name", "id"])
@@ -317,10 +457,12 @@ BRACKETED = ["Unit/TIC[1].PV", "Unit/TIC[1]", "Unit/TIC[2]"]
         ("Unit/TIC[2]=0..1", BRACKETED[2], "", 0.0),
         ("TIC.PV[degC]=0..120", "TIC.PV", "degC", 0.0),
         ("ns=2;s=TIC.PV[degC]=0..120", "ns=2;s=TIC.PV", "degC", 0.0),
+        ("FI=3..4", "FI=3..4", "", None),
     ],
 )
 def test_tags_with_brackets_and_slashes(option: str, tag: str, unit: str, low: float | None, tmp_path: Path) -> None:
-    path = write(tmp_path / "x.csv", rows(), ("time", "Unit/TIC[1].PV [degC]", *BRACKETED[1:]))
+    own = [[*row, "1"] for row in rows()]
+    path = write(tmp_path / "x.csv", own, ("time", "Unit/TIC[1].PV [degC]", *BRACKETED[1:], "FI=3..4"))
     found = parse_tag(option, "pv", lambda: tags_in([path]))
     assert (found.tag, found.unit, found.low) == (tag, unit, low)
     check(path, BRACKETED)
@@ -403,6 +545,8 @@ KINDS = [
     (b"SQLite format 3\x00" + bytes(600), "an SQLite database"),
     (b"\x89HDF\r\n\x1a\n" + bytes(600), "an HDF5 file"),
     (b"MATLAB 5.0 MAT-file, Platform" + bytes(600), "a MATLAB file"),
+    (gzip.compress(b"PAR1" + bytes(600)), "a Parquet file, gzipped; unpack it"),
+    (gzip.compress(zipped(["xl/workbook.xml"])), "gzipped; unpack it"),
 ]
 
 
