@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.historian.guessing import guesses
+from pipeline.historian.linear import fitted
 from pipeline.historian.reading import read_export, units_of
 
 N = 3000
@@ -67,3 +68,12 @@ def test_a_label_is_no_mv(head: str, tmp_path: Path) -> None:
 
 def test_an_mv_of_two_values_is_one(tmp_path: Path) -> None:
     assert roles(tmp_path / "export.csv", {"LI-1 [m]": "level", "HV-1 [%]": "two"})["HV-1"] == "mv"
+
+
+@pytest.mark.parametrize("seed", [5, 8, 20, 37, 43])
+def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
+    """The fit is exact but for its ridge: once no row was left of it, and `new` ended without a table."""
+    u = np.repeat(np.round(np.clip(np.random.default_rng(seed).normal(50, 15, 70), 5, 95), 1), 60)[:4000]
+    model = fitted(u, [u], np.zeros(len(u), dtype=np.int64))
+    assert model is not None
+    assert max(model.strength[0], model.ahead[0][0]) > 1e3
