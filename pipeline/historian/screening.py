@@ -22,7 +22,7 @@ from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.free_run import believed
 from pipeline.historian.grid import Grid, resampled
-from pipeline.historian.left_out import flag_readings, flag_rows, of_left_out, spans_of
+from pipeline.historian.left_out import flag_readings, flag_rows, interval_text, of_left_out, spans_of
 from pipeline.historian.linear import Linear
 from pipeline.historian.loads import with_load_moves
 from pipeline.historian.modes import check_modes
@@ -78,7 +78,7 @@ def screened(
     findings: list[Finding] = [*of_notes(export), *of_files(export, tags)]
     spans = spans_of(leave_out, export)
     flag_readings(own.values(), spans, Reason.LEFT_OUT)
-    stopped, stop = stops(own, tags)
+    stopped, stop = stops(own, tags, lambda first_s, end_s: interval_text(first_s, end_s, export))
     flag_readings(own.values(), stopped, Reason.STOP)
     findings += stop
     findings += drop_copies(own, tags)

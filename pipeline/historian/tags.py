@@ -22,6 +22,7 @@ SIGNAL_ROLES = ("pv", "mv", "dv")
 COMMANDS = ("command_low", "command_high", "max_move_per_min")  # of an MV, for the controller
 WORDS = {"between": ("step", "line"), "ends": ("keep", "drop")}  # of columns that say how readings are taken
 GUESSED_PAD = 0.25  # of the usual span, beyond it, in the range that the table guesses
+KEEP = "write keep into column ends of the table of tags, which `loopwright new` without roles writes for --tags"
 CERTAIN = {"": False, "no": False, "yes": True}
 NUMBERS = ("low", "high", *COMMANDS)
 COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "step", "good_percent", "remark")
@@ -39,7 +40,7 @@ unit_certain: yes where no reading can be in another unit; empty lets the screen
 between: line or step, how a tag that is stored by exception or compressed goes from one reading to the next; empty
   guesses
 ends: keep or drop rows at the lowest or highest value, a limit of the plant or the end of the transmitter; empty
-  drops them unless low and high, given by you, go beyond
+  drops them unless low and high, given by you, go beyond; keep of an mv says that no rest of it is a stop of the plant
 step, good_percent, remark: the smallest difference of two readings, the share of good ones, what was seen; only to
   read. docs/tag_table.md says more"""
 
