@@ -8,6 +8,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Literal
 
@@ -85,6 +86,17 @@ class Tag:
         return Signal(self.name or safe_name(self.tag), self.unit, low, high)
 
 
+class Look(Enum):
+    """What the readings of a tag look like."""
+
+    TEXTS = "texts instead of numbers"
+    NOTHING = "no good reading"
+    CONSTANT = "constant"
+    LABEL = "a label, a counter or a switch"  # none is a signal
+    STEPS = "moves in steps"
+    MOVES = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Guess:
     """One line of the table: the tag as guessed, and what its readings look like."""
@@ -92,7 +104,17 @@ class Guess:
     tag: Tag
     step: float  # smallest difference of two values; 0 where it has none
     good: float  # share of good readings
-    remark: str
+    look: Look = Look.MOVES
+    notes: tuple[str, ...] = ()
+
+    @property
+    def remark(self) -> str:
+        """What was seen and guessed, for a person."""
+        return "; ".join(filter(None, (self.look.value, *self.notes)))
+
+    def as_role(self, role: str, note: str = "") -> Guess:
+        """The guess with another role, and a note on why."""
+        return replace(self, tag=replace(self.tag, role=role), notes=(*self.notes, *filter(None, [note])))
 
 
 def safe_name(tag: str) -> str:
