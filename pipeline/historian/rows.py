@@ -144,6 +144,8 @@ def _remedy(counts: NDArray[np.int64]) -> str:
         return "leave fewer modes out: give --without-mode for fewer of them"
     if most == Reason.GAP or not causes[most]:
         return "name fewer tags, or a longer --hold"
+    if most == Reason.EMPTY:
+        return "name fewer tags, or a longer --hold where an empty cell says that nothing changed"
     return "name fewer tags, or export them again"
 
 

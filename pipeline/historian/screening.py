@@ -90,7 +90,7 @@ def screened(
     drawn = [own[t.tag] for t in tags if t.role in {"pv", "dv"}]
     held = [own[t.tag] for t in tags if t.role in {"mv", "sp", "mode"}]
     pvs = [own[t.tag] for t in tags if t.role == "pv"]
-    step = proposed_period(pvs)
+    step = proposed_period(pvs, [own[t.tag] for t in tags if t.role == "mv"])
     pace = pace_of(own, tags, step)
     period = period_s or pace.period(step)
     findings += of_period(pace, period, step, given=period_s is not None)
