@@ -43,7 +43,7 @@ def table_from(path: Path, tags: Sequence[Tag], where: str, period_s: float | No
 def proposals(of: Description) -> list[Guess]:
     """Inputs as MVs, outputs as PVs, and the other variables without a role, as far as they could be a PV."""
     found = [v for v in of.variables.values() if v.causality in PROPOSED]
-    return [Guess(_tag(v), 0.0, 1.0, _remark(v)) for v in sorted(found, key=lambda v: v.causality)]
+    return [Guess(_tag(v), 0.0, 1.0, notes=(_remark(v),)) for v in sorted(found, key=lambda v: v.causality)]
 
 
 def write_table(path: Path, fmu: Path) -> int:

@@ -36,7 +36,7 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
         moved = zip(test.names, test.units, test.sizes, strict=True)
         sizes = ", ".join(f"{mv} by up to {axis_label(f'{size:.3g}', unit)} to each side" for mv, unit, size in moved)
         print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h; "
-              f"it moves {sizes}")  # fmt: skip
+              f"it moves {sizes}{test.reading}")  # fmt: skip
 
 
 def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:

@@ -39,6 +39,8 @@ CONVERSIONS: dict[str, tuple[float, float]] = {
     "x 3.6": (3.6, 0.0),
     "/ 3.6": (1 / 3.6, 0.0),
 }
+TEMPERATURES = frozenset({"degc", "°c", "c", "deg c", "celsius", "k", "kelvin", "degf", "°f", "f", "deg f", "grd", "°"})
+"""Units of temperatures, in small letters: their zero is no nothing."""
 MV_CONVERSIONS = ("x 100", "/ 100", "x 1000", "/ 1000")  # of a value that jumps whenever it is moved
 JUMP_SD, JUMP_SPAN = 15.0, 0.5  # a change of unit moves the value by more than these
 MATCH_SD, MATCH_SHARE = 6.0, 0.05  # how near the conversion must come: noise, and share of the jump

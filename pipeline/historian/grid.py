@@ -38,6 +38,15 @@ class Grid:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    def known(self, tag: str) -> Array:
+        """The tag's values (n,), NaN where it has a reason or stands at its end; its own array where it never does.
+
+        At the end it answers to nothing.
+        """
+        code = self.code[tag]
+        out = (code != 0) | self.limits[tag] if tag in self.limits else code != 0
+        return np.where(out, np.nan, self.value[tag]) if out.any() else self.value[tag]
+
     def lighten(self, tag: str) -> None:
         """Keep single precision of a long tag: enough for what is only drawn from here on."""
         if len(self) > LONG:

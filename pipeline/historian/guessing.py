@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from pipeline.historian.linear import fitted
 from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import proposed_period
-from pipeline.historian.tags import GUESSED_PAD, Guess, Tag
+from pipeline.historian.tags import GUESSED_PAD, Guess, Look, Tag
 from pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
@@ -29,14 +28,33 @@ ENDINGS: tuple[tuple[str, str], ...] = (
     (r"(^|[ ._:/-])(op|out|mv|co|valve|stellwert|y)([ ._:/-]|$)", "mv"),
     (r"(^|[ ._:/-])(pv|cv|me|meas|istwert|x)([ ._:/-]|$)", "pv"),
 )
-FLOW = re.compile(r"flow|flu(ss|ß)|^f[a-z]{0,3}[ _-]?[0-9]", re.IGNORECASE)
-FLOW_UNIT = re.compile(r"^(n?m3|n?m³|k?g|t|m?l|lb|gal|k?mol|scf)/(s|sec|min|h|hr|d|day)$", re.IGNORECASE)
-LABEL = re.compile(
-    r"(^|[ ._:/-])(batch|lot|charge|campaign|grade|product|recipe|phase|shift|state|status|code|count(er)?|no|nr|id)"
-    r"([ ._:/-]|$)",
+ATTRIBUTE = re.compile(r"([ ._:/-](?:mode|sp|op|out|mv|co|pv))[./#](cv|f_cv|value|val|actual)$", re.IGNORECASE)
+"""The current value of a parameter, as SP.CV and MODE.ACTUAL: the parameter's name says what it is."""
+FLOW = re.compile(
+    r"flow|flu(ss|ß)|(zu|ab|aus|ein)lauf|durchsatz|feed|discharge|throughput|d[ée]bit|caudal|portata"
+    r"|^f[a-z]{0,3}[ _-]?[0-9]",
     re.IGNORECASE,
 )
-COUNTED = "a label, a counter or a switch"  # the remark on a column of which none is a signal
+FLOW_UNIT = re.compile(
+    r"^((n|s|k|kn|ks)?m3|(n|s|k|kn|ks)?m³|k?g|t|[mhn]?l|lbs?|gal|bbl|k?mol|[ak]?scf|cf|ft3|ft³)"
+    r"/(s|sec|min|mn|h|hr|hour|std|d|day|tag)$"
+    r"|^((us|imp)?gp[mhd]|[ns]?lp[mh]|[as]?cf[mh]|sccm|slm|[mk]?scfd|bpd|mgd|tph|kgh|m3h)$",
+    re.IGNORECASE,
+)
+NO_FLOW = re.compile(
+    r"temp|level|niveau|f(ü|ue)llstand|press|druck|conc|speed|drehzahl|valve|ventil|vanne|v[áa]lvula|valvola|stell|damper",
+    re.IGNORECASE,
+)
+"""Words of other quantities: F101 Temp is a temperature, and a flow valve moves one."""
+LABEL = re.compile(
+    r"(^|[ ._:/-])("
+    r"batch|lot|campaign|grade|product|recipe|phase|shift|crew|order|state|status|alarm|fault|code|count(er)?"
+    r"|(charge|los|produkt|rezept|sorte|schicht|auftrag|artikel|kampagne|phase|schritt|zustand|st(ö|oe)rung|z(ä|ae)hler)\w*"
+    r"|\w+nummer|recette|produit|[ée]quipe|num[ée]ro|lote|receta|producto|turno|lotto|ricetta|prodotto"
+    r")([ ._:/-]|$)"
+    r"|(^|[ ._:/-])(no|nr|id|n°|nº)\.?$",
+    re.IGNORECASE,
+)
 HELD_SHARE = 0.9  # of the readings equal to the one before: moved in steps
 LEAST_GOOD = 0.5  # share of the readings of a tag that is tried as a disturbance
 MOST_TRIED, MOST_READINGS = 60, 20_000
@@ -49,28 +67,37 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     found = [_guess(s, units.get(name, "")) for name, s in export.series.items()]
     found = _flows_without_loop([_cascaded(g, found) for g in found])
     if not any(g.tag.role == "mv" for g in found):  # names say nothing: what moves in steps may be one
-        moved = [g for g in found if not g.tag.role and g.remark.startswith("moves in steps")]
+        moved = [g for g in found if not g.tag.role and g.look is Look.STEPS]
         moved = [g for g in moved if not _is_flow(g)] or moved  # a feed that others set, where a valve is there
-        found = [
-            replace(g, tag=replace(g.tag, role="mv"), remark=f"{g.remark}; guessed: moves in steps".strip("; "))
-            if g in moved
-            else g
-            for g in found
-        ]
+        found = [g.as_role("mv", "guessed: moves in steps") if g in moved else g for g in found]
     if not any(g.tag.role == "pv" for g in found):
-        loops = {m["loop"] for g in found if g.tag.role in {"mv", "sp"} and (m := LOOP.match(g.tag.tag))}
+        loops = {loop for g in found if g.tag.role in {"mv", "sp"} and (loop := _loop(g.tag.tag))}
         free = [g for g in found if not g.tag.role and g.good > 0 and g.step >= 0 and g.tag.low is not None]
-        free = [g for g in free if not g.remark.startswith(COUNTED)]
+        free = [g for g in free if g.look is not Look.LABEL]
         own = [g for g in free if g.tag.tag in loops] or [g for g in free if not _is_flow(g)][:1] or free[:1]
-        found = [replace(g, tag=replace(g.tag, role="pv")) if g in own else g for g in found]
+        found = [g.as_role("pv") if g in own else g for g in found]
     # A variable that looks like a PV and answers to nothing may drift as the PVs do: no guess makes it a cause of them.
     taken = {g.tag.tag for g in found if g.tag.role == "pv"}
     return disturbances(without_answers(found, export), export, taken)
 
 
+def _parameter(tag: str) -> str:
+    """The tag without the attribute of a parameter, as TIC-1/SP of TIC-1/SP.CV."""
+    return ATTRIBUTE.sub(r"\1", tag)
+
+
+def _loop(tag: str) -> str:
+    """The loop that a tag belongs to by its name, as TIC-1 of TIC-1.SP and TIC-1/SP.CV; empty where it names none."""
+    match = LOOP.match(_parameter(tag))
+    return match["loop"] if match else ""
+
+
 def _is_flow(guess: Guess) -> bool:
-    """Whether a tag is a flow by its name or its unit."""
-    return bool(FLOW.search(guess.tag.tag) or FLOW_UNIT.match(guess.tag.unit))
+    """Whether a tag is a flow by its unit, or by its name where the unit does not say another."""
+    unit = guess.tag.unit.strip()
+    if FLOW_UNIT.match(unit):
+        return True
+    return unit in {"", "%", "-", "1"} and bool(FLOW.search(guess.tag.tag)) and not NO_FLOW.search(guess.tag.tag)
 
 
 def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
@@ -78,28 +105,22 @@ def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
 
     An outflow through an MV's valve follows the MV, and a feed disturbs: neither is what a controller shall hold.
     """
-    matches = {g.tag.tag: m["loop"] for g in found if (m := LOOP.match(g.tag.tag))}
-    held = {matches[g.tag.tag] for g in found if g.tag.role in {"sp", "mv", "mode"} and g.tag.tag in matches}
-    alone = [g for g in found if g.tag.role == "pv" and _is_flow(g) and matches.get(g.tag.tag, g.tag.tag) not in held]
+    held = {loop for g in found if g.tag.role in {"sp", "mv", "mode"} and (loop := _loop(g.tag.tag))}
+    alone = [g for g in found if g.tag.role == "pv" and _is_flow(g) and (_loop(g.tag.tag) or g.tag.tag) not in held]
     if all(g in alone for g in found if g.tag.role == "pv"):
         return list(found)
-    words = "a flow without a loop of its own: role pv if it is to be controlled"
-    return [
-        replace(g, tag=replace(g.tag, role=""), remark=f"{g.remark}; {words}".strip("; ")) if g in alone else g
-        for g in found
-    ]
+    note = "a flow without a loop of its own: role pv if it is to be controlled"
+    return [g.as_role("", note) if g in alone else g for g in found]
 
 
 def _cascaded(guess: Guess, found: Sequence[Guess]) -> Guess:
     """The guess; an MV where it is the set point of a loop of which nothing else is there: a lower loop follows it."""
-    match = LOOP.match(guess.tag.tag)
-    if guess.tag.role != "sp" or match is None or guess.tag.low is None:
+    loop = _loop(guess.tag.tag)
+    if guess.tag.role != "sp" or not loop or guess.tag.low is None:
         return guess
-    own = [g for g in found if g is not guess and (m := LOOP.match(g.tag.tag)) and m["loop"] == match["loop"]]
-    if own or any(g.tag.tag == match["loop"] for g in found):
+    if any(loop in {_loop(g.tag.tag), g.tag.tag} for g in found if g is not guess):
         return guess
-    words = "guessed: the set point of a loop of which nothing else is here"
-    return replace(guess, tag=replace(guess.tag, role="mv"), remark=f"{guess.remark}; {words}".strip("; "))
+    return guess.as_role("mv", "guessed: the set point of a loop of which nothing else is here")
 
 
 def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
@@ -119,11 +140,8 @@ def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
     still = [name for name in pvs if not _answers(grid.value[name], u, run)]
     if len(still) == len(pvs):
         return list(found)
-    words = "answers to no MV; role dv if it disturbs what the MVs move, pv if an MV moves it all the same"
-    return [
-        replace(g, tag=replace(g.tag, role=""), remark=f"{g.remark}; {words}".strip("; ")) if g.tag.tag in still else g
-        for g in found
-    ]
+    note = "answers to no MV; role dv if it disturbs what the MVs move, pv if an MV moves it all the same"
+    return [g.as_role("", note) if g.tag.tag in still else g for g in found]
 
 
 def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
@@ -135,13 +153,8 @@ def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
 
 def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:
     """The tags, the PVs whose loop has a set point before the others."""
-    loops = {m["loop"] for t in tags if t.role == "sp" and (m := LOOP.match(t.tag))}
-
-    def after(tag: Tag) -> bool:
-        match = LOOP.match(tag.tag)
-        return tag.role == "pv" and not (match is not None and match["loop"] in loops)
-
-    return tuple(sorted(tags, key=after)) if loops else tuple(tags)
+    loops = {loop for t in tags if t.role == "sp" and (loop := _loop(t.tag))}
+    return tuple(sorted(tags, key=lambda t: t.role == "pv" and _loop(t.tag) not in loops)) if loops else tuple(tags)
 
 
 def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] = ()) -> list[Guess]:
@@ -151,8 +164,8 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     """
     pvs, mvs = ([g.tag.tag for g in found if g.tag.role == role] for role in ("pv", "mv"))
     free = [g.tag.tag for g in found if not g.tag.role and g.good > LEAST_GOOD and g.tag.low is not None]
-    counted = {g.tag.tag for g in found if g.remark.startswith(COUNTED)}
-    free = [tag for tag in free if tag not in taken and tag not in counted]
+    labels = {g.tag.tag for g in found if g.look is Look.LABEL}
+    free = [tag for tag in free if tag not in taken and tag not in labels]
     if not pvs or not mvs or not free:
         return list(found)
     roles = dict.fromkeys(pvs, "pv") | dict.fromkeys(mvs, "mv") | dict.fromkeys(free[:MOST_TRIED], "dv")
@@ -172,14 +185,7 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
             seen = model is not None and model.strength[len(mvs)] > STRONG and name not in consequences
             if seen and follows(grid.value[name], y, grid.piece) < FOLLOWS and name not in causes:
                 causes[name] = pv
-    return [
-        replace(
-            g, tag=replace(g.tag, role="dv"), remark=f"{g.remark}; guessed: {causes[g.tag.tag]} answers".strip("; ")
-        )
-        if g.tag.tag in causes
-        else g
-        for g in found
-    ]
+    return [g.as_role("dv", f"guessed: {causes[g.tag.tag]} answers") if g.tag.tag in causes else g for g in found]
 
 
 def _excerpt(series: Series, role: str) -> Series:
@@ -193,32 +199,31 @@ def _excerpt(series: Series, role: str) -> Series:
 
 def _guess(series: Series, unit: str) -> Guess:
     tag, good = series.tag, float(series.good.mean()) if len(series) else 0.0
-    role = next((r for pattern, r in ENDINGS if re.search(pattern, tag, re.IGNORECASE)), "")
+    role = next((r for pattern, r in ENDINGS if re.search(pattern, _parameter(tag), re.IGNORECASE)), "")
     texts, counts = sum(series.texts.values()), series.counts()
     if texts > 0.5 * len(series):
-        words = ", ".join(t for t, _ in series.texts.most_common(4))
+        words = (", ".join(t for t, _ in series.texts.most_common(4)),)
         if role == "mode":
-            return Guess(Tag(tag, role, unit), 0.0, 1.0 - counts.get("empty", 0) / len(series), f"texts: {words}")
-        return Guess(Tag(tag, "", unit), 0.0, good, f"texts: {words}")
+            good = 1.0 - counts.get("empty", 0) / len(series)
+        return Guess(Tag(tag, "mode" if role == "mode" else "", unit), 0.0, good, Look.TEXTS, words)
     if not series.good.any():
-        return Guess(Tag(tag, "", unit), 0.0, good, "no good reading")
+        return Guess(Tag(tag, "", unit), 0.0, good, Look.NOTHING)
     plain, codes, found = _plain(series, Tag(tag, role, unit))
-    remarks = []
+    look, notes = Look.MOVES, list[str]()
     still = np.abs(np.diff(plain)) <= 0
     if np.ptp(plain) == 0:
-        remarks.append("constant")
-        role = "" if role == "pv" else role
+        look, role = Look.CONSTANT, "" if role == "pv" else role
     elif not role and _counts(tag, plain):
-        remarks.append(COUNTED)
+        look = Look.LABEL
     elif still.mean() >= HELD_SHARE:
-        remarks.append("moves in steps")
+        look = Look.STEPS
     if found:
-        remarks.append("codes: " + ", ".join(found))
+        notes.append("codes: " + ", ".join(found))
     if texts:
-        remarks.append("texts: " + ", ".join(repr(t) for t, _ in series.texts.most_common(3)))
+        notes.append("texts: " + ", ".join(repr(t) for t, _ in series.texts.most_common(3)))
     low, high = _range(plain, unit, role)
     kept = good - float(codes.mean())
-    return Guess(Tag(tag, role, unit, low, high), smallest_difference(plain), kept, "; ".join(remarks))
+    return Guess(Tag(tag, role, unit, low, high), smallest_difference(plain), kept, look, tuple(notes))
 
 
 def _counts(tag: str, plain: Array) -> bool:

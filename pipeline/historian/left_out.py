@@ -47,6 +47,14 @@ def _seconds(moment: datetime | float, text: str, export: Export, first_s: float
     return (moment if moment.tzinfo is not None else moment.replace(tzinfo=export.local or UTC)).timestamp()
 
 
+def interval_text(first_s: float, end_s: float, export: Export) -> str:
+    """An interval [s] as `--leave-out` takes it: dates as the export writes them, to the second, or seconds."""
+    if not export.zone:
+        return f"{first_s:.10g}..{end_s:.10g}"
+    first, end = (datetime.fromtimestamp(t, export.local or UTC) for t in (np.floor(first_s), np.ceil(end_s)))
+    return f"{first:%Y-%m-%dT%H:%M:%S}..{end:%Y-%m-%dT%H:%M:%S}"
+
+
 def flag_readings(series: Iterable[Series], spans: Sequence[Span], reason: Reason) -> None:
     """Give the good readings within the spans their reason."""
     for one in series:

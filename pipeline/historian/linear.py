@@ -215,7 +215,11 @@ def _sums(u: Array) -> Array:
 
 
 def least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Coefficients and their covariance, from the rows whose residual is within OUTSIDE_SD of a first fit."""
+    """Coefficients and their covariance, from the rows whose residual is within OUTSIDE_SD of a first fit.
+
+    From all rows where the first fit is exact, as of a column that copies another: only its ridge is left then, which
+    moves all residuals to one side.
+    """
     scale = np.abs(x).max(axis=0)
     scale[scale == 0] = 1.0  # an input that never moves
     z = x / scale
@@ -229,6 +233,8 @@ def least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.boo
         residual = target - z @ theta
         used, sd = keep, _robust_sd(residual)
         keep = np.abs(residual) <= max(OUTSIDE_SD * sd, 1e-12 * np.abs(target).max())
+        if 2 * np.count_nonzero(keep) < len(keep):
+            break
     variance = float(np.mean(residual[used] ** 2)) * used.sum() / max(used.sum() - z.shape[1], 1)
     return theta / scale, variance * inverse / np.outer(scale, scale), used
 

@@ -12,8 +12,9 @@ from pipeline.errors import RecordError
 from pipeline.historian.excerpt import SEEN
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
-from pipeline.historian.grid import Grid, resampled
+from pipeline.historian.grid import resampled
 from pipeline.historian.linear import Linear, fitted
+from pipeline.historian.rows import stretches
 from pipeline.historian.sampling import NICE_S
 from pipeline.historian.settled import certain, grows
 from pipeline.historian.tags import Tag
@@ -134,17 +135,20 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
     pv, mv, dv = ([series[t.tag] for t in tags if t.role == role] for role in ("pv", "mv", "dv"))
     cut = _excerpt(pv, (*pv, *mv, *dv), step_s)
     try:
-        grid, _ = resampled([cut[s.tag] for s in (*pv, *dv)], [cut[s.tag] for s in mv], step_s)
+        grid, rates = resampled([cut[s.tag] for s in (*pv, *dv)], [cut[s.tag] for s in mv], step_s)
     except RecordError:  # of the record's own rows, whose period a person may have given, it is raised again
         return Pace()
+    # A sensor that is stuck would answer to nothing, and make the plant seem to settle otherwise in rows thinned out.
+    stretches(grid, [t for t in tags if t.tag in grid.value], {rate.tag: rate for rate in rates})
+    known = {tag: grid.known(tag) for tag in grid.value}
     names, inputs = [s.tag for s in pv], [s.tag for s in (*mv, *dv)]
-    spans = np.array([_span(grid.value[tag]) for tag in inputs])
+    spans = np.array([_span(known[tag]) for tag in inputs])
     found: dict[tuple[str, str], list[tuple[int, bool, float]]] = {}
     thinned: dict[int, tuple[dict[str, Array], NDArray[np.int64]]] = {}
     for factor in FACTORS:
         if factor > 1 and len(grid) < factor * LEAST_ROWS:
             break
-        thinned[factor] = value, run = _thinned(grid, {s.tag for s in mv}, factor)
+        thinned[factor] = value, run = _thinned(known, grid.piece, {s.tag for s in mv}, factor)
         for name in names:
             model = fitted(value[name], [value[tag] for tag in inputs], run)
             if model is not None:
@@ -161,7 +165,7 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
             kind = found[name, moved][-1][1]
             sure = certain(value[name], u, run, i, rows) if kind else grows(value[name], u, run, i)
             answers[sure].append(Answer(name, moved, n * step_s, shown))
-    hold = min((_hold(grid.value[s.tag], grid.piece) for s in mv), default=np.inf) * step_s
+    hold = min((_hold(known[s.tag], grid.piece) for s in mv), default=np.inf) * step_s
     return Pace(tuple(answers[True]), hold, tuple(answers[False]))
 
 
@@ -181,20 +185,20 @@ def _excerpt(clock: Sequence[Series], series: Sequence[Series], step_s: float) -
     return {s.tag: cut(s) for s in series}
 
 
-def _thinned(grid: Grid, held: set[str], factor: int) -> tuple[dict[str, Array], NDArray[np.int64]]:
-    """Values (m,) of the grid's tags by ``factor`` rows, and the pieces (m,): means, as ``resampled`` takes them.
+def _thinned(
+    value: dict[str, Array], piece: NDArray[np.int64], held: set[str], factor: int
+) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    """Values (m,) of tags, (n,) each, by ``factor`` rows, and the pieces (m,): means, as ``resampled`` takes them.
 
     Row k has what is ``held`` from its time on, and the others up to its time.
     """
     if factor == 1:
-        return grid.value, grid.piece
-    place = np.arange(len(grid)) - np.searchsorted(grid.piece, grid.piece)
+        return value, piece
+    place = np.arange(len(piece)) - np.searchsorted(piece, piece)
     row = np.flatnonzero(place % factor == factor - 1)
-    row = row[row + factor <= len(grid)]
-    row = row[grid.piece[row + factor - 1] == grid.piece[row]]
-    return {
-        tag: _means(v, row if tag in held else row - factor + 1, factor) for tag, v in grid.value.items()
-    }, grid.piece[row]
+    row = row[row + factor <= len(piece)]
+    row = row[piece[row + factor - 1] == piece[row]]
+    return {tag: _means(v, row if tag in held else row - factor + 1, factor) for tag, v in value.items()}, piece[row]
 
 
 def _means(v: Array, first: NDArray[np.int64], n: int) -> Array:

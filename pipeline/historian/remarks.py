@@ -74,8 +74,12 @@ def of_notes(export: Export) -> list[Finding]:
 
 
 def of_rows(series: Sequence[Series], period_s: float, step_s: float) -> list[Finding]:
-    """PVs sampled at a rate that is no whole part of the record's: their rows lie between readings."""
-    if whole_multiple(period_s, step_s) or sampling(series[0]).irregular:
+    """PVs whose rows lie between readings: stored as lines, or at a rate that is no whole part of the record's."""
+    rate = sampling(series[0])
+    if rate.irregular and not rate.dead_band and period_s == step_s < rate.step_s:
+        words = f"rows of {period_s:g} s lie on the lines between stored readings; --period says another"
+        return [Finding("drawn", series[0].tag, words)]
+    if whole_multiple(period_s, step_s) or rate.irregular:
         return []
     better = max(1, round(period_s / step_s)) * step_s
     words = (

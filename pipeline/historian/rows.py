@@ -18,12 +18,12 @@ from pipeline.historian.grid import Grid
 from pipeline.historian.missing_codes import PERCENT
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import Sampling
-from pipeline.historian.tags import GUESSED_PAD, Tag
+from pipeline.historian.tags import GUESSED_PAD, KEEP, Tag
 from pipeline.metrics import Array
 from pipeline.records.record import Record
 from serving.manifest import Signal
 
-KEEP = "where the plant ends there, as a tank that overflows, write keep into column ends of the table of tags"
+OVERFLOWS = f"where the plant ends there, as a tank that overflows, {KEEP}"
 SHORTEST_RUN = 20  # rows
 PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
 
@@ -67,8 +67,8 @@ def _of_ends(tag: Tag, ends: Sequence[tuple[float, int]], *, kept: bool) -> str:
         return f"stands at a limit of the plant: {places}; these rows stay"
     given = [v for v in (tag.low, tag.high) if v is not None and any(abs(v - end) <= 1e-6 * abs(v) for end, _ in ends)]
     if given:
-        return f"stands at the end of its range: {places}; {KEEP}"
-    return f"stands at its lowest or highest value: {places}, taken for the end of the transmitter's range; {KEEP}"
+        return f"stands at the end of its range: {places}; {OVERFLOWS}"
+    return f"stands at its lowest or highest value: {places}, taken for the end of the transmitter's range; {OVERFLOWS}"
 
 
 def _within_its_range(tag: Tag, values: Array, ends: Sequence[float]) -> bool:
@@ -144,6 +144,8 @@ def _remedy(counts: NDArray[np.int64]) -> str:
         return "leave fewer modes out: give --without-mode for fewer of them"
     if most == Reason.GAP or not causes[most]:
         return "name fewer tags, or a longer --hold"
+    if most == Reason.EMPTY:
+        return "name fewer tags, or a longer --hold where an empty cell says that nothing changed"
     return "name fewer tags, or export them again"
 
 

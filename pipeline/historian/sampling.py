@@ -22,7 +22,9 @@ HOLD_PERIODS = 3.2
 IRREGULAR = 2.5  # 90 % over 10 % quantile of the steps, above which a tag reports by exception
 EDGE = 0.35  # smallest moves over the median one, of a tag with a dead band
 RESTED, LONGEST, ON_TIME, FEWEST = 2.0, 0.999, 0.02, 15  # of the shortest step; of the longest; share of such; moves
-FAR, TO_AND_FRO = 5.0, 0.55  # scans between two steps, and share of the moves that go back
+FAR, TO_AND_FRO = 5.0, 0.6  # scans between two steps, and share of the moves that go back
+ROWS_A_LINE, MOST_ROWS_A_LINE = 4, 16  # rows on the median line of a PV that is drawn, and on the mean one
+FINEST = 1e-3  # of the median step: an archive's scan
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +44,13 @@ def sampling(series: Series, period_s: float | None = None, hold_s: float | None
     Without a stated one, three steps of a tag sampled regularly; of one that reports by exception, twice the 99 %
     quantile of its steps.
     """
-    once = series.code != Reason.DUPLICATE
-    step = np.diff(series.time_s[once])
+    stamps = _stamps(series)
+    step = np.diff(stamps)
     step = step[step > 0]
     if not step.size:
         return Sampling(series.tag, 0.0, False, False, hold_s or HOLD_PERIODS * (period_s or 1.0))
     low, median, high = np.quantile(step[:: max(1, len(step) // 200_000)], [0.1, 0.5, 0.9])
-    irregular = bool(high > IRREGULAR * low) and not keeps_time(_stamps(series))
+    irregular = bool(high > IRREGULAR * low) and not keeps_time(stamps)
     own = 2.0 * float(np.quantile(step, 0.99)) if irregular else HOLD_PERIODS * float(median)
     stored = series.time_s[series.good], series.value[series.good]
     band = irregular and len(stored[0]) > 1 and _is_held(np.diff(stored[0]), stored[1])
@@ -79,22 +81,41 @@ def _is_held(step: Array, values: Array) -> bool:
     return bool(scan > 0 and np.quantile(step, 0.05) >= FAR * scan and back.mean() > TO_AND_FRO)
 
 
-def proposed_period(series: Sequence[Series]) -> float:
+def proposed_period(series: Sequence[Series], others: Sequence[Series] = ()) -> float:
     """The period [s] that the PVs' own steps propose: the slowest PV's, exactly where its clock keeps time.
 
-    The median step of a PV that keeps none.
+    The median step of a PV that keeps none; of one that is drawn on lines, a part of it, a multiple of the scan: that
+    of its stamps, or the step of ``others`` that keep time. A swinging door stores nothing for long where the PV goes
+    straight, and says all the same where it was.
     """
-    steps = [s for s in (_step(one) for one in series) if s > 0]
+    regular = [r.step_s for r in map(sampling, others) if r.step_s and not r.irregular]
+    steps = [s for s in (_step(one, min(regular, default=0.0)) for one in series) if s > 0]
     if not steps:
         raise RecordError("no process variable has two readings of different times; export a longer time")
     return max(steps)
 
 
-def _step(series: Series) -> float:
+def _step(series: Series, scan_s: float) -> float:
     rate = sampling(series)
+    if rate.irregular and not rate.dead_band:
+        return _part_of_a_line(_stamps(series), scan_s)
     exact = None if rate.irregular or not rate.step_s else exact_step(_stamps(series))
     return float(f"{rate.step_s:.6g}") if exact is None else exact
 
 
+def _part_of_a_line(stamps: Array, scan_s: float) -> float:
+    """Rows [s] with which some lie on the lines between stamps (n,), a whole number of scans; a line where none is."""
+    step = np.diff(stamps)
+    step = step[step > 0]
+    median = float(np.median(step))
+    own = quantum(step)
+    scan = own if own > FINEST * median else scan_s  # finer ones are jitter, or the digits of the stamps
+    if not 0 < scan < median:
+        return float(f"{median:.6g}")
+    part = max(median / ROWS_A_LINE, float(np.mean(step)) / MOST_ROWS_A_LINE)
+    return float(f"{max(round(part / scan), 1) * scan:.6g}")
+
+
 def _stamps(series: Series) -> Array:
-    return series.time_s[series.code != Reason.DUPLICATE]
+    """Times (m,) [s] at which the tag was stored: a cell that stays empty until the value changes is no reading."""
+    return series.time_s[(series.code != Reason.DUPLICATE) & (series.code != Reason.EMPTY)]

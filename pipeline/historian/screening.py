@@ -22,7 +22,7 @@ from pipeline.historian.few_levels import with_levels
 from pipeline.historian.findings import Finding, Screening, TagReport
 from pipeline.historian.free_run import believed
 from pipeline.historian.grid import Grid, resampled
-from pipeline.historian.left_out import flag_readings, flag_rows, of_left_out, spans_of
+from pipeline.historian.left_out import flag_readings, flag_rows, interval_text, of_left_out, spans_of
 from pipeline.historian.linear import Linear
 from pipeline.historian.loads import with_load_moves
 from pipeline.historian.modes import check_modes
@@ -39,7 +39,6 @@ from pipeline.historian.stopped import of_zeros
 from pipeline.historian.tags import Tag
 from pipeline.historian.unmoved import of_answers
 from pipeline.historian.wandering import of_levels, of_quick_models
-from pipeline.metrics import Array
 from pipeline.records.record import Record
 
 LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
@@ -79,7 +78,7 @@ def screened(
     findings: list[Finding] = [*of_notes(export), *of_files(export, tags)]
     spans = spans_of(leave_out, export)
     flag_readings(own.values(), spans, Reason.LEFT_OUT)
-    stopped, stop = stops(own, tags)
+    stopped, stop = stops(own, tags, lambda first_s, end_s: interval_text(first_s, end_s, export))
     flag_readings(own.values(), stopped, Reason.STOP)
     findings += stop
     findings += drop_copies(own, tags)
@@ -91,7 +90,7 @@ def screened(
     drawn = [own[t.tag] for t in tags if t.role in {"pv", "dv"}]
     held = [own[t.tag] for t in tags if t.role in {"mv", "sp", "mode"}]
     pvs = [own[t.tag] for t in tags if t.role == "pv"]
-    step = proposed_period(pvs)
+    step = proposed_period(pvs, [own[t.tag] for t in tags if t.role == "mv"])
     pace = pace_of(own, tags, step)
     period = period_s or pace.period(step)
     findings += of_period(pace, period, step, given=period_s is not None)
@@ -176,26 +175,16 @@ def screened(
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
     """Stretches in which PVs and inputs contradict each other are masked, slow motion without the inputs is named."""
     inputs = [t.tag for t in signals if t.role != "pv"]
-    u = [_kept(grid, t) for t in inputs]
+    u = [grid.known(t) for t in inputs]
     pvs = [t.tag for t in signals if t.role == "pv"]
-    answers = {tag: explained(_kept(grid, tag), u, grid.piece) for tag in pvs}
+    answers = {tag: explained(grid.known(tag), u, grid.piece) for tag in pvs}
     expected = {tag: values for tag, (values, _) in answers.items()}
     settling = {tag: rows for tag, (_, rows) in answers.items()}
     found = contradict(grid, signals, expected, settling)
     for tag in pvs:
-        y = _kept(grid, tag)
+        y = grid.known(tag)
         found += of_levels(tag, y, expected[tag], float(np.ptp(usual(y))), settling[tag])
     return found
-
-
-def _kept(grid: Grid, tag: str) -> Array:
-    """The tag's values (n,), NaN where it has a reason or stands at its end; the grid's own array where it never does.
-
-    At the end it answers to nothing.
-    """
-    code = grid.code[tag]
-    out = (code != 0) | grid.limits[tag] if tag in grid.limits else code != 0
-    return np.where(out, np.nan, grid.value[tag]) if out.any() else grid.value[tag]
 
 
 def models_of(record: Record) -> dict[str, Linear | None]:

@@ -1,77 +1,152 @@
-"""Stops of the plant: MVs rest at an end, the other signals leave where they work; with the warm-up after each."""
+"""Stops of the plant: MVs rest at an end or the feed is off, and the PVs leave where they work; with the warm-up."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.historian.cells import TEMPERATURES
 from pipeline.historian.character import runs_of
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
+from pipeline.historian.guessing import seen_range
 from pipeline.historian.pace import in_words
-from pipeline.historian.tags import Tag
+from pipeline.historian.tags import KEEP, Tag
 from pipeline.metrics import Array
 
 Where = NDArray[np.bool_]
+Band = tuple[float, float]
+Rows = tuple[int, int]  # from the first to before the second
 
 SAMPLES = 100_000  # of the time of the record
 SHORTEST, BACK = 20, 10  # rows of a stop, and rows in a row that the signals work again
 MOST_SHARE = 0.3  # of the rows: more is how the plant is run
 OUTER = 0.02  # quantile at each end of the band where a signal works
-AT_END, NONE = 0.01, 0.2  # of an MV's span at its end; of a disturbance's usual value, a flow that stopped
-PAD, FAR = 0.25, 1.0  # widths of that band beyond it: away; far away, where no disturbance tells a stop
+AT_END = 0.01  # of an MV's span at its end
+OFF, QUIET = 0.02, 0.05  # of a feed's usual value, and of its band: below both it is off, and at rest
+PAD, FAR = 0.25, 1.0  # widths of a signal's band beyond it: away; far away
 BEYOND_MV = 2.0  # how much farther than the MVs, in widths of the band each: no answer goes so far
+ARRIVED, LONG = 0.1, 5.0  # of a PV's way: it has come to rest; and times the way, a rest that no test holds
 MOSTLY = 0.5  # of a stop's rows
+NAMED = 3  # stops whose times are named
 
 
-def stops(own: Mapping[str, Series], tags: Sequence[Tag]) -> tuple[list[tuple[float, float]], list[Finding]]:
-    """Spans [s] of time in which the plant stood still and warmed up again, and a finding for them.
+@dataclass(frozen=True, slots=True)
+class _Plant:
+    """The values (n,) of all signals at one clock, their bands where the plant works, and their usual values."""
 
-    A stop is a rest of all MVs, each at zero or at an end of its stated range, in which several signals leave the band
-    where they work: a measured disturbance near zero and a PV, or else all PVs by more than MVs explain. The largest
-    move of a record is no end of a range: such rows say most of the plant.
-    The warm-up lasts until each of them is back in its band.
+    value: Mapping[str, Array]
+    band: Mapping[str, Band]
+    usual: Mapping[str, float]
+    tags: Mapping[str, Tag]
+
+    def of(self, role: str) -> list[str]:
+        return [tag for tag in self.value if self.tags[tag].role == role]
+
+    def beyond(self, tag: str, rows: Rows) -> Array:
+        """How far a signal is outside its band in some rows (m,), in widths of the band."""
+        v, (low, high) = self.value[tag][slice(*rows)], self.band[tag]
+        width = max(high - low, 1e-9 * max(abs(low), abs(high), 1e-300))
+        return np.maximum(np.maximum(low - v, v - high), 0.0) / width
+
+    def away(self, rows: Rows) -> list[str]:
+        """PVs and disturbances that have left their bands."""
+        return [t for role in ("pv", "dv") for t in self.of(role) if np.mean(self.beyond(t, rows) > PAD) > MOSTLY]
+
+    def off(self, tag: str, rows: Rows) -> bool:
+        """Whether a feed is off: near zero beside its usual value, and at rest. A temperature has no zero."""
+        if self.tags[tag].unit.strip().casefold() in TEMPERATURES:
+            return False
+        v, (low, high) = self.value[tag][slice(*rows)], self.band[tag]
+        spread = float(np.ptp(np.quantile(v, [0.05, 0.95])))
+        most = OFF * abs(self.usual[tag])
+        return abs(float(np.median(v))) < most and spread <= QUIET * max(high - low, most)
+
+    def far(self, rows: Rows, beyond: float = FAR) -> bool:
+        """Whether every PV is far outside its band, in the median by more than ``beyond`` widths."""
+        return all(float(np.median(self.beyond(tag, rows))) > max(FAR, beyond) for tag in self.of("pv"))
+
+
+def stops(
+    own: Mapping[str, Series], tags: Sequence[Tag], text_of: Callable[[float, float], str]
+) -> tuple[list[tuple[float, float]], list[Finding]]:
+    """Spans [s] of time in which the plant stood still and warmed up again, and findings for them and for what may be.
+
+    A stop is one of these:
+
+    - A measured disturbance is off, as a feed that stopped; all MVs rest somewhere, and all PVs have left the band
+      where they work. A PV is enough where all MVs rest at zero or at an end of their stated range.
+    - All MVs rest at such an end, well outside of where they work, and all PVs are far outside of theirs: farther than
+      MVs explain, or for so much longer than they took to get there that it is no test.
+
+    The warm-up lasts until each signal that was away is back in its band. Other long rests far outside are named with
+    the ``--leave-out`` that takes them: the largest move of a record may say most of the plant. ``text_of`` writes a
+    span [s] as FROM..TO. A tag of an MV whose ``ends`` say keep tells no stop.
     """
-    groups = {r: [t.tag for t in tags if t.role == r and own[t.tag].good.any()] for r in ("pv", "mv", "dv")}
-    if not groups["pv"] or not groups["mv"]:
+    known = {t.tag: t for t in tags if t.role in {"pv", "mv", "dv"} and own[t.tag].good.any()}
+    mvs = [t for t in known.values() if t.role == "mv"]
+    pvs = [t for t in known.values() if t.role == "pv"]
+    if not pvs or not mvs or any(t.ends == "keep" for t in mvs):
         return [], []
-    time_s = own[groups["pv"][0]].time_s
+    time_s = own[pvs[0].tag].time_s
     time_s = np.unique(time_s[:: max(1, len(time_s) // SAMPLES)])
-    value = {tag: _held(own[tag], time_s) for group in groups.values() for tag in group}
-    resting = np.ones(len(time_s), dtype=bool)
-    stated = {t.tag: [end for end in (t.low, t.high) if end is not None] for t in tags}
-    for tag in groups["mv"]:
-        u = value[tag]
-        near = AT_END * float(np.ptp(u))
-        resting &= np.min([np.abs(u - end) for end in (0.0, *stated[tag])], axis=0) <= near
-    start, end = runs_of(resting)
-    long = end - start >= SHORTEST
-    rests = list(zip(start[long].tolist(), end[long].tolist(), strict=True))
-    stopped = _spread_over(len(time_s), rests)
-    if not rests or stopped.mean() > MOST_SHARE:
+    value = {tag: _held(own[tag], time_s) for tag in known}
+    at_end = _rests([_near(value[t.tag], (0.0, *_stated(t, own[t.tag]))) for t in mvs])
+    at_own = _rests([_near(value[t.tag], (value[t.tag].min(), value[t.tag].max())) for t in mvs])
+    off = [rows for t in known.values() if t.role == "dv" for rows in _rests([_is_off(value[t.tag])])]
+    if not (at_end or at_own or off):
         return [], []
-    whole = stopped
+    rests = _spread_over(len(time_s), [*at_end, *off])
+    whole = rests
     for _ in range(2):  # the warm-up is where no signal works: the second time it is left out of the bands
-        bands = {tag: _band(v[~whole]) for tag, v in value.items()}
-        found = [
-            (a, b, away)
-            for a, b in rests
-            if (away := _away({t: v[a:b] for t, v in value.items()}, bands, groups, _usual(value, ~whole)))
-        ]
-        spans = [_with_warm_up(a, b, [value[t] for t in away], [bands[t] for t in away]) for a, b, away in found]
-        whole = stopped | _spread_over(len(time_s), spans)
-    if not found or _spread_over(len(time_s), spans).mean() > MOST_SHARE:
-        return [], []
+        working = {tag: v[~whole] for tag, v in value.items()}
+        plant = _Plant(
+            value, {t: _band(v) for t, v in working.items()}, {t: _usual(v) for t, v in working.items()}, known
+        )
+        found = _joined(
+            [rows for rows in at_end if _is_stop(plant, rows)] + [r for r in off if _without_feed(plant, r)]
+        )
+        spans = [_with_warm_up(plant, rows) for rows in found]
+        whole = rests | _spread_over(len(time_s), spans)
+    if _spread_over(len(time_s), spans).mean() > MOST_SHARE:
+        found, spans = [], []
     step = float(np.median(np.diff(time_s)))
-    times = [(float(time_s[a]) - 0.5 * step, float(time_s[b - 1]) + 0.5 * step) for a, b in spans]
-    stood = in_words(float(sum(time_s[b - 1] - time_s[a] for a, b, _ in found)))
-    lost = in_words(float(sum(b - a for a, b in times)))
-    names = ", ".join(dict.fromkeys(t for *_, away in found for t in (*groups["mv"], *away)))
-    many = f"{len(found)} stops" if len(found) > 1 else "a stop"
-    words = f"{many} of the plant: the MVs rest for {stood}; with the warm-up after it {lost} are left out"
-    return times, [Finding("stop", names, words, True)]
+    seconds = [(float(time_s[a]) - 0.5 * step, float(time_s[b - 1]) + 0.5 * step) for a, b in spans]
+    stood = sum(float(time_s[b - 1] - time_s[a]) for a, b in found)
+    away = [t.tag for t in mvs] + [tag for rows in found for tag in plant.away(rows)]
+    findings = [_of_stops(list(dict.fromkeys(away)), seconds, stood, text_of)] if found else []
+    taken = _spread_over(len(time_s), spans)
+    perhaps = [r for r in at_end if plant.far(r)] + [r for r in at_own if plant.far(r) and _is_long(plant, r)]
+    perhaps = _joined([_with_warm_up(plant, r) for r in perhaps if not taken[slice(*r)].any()])
+    texts = [text_of(float(time_s[a]) - 0.5 * step, float(time_s[b - 1]) + 0.5 * step) for a, b in perhaps]
+    return seconds, findings + _of_rests(pvs, mvs, texts)
+
+
+def _of_stops(
+    tags: Sequence[str], spans: Sequence[tuple[float, float]], stood_s: float, text_of: Callable[[float, float], str]
+) -> Finding:
+    when = ", ".join(text_of(*span) for span in spans[:NAMED]) + ", ..." * (len(spans) > NAMED)
+    many = f"{len(spans)} stops of the plant, together" if len(spans) > 1 else "a stop of the plant, of"
+    words = (
+        f"{many} {in_words(stood_s)}; {in_words(sum(b - a for a, b in spans))} are left out with the warm-up, {when}; "
+        f"where the plant worked, {KEEP}"
+    )
+    return Finding("stop", ", ".join(tags), words, True)
+
+
+def _of_rests(pvs: Sequence[Tag], mvs: Sequence[Tag], texts: Sequence[str]) -> list[Finding]:
+    """What a person may leave out: stretches that may be a stop of the plant, or say most of it."""
+    if not texts:
+        return []
+    options = " ".join(f"--leave-out {text}" for text in texts[:NAMED])
+    words = (
+        f"far outside of where it works while {', '.join(t.tag for t in mvs)} rests at an end: was that a stop of the "
+        f"plant? {options} leaves it out"
+    )
+    return [Finding("rest", ", ".join(t.tag for t in pvs), words)]
 
 
 def _held(series: Series, at: Array) -> Array:
@@ -81,52 +156,99 @@ def _held(series: Series, at: Array) -> Array:
     return series.value[good][np.maximum(place, 0)]
 
 
-def _usual(value: Mapping[str, Array], working: Where) -> dict[str, float]:
-    return {tag: float(np.median(v[working])) for tag, v in value.items()}
+def _near(u: Array, ends: Sequence[float]) -> Where:
+    return np.min([np.abs(u - end) for end in ends], axis=0) <= AT_END * float(np.ptp(u))
 
 
-def _spread_over(n: int, stretches: Sequence[tuple[int, int]]) -> Where:
+def _stated(tag: Tag, series: Series) -> list[float]:
+    """The ends of an MV's range that somebody stated: the table writes its lowest and highest reading as a guess."""
+    ends = [end for end in (tag.low, tag.high) if end is not None]
+    if len(ends) < 2 or tag.unit == "%":
+        return ends
+    seen = seen_range(series)
+    return [] if seen is not None and np.allclose(seen, ends, rtol=1e-5, atol=0.0) else ends
+
+
+def _is_off(v: Array) -> Where:
+    """Where a disturbance (n,) is near zero, beside what it usually is."""
+    return np.abs(v) < OFF * abs(_usual(v))
+
+
+def _usual(v: Array) -> float:
+    return float(np.median(v))
+
+
+def _rests(where: Sequence[Where]) -> list[Rows]:
+    """Stretches of at least SHORTEST rows in which all of ``where``, (n,) each, hold; none where that is usual."""
+    both = np.all(where, axis=0)
+    start, end = runs_of(both)
+    long = end - start >= SHORTEST
+    found = list(zip(start[long].tolist(), end[long].tolist(), strict=True))
+    return found if _spread_over(len(both), found).mean() <= MOST_SHARE else []
+
+
+def _spread_over(n: int, stretches: Sequence[Rows]) -> Where:
     where = np.zeros(n, dtype=bool)
     for a, b in stretches:
         where[a:b] = True
     return where
 
 
-def _band(working: Array) -> tuple[float, float]:
+def _joined(stretches: Sequence[Rows]) -> list[Rows]:
+    """The stretches in order, those that overlap as one."""
+    n = max((b for _, b in stretches), default=0)
+    start, end = runs_of(_spread_over(n, stretches))
+    return list(zip(start.tolist(), end.tolist(), strict=True))
+
+
+def _band(working: Array) -> Band:
     low, high = np.quantile(working, [OUTER, 1 - OUTER])
     return float(low), float(high)
 
 
-def _beyond(v: Array, band: tuple[float, float]) -> Array:
-    """How far values (n,) are outside the band, in its widths."""
-    width = max(band[1] - band[0], 1e-9 * max(abs(band[0]), abs(band[1]), 1e-300))
-    return np.maximum(np.maximum(band[0] - v, v - band[1]), 0.0) / width
+def _is_stop(plant: _Plant, rows: Rows) -> bool:
+    """Whether a rest of all MVs at an end is a stop."""
+    away = plant.away(rows)
+    pvs = plant.of("pv")
+    if any(t in pvs for t in away) and any(plant.off(t, rows) for t in away if t not in pvs):
+        return True  # a load that is as large as never before is none
+    beyond = max(float(np.median(plant.beyond(tag, rows))) for tag in plant.of("mv"))
+    if beyond <= PAD:  # it works there: a valve that is closed in cold weather
+        return False
+    return plant.far(rows, BEYOND_MV * beyond) or (beyond > FAR and plant.far(rows) and _is_long(plant, rows))
 
 
-def _away(
-    value: Mapping[str, Array],
-    bands: Mapping[str, tuple[float, float]],
-    groups: Mapping[str, Sequence[str]],
-    usual: Mapping[str, float],
-) -> list[str]:
-    """The PVs and disturbances that have left their bands in a rest of the MVs; none where it is no stop."""
-    beyond = {tag: _beyond(v, bands[tag]) for tag, v in value.items()}
-    away = [tag for role in ("pv", "dv") for tag in groups[role] if np.mean(beyond[tag] > PAD) > MOSTLY]
-    pvs = [tag for tag in groups["pv"] if tag in away]
-    if pvs and any(abs(float(np.median(value[tag]))) < NONE * abs(usual[tag]) for tag in away if tag not in pvs):
-        return away  # a load that is as large as never before is none
-    explained = BEYOND_MV * max(float(np.median(beyond[tag])) for tag in groups["mv"])
-    far = [tag for tag in pvs if float(np.median(beyond[tag])) > max(FAR, explained)]
-    return away if far and far == list(groups["pv"]) else []
+def _without_feed(plant: _Plant, rows: Rows) -> bool:
+    """Whether the feed is off in some rows while the MVs rest wherever they are, and all PVs are away."""
+    away = plant.away(rows)
+    if not all(t in away for t in plant.of("pv")) or not any(plant.off(t, rows) for t in plant.of("dv")):
+        return False
+    for tag in plant.of("mv"):
+        u = plant.value[tag]
+        v = u[slice(*rows)]
+        if np.mean(np.abs(v - np.median(v)) <= AT_END * float(np.ptp(u))) <= MOSTLY:
+            return False
+    return True
 
 
-def _with_warm_up(
-    first: int, last: int, values: Sequence[Array], bands: Sequence[tuple[float, float]]
-) -> tuple[int, int]:
+def _is_long(plant: _Plant, rows: Rows) -> bool:
+    """Whether a rest is longer by far than the PVs took to get to where they stay in it: no test holds for so long."""
+    took = 1
+    for tag in plant.of("pv"):
+        v = plant.value[tag][slice(*rows)]
+        end = float(np.median(v[len(v) // 2 :]))
+        on_its_way = np.abs(v - end) > ARRIVED * abs(v[0] - end)
+        took = max(took, int(np.argmin(on_its_way)))
+    return rows[1] - rows[0] > LONG * took
+
+
+def _with_warm_up(plant: _Plant, rows: Rows) -> Rows:
     """The rest, from where the first signal leaves its band before it to where all are back in theirs for BACK rows."""
-    inside = np.all([_beyond(v, band) == 0 for v, band in zip(values, bands, strict=True)], axis=0)
-    wide = np.all([_beyond(v, band) <= PAD for v, band in zip(values, bands, strict=True)], axis=0)
+    first, last = rows
+    n = len(next(iter(plant.value.values())))
+    beyond = [plant.beyond(tag, (0, n)) for tag in plant.away(rows)]
+    inside, wide = np.all([b == 0 for b in beyond], axis=0), np.all([b <= PAD for b in beyond], axis=0)
     while first > 0 and not wide[first - 1]:
         first -= 1
     run = np.convolve(inside[last:], np.ones(BACK), "valid") == BACK
-    return first, last + int(np.argmax(run)) if run.any() else len(inside)
+    return first, last + int(np.argmax(run)) if run.any() else n

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.historian.excitation import SEEN
 from pipeline.historian.findings import InputReport
+from pipeline.metrics import Array
 
 MOVES = 24  # random ones
 AMPLITUDE, LARGEST = 0.05, 0.12  # of the range, to each side of the present value
@@ -38,11 +39,17 @@ class StepTest:
     hold_s: tuple[float, ...]
     values: tuple[tuple[float, ...], ...]
     ramp_s: tuple[float, ...]
+    reading_s: float = 0.0  # [s] at most between readings of the test, where the record's rows are too long for it
 
     @property
     def hours(self) -> float:
         """Length of the whole test."""
         return (self.start_s[-1] + self.hold_s[-1]) / 3600.0
+
+    @property
+    def reading(self) -> str:
+        """The end of a sentence on how often its readings must come, where holds are few rows of the record."""
+        return f"; export it with a reading every {self.reading_s:.3g} s or less" if self.reading_s else ""
 
     @property
     def sizes(self) -> tuple[float, ...]:
@@ -74,7 +81,8 @@ def planned(
     """Steps around the present values: first one MV at a time, then all at random, from a fixed seed.
 
     Amplitude: AMPLITUDE of the range, LARGEST where no answer was seen; more where loads would hide the answer, up to
-    MOST, or up to LARGEST where the gain is not certain. Holds: HOLDS of ``usual_hold``. ``fastest``: MV -> its largest
+    MOST, or up to LARGEST where the gain is not certain. Holds: HOLDS of ``usual_hold``, LEAST_PERIODS rows at least,
+    or fewer where the test would take longer than LONGEST_H, ramps apart. ``fastest``: MV -> its largest
     change in a minute; a step beyond it becomes a ramp, and its hold begins when the ramp has ended.
     """
     mvs = [i for i in inputs if i.role == "mv"]
@@ -98,12 +106,24 @@ def planned(
     one_period = change <= rates * period_s * (1 + 1e-9)
     needed = np.where(one_period, 0.0, change / rates).max(axis=1)  # [s]
     ramps = np.ceil(needed / period_s - 1e-9) * period_s
-    hold_s = tuple(
-        float(max(LEAST_PERIODS, round(h / period_s)) * period_s + r) for h, r in zip(holds, ramps, strict=True)
-    )
+    rows = _rows_of(np.array(holds), period_s)
+    hold_s = tuple(float(n * period_s + r) for n, r in zip(rows, ramps, strict=True))
     start = tuple(float(t) for t in np.r_[0.0, np.cumsum(hold_s[:-1])])
     names, units = tuple(i.name for i in mvs), tuple(i.unit for i in mvs)
-    return StepTest(names, units, start, hold_s, tuple(values), tuple(map(float, ramps)))
+    reading_s = period_s * float(rows.min()) / LEAST_PERIODS if rows.min() < LEAST_PERIODS else 0.0
+    return StepTest(names, units, start, hold_s, tuple(values), tuple(map(float, ramps)), reading_s)
+
+
+def _rows_of(hold_s: Array, period_s: float) -> Array:
+    """Rows (n,) of each hold (n,) [s], together within LONGEST_H as far as whole rows allow."""
+    longest = LONGEST_H * 3600.0
+    hold_s = hold_s * min(1.0, longest / float(hold_s.sum()))
+    for least in range(LEAST_PERIODS, 0, -1):
+        for whole in (np.round, np.floor):
+            rows = np.maximum(whole(hold_s / period_s), least)
+            if rows.sum() * period_s <= longest:
+                return rows
+    return rows
 
 
 def usual_hold(inputs: Sequence[InputReport], period_s: float) -> tuple[float, int]:
@@ -111,15 +131,18 @@ def usual_hold(inputs: Sequence[InputReport], period_s: float) -> tuple[float, i
 
     The settling time, where it is certain; else UNKNOWN_PERIODS, or a longer guess of it as far as the test does not
     take longer than GUESSED_H. A plant whose settling time is certain and long has FEWEST random moves, and shorter
-    holds where the test would take longer than LONGEST_H.
+    holds where the test would take longer than LONGEST_H. A record of long rows has fewer random moves too, so that
+    each is held for LEAST_PERIODS of them.
     """
     mvs = [i for i in inputs if i.role == "mv"]
     alone = 2 + 3 * ALONE * len(mvs)  # holds outside the random moves
-    many = alone + MOVES * float(np.mean(HOLDS))
     certain = max((i.settling_s for i in mvs), default=0.0)
     if certain <= 0:
+        most = LONGEST_H * 3600 * min(HOLDS) / (LEAST_PERIODS * period_s)  # of all holds within the longest test
+        moves = int(np.clip((most - alone) / np.mean(HOLDS), FEWEST, MOVES))
+        many = alone + moves * float(np.mean(HOLDS))
         guess = min(max((i.uncertain_s for i in mvs), default=0.0), GUESSED_H * 3600 / many)
-        return min(max(guess, UNKNOWN_PERIODS * period_s), LONGEST_H * 3600 / many), MOVES
+        return min(max(guess, UNKNOWN_PERIODS * period_s), LONGEST_H * 3600 / many), moves
     longest = LONGEST_H * 3600 / certain  # holds within the longest test
     moves = int(np.clip((longest - alone) / np.mean(HOLDS), FEWEST, MOVES))
     return min(certain, LONGEST_H * 3600 / (alone + moves * float(np.mean(HOLDS)))), moves

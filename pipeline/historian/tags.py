@@ -8,6 +8,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +24,7 @@ SIGNAL_ROLES = ("pv", "mv", "dv")
 COMMANDS = ("command_low", "command_high", "max_move_per_min")  # of an MV, for the controller
 WORDS = {"between": ("step", "line"), "ends": ("keep", "drop")}  # of columns that say how readings are taken
 GUESSED_PAD = 0.25  # of the usual span, beyond it, in the range that the table guesses
+KEEP = "write keep into column ends of the table of tags, which `loopwright new` without roles writes for --tags"
 CERTAIN = {"": False, "no": False, "yes": True}
 NUMBERS = ("low", "high", *COMMANDS)
 COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "step", "good_percent", "remark")
@@ -40,7 +42,7 @@ unit_certain: yes where no reading can be in another unit; empty lets the screen
 between: line or step, how a tag that is stored by exception or compressed goes from one reading to the next; empty
   guesses
 ends: keep or drop rows at the lowest or highest value, a limit of the plant or the end of the transmitter; empty
-  drops them unless low and high, given by you, go beyond
+  drops them unless low and high, given by you, go beyond; keep of an mv says that no rest of it is a stop of the plant
 step, good_percent, remark: the smallest difference of two readings, the share of good ones, what was seen; only to
   read. docs/tag_table.md says more"""
 
@@ -85,6 +87,17 @@ class Tag:
         return Signal(self.name or safe_name(self.tag), self.unit, low, high)
 
 
+class Look(Enum):
+    """What the readings of a tag look like."""
+
+    TEXTS = "texts instead of numbers"
+    NOTHING = "no good reading"
+    CONSTANT = "constant"
+    LABEL = "a label, a counter or a switch"  # none is a signal
+    STEPS = "moves in steps"
+    MOVES = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Guess:
     """One line of the table: the tag as guessed, and what its readings look like."""
@@ -92,7 +105,17 @@ class Guess:
     tag: Tag
     step: float  # smallest difference of two values; 0 where it has none
     good: float  # share of good readings
-    remark: str
+    look: Look = Look.MOVES
+    notes: tuple[str, ...] = ()
+
+    @property
+    def remark(self) -> str:
+        """What was seen and guessed, for a person."""
+        return "; ".join(filter(None, (self.look.value, *self.notes)))
+
+    def as_role(self, role: str, note: str = "") -> Guess:
+        """The guess with another role, and a note on why."""
+        return replace(self, tag=replace(self.tag, role=role), notes=(*self.notes, *filter(None, [note])))
 
 
 def safe_name(tag: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.historian.guessing import guesses
+from pipeline.historian.linear import fitted
 from pipeline.historian.reading import read_export, units_of
 
 N = 3000
@@ -30,6 +31,9 @@ def tank() -> dict[str, np.ndarray]:
         "batch": 4711 + np.arange(N) // 333.0,
         "switch": np.arange(N) // 500 % 2.0,
         "grade": np.repeat(random.integers(1, 5, N // 250), 250).astype(float),
+        "whole": np.round(valve),
+        "sp": np.repeat(random.uniform(4, 6, N // 100), 100).round(1),
+        "mode": np.where(np.arange(N) % 900 < 800, "AUTO", "MAN"),
         "two": np.where(valve > 50, 55.0, 45.0),
     }
 
@@ -37,8 +41,10 @@ def tank() -> dict[str, np.ndarray]:
 def roles(path: Path, columns: dict[str, str]) -> dict[str, str]:
     """Guessed roles of an export of some columns of the tank, by their heads."""
     data = tank()
-    table = np.column_stack([10.0 * np.arange(N), *(data[key] for key in columns.values())])
-    np.savetxt(path, table, delimiter=",", header=",".join(["time_s", *columns]), comments="", fmt="%.6g")
+    columns_of = [10 * np.arange(N), *(data[key] for key in columns.values())]
+    texts = [[v if isinstance(v, str) else f"{v:.6g}" for v in column.tolist()] for column in columns_of]
+    lines = [",".join(["time_s", *columns]), *map(",".join, zip(*texts, strict=True))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return {g.tag.tag: g.tag.role for g in guesses(read_export([path]), units_of([path]))}
 
 
@@ -58,12 +64,50 @@ def test_a_flow_with_a_loop_of_its_own_is(tmp_path: Path) -> None:
     assert roles(tmp_path / "export.csv", heads)["FIC-2.PV"] == "pv"
 
 
-@pytest.mark.parametrize("head", ["Batch", "Product grade", "Mixer on"])
+@pytest.mark.parametrize("flow", ["Débit sortie", "Ablauf", "Durchsatz", "Product [gpm]", "Gas [kNm³/h]", "F-2"])
+def test_a_flow_is_told_in_many_ways(flow: str, tmp_path: Path) -> None:
+    found = roles(tmp_path / "export.csv", {flow: "out", "Quality": "level", "Vanne": "valve"})
+    assert list(found.values()) == ["", "pv", "mv"]
+
+
+@pytest.mark.parametrize("head", ["F101 Temp", "F1-T [degC]", "Flow box level", "FI-7 [bar]"])
+def test_another_quantity_is_no_flow(head: str, tmp_path: Path) -> None:
+    found = roles(tmp_path / "export.csv", {head: "level", "LC": "out", "valve": "valve"})
+    assert found[head.partition(" [")[0]] == "pv"
+
+
+@pytest.mark.parametrize("head", ["ID-fan", "Fan No 1 speed", "Speed no 1"])
+def test_a_number_within_a_name_makes_no_label(head: str, tmp_path: Path) -> None:
+    found = roles(tmp_path / "export.csv", {"Temp": "level", head: "whole"})
+    assert found == {"Temp": "pv", head: "mv"}
+
+
+def test_the_current_value_of_a_parameter_is_its_role(tmp_path: Path) -> None:
+    heads = {"T1/PID1/PV.CV": "level", "T1/PID1/SP.CV": "sp", "T1/PID1/OUT.CV": "valve", "T1/PID1/MODE.ACTUAL": "mode"}
+    assert list(roles(tmp_path / "export.csv", heads).values()) == ["pv", "sp", "mv", "mode"]
+
+
+LABELS = {"Batch": "batch", "Product grade": "grade", "Mixer on": "switch"}
+LABELS |= dict.fromkeys(
+    ["Produktnummer", "Rezept", "Sorte", "Schicht", "Recette", "Lote", "Batch ID", "Lot nr."], "grade"
+)
+
+
+@pytest.mark.parametrize("head", LABELS)
 def test_a_label_is_no_mv(head: str, tmp_path: Path) -> None:
-    label = {"Batch": "batch", "Product grade": "grade", "Mixer on": "switch"}[head]
+    label = LABELS[head]
     found = roles(tmp_path / "export.csv", {head: label, "LI-1 [m]": "level", "HV-1 [%]": "valve"})
     assert found == {head: "", "LI-1": "pv", "HV-1": "mv"}
 
 
 def test_an_mv_of_two_values_is_one(tmp_path: Path) -> None:
     assert roles(tmp_path / "export.csv", {"LI-1 [m]": "level", "HV-1 [%]": "two"})["HV-1"] == "mv"
+
+
+@pytest.mark.parametrize("seed", [5, 8, 20, 37, 43])
+def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
+    """The fit is exact but for its ridge: once no row was left of it, and `new` ended without a table."""
+    u = np.repeat(np.round(np.clip(np.random.default_rng(seed).normal(50, 15, 70), 5, 95), 1), 60)[:4000]
+    model = fitted(u, [u], np.zeros(len(u), dtype=np.int64))
+    assert model is not None
+    assert max(model.strength[0], model.ahead[0][0]) > 1e3

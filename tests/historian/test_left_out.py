@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -72,11 +73,14 @@ def test_dates_need_an_export_with_dates(tmp_path: Path) -> None:
         screen_of(data.with_(time_s=data.time_s - START_S), tmp_path, leave_out=[DATES])
 
 
-def with_a_stop(seed: int, first: int = 2000, last: int = 2700) -> tuple[Clean, np.ndarray]:
-    """A plant without feed and heat for a while, cooling down, and heated up again; where (n,) it is at work."""
+def with_a_stop(seed: int, first: int = 2000, last: int = 2700, rest: float = 0.0) -> tuple[Clean, np.ndarray]:
+    """A plant without feed and heat for a while, cooling down, and heated up again; where (n,) it is at work.
+
+    The valve rests at ``rest`` [%].
+    """
     random, n = np.random.default_rng(seed), 5000
     mv, dv = steps(random, n, 25, 75), 500 + steps(random, n, -50, 50)
-    mv[first:last], dv[first:last] = 0.0, 0.0
+    mv[first:last], dv[first:last] = rest, 0.0
     mv[last : last + 40], dv[last : last + 40] = 60.0, np.linspace(0, 500, 40)
     y = np.full(n, 60.0)
     for k in range(n - 1):
@@ -94,9 +98,9 @@ def stopped(found: Screened) -> np.ndarray:
     return found.code == Reason.STOP
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_stop_is_called_one_and_goes_with_its_warm_up(seed: int, tmp_path: Path) -> None:
-    data, work = with_a_stop(seed)
+@pytest.mark.parametrize(("seed", "rest"), [(0, 0.0), (1, 0.0), (2, 0.0), (0, 3.0), (1, 15.0)])
+def test_a_stop_is_called_one_and_goes_with_its_warm_up(seed: int, rest: float, tmp_path: Path) -> None:
+    data, work = with_a_stop(seed, rest=rest)
     found = screen_of(data, tmp_path)
     assert [f.kind for f in found.report.findings if f.kind in {"stop", "sentinel", "zero", "unlike"}] == ["stop"]
     assert np.mean(stopped(found)[~work]) > 0.98
@@ -124,3 +128,63 @@ def test_the_largest_moves_of_a_record_are_no_stop(tmp_path: Path) -> None:
     pv = np.round(answer(mv, dv) + load + random.normal(0, 0.1, n), 3)
     data = Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(dv, 2))
     assert not stopped(screen_of(data, tmp_path)).any()
+
+
+def regulated(seed: int, first: int, last: int, valve: float) -> Clean:
+    """A valve that works from 40 to 50 %, and stands at ``valve`` from row ``first`` to ``last``; the feed goes on."""
+    random, n = np.random.default_rng(seed), 4000
+    mv, dv = steps(random, n, 40, 50), 500 + random.normal(0, 5, n)
+    mv[first:last] = valve
+    pv = np.round(answer(mv, dv) + random.normal(0, 0.1, n), 3)
+    return Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(dv, 2))
+
+
+def test_a_shut_valve_for_long_is_a_stop_though_the_feed_goes_on(tmp_path: Path) -> None:
+    found = screen_of(regulated(0, 2000, 2600, 0.0), tmp_path)
+    rows = np.flatnonzero(stopped(found))
+    assert abs(rows[0] - 2000) <= 3
+    assert 2600 < rows[-1] < 2650
+    (stop,) = [f for f in found.report.findings if f.kind == "stop"]
+    assert "2024-03-04T09:19:57..2024-03-04T10:2" in stop.words
+    kept = (TAGS[0], replace(TAGS[1], ends="keep"), TAGS[2])
+    assert not stopped(screen_of(regulated(0, 2000, 2600, 0.0), tmp_path, kept)).any()
+
+
+@pytest.mark.parametrize("valve", [0.0, 100.0])
+def test_a_test_at_an_end_stays_and_a_line_asks_about_it(valve: float, tmp_path: Path) -> None:
+    tags = (TAGS[0], replace(TAGS[1], low=0.0, high=100.0), TAGS[2])
+    found = screen_of(regulated(1, 2000, 2060, valve), tmp_path, tags)
+    assert not stopped(found).any()
+    (rest,) = [f for f in found.report.findings if f.kind == "rest"]
+    left_out = rest.words.partition("--leave-out ")[2].split()[0]
+    asked = screen_of(regulated(1, 2000, 2060, valve), tmp_path, tags, leave_out=[left_out])
+    rows = np.flatnonzero(asked.code == Reason.LEFT_OUT)
+    assert abs(rows[0] - 2000) <= 5
+    assert 2060 < rows[-1] < 2100
+
+
+def test_a_range_that_the_table_guessed_states_no_end(tmp_path: Path) -> None:
+    """It writes an MV's lowest and highest reading as low and high, unless its unit is %."""
+    data = regulated(2, 2000, 2600, 70.0)
+    guess = replace(TAGS[1], unit="m3/h", low=float(data.mv.min()), high=70.0)
+    for tag, stops in ((guess, False), (replace(guess, low=0.0), True)):
+        assert bool(stopped(screen_of(data, tmp_path, (TAGS[0], tag, TAGS[2]))).any()) is stops
+
+
+def test_cold_weather_is_no_stop(tmp_path: Path) -> None:
+    """A cooling valve is closed, and the ambient temperature is nearly 0 degC: the plant works."""
+    random, n = np.random.default_rng(3), 3000
+    cold = np.interp(np.arange(n), [0, 1800, 1900, 2100, 2200, n], [15, 14, 0.3, 0.3, 15, 16])
+    ambient = cold + np.where((np.arange(n) > 1900) & (np.arange(n) < 2100), 0.02, 1.0) * random.normal(0, 1, n)
+    y, total, mv, pv = 20.0, 50.0, np.zeros(n), np.zeros(n)
+    for k in range(n):
+        error = y - (20 + (k // 100 % 3) - 1)
+        total = min(max(total + 0.8 * error, 0.0), 100.0)
+        mv[k] = np.round(np.clip(10 * error + total, 0, 100), 2)
+        y += 0.05 * (ambient[k] + 14 - y - 0.18 * mv[k])
+        pv[k] = round(y + 0.03 * random.normal(), 3)
+    assert np.mean(mv[1920:2100] == 0) > 0.9
+    data = Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(ambient, 2))
+    for unit in ("degC", ""):
+        found = screen_of(data, tmp_path, (*TAGS[:2], replace(TAGS[2], unit=unit)))
+        assert not stopped(found).any()

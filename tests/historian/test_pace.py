@@ -72,6 +72,20 @@ def test_a_slow_plant_with_noise_and_hum(seed: int, hold: tuple[int, int]) -> No
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_a_stuck_sensor_does_not_change_the_pace(seed: int) -> None:
+    u = steps(seed, 4000, 40, 80)
+    y = lagged(u, 30, dead_s=3) + noise(seed, len(u), 0.1)
+    stuck = y.copy()
+    stuck[2000:2120] = y[2000]
+    for values in (y, stuck):
+        found = pace([values], [u], 10.0)
+        assert found.period(10.0) == 10.0
+        assert found.slowest is not None
+        assert found.slowest.settles_s == pytest.approx(720, rel=0.1)
+        assert found.slowest.shown
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_a_dead_time_counts(seed: int) -> None:
     u = steps(seed, 20_000, 300, 1200)
     found = pace([lagged(u, 30, dead_s=150) + noise(seed, len(u), 0.3)], [u])

@@ -10,12 +10,12 @@ import pytest
 from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, clean, screen_of, steps
 
 from pipeline.errors import RecordError
-from pipeline.historian.export import Series
+from pipeline.historian.export import Export, Series
 from pipeline.historian.exported import exported, signal_tags
 from pipeline.historian.grid import resampled
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import sampling
-from pipeline.historian.screening import Screened
+from pipeline.historian.screening import Screened, screened
 from pipeline.historian.tags import Tag, named, read_tags
 
 PV, MV, DV = TAGS
@@ -140,6 +140,39 @@ def test_an_archive_is_read_as_it_stored_whatever_the_noise(archive, held: bool,
     grid, _ = resampled([clock, series], [], 5.0, hold_s=1e4)
     error = np.nanstd(grid.value["y"] - y)
     assert error < max(1.5 * noise, 0.3)
+
+
+@pytest.mark.parametrize("share", [0.005, 0.017, 0.03])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_compressed_pv_gets_rows_that_show_the_plant(share: float, seed: int) -> None:
+    """Its readings stand as far apart as the plant settles, and the lines between them tell what it does."""
+    random = np.random.default_rng(seed)
+    u = steps(random, 12_000, 20, 80)[::2].repeat(2)
+    y = np.full(len(u), 55.0)
+    for k in range(len(u) - 1):
+        y[k + 1] = y[k] + 0.03 * (20 + 0.8 * u[max(k - 2, 0)] - y[k])
+    t, v = 10.0 * np.arange(len(u)), np.round(y + random.normal(0, 0.05, len(u)), 3)
+    kept = swinging_door(v, share * float(np.ptp(v)))
+    series = {
+        "y": Series("y", t[kept], v[kept], np.zeros(len(kept), np.uint8)),
+        "u": Series("u", t, u, np.zeros(len(t), np.uint8)),
+    }
+    found = screened("x", Export(series, (), "wide", len(t), 0, 0), named((Tag("y", "pv"), Tag("u", "mv"))))
+    assert not found.report.tags[0].sampling.dead_band
+    assert found.report.period_s % 10.0 == 0
+    assert found.report.period_s <= found.report.tags[0].sampling.step_s / 3
+    assert found.report.verdict.inputs[0].gain["y"] == pytest.approx(0.8, rel=0.1)
+
+
+def test_cells_that_stay_empty_until_the_value_changes_are_held() -> None:
+    t, u = 10.0 * np.arange(1200), steps(np.random.default_rng(0), 1200, 20, 80)
+    y = np.round(answer(u, np.full(1200, 500.0)) + np.random.default_rng(1).normal(0, 0.1, 1200), 3)
+    same = np.r_[False, np.diff(u) == 0]
+    code = np.where(same, np.uint8(Reason.EMPTY), np.uint8(0)).astype(np.uint8)
+    series = {"y": Series("y", t, y, np.zeros(1200, np.uint8)), "u": Series("u", t, np.where(same, np.nan, u), code)}
+    found = screened("x", Export(series, (), "wide", 1200, 0, 0), named((Tag("y", "pv"), Tag("u", "mv"))))
+    assert found.report.kept_rows > 1150
+    np.testing.assert_array_equal(found.record.mv[:1000, 0], u[:1000])
 
 
 def test_what_was_said_of_a_tag_goes_before_the_guess() -> None:

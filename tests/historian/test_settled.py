@@ -92,7 +92,12 @@ def report_of(tmp_path: Path, **changed: object) -> InputReport:
 @pytest.mark.parametrize("settling", [{"settling_s": 0.0, "uncertain_s": 9e6, "certain": ()}, {"settling_s": 9e6}])
 def test_a_step_test_takes_hours(settling: dict[str, object], tmp_path: Path) -> None:
     report = report_of(tmp_path, **settling)
-    assert planned([report], [50.0], 30.0).hours < LONGEST_H * 1.05
+    assert planned([report], [50.0], 30.0).hours <= LONGEST_H
+    for period_s in (30.0, 60.0, 300.0, 600.0, 900.0, 1800.0, 3600.0):
+        test = planned([report] * 2, [50.0] * 2, period_s)
+        assert LONGEST_H / 4 < test.hours <= LONGEST_H
+        shortest = min(test.hold_s)
+        assert test.reading_s == (shortest / 5 if shortest < 5 * period_s else 0.0)
     guessed = planned([replace(report, settling_s=0.0, uncertain_s=300.0)], [50.0], 1.0)
     assert planned([replace(report, settling_s=300.0)], [50.0], 1.0).hours == guessed.hours
     assert planned([replace(report, settling_s=0.0, uncertain_s=9e6)], [50.0], 1.0).hours < GUESSED_H * 1.05
