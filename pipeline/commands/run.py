@@ -21,6 +21,7 @@ from pipeline.errors import ParamsError, PipelineError, nearest
 from pipeline.report.results import show_results, without_controller
 from pipeline.stages.check import mistakes
 from pipeline.stages.code import code as list_files
+from pipeline.stages.overview import brought_up
 
 ARTIFACTS = Path("artifacts")
 MANY = 25  # stages that a person does not read line by line
@@ -83,6 +84,9 @@ def _run(options: argparse.Namespace) -> int:
         # Somebody who asked for one case need not look for it in the table of all.
         asked = options.targets if targets and all(t.startswith("report@") for t in targets) else [None]
         part = targets and not any(t.startswith("report") for t in targets)
+        # The reports of some cases are no reason for DVC to make those of all, which the stage `overview` waits for.
+        if targets and not part and brought_up():
+            ask("commit", "--force", "overview", finish=True)
         if not part or any(ARTIFACTS.glob("*/validation.json")):
             for case in asked:
                 show_results(ARTIFACTS, case=case)

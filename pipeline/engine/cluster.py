@@ -6,6 +6,7 @@ TLS and all else of the connection is set as Dask sets it (``DASK_DISTRIBUTED__C
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import tempfile
@@ -29,6 +30,9 @@ MEMORY = {
     "MALLOC_TRIM_THRESHOLD_": str(512 * 1024**2),  # bytes at the end of it that are kept
     "MALLOC_ARENA_MAX": "1",  # for all threads: one of them computes
 }
+# What a browser that goes away while its page is being made raises is logged here; nothing of the run depends on the
+# page. Dask's own errors have loggers of their own.
+OF_THE_PAGE = ("tornado.application", "bokeh", "asyncio")
 # Read as distributed is imported. A long computation that holds the interpreter is no dead worker.
 CONFIG = {
     **{f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in MEMORY.items()},
@@ -62,6 +66,9 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] | Non
     from distributed import LocalCluster
 
     drawn = say is not None and _can_draw()
+    if drawn:
+        for name in OF_THE_PAGE:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     with tempfile.TemporaryDirectory(prefix="loopwright-workers-", ignore_cleanup_errors=True) as folder:
         cluster = LocalCluster(
             n_workers=0,

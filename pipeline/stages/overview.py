@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
+from pathlib import Path
 
 from pipeline.config.params import sections
 from pipeline.engine.command import run_stage
 from pipeline.evaluation.standing import Standing
-from pipeline.report.overview import write_overview
+from pipeline.evaluation.validation import FILE
+from pipeline.report.overview import PAGES, write_overview
 from pipeline.stages.paths import ARTIFACTS
 
 
 def overview() -> None:
-    """Write artifacts/report.html and artifacts/report.md."""
-    standings = [Standing.read(ARTIFACTS / case) for case in sections("cases")]
-    for path in write_overview(standings, ARTIFACTS):
+    """Write artifacts/report.html and artifacts/report.md. PipelineError where a case has no report."""
+    for path in _written(sections("cases")):
         print(path)
+
+
+def brought_up() -> bool:
+    """Write both pages over the cases that have a report, as after a run of one case; whether they have changed."""
+    pages = [ARTIFACTS / name for name in PAGES]
+    before = [page.read_bytes() if page.exists() else b"" for page in pages]
+    _written(case for case in sections("cases") if (ARTIFACTS / case / FILE).exists())
+    return before != [page.read_bytes() for page in pages]
+
+
+def _written(cases: Iterable[str]) -> list[Path]:
+    return write_overview([Standing.read(ARTIFACTS / case) for case in cases], ARTIFACTS)
 
 
 if __name__ == "__main__":

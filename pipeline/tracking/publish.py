@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,7 +26,8 @@ def publish(root: Path) -> dict[str, Any]:
 
     The receipt names what the store now holds by content (stage keys, controller digests), not by
     run ids, so it is the same after a deleted store was rebuilt. A result whose files on disk are
-    not those of dvc.lock (a stage that was killed) is left out, with a line saying so.
+    not those of dvc.lock (a stage that was killed, a case that never ran here) is left out; one line
+    counts these by case.
 
     Where the environment names a key (see ``pipeline.tracking.signing``), it signs the controllers.
 
@@ -37,8 +39,11 @@ def publish(root: Path) -> dict[str, Any]:
     for result in (r for r in results if r.case is not None and r.is_current(root)):
         by_case.setdefault(str(result.case), []).append(result)
     if by_case:
-        for name in [r.name for r in results if r.case is not None and r not in by_case.get(r.case, [])]:
-            _say(f"left out {name}: its files are not those of dvc.lock; `loopwright run` makes them anew")
+        if left := Counter(str(r.case) for r in results if r.case is not None and r not in by_case.get(r.case, [])):
+            stages = ", ".join(f"{n} of {case}" for case, n in left.items())
+            _say(
+                f"left out, their files are not those of dvc.lock (`loopwright run` makes them anew): stages, {stages}"
+            )
     else:
         _say(
             "nothing to publish: the results of dvc.lock are not here, as in a fresh clone; `loopwright run` makes them"

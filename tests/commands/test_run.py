@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,7 @@ def test_a_case_without_any_controller_ends_with_a_status_of_its_own(
     monkeypatch.setattr(run, "ask", lambda *_, **__: "")
     monkeypatch.setattr(run, "ask_in_turn", lambda *_: ["{}", ""])
     monkeypatch.setattr(run, "stages_of", lambda name: [f"report@{name}"])
+    monkeypatch.setattr(run, "brought_up", lambda: False)
     shown: list[str | None] = []
     monkeypatch.setattr(run, "show_results", lambda _, case: shown.append(case))
     folder = tmp_path / "artifacts" / "tank"
@@ -125,6 +127,28 @@ def test_a_case_without_any_controller_ends_with_a_status_of_its_own(
     (folder / "other.onnx").write_bytes(b"a controller")
     assert main(["run", "tank"]) == 0
     assert shown == ["tank", None, "tank"]
+
+
+def test_the_overview_follows_the_run_of_one_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """DVC makes the stage `overview` with the reports of all cases only: it is told that these pages are its output."""
+    told: list[tuple[str, ...]] = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run, "mistakes", list)
+    monkeypatch.setattr(run, "list_files", lambda: None)
+    monkeypatch.setattr(run, "ask", lambda *said, **_: told.append(said) or "")
+    monkeypatch.setattr(run, "status", lambda _: ({}, ""))
+    monkeypatch.setattr(run, "show_results", lambda *_, **__: None)
+    (tmp_path / "params.yaml").write_text("cases: {batch_reactor: {}, reversible_cstr: {}, thiosulfate_cstr: {}}\n")
+    for case in ("batch_reactor", "reversible_cstr"):
+        shutil.copytree(ROOT / "artifacts" / case, tmp_path / "artifacts" / case)
+    assert main(["run", "reversible_cstr"]) == 0
+    page = (tmp_path / "artifacts" / "report.md").read_text()
+    assert "(batch_reactor/report.md)" in page
+    assert "(reversible_cstr/report.md)" in page
+    assert ("commit", "--force", "overview") in told
+    told.clear()
+    assert main(["run", "reversible_cstr"]) == 0
+    assert ("commit", "--force", "overview") not in told
 
 
 def test_a_part_runs_where_no_report_was_made_yet(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import platform
 import resource
@@ -24,7 +25,16 @@ from dask_cluster import ROOT, Cluster, joined, two_workers  # noqa: F401
 from engine_pieces import fatal, pages_of, process_of, refuse, squares, sums_of_squares, waking_ms, watched
 from processes import within
 
-from pipeline.engine.cluster import ADDRESS, MEMORY, WORKERS, connected, disconnect, local_cluster, usual_workers
+from pipeline.engine.cluster import (
+    ADDRESS,
+    MEMORY,
+    OF_THE_PAGE,
+    WORKERS,
+    connected,
+    disconnect,
+    local_cluster,
+    usual_workers,
+)
 from pipeline.engine.fingerprint import fingerprint
 from pipeline.engine.parallel import _answers, parallel_map
 from pipeline.engine.pieces import Task
@@ -183,6 +193,8 @@ def test_a_cluster_of_this_machine_has_the_workers_asked_for_and_ends_with_its_b
         (line,) = said
         with urlopen(line.split()[-1], timeout=20) as page:
             assert b"Dask" in page.read()
+        # A browser that goes away early makes bokeh's handlers fail in a callback, whose traceback is logged here.
+        assert not any(logging.getLogger(name).isEnabledFor(logging.ERROR) for name in OF_THE_PAGE)
         connected(at).wait_for_workers(2, timeout=60)
         assert len(connected(at).scheduler_info(n_workers=-1)["workers"]) == 2
         pids = set(parallel_map(process_of, range(8), "processes"))
