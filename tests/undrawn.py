@@ -9,9 +9,9 @@ SCREENING = ("trends", "details", "readings", "inputs", "verdict")
 
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
-    """Build every picture of a report, but give its panels no places and write an empty file; build none of a screening.
+    """Build every picture of a report, but give its panels no places and write an empty file.
 
-    A screening's page is half of what ``loopwright new`` computes: up to 90 panels.
+    Build none of a screening: its page is half of what ``loopwright new`` computes: up to 90 panels.
     """
     for name in SCREENING:
         patch.setattr(f"pipeline.report.screening.{name}", lambda found: Figure())

@@ -225,11 +225,10 @@ def least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.boo
     z = x / scale
     keep = np.ones(len(z), dtype=bool)
     for _ in range(2):
-        kept = z[keep]
-        gram = kept.T @ z[keep]  # of two copies: a product of one with itself rounds otherwise
+        gram = z[keep].T @ z[keep]
         gram[np.diag_indices_from(gram)] += 1e-9 * np.trace(gram) / len(gram)
         inverse = np.linalg.pinv(gram, hermitian=True)
-        theta = inverse @ (kept.T @ target[keep])
+        theta = inverse @ (z[keep].T @ target[keep])
         residual = target - z @ theta
         used, sd = keep, _robust_sd(residual)
         keep = np.abs(residual) <= max(OUTSIDE_SD * sd, 1e-12 * np.abs(target).max())

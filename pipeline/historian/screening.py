@@ -56,7 +56,6 @@ class Screened:
     code: NDArray[np.uint8]  # (n,) Reason of each row of the grid
     series: Mapping[str, Series]  # the readings of each tag, with their reasons
     report: Screening
-    models: Mapping[str, Linear | None]  # the quick one of each PV, of the record's excerpt
     step_s: float = 0.0  # of the export's own readings, where the rows were resampled from some
 
 
@@ -169,7 +168,7 @@ def screened(
         verdict=verdict,
         zone=export.zone,
     )
-    return Screened(record, grid, code, own, report, models, step)
+    return Screened(record, grid, code, own, report, step)
 
 
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:

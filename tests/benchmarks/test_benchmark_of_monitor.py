@@ -13,7 +13,6 @@ from pipeline.cases import CASES
 from serving.monitor import monitor, pace
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "monitor.py"
-LEARNT_IN_FULL = {"ph_neutralization"}  # its loads wander for days: learnt for less, an upset of them is new
 # Of a chart. Fewer than 12 that are independent make it learn four times as long, as here the 10 of the first case do:
 # after 14 blocks of it another verdict would come first.
 BLOCKS = {"thiosulfate_cstr": 10}
@@ -49,12 +48,11 @@ def test_a_drift_is_found_and_the_same_run_without_it_is_quiet(
     benchmark: ModuleType, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is normal is learnt in less time than on a plant, so that a run is short; batches are learnt in full."""
-    if name not in LEARNT_IN_FULL:
-        monkeypatch.setattr(monitor, "LEARN_RESTS", 60)
-        monkeypatch.setattr(monitor, "LEARN_MODEL", 6)
-        monkeypatch.setattr(monitor, "LEARN_BLOCKS", BLOCKS.get(name, 14))
-        monkeypatch.setattr(pace, "FINE_S", 0.0)
-        monkeypatch.setattr(pace, "LEARN_S", 0.0)
+    monkeypatch.setattr(monitor, "LEARN_RESTS", 60)
+    monkeypatch.setattr(monitor, "LEARN_MODEL", 6)
+    monkeypatch.setattr(monitor, "LEARN_BLOCKS", BLOCKS.get(name, 14))
+    monkeypatch.setattr(pace, "FINE_S", 0.0)
+    monkeypatch.setattr(pace, "LEARN_S", 0.0)
     # Looking takes a quarter of the time where it is done at every scan.
     monkeypatch.setattr(benchmark, "LOOK_S", 10 * CASES[name].plant.period_s)
     parameter, share, verdict, within = DRIFTS[name]

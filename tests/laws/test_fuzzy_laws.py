@@ -168,17 +168,24 @@ def test_after_moves_by_hand_the_law_knows_where_the_plant_is(name: str) -> None
 
 
 # ---------------------------------------------------------------- a model that is off
+@pytest.fixture(scope="module")
+def without_feedback() -> Loops:
+    """Six plants that the law's model does not describe, under the law that corrects nothing."""
+    return loops(made("fuzzy_feedforward"), plants(off(6, 0.1)), 6)
+
+
 @pytest.mark.parametrize(("name", "overshoot"), [("fuzzy_feedforward_pi", 0.4), ("fuzzy_feedforward_observer", 0.1)])
 def test_feedback_leaves_no_offset_where_coefficients_are_off_and_the_signals_noisy(
-    name: str, overshoot: float
+    name: str, overshoot: float, without_feedback: Loops
 ) -> None:
-    theta = off(6, 0.1)
     params = {"k_jacket": 0.5} if name.endswith("pi") else {}  # the printed cold gain is far from any of these
-    run = loops(made(name, **params), plants(theta), 6, NOISE)
-    without = loops(made("fuzzy_feedforward"), plants(theta), 6)
+    run = loops(made(name, **params), plants(off(6, 0.1)), 6, NOISE)
     ends = [(slice(a, b), level, s) for a, b, level, s in ((0, 800, 62, 1), (800, 1600, 26, -1), (1600, 2000, 35, 1))]
     offsets = np.array(
-        [[abs(np.mean(r.pv[:, part, 0][:, -50:] - level, axis=1)) for part, level, _ in ends] for r in (run, without)]
+        [
+            [abs(np.mean(r.pv[:, part, 0][:, -50:] - level, axis=1)) for part, level, _ in ends]
+            for r in (run, without_feedback)
+        ]
     )
     assert offsets[0].max() <= 0.05
     assert offsets[1].max() > 1.0

@@ -44,7 +44,7 @@ from pipeline.models.static.mlp import MLP
 from serving import Controller
 from serving.manifest import Signal
 
-few = settings(max_examples=15, deadline=None)
+few = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**16)
 
 

@@ -31,7 +31,7 @@ def weighted_least_squares(
 @given(
     seed=st.integers(0, 10**6), n=st.integers(1, 6), rows=st.integers(1, 40), f=st.sampled_from([1.0, 0.98, 0.8, 0.5])
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_solves_the_weighted_least_squares_with_its_prior(seed: int, n: int, rows: int, f: float) -> None:
     phi, y = drawn(seed, rows, n)
     theta0, p0 = torch.from_numpy(np.random.default_rng(seed + 1).normal(size=n)), 7.0
@@ -73,7 +73,7 @@ def test_without_excitation_the_covariance_settles_on_its_bound(f: float) -> Non
 
 
 @given(seed=st.integers(0, 10**6), f=st.floats(0.45, 1.0), size=st.sampled_from([1e-3, 1.0, 1e6]))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_covariance_stays_within_its_bound_whatever_comes(seed: int, f: float, size: float) -> None:
     rls = RecursiveLeastSquares(f, largest=100.0)
     phi, y = drawn(seed, 200, 4)

@@ -174,7 +174,7 @@ def test_claims_follow_the_measurement(tmp_path):
     assert outcome("validation RMSE 18.76 K") is True
 
 
-def test_requirements_are_met_or_not(root, tmp_path):
+def test_requirements_are_met_or_not(root, tmp_path, monkeypatch):
     evidence = load(root)
 
     def met(need: Requirement) -> bool | None:
@@ -197,6 +197,7 @@ def test_requirements_are_met_or_not(root, tmp_path):
     assert locked.best is None
     rows = {v.what: v for v in acceptance(locked, PLAIN)}
     assert rows["best controller, data seeds"].holds is False
+    draw_nothing(monkeypatch)
     made_up.report(locked, tmp_path / "out")  # a report also of a case where nothing works
     assert "No law qualifies" in (tmp_path / "out" / "report.html").read_text()
     for page in ("report.html", "report.md"):

@@ -43,11 +43,13 @@ def load(root: Path, mini: Miniature, own_data: bool = False) -> Evidence:
 
 @pytest.fixture(scope="module", params=[PH, BATCH], ids=lambda mini: mini.case)
 def written(request, tmp_path_factory) -> tuple[Path, Evidence]:
-    """A report's folder, and the evidence that it shows."""
+    """A report's folder, and the evidence that it shows; its pictures are drawn in tests/pictures."""
     root = tmp_path_factory.mktemp(request.param.case)
     made_up.write_case(root, mini=request.param)
     evidence, out = load(root, request.param), root / "artifacts" / request.param.case
-    made_up.report(evidence, out)
+    with pytest.MonkeyPatch.context() as undrawn:
+        draw_nothing(undrawn)
+        made_up.report(evidence, out)
     return out, evidence
 
 

@@ -665,7 +665,7 @@ CHAOS_FILES = [p for p in SHIPPED if p.stem in ("inverse_dob", "minimum_variance
 CHAOS_FILES += [p for p in SHIPPED if p.parent.name == "jacketed_batch_reactor"]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(
     st.data(),
     st.sampled_from(CHAOS_FILES),

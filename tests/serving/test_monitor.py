@@ -446,7 +446,7 @@ def forged(tree: Any, data: st.DataObject) -> Any:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy's, of numbers that nothing could have measured
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(st.data())
 def test_a_forged_memory_is_refused_or_does_no_harm(data: st.DataObject) -> None:
     state = learnt()

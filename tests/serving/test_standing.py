@@ -289,7 +289,7 @@ BACK = 60.0
 MOVES = st.none() | st.floats(0.0, RANGE - 1.0) | st.floats(RANGE + 3.0, 200.0) | st.floats(-200.0, -3.0)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=120)
 @given(st.data(), st.sampled_from([0, 1, 2]), st.sampled_from([0.0, 0.5]), st.sampled_from([Mode.MANUAL, Mode.HOLD]))
 def test_no_outage_moves_an_mv_that_nobody_moved_and_none_writes_over_one_that_was_moved(
     law: Controller, data: st.DataObject, lag: int, offset: float, mode: Mode
