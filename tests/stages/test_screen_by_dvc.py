@@ -42,10 +42,10 @@ def _repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("pipeline", "serving"):
         # With what Python and numba have compiled, which takes them many seconds.
         shutil.copytree(ROOT / package, package)
-    for name in ("dvc.yaml", ".dvcignore", ".gitignore"):
+    Path(".dvc").mkdir()
+    for name in ("dvc.yaml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore"):
         shutil.copy(ROOT / name, name)
     subprocess.run(["git", "init", "--quiet"], check=True)
-    dvc("init", "--quiet")
     # Without the section of exports, as written before there was one.
     Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
 
