@@ -22,7 +22,7 @@ from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point
 from serving.opcua.values import FLOATS, INTEGERS
 
-LOOK_S = 60.0  # between two looks at what may change without a new connection
+LOOK_S, WRONG_S = 60.0, 2.0  # between two looks at what may change without a new connection; while something is wrong
 UNKNOWN = "-"
 NULL = ua.VariantType.Null
 WRITTEN = ", written"  # of a row: the node that the loop writes, where the MV is read back from another one
@@ -128,7 +128,7 @@ class Nameplates:
     async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
         while True:
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(WRONG_S if self.wrong else LOOK_S)
             try:
                 await self.again(link, plan, timeout_s)
             except ChangedNodeError as error:
