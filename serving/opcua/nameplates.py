@@ -214,14 +214,15 @@ async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s:
     """
     spaces, texts = await link.namespaces(timeout_s), [p.node for p in nodes.points("mv").values()]
     found = {n: uri for n in numbers(nodes.ids()) if (uri := uri_of(spaces, n))}
-    written = {_whole(node_id(t, spaces), spaces): t for t in texts}
+    written = {whole(node_id(t, spaces), spaces): t for t in texts}
     name = await link.server_uri(timeout_s)
     if not name or started_s is None:
         return Identity(found, {}, written)
     return Identity(found, {f"{name} {started_s!r} {node}": t for node, t in written.items()}, written)
 
 
-def _whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
+def whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
+    """A node's id with its namespace's name, or its number where a server does not tell the name."""
     number = int(node.NamespaceIndex)
     return _named(node, uri_of(spaces, number) or str(number))
 
