@@ -105,6 +105,7 @@ class OpcUaEndpoint:
         self.unwritten = ""  # why the last MV did not reach the plant
         self._barred = ""  # why this connection takes none
         self._told_lost = ""  # what was said of the connection since it was lost
+        self.connected = False  # as it was told last
         self.connections = self.starts = 0
         self._started_s: float | None = None  # when the server started, by its own clock
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
@@ -262,6 +263,7 @@ class OpcUaEndpoint:
                 self._link = link
                 pause = FIRST_RETRY_S
                 self._told_lost = ""
+                self.connected = True
                 self.tell(f"connected to {self.server.endpoint}{anew}; {await self._leased(link, plan)}")
                 self.nameplates.moved = None
                 watching = asyncio.create_task(self.nameplates.watch(link, plan, patience_s))
@@ -302,6 +304,7 @@ class OpcUaEndpoint:
 
     def _lost(self, why: str, *, late: bool = False) -> None:
         """Say it once. A silent server has been the trouble for some scans already, and was not told as lost."""
+        self.connected = False
         if not late:
             self._missed = why
         if why != self._told_lost:

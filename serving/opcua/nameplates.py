@@ -15,6 +15,7 @@ from typing import NamedTuple
 from asyncua import ua
 
 from serving.errors import EndpointError
+from serving.fault import Fault
 from serving.manifest import Manifest, Signal
 from serving.opcua.answers import unanswered
 from serving.opcua.link import Link, node_id
@@ -102,7 +103,8 @@ class Nameplates:
         before = self._kinds.setdefault(name, kind)
         if kind is before or (name in self._any_number and {kind, before} <= NUMBERS):
             return ""
-        return f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
+        words = f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
+        return Fault(words, "type", name)
 
     async def look(self, link: Link, plan: Plan, written: Sequence[ua.VariantType | None], timeout_s: float) -> None:
         """See which unit, range and type each node has now; ``written`` are the types of the MVs' nodes (n_mv,).
@@ -156,7 +158,7 @@ class Nameplates:
             misfit = other_unit(is_now, point, signal) if judged and signal is not None else ""
             if was not in {UNKNOWN, is_now}:
                 misfit = f"its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
-            self._judge(name, what, f"{name}: {misfit}" if misfit else "")
+            self._judge(name, what, Fault(f"{name}: {misfit}", what, name) if misfit else "")
 
     def _judge(self, name: str, what: str, why: str) -> None:
         """What is wrong with a row begins, lasts, or is over (empty)."""
