@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from serving.errors import ContractError, SampleError
+from serving.fault import reworded
 from serving.guard import Sample, implausible
 from serving.manifest import Signal
 from serving.standing import Standing
@@ -108,7 +109,7 @@ class AppliedMV:
             return Shown()
         outside = self._outside(sample)
         if outside:
-            return Shown(silent=f"{outside}: nothing is written before it is back", outside=True)
+            return Shown(silent=reworded(outside, f"{outside}: nothing is written before it is back"), outside=True)
         is_read = self._is_read or getattr(sample, "mv_applied", None) is not None
         return Shown(silent=UNREAD if is_read else "")
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 from serving.clock import MonotonicClock
 from serving.endpoint import Endpoint, HandsBack
 from serving.errors import LoopError
+from serving.fault import told_by
 from serving.guard import Sample
 from serving.words import named
 
@@ -127,7 +128,7 @@ def _exchange(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sampl
         sample = endpoint.read()
     except Exception as error:
         _trace("read")
-        command = loop.miss(reason or f"the plant cannot be read: {named(error)}")
+        command = loop.miss(reason or told_by(error, f"the plant cannot be read: {named(error)}"))
     else:
         command = loop.miss(reason) if reason else loop.scan(sample)
     try:
@@ -139,7 +140,7 @@ def _exchange(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sampl
     except Exception as error:
         _trace("write")
         doing = "cannot be handed back" if command.hand_back else "cannot be written"
-        command = loop.unwritten(last, f"the plant {doing}: {named(error)}")
+        command = loop.unwritten(last, told_by(error, f"the plant {doing}: {named(error)}"))
     return sample if isinstance(sample, Sample) else None, command
 
 

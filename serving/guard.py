@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from serving.errors import LoopError
+from serving.fault import Fault
 from serving.manifest import Manifest, Signal
 from serving.words import first_line
 
@@ -41,7 +42,7 @@ class Sample:
 
 
 class Guard(Protocol):
-    """One reason not to act."""
+    """One reason not to act: a text, or a ``serving.fault.Fault``, which also says which reason it is."""
 
     @property
     def memory(self) -> int:
@@ -81,7 +82,7 @@ class Complete:
                 continue
             for signal, value in zip(signals, numbers, strict=True):  # a sum of finite numbers may overflow
                 if not isfinite(value):
-                    return f"{label} {signal.name} is {value}"
+                    return Fault(f"{label} {signal.name} is {value}", "number", f"{label} {signal.name}")
         return None
 
 
@@ -98,7 +99,8 @@ class InRange:
         for s, value in zip(self.signals, sample.pv.tolist(), strict=True):
             slack = self.margin * (s.high - s.low)
             if not s.low - slack <= value <= s.high + slack:
-                return f"PV {s.name} is {value:.6g} {s.unit}, outside its range [{s.low:g}, {s.high:g}] {s.unit}"
+                words = f"PV {s.name} is {value:.6g} {s.unit}, outside its range [{s.low:g}, {s.high:g}] {s.unit}"
+                return Fault(words, "range", f"PV {s.name}")
         return None
 
 
@@ -141,7 +143,8 @@ class Frozen:
             return None
         for i, s in enumerate(self.signals):
             if all(old.pv[i] == sample.pv[i] for old in recent):
-                return f"PV {s.name} is frozen at {sample.pv[i]:.6g} {s.unit} for {self.samples} samples"
+                words = f"PV {s.name} is frozen at {sample.pv[i]:.6g} {s.unit} for {self.samples} samples"
+                return Fault(words, "frozen", f"PV {s.name}")
         return None
 
 
@@ -165,7 +168,8 @@ class Fresh:
             return f"the sample's age is {sample.age_s!r}; it must be a finite number of seconds, 0 or more"
         if sample.age_s > self.max_age_s:
             of = f" of {sample.late}" if sample.late else ""
-            return f"the sample{of} is {sample.age_s:.3g} s old; allowed are {self.max_age_s:.3g} s"
+            words = f"the sample{of} is {sample.age_s:.3g} s old; allowed are {self.max_age_s:.3g} s"
+            return Fault(words, "age", sample.late, f"the sample{of} is older than {self.max_age_s:.3g} s")
         return None
 
 
@@ -184,7 +188,8 @@ class Rate:
         moves = np.abs(sample.pv - list(past)[-1].pv).tolist()
         for s, move, largest in zip(self.signals, moves, self.largest, strict=True):
             if not move <= largest:
-                return f"PV {s.name} moved by {move:.6g} {s.unit} in one sample; allowed are {largest:g} {s.unit}"
+                words = f"PV {s.name} moved by {move:.6g} {s.unit} in one sample; allowed are {largest:g} {s.unit}"
+                return Fault(words, "rate", f"PV {s.name}")
         return None
 
 
@@ -199,7 +204,7 @@ def refused(guards: Sequence[Guard], sample: Sample, past: Collection[Sample]) -
         try:
             reason = guard.check(sample, past)
             if reason:
-                return str(reason)
+                return reason if isinstance(reason, str) else str(reason)  # of another's guard it may be anything
         except Exception as error:
             return f"{type(guard).__name__} failed: {first_line(error)}"
     return None
@@ -210,11 +215,13 @@ def implausible(signals: Sequence[Signal], applied: Sequence[float]) -> str | No
     for s, value in zip(signals, applied, strict=True):
         if s.values is not None:
             if value not in s.values:
-                return f"applied MV {s.name} is {value:.6g}, none of {', '.join(f'{v:g}' for v in s.values)}"
+                words = f"applied MV {s.name} is {value:.6g}, none of {', '.join(f'{v:g}' for v in s.values)}"
+                return Fault(words, "range", f"MV {s.name}")
             continue
         slack = READ_BACK_MARGIN * (s.high - s.low)
         if not s.low - slack <= value <= s.high + slack:
-            return f"applied MV {s.name} is {value:.6g} {s.unit}, outside its range [{s.low:g}, {s.high:g}] {s.unit}"
+            words = f"applied MV {s.name} is {value:.6g} {s.unit}, outside its range [{s.low:g}, {s.high:g}] {s.unit}"
+            return Fault(words, "range", f"MV {s.name}")
     return None
 
 

@@ -43,7 +43,7 @@ class InCharge:
         if not isinstance(sample, Sample):
             return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
         if sample.fault:
-            return str(sample.fault)
+            return sample.fault if isinstance(sample.fault, str) else str(sample.fault)
         return refused(self.guards, sample, self._past)
 
     def step(self, sample: Sample, sp: Array, applied: Array) -> Step:

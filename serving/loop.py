@@ -17,6 +17,7 @@ from serving.controller import Controller
 from serving.endpoint import Endpoint, HandsBack
 from serving.errors import LoopError
 from serving.fallback import Fallback
+from serving.fault import reworded
 from serving.grid import RunReport, run_on_grid
 from serving.guard import Guard, Sample, default_guards
 from serving.in_charge import Guards, InCharge
@@ -230,7 +231,8 @@ class ControlLoop:
             if shown.outside:
                 self._mv = np.full(len(self._mv), nan)
             doubled = not reason or shown.silent.startswith(reason)
-            return self._missed(shown.silent if doubled else f"{reason}; {shown.silent}", silent=True)
+            both = shown.silent if doubled else reworded(reason or "", f"{reason}; {shown.silent}")
+            return self._missed(both, silent=True)
         if self.found is not None:
             self._mv = self.found.copy()
         if reason:

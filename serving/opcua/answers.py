@@ -24,7 +24,12 @@ GONE = {
     ua.StatusCodes.BadSessionNotActivated,
 }  # answers after which no other request has a chance
 
-
+TOO_MANY = {
+    ua.StatusCodes.BadEncodingLimitsExceeded,
+    ua.StatusCodes.BadRequestTooLarge,
+    ua.StatusCodes.BadResponseTooLarge,
+    ua.StatusCodes.BadTooManyOperations,
+}  # answers after which a smaller request has a chance
 BUSY = {
     ua.StatusCodes.BadNoContinuationPoints,
     ua.StatusCodes.BadOutOfMemory,

@@ -22,7 +22,7 @@ from serving.opcua.answers import LateError
 from serving.opcua.heartbeat import Heartbeat
 from serving.opcua.lease import LeaseRefusedError, NodeLease
 from serving.opcua.link import Link
-from serving.opcua.nameplates import Identity, Nameplates, identity
+from serving.opcua.nameplates import Identity, Nameplates, identity, whole
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import Nodes, Server
@@ -103,7 +103,9 @@ class OpcUaEndpoint:
         self._missed = ""  # why the last reading failed at once, or the connection did; late answers grow old instead
         self._given: Values | None = None  # at the last scan
         self.unwritten = ""  # why the last MV did not reach the plant
+        self._barred = ""  # why this connection takes none
         self._told_lost = ""  # what was said of the connection since it was lost
+        self.connected = False  # as it was told last
         self.connections = self.starts = 0
         self._started_s: float | None = None  # when the server started, by its own clock
         self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
@@ -176,7 +178,7 @@ class OpcUaEndpoint:
         now, before, self._called = self._scans, self._called, self._scans
         if now - before > 1:
             self.unwritten = ""  # of a time after which nothing was written: it says nothing of now
-        refused = self.unwritten or self.nameplates.unwritable
+        refused = self.unwritten or self.nameplates.unwritable or self._barred
         if self._link is None or self._shown == 0 or self._told != self._shown:
             unread = "where the MV stands has not been read yet"
             self._refuse(self.trouble or refused or ("not connected" if self._link is None else unread))
@@ -257,11 +259,12 @@ class OpcUaEndpoint:
                 if self._outbox:
                     self._outbox.clear()  # what was to be written then is too old now
                     self.unwritten = self.unwritten or "the connection was lost before the MV was sent"
-                self._written, self._shown = None, 0
+                self._written, self._shown, self._barred = None, 0, plan.unwritable
                 self._link = link
                 pause = FIRST_RETRY_S
                 self._told_lost = ""
-                self.tell(f"connected to {self.server.endpoint}{anew}")
+                self.connected = True
+                self.tell(f"connected to {self.server.endpoint}{anew}; {await self._leased(link, plan)}")
                 self.nameplates.moved = None
                 watching = asyncio.create_task(self.nameplates.watch(link, plan, patience_s))
                 await self._exchange(link, plan)
@@ -282,6 +285,13 @@ class OpcUaEndpoint:
             await self._rest(pause)
             pause = min(pause * GROWTH, LAST_RETRY_S)
 
+    async def _leased(self, link: Link, plan: Plan) -> str:
+        """Which lease keeps loops on other machines from writing the same MVs, in words."""
+        if plan.lease is None:
+            return plan.unwritable or "no lease"
+        spaces = await link.namespaces(self.server.connect_s)
+        return f"lease {whole(plan.lease, spaces)}"
+
     async def _anew(self, link: Link) -> str:
         """Whether the server has started anew, or may have, since it was last spoken to: counted, and in words."""
         before, self._started_s = self._started_s, await link.started_s(self.server.connect_s)
@@ -294,6 +304,7 @@ class OpcUaEndpoint:
 
     def _lost(self, why: str, *, late: bool = False) -> None:
         """Say it once. A silent server has been the trouble for some scans already, and was not told as lost."""
+        self.connected = False
         if not late:
             self._missed = why
         if why != self._told_lost:
@@ -361,8 +372,9 @@ class OpcUaEndpoint:
         if last is None:
             return
         handing = isinstance(last, str)
-        if not handing and self.nameplates.unwritable:  # since it was passed on
-            self._failed(self.nameplates.unwritable)
+        barred = self.nameplates.unwritable or plan.unwritable
+        if not handing and barred:  # it may be so since the MV was passed on
+            self._failed(barred)
             return
         try:
             rows = [plan.hand_back()] if isinstance(last, str) else plan.variants(last)

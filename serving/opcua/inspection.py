@@ -16,9 +16,10 @@ from serving.errors import EndpointError
 from serving.guard import InRange, Sample, implausible
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import last_day, valid_until
-from serving.opcua.lease import NAME, WRITABLE, beside
+from serving.opcua.lease import NAME, WRITABLE, SeveralLeasesError, beside
 from serving.opcua.link import Link
 from serving.opcua.nameplates import (
+    WRITTEN,
     Identity,
     Plate,
     by_name,
@@ -29,8 +30,9 @@ from serving.opcua.nameplates import (
     renumbered,
     signal_of,
     uri_of,
+    whole,
 )
-from serving.opcua.plan import Plan
+from serving.opcua.plan import Plan, shared_node
 from serving.opcua.sampling import NO_NUMBERS
 from serving.opcua.settings import NO_LEASE, Nodes, Point, Server
 from serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
@@ -111,12 +113,25 @@ async def _inspected(
         beat, back = nodes.heartbeat, nodes.hand_back
         rows += [("heartbeat, written", beat, Point(beat), True)] if beat else []
         rows += [("hand_back, written", back.node, Point(back.node), True)] if back is not None else []
-        lease = await _lease_of(link, server, nodes)
+        several = ""
+        try:
+            lease = await _lease_of(link, server, nodes)
+        except SeveralLeasesError as error:
+            lease, several = "", first_line(error)
         asked = await _asked(link, server, [node for _, node, _, _ in rows] + ([lease] if lease else []))
         found = [_one(manifest, server, *row, asked[row[1]], margin) for row in rows]
         if back is not None and not found[-1].wrong:
             found[-1] = replace(found[-1], wrong=_unfit(back.value, found[-1].kind))
-        found.append(_lease(lease, asked[lease]) if lease else Found("lease", "-", note=NO_LEASE_NOTE))
+        if several:
+            found.append(Found("lease, written", "-", wrong=several))
+        elif lease:
+            found.append(_lease(lease, asked[lease]))
+        else:
+            found.append(Found("lease", "-", note="" if nodes.lease == NO_LEASE else NO_LEASE_NOTE))
+        targets = [(f.signal.removesuffix(WRITTEN), a.at) for f in found if f.signal.endswith(WRITTEN)
+                   and isinstance(a := asked.get(f.node, ""), _Asked)]  # fmt: skip
+        shared = shared_node([name for name, _ in targets], [at for _, at in targets])
+        found += [Found("nodes, written", "-", wrong=shared)] if shared else []
         found += _namespaces(nodes, await link.namespaces(server.connect_s), spaces)
         try:
             known = await identity(link, nodes, await link.started_s(server.connect_s), server.connect_s)
@@ -188,7 +203,7 @@ async def _lease_of(link: Link, server: Server, nodes: Nodes) -> str:
         written = await link.resolved([p.node for p in nodes.points("mv").values()], server.connect_s)
         at = await beside(link, written, server.connect_s)
         if at is not None:
-            return by_name(at.to_string(), uri_of(await link.namespaces(server.connect_s), int(at.NamespaceIndex)))
+            return whole(at, await link.namespaces(server.connect_s))
     return ""
 
 

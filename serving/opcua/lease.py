@@ -11,7 +11,8 @@ from contextlib import suppress
 
 from asyncua import ua
 
-from serving.errors import EndpointError
+from serving.errors import EndpointError, LoopError
+from serving.opcua.answers import unanswered
 from serving.opcua.link import Link
 from serving.opcua.values import GOOD, words
 
@@ -96,24 +97,34 @@ class NodeLease:
             raise LeaseRefusedError(f"the server refuses lease: {words(status)}")
 
 
+class SeveralLeasesError(LoopError):
+    """The MVs have several leases: whoever takes another one than this loop would write beside it."""
+
+
 async def beside(link: Link, written: Iterable[ua.NodeId], timeout_s: float) -> ua.NodeId | None:
-    """The node NAME beside all MVs, where it is one text that this user may write; None: there is no such node."""
-    found = set[ua.NodeId]()
+    """The node NAME that lies beside one or more of the MVs, where it is a text that this user may write.
+
+    None where there is no such node, and where the server refuses to show its folders. EndpointError where it does not
+    answer, as nobody knows then whether there is one; SeveralLeasesError where there are several.
+    """
+    found = dict[ua.NodeId, None]()
     try:
         for node in written:
-            found |= set(await link.beside(node, NAME, timeout_s))
-        if len(found) != 1:
-            return None
-        (at,) = found
-        (text,) = await link.read([at], timeout_s)
-        (access,) = await link.values([at], timeout_s, ua.AttributeIds.UserAccessLevel)
-    except EndpointError:
-        if link.gone:
+            found |= dict.fromkeys(await link.beside(node, NAME, timeout_s))
+        texts = await link.read(list(found), timeout_s)
+        access = await link.values(list(found), timeout_s, ua.AttributeIds.UserAccessLevel)
+    except EndpointError as error:
+        if unanswered(error, link.gone):
             raise
-        return None  # this server's folders cannot be looked at
-    level = None if access.Value is None else access.Value.Value
-    may = isinstance(level, int) and bool(level & WRITABLE)
-    return at if may and text.kind is ua.VariantType.String else None
+        return None
+    may = [a.Value is not None and isinstance(a.Value.Value, int) and bool(a.Value.Value & WRITABLE) for a in access]
+    usable = [n for n, text, m in zip(found, texts, may, strict=True) if m and text.kind is ua.VariantType.String]
+    if len(usable) > 1:
+        those = ", ".join(n.to_string() for n in usable)
+        raise SeveralLeasesError(
+            f"there are {len(usable)} nodes {NAME} beside the MVs ({those}); name one by nodes.lease"
+        )
+    return next(iter(usable), None)
 
 
 def _owner(text: str) -> str:

@@ -53,16 +53,18 @@ async def in_pieces(
     A server may refuse more than it told, or have told nothing: the pieces then become half as large. Raises what
     ``ask`` raises, and TooManyError where the server refuses a single row.
     """
-    end, found = time.monotonic() + timeout_s, list[R]()
+    end, left_s, found = time.monotonic() + timeout_s, timeout_s, list[R]()
     while len(found) < len(rows):
         piece = rows[len(found) : len(found) + pieces.most] if pieces.most else rows[len(found) :]
         try:
-            answers = await ask(piece, max(end - time.monotonic(), 0.0) if found else timeout_s)
+            answers = await ask(piece, left_s)
         except TooManyError:
             if len(piece) == 1:
                 raise
             pieces.most = len(piece) // 2
             continue
+        finally:
+            left_s = max(end - time.monotonic(), 0.0)
         if len(answers) != len(piece):
             raise EndpointError(f"the server gives {len(answers)} answers to a request for {len(piece)} nodes")
         found += answers

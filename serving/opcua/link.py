@@ -14,7 +14,7 @@ from asyncua import Client, ua
 from asyncua.crypto import security_policies
 
 from serving.errors import EndpointError, LoopError
-from serving.opcua.answers import BUSY, GONE, BusyError, LateError, in_time, reason
+from serving.opcua.answers import BUSY, GONE, TOO_MANY, BusyError, LateError, in_time, reason
 from serving.opcua.certificates import APPLICATION, identity, require_valid
 from serving.opcua.limits import LIMITS, OperationLimits, TooManyError, in_pieces
 from serving.opcua.settings import Server
@@ -238,8 +238,23 @@ class Link:
                 row.BrowseDirection = ua.BrowseDirection.Inverse if inverse else ua.BrowseDirection.Forward
                 row.ResultMask = ua.UInt32(result)
                 request.NodesToBrowse.append(row)
-            found = await self._within(self.client.uaclient.session.browse(request), left_s)
-            return [list(row.References or []) for row in found]
+            end_s = asyncio.get_running_loop().time() + left_s
+            found = list(await self._within(self.client.uaclient.session.browse(request), left_s))
+            rows = [list(row.References or []) for row in found]
+            crowded = any(row.StatusCode.value == ua.StatusCodes.BadNoContinuationPoints for row in found)
+            parted = [(i, row.ContinuationPoint) for i, row in enumerate(found) if row.ContinuationPoint]
+            while parted:  # to the end: a server keeps few points open, and none for longer than it must
+                following = ua.BrowseNextParameters()
+                following.ContinuationPoints = [point for _, point in parted]
+                left_s = max(end_s - asyncio.get_running_loop().time(), 0.0)
+                more = list(await self._within(self.client.uaclient.session.browse_next(following), left_s))
+                parts = list(zip((i for i, _ in parted), more, strict=False))
+                for i, row in parts:
+                    rows[i] += row.References or []
+                parted = [(i, row.ContinuationPoint) for i, row in parts if row.ContinuationPoint]
+            if crowded and len(piece) > 1:
+                raise TooManyError(f"{self.server.endpoint}: BadNoContinuationPoints")
+            return rows
 
         return await in_pieces(nodes, self.limits.browse, ask, timeout_s)
 
@@ -292,7 +307,7 @@ class Link:
             code = getattr(error, "code", None) if isinstance(error, ua.UaStatusCodeError) else None
             if code in GONE:
                 self._gone = reason(error)
-            if code == ua.StatusCodes.BadTooManyOperations:
+            if code in TOO_MANY:
                 raise TooManyError(f"{self.server.endpoint}: {reason(error)}") from None
             if code in BUSY:
                 raise BusyError(f"{self.server.endpoint}: {reason(error)}") from None

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from asyncua import ua
 
 from serving.errors import EndpointError
+from serving.fault import Fault
 from serving.manifest import Manifest, Signal
 from serving.opcua.answers import unanswered
 from serving.opcua.link import Link, node_id
@@ -22,7 +23,7 @@ from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Point
 from serving.opcua.values import FLOATS, INTEGERS
 
-LOOK_S = 60.0  # between two looks at what may change without a new connection
+LOOK_S, WRONG_S = 60.0, 2.0  # between two looks at what may change without a new connection; while something is wrong
 UNKNOWN = "-"
 NULL = ua.VariantType.Null
 WRITTEN = ", written"  # of a row: the node that the loop writes, where the MV is read back from another one
@@ -102,7 +103,8 @@ class Nameplates:
         before = self._kinds.setdefault(name, kind)
         if kind is before or (name in self._any_number and {kind, before} <= NUMBERS):
             return ""
-        return f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
+        words = f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
+        return Fault(words, "type", name)
 
     async def look(self, link: Link, plan: Plan, written: Sequence[ua.VariantType | None], timeout_s: float) -> None:
         """See which unit, range and type each node has now; ``written`` are the types of the MVs' nodes (n_mv,).
@@ -128,7 +130,7 @@ class Nameplates:
     async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
         while True:
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(WRONG_S if self.wrong else LOOK_S)
             try:
                 await self.again(link, plan, timeout_s)
             except ChangedNodeError as error:
@@ -156,7 +158,7 @@ class Nameplates:
             misfit = other_unit(is_now, point, signal) if judged and signal is not None else ""
             if was not in {UNKNOWN, is_now}:
                 misfit = f"its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
-            self._judge(name, what, f"{name}: {misfit}" if misfit else "")
+            self._judge(name, what, Fault(f"{name}: {misfit}", what, name) if misfit else "")
 
     def _judge(self, name: str, what: str, why: str) -> None:
         """What is wrong with a row begins, lasts, or is over (empty)."""
@@ -214,14 +216,15 @@ async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s:
     """
     spaces, texts = await link.namespaces(timeout_s), [p.node for p in nodes.points("mv").values()]
     found = {n: uri for n in numbers(nodes.ids()) if (uri := uri_of(spaces, n))}
-    written = {_whole(node_id(t, spaces), spaces): t for t in texts}
+    written = {whole(node_id(t, spaces), spaces): t for t in texts}
     name = await link.server_uri(timeout_s)
     if not name or started_s is None:
         return Identity(found, {}, written)
     return Identity(found, {f"{name} {started_s!r} {node}": t for node, t in written.items()}, written)
 
 
-def _whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
+def whole(node: ua.NodeId, spaces: Sequence[str]) -> str:
+    """A node's id with its namespace's name, or its number where a server does not tell the name."""
     number = int(node.NamespaceIndex)
     return _named(node, uri_of(spaces, number) or str(number))
 

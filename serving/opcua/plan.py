@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
 from asyncua import ua
 from numpy.typing import NDArray
 
-from serving.errors import EndpointError
+from serving.errors import EndpointError, LoopError
 from serving.manifest import Manifest
-from serving.opcua.lease import beside
+from serving.opcua.lease import SeveralLeasesError, beside
 from serving.opcua.link import Link
 from serving.opcua.settings import NO_LEASE, Nodes, Point
 from serving.opcua.values import exact, variant
+from serving.words import first_line
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -45,6 +47,7 @@ class Plan:
         self.written: list[tuple[ua.NodeId, ua.VariantType]] = []
         self.heartbeat: tuple[ua.NodeId, ua.VariantType, int] | None = None
         self.lease: ua.NodeId | None = None  # read last, after the points
+        self.unwritable = ""  # why no MV may be written on this connection
         self._hand_back: tuple[ua.NodeId, ua.VariantType] | None = None
 
     @classmethod
@@ -52,21 +55,27 @@ class Plan:
         """Ask the server for ids and types."""
         plan = cls(nodes, manifest)
         texts = [p.read_back or p.node for _, p, _ in plan.points]
-        extra = [nodes.heartbeat] if nodes.heartbeat else []
-        extra += [nodes.hand_back.node] if nodes.hand_back is not None else []
-        ids = await link.resolved([*texts, *(p.node for p in plan.mv_points), *extra], timeout_s)
-        plan.asked = ids[: len(texts)]
+        others = {"heartbeat": nodes.heartbeat, "hand_back": "" if nodes.hand_back is None else nodes.hand_back.node}
+        extra = [name for name, node in others.items() if node]
+        ids = await link.resolved(
+            [*texts, *(p.node for p in plan.mv_points), *(others[name] for name in extra)], timeout_s
+        )
+        names = [*(f"MV {n}" for n in plan.mv_names), *extra]
+        shared = shared_node(names, ids[len(texts) :])
+        if shared:
+            raise LoopError(shared)
+        plan.asked, targets = ids[: len(texts)], ids[len(texts) : len(texts) + len(plan.mv_points)]
         if nodes.lease == NO_LEASE:
             plan.lease = None
         elif nodes.lease:
             (plan.lease,) = await link.resolved([nodes.lease], timeout_s)
         else:
-            plan.lease = await beside(
-                link, dict.fromkeys(ids[len(texts) : len(texts) + len(plan.mv_points)]), timeout_s
-            )
+            try:
+                plan.lease = await beside(link, dict.fromkeys(targets), timeout_s)
+            except SeveralLeasesError as error:
+                plan.unwritable = f"lease: {first_line(error)}"
         plan.asked += [plan.lease] if plan.lease is not None else []
         kinds = [r.kind for r in await link.read(ids[len(texts) :], timeout_s)]
-        names = [*(f"MV {n}" for n in plan.mv_names), *extra]
         for name, kind in zip(names, kinds, strict=True):
             if kind in {None, ua.VariantType.Null}:  # the node is not there now, or holds nothing yet
                 raise EndpointError(f"{name}: the server gives no value, so its type is not known")
@@ -106,3 +115,12 @@ class Plan:
         assert self.nodes.hand_back is not None
         (node, kind), value = self._hand_back, self.nodes.hand_back.value
         return node, exact(value, kind)
+
+
+def shared_node(names: Sequence[str], ids: Sequence[ua.NodeId]) -> str:
+    """Why nodes cannot be written: that of an MV is that of something else, too. Empty: each has its own."""
+    for i, name in enumerate(names):
+        others = [n for k, n in enumerate(names) if k != i and ids[k] == ids[i]]
+        if others and name.startswith("MV "):
+            return f"{name} and {', '.join(others)} are one node, {ids[i].to_string()}; give each its own"
+    return ""

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from serving.fault import Fault
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
 from serving.opcua.nameplates import Nameplates
@@ -75,9 +76,9 @@ class Sampling:
             if fault or not judged:
                 continue
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
-                fault = f"{name}: {answer.words}"
+                fault = Fault(f"{name}: {answer.words}", f"quality {answer.words}", name)
             elif answer.text:
-                fault = f"{name}: {_given(name, answer.text)}"
+                fault = Fault(f"{name}: {_given(name, answer.text)}", "number", name)
         judge = self.server.source_time == "judge"
         timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
         m = self.manifest

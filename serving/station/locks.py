@@ -46,7 +46,8 @@ class Locks:
                 self._lease.tend()  # the other loop may have ended since, or only have looked whether it is free
         self._tell()
         if self._lease.lost:
-            self._recorder.note("change", "loop", f"mode {loop.mode} -> {Mode.SHADOW}", self._lease.lost)
+            words = f"mode {loop.mode} -> {Mode.SHADOW}"
+            self._recorder.note("change", "loop", words, self._lease.lost, mode=Mode.SHADOW)
             loop.set_mode(Mode.SHADOW)
 
     def tend(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, suppress
@@ -14,17 +13,15 @@ from numpy.typing import NDArray
 
 from serving.controller import Controller
 from serving.errors import LoopError
+from serving.fault import kind_of, lasting
 from serving.guard import Sample
 from serving.journal import Event, Journal, JournalReader, Scan
 from serving.journal.entries import Kind
-from serving.loop import Command, ControlLoop
+from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest
 from serving.words import plain
 
 Array: TypeAlias = NDArray[np.float64]
-
-AGE = re.compile(r"is \S+ s old; allowed are (\S+) s")
-NUMBER = re.compile(r"(?<!\w)[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?!\w)")
 
 
 class Recorder:
@@ -62,11 +59,15 @@ class Recorder:
         alarm: str = "",
         raised: bool = False,
         about: int = 0,
+        mode: Mode | None = None,
     ) -> None:
-        """Write an event down, and say it. A server's or a file's text is spelt out where it would act on a reader."""
+        """Write an event down, and say it; ``mode`` is what somebody changed the mode to.
+
+        A server's or a file's text is spelt out where it would act on a reader.
+        """
         what, reason = plain(what), plain(reason)
-        if kind == "change" and what.startswith("mode "):  # "mode AUTO" or "mode SHADOW -> AUTO"
-            self._mode = what.rpartition(" ")[2]
+        if mode is not None:
+            self._mode = mode.value
         self.journal.event(Event(time.time(), kind, who, what, reason, alarm, raised, about))
         said = f"acknowledged: {what}" if kind == "acknowledged" else what
         self._say(f"{who}: {said}" + (f" ({reason})" if reason else ""))
@@ -79,7 +80,7 @@ class Recorder:
         # A reason whose numbers change, such as an age, is the same fault.
         if command.reason != self._fault and kind_of(command.reason) != kind_of(self._fault):
             before, self._fault = self._fault, command.reason
-            what = lasting(command.reason or f"over: {before}")
+            what = lasting(command.reason) or f"over: {lasting(before)}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.reason))
         self._changed(command)
         if loop.controller is not self.controller:
@@ -90,7 +91,8 @@ class Recorder:
     def _changed(self, command: Command) -> None:
         """Say that the mode is another one though nobody asked for it: HOLD by a fault, and the way back."""
         if self._mode and command.mode.value != self._mode:
-            self.note("change", "loop", f"mode {self._mode} -> {command.mode.value}", lasting(command.reason))
+            words = f"mode {self._mode} -> {command.mode.value}"
+            self.note("change", "loop", words, lasting(command.reason), mode=command.mode)
         self._mode = command.mode.value
 
     def _tried(self, loop: ControlLoop) -> None:
@@ -99,16 +101,6 @@ class Recorder:
         if reason and kind_of(reason) != kind_of(self._trial) and loop.successor is not None:
             self.note("swap", "loop", f"the trial of {named(loop.successor.controller)} begins anew", reason)
         self._trial = reason
-
-
-def kind_of(reason: str) -> str:
-    """A reason without its numbers."""
-    return NUMBER.sub("#", reason)
-
-
-def lasting(reason: str) -> str:
-    """A reason for as long as it lasts: an age grows meanwhile."""
-    return AGE.sub(r"is older than \1 s", reason)
 
 
 def named(controller: Controller) -> str:

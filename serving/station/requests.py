@@ -34,6 +34,7 @@ class Change:
     reason: str = ""
     done: Callable[[str], None] = lambda _: None
     kind: Kind = "change"
+    mode: Mode | None = None  # to which it changes the mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +85,8 @@ def _mode(request: Request, loop: ControlLoop, _: Opened) -> Change:
         raise LoopError(f"mode is {request.value!r}{nearest(request.value, [m.value for m in Mode])}")
     mode = Mode(request.value)
     if mode is not Mode.AUTO:
-        return Change(lambda loop: loop.set_mode(mode), f"mode {loop.mode} -> {mode}", request.who, request.reason)
+        what = f"mode {loop.mode} -> {mode}"
+        return Change(lambda loop: loop.set_mode(mode), what, request.who, request.reason, mode=mode)
     unproven = require_proven(loop, request.accept_unproven)
     said = f"accepted though {unproven}" if unproven else ""
     reason = "; ".join(filter(None, (request.reason, said)))
@@ -93,7 +95,7 @@ def _mode(request: Request, loop: ControlLoop, _: Opened) -> Change:
         require_proven(loop, request.accept_unproven)  # another controller may have taken over since
         loop.set_mode(mode)
 
-    return Change(act, f"mode {loop.mode} -> {mode}", request.who, reason)
+    return Change(act, f"mode {loop.mode} -> {mode}", request.who, reason, mode=mode)
 
 
 def require_proven(loop: ControlLoop, accepted: bool) -> str:

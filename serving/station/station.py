@@ -226,7 +226,7 @@ class Station:
                 )
                 continue
             change.done("")
-            self.recorder.note(change.kind, change.who, change.what, change.reason)
+            self.recorder.note(change.kind, change.who, change.what, change.reason, mode=change.mode)
         values = self.endpoint.values
         if values is not None and self.scans:
             self._plant_side(self.loop, values)
@@ -253,7 +253,7 @@ class Station:
         if changed:
             self._set_points(loop, changed)
         if mode:
-            self._from_plant(partial(self._set_mode, loop, Mode(mode)), f"mode {mode}")
+            self._from_plant(partial(self._set_mode, loop, Mode(mode)), f"mode {mode}", Mode(mode))
 
     def _set_points(self, loop: ControlLoop, changed: Mapping[str, float]) -> None:
         """Each for itself: one outside its range takes no other one with it."""
@@ -269,13 +269,13 @@ class Station:
             require_proven(loop, self.settings.accept_unproven)
         loop.set_mode(mode)
 
-    def _from_plant(self, act: Callable[[], None], what: str) -> None:
+    def _from_plant(self, act: Callable[[], None], what: str, mode: Mode | None = None) -> None:
         try:
             act()
         except LoopError as error:
             self.recorder.note("change", "plant", f"refused: {what} ({first_line(error)})")
             return
-        self.recorder.note("change", "plant", what)
+        self.recorder.note("change", "plant", what, mode=mode)
 
     def _observe(self, sample: Sample | None, command: Command) -> None:
         """Write the scan down, and show it."""
@@ -361,8 +361,7 @@ class Station:
         self.locks.identified(found, writes=self.loop is not None and self.loop.mode is not Mode.SHADOW)
 
     def _connection(self, what: str) -> None:
-        up = what.startswith("connected")
-        self.recorder.note("connection", "opcua", what, alarm="connection", raised=not up)
+        self.recorder.note("connection", "opcua", what, alarm="connection", raised=not self.endpoint.connected)
 
 
 def _shown(values: Array, signals: tuple[Signal, ...]) -> str:

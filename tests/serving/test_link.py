@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from asyncua import ua
 from processes import within
 
 from serving import Controller
-from serving.errors import EndpointError
-from serving.opcua.answers import in_time
+from serving.errors import EndpointError, LoopError
+from serving.opcua.answers import LateError, in_time
 from serving.opcua.endpoint import OpcUaEndpoint
+from serving.opcua.lease import SeveralLeasesError, beside
 from serving.opcua.limits import OperationLimits, Pieces, TooManyError, in_pieces
-from serving.opcua.link import Link
+from serving.opcua.link import Link, node_id
+from serving.opcua.plan import Plan
 from serving.opcua.settings import Nodes, Server
+from serving.opcua.values import Reading
 
 pytest_plugins = ["small_laws"]
 
@@ -118,3 +125,131 @@ def test_limits_that_a_server_does_not_tell_are_none() -> None:
 
     found = OperationLimits.told([limit(20, ua.VariantType.UInt32), limit(0, ua.VariantType.UInt32), ua.DataValue()])
     assert [found.read.most, found.write.most, found.browse.most] == [20, 0, 0]
+
+
+def test_the_pieces_of_a_request_share_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each half of what a server refused had the whole time anew."""
+    now, left = [0.0], list[float]()
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+
+    async def ask(piece: Sequence[int], left_s: float) -> list[int]:
+        left.append(left_s)
+        now[0] += 1.0
+        if len(piece) > 2:
+            raise TooManyError("BadTooManyOperations")
+        return list(piece)
+
+    asyncio.run(in_pieces(range(8), Pieces(), ask, 5.0))
+    assert left == [5.0, 4.0, 3.0, 2.0, 1.0, 0.0]
+
+
+class Session:
+    """A server that answers a browse with one reference at a time, to at most ``points`` nodes in one request."""
+
+    def __init__(self, references: int, points: int = 99) -> None:
+        self.references, self.points = references, points
+        self.open: dict[bytes, int] = {}
+
+    def _part(self, node: bytes, k: int) -> ua.BrowseResult:
+        found = ua.BrowseResult()
+        found.References = [ua.ReferenceDescription(NodeId=ua.NodeId(f"{node.decode()} {k}", 2))]
+        if k + 1 < self.references:
+            self.open[node] = k + 1
+            found.ContinuationPoint = node
+        return found
+
+    async def browse(self, request: ua.BrowseParameters) -> list[ua.BrowseResult]:
+        rows = []
+        for n in request.NodesToBrowse:
+            full = len(self.open) >= self.points
+            refused = ua.BrowseResult(StatusCode=ua.StatusCode(ua.StatusCodes.BadNoContinuationPoints))
+            rows.append(refused if full else self._part(n.NodeId.Identifier.encode(), 0))
+        return rows
+
+    async def browse_next(self, request: ua.BrowseNextParameters) -> list[ua.BrowseResult]:
+        return [self._part(p, self.open.pop(p)) for p in request.ContinuationPoints]
+
+    async def read(self, _: ua.ReadParameters) -> list[ua.DataValue]:
+        raise ua.UaStatusCodeError(ua.StatusCodes.BadResponseTooLarge)
+
+
+def link_of(session: Session) -> Link:
+    client: Any = SimpleNamespace(uaclient=SimpleNamespace(session=session, protocol=1))
+    return Link(client, Server("opc.tcp://127.0.0.1:1", security="None", insecure=True))
+
+
+@pytest.mark.parametrize("points", [99, 2, 1])
+def test_a_browse_that_is_answered_in_parts_is_read_to_its_end(points: int) -> None:
+    """A unit in the second part was not seen, and the points stayed open until the server had none left."""
+    session = Session(3, points)
+    nodes = [ua.NodeId(f"n{i}", 2) for i in range(3)]
+    found = asyncio.run(link_of(session).browsed(nodes, ua.ObjectIds.HasProperty, 5.0))
+    assert [[r.NodeId.Identifier for r in rows] for rows in found] == [
+        [f"n{i} {k}" for k in range(3)] for i in range(3)
+    ]
+    assert session.open == {}
+
+
+def test_a_request_that_is_too_large_for_a_server_is_made_smaller() -> None:
+    link = link_of(Session(1))
+    with pytest.raises(TooManyError, match="BadResponseTooLarge"):
+        asyncio.run(link.values([ua.NodeId(1), ua.NodeId(2)], 5.0))
+    assert link.limits.read.most == 1
+
+
+class Folders:
+    """A server whose folders hold some leases."""
+
+    gone = ""
+
+    def __init__(self, *leases: str) -> None:
+        self.leases, self.kind, self.fails = leases, ua.VariantType.String, None
+
+    async def beside(self, node: ua.NodeId, _: str, __: float) -> list[ua.NodeId]:
+        if self.fails is not None:
+            raise self.fails
+        return [ua.NodeId(n, 2) for n in self.leases if n.startswith(str(node.Identifier)[0])]
+
+    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
+        return [Reading(float("nan"), 0, None, self.kind) for _ in nodes]
+
+    async def values(self, nodes: Sequence[ua.NodeId], _: float, __: int) -> list[ua.DataValue]:
+        return [ua.DataValue(ua.Variant(3, ua.VariantType.Byte)) for _ in nodes]
+
+
+def test_a_lease_is_found_beside_any_mv_and_never_missed_because_an_answer_was_late() -> None:
+    """A late answer, or a lease in each of two folders, let the loop write without one, and nobody was told."""
+    written = [ua.NodeId("a1", 2), ua.NodeId("b1", 2)]
+
+    def found(folders: Any) -> ua.NodeId | None:
+        return asyncio.run(beside(folders, written, 1.0))
+
+    assert found(Folders()) is None
+    assert found(Folders("b lease")) == ua.NodeId("b lease", 2)
+    with pytest.raises(SeveralLeasesError, match=r"name one by nodes\.lease"):
+        found(Folders("a lease", "b lease"))
+    folders: Any = Folders("a lease", "b lease")
+    folders.kind = ua.VariantType.Int32  # no text, so no lease
+    assert found(folders) is None
+    folders.fails = EndpointError("BadServiceUnsupported")
+    assert found(folders) is None
+    folders.fails = LateError("late")
+    with pytest.raises(LateError):
+        found(folders)
+
+
+@pytest.mark.parametrize("also", ["heartbeat", "MV b"])
+def test_what_is_written_as_an_mv_is_written_as_nothing_else(also: str, controller: Controller) -> None:
+    """Two MVs of one loop.toml on one node, spelt two ways: nothing objected."""
+    signals = [replace(controller.manifest.mv[0], name=name) for name in ("a", "b")]
+    manifest = replace(controller.manifest, mv=tuple(signals))
+    pv, dv = ({s.name: f"ns=2;s={s.name}" for s in manifest.signals(g)} for g in ("pv", "dv"))
+    mv = {"a": "ns=2;s=a", "b": "ns=2;s=b" if also == "heartbeat" else "nsu=u;s=a"}
+    nodes = Nodes(pv, mv, dv, heartbeat="nsu=u;s=a" if also == "heartbeat" else "")
+
+    class Resolving:
+        async def resolved(self, texts: Sequence[str], _: float) -> list[ua.NodeId]:
+            return [node_id(t, ["", "", "u"]) for t in texts]
+
+    with pytest.raises(LoopError, match=f"MV a and {also} are one node, ns=2;s=a; give each its own"):
+        asyncio.run(Plan.made(Resolving(), manifest, nodes, 1.0))  # type: ignore[arg-type]

@@ -216,7 +216,7 @@ def test_a_connection_that_is_lost_by_silence_is_told_once_and_so_is_the_next_on
         assert within(20, lambda: scanning.told.count("it does not answer") == n)  # noqa: B023
         link.silent = False
         assert scanning.becomes("")
-    connected = "connected to opc.tcp://127.0.0.1:1"
+    connected = "connected to opc.tcp://127.0.0.1:1; lease nsu=urn:plant;s=lease"
     assert scanning.told == [connected, "it does not answer", connected, "it does not answer", connected]
 
 

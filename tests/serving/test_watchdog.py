@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from serving import Controller
+from serving.fault import kind_of
 from serving.opcua.sampling import Sampling
 from serving.opcua.settings import Nodes, Server
-from serving.station.recorder import kind_of
 
 pytest_plugins = ["small_laws"]
 
@@ -46,8 +46,8 @@ def test_one_that_is_slow_is_told_once(sampling: Sampling, scans: int) -> None:
     """A loop at speed 5 on a plant at speed 1 had a fault of each value."""
     kinds = [kind for kind, _ in groupby(kind_of(sampling.dead(float(k // scans))) for k in range(430))]
     assert len(kinds) == 3
-    assert kinds[:2] == ["", "the plant's watchdog has stood at # for # scans"]
-    assert "moves, but not within # scans: the plant runs at another speed" in kinds[2]
+    assert kinds[:2] == [("",), ("the plant's watchdog has stood at # for # scans",)]
+    assert "moves, but not within # scans: the plant runs at another speed" in kinds[2][0]
 
 
 def test_a_plant_that_comes_to_its_speed_is_believed(sampling: Sampling) -> None:
