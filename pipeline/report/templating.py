@@ -10,6 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.files import write_text
 from pipeline.pictures.numbers import figure, kilobytes, ratio, times
+from serving.words import harmless
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 """Where `make registry` serves the registry, unless another port was asked for."""
@@ -24,9 +25,15 @@ def render(name: str, content: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
+        finalize=_shown,
     )
     environment.filters |= {f.__name__: f for f in (figure, times, ratio, kilobytes, cell, sentence)}
     return environment.get_template(name).render(content)
+
+
+def _shown(value: Any) -> Any:
+    """A value of a template: what would act on a reader is spelt out, whoever let it come so far. Markup stays."""
+    return harmless(value) if type(value) is str else value
 
 
 def write_pages(out: Path, files: Mapping[str, str]) -> list[Path]:
