@@ -14,6 +14,7 @@ from serving.errors import ContractError, SampleError
 from serving.fault import reworded
 from serving.guard import Sample, implausible
 from serving.manifest import Signal
+from serving.ranges import numbers
 from serving.standing import Standing
 
 Array: TypeAlias = NDArray[np.float64]
@@ -86,11 +87,10 @@ class AppliedMV:
             if isnan(last[0]):
                 raise SampleError("there is no read-back, so where the MV stands is not known and nothing is written")
             return last
-        given = np.asarray(sample.mv_applied)
-        if given.dtype.kind not in "fiu" or (given is not sample.mv_applied and _holds_bool(sample.mv_applied)):
-            kind = "bool" if given.dtype.kind in "fiu" else str(given.dtype)
-            raise ContractError(f"applied MV is of the type {kind}; it needs numbers")  # "1" and True are none
-        applied = np.array(given, dtype=np.float64, ndmin=1)
+        try:
+            applied = np.array(numbers(sample.mv_applied), dtype=np.float64, ndmin=1)
+        except TypeError as error:
+            raise ContractError(f"applied MV {error}; it needs numbers") from None  # "1" and True are none
         if applied.shape != last.shape:
             raise ContractError(f"applied MV has the shape {applied.shape} instead of {last.shape}")
         values = applied.tolist()
@@ -120,8 +120,3 @@ class AppliedMV:
             if applied.shape == self._given.shape and np.isfinite(applied).all():
                 return implausible(self._signals, applied.tolist()) or ""
         return ""
-
-
-def _holds_bool(given: object) -> bool:
-    """Whether a list, which numpy makes numbers of, holds a truth value."""
-    return any(isinstance(v, bool | np.bool_) for v in given) if isinstance(given, list | tuple) else False

@@ -17,6 +17,7 @@ from serving.digest import DIGEST_KEY, file_digest, unseal
 from serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
 from serving.graph_audit import MAX_BYTES, audit
 from serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
+from serving.ranges import numbers
 from serving.step_lock import step_lock
 
 Array: TypeAlias = NDArray[np.float64]
@@ -177,11 +178,9 @@ class Controller:
         if value is None:
             raise ContractError(f"{name} is missing; the law {self.manifest.law!r} needs {self._allowed(name)}")
         try:
-            array = np.asarray(value)
-        except (ValueError, TypeError) as error:
-            raise ContractError(f"{name} is no vector of numbers: {error}; it needs {self._allowed(name)}") from error
-        if array.dtype.kind not in "fiu":
-            raise ContractError(f"{name} has the type {array.dtype}; it needs numbers: {self._allowed(name)}")
+            array = numbers(value)
+        except TypeError as error:
+            raise ContractError(f"{name} {error}; it needs numbers: {self._allowed(name)}") from error
         if array.ndim == 0 and length == 1:
             array = array.reshape(1)
         if array.shape != (length,):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 from typing import Any, Self
 
 from serving.errors import ArtifactError
 from serving.plain_values import MAX_DIGITS, refused, shown
+from serving.words import ACTS
 
 SCHEMA = 1
 MANIFEST_KEY = "loopwright.manifest"
@@ -19,8 +19,6 @@ MAX_CHARACTERS = 2**20
 MAX_NAME = 200  # characters
 MAX_DEPTH = 20  # of lists and objects in each other
 MAX_STATE = 1_000_000
-# Line breaks, control characters and overrides of direction: a name with one could forge a line wherever it is shown.
-FORBIDDEN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 SHORTEST_S, LONGEST_S = 1e-6, 1e9  # a period
 MOVE_ROUNDING = 1e-9  # share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
@@ -257,7 +255,7 @@ def _name(value: object) -> str:
     if not isinstance(value, str) or len(value) > MAX_NAME:
         raise TypeError(f"a name is {shown(value)}; it must be a text of at most {MAX_NAME} characters")
     value.encode()  # half a surrogate pair cannot be printed
-    if FORBIDDEN.search(value):
+    if ACTS.search(value):
         raise ValueError(
             f"a name is {ascii(value)[:MAX_NAME]}; it may hold no line break, control or direction character"
         )

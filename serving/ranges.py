@@ -1,9 +1,9 @@
-"""Values that somebody sets, held against the ranges of their signals."""
+"""Values that somebody gives: whether they are numbers, and whether they lie in the ranges of their signals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,12 +14,37 @@ from serving.manifest import Signal
 Array: TypeAlias = NDArray[np.float64]
 
 
+def numbers(given: object) -> NDArray[Any]:
+    """``given`` as an array of integers or floats, of any shape.
+
+    TypeError, whose text goes on a name, for anything else. Of a truth value among numbers numpy makes a number; this
+    does not.
+    """
+    try:
+        array = np.asarray(given)
+    except ValueError as error:
+        raise TypeError(f"is no vector of numbers: {error}") from None
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"has the type {array.dtype}")
+    if array is not given and any(map(_is_truth, _entries(given))):
+        raise TypeError("has the type bool in part")
+    return array
+
+
+def _entries(given: Any) -> Any:
+    return () if hasattr(given, "dtype") or isinstance(given, int | float) else given
+
+
+def _is_truth(value: object) -> bool:
+    return type(value) is bool or getattr(getattr(value, "dtype", None), "kind", "") == "b"
+
+
 def within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
     """``values`` as (n,); LoopError outside the signals' ranges."""
     try:
-        vector = np.array(values, dtype=np.float64, ndmin=1)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise LoopError(f"the {what} is no vector of numbers: {error}") from error
+        vector = np.array(numbers(values), dtype=np.float64, ndmin=1)
+    except (TypeError, OverflowError) as error:
+        raise LoopError(f"the {what} {error}; it needs numbers") from error
     if vector.shape != (len(signals),):
         names = ", ".join(f"{s.name} [{s.unit}]" for s in signals)
         raise LoopError(f"the {what} has the shape {vector.shape}; it needs ({len(signals)},): {names}")

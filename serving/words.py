@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from serving.errors import LoopwrightError
+
+# Line breaks, control characters, marks and overrides of direction, the mark of a byte order: they forge a line, clear
+# a screen or turn a text round wherever it is shown.
+ACTS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]")
 
 
 def plain(text: str) -> str:
@@ -15,6 +20,11 @@ def plain(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def harmless(text: str) -> str:
+    """A text of many lines as it may be shown: what would act on a reader is spelt out, but lines and tabs stay."""
+    return ACTS.sub(lambda c: c[0] if c[0] in "\n\t" else c[0].encode("unicode_escape").decode(), text)
 
 
 def plain_tree(value: Any) -> Any:

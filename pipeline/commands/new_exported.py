@@ -26,6 +26,7 @@ from pipeline.historian.tags import (
     read_tags,
     write_tags,
 )
+from serving.words import plain
 
 
 def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
@@ -74,11 +75,11 @@ def propose_tags(name: str, options: argparse.Namespace) -> None:
     rows = guesses(export, units_of(options.files))
     write_tags(path, rows)
     for note in export.notes:
-        print(f"  {note.column}: {note.words}")
+        print(plain(f"  {note.column}: {note.words}"))
     roles = {r: [g.tag.tag for g in rows if g.tag.role == r] for r in ROLES}
     print(f"{path}: {len(rows)} tags with guessed roles; nothing else was written")
     for role, tags in roles.items():
-        print(f"  {role:5} {', '.join(tags) or '-'}")
+        print(plain(f"  {role:5} {', '.join(tags) or '-'}"))
     files = " ".join(map(str, options.files))
     how = (("--time", options.time), ("--time-format", options.time_format), ("--time-zone", options.time_zone))
     given = "".join(f" {option} {shlex.quote(value)}" for option, value in how if value)

@@ -8,6 +8,7 @@ from pathlib import Path
 from pipeline.historian.findings import InputReport, Screening, Verdict
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.drawing import axis_label, ratio_unit
+from serving.words import plain
 
 
 def tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:
@@ -20,12 +21,12 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
     for reason, rows in report.dropped_rows.items():
         print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
     for finding in report.findings:
-        print(f"  {finding.tag}: {finding.words}")
+        print(plain(f"  {finding.tag}: {finding.words}"))
     for line in sayings(report.verdict, {tag.name: tag.unit for tag in report.tags}):
-        print(f"  {line}")
+        print(plain(f"  {line}"))
     print(f"can these data carry a model: {report.verdict.carries}")
     for reason in report.verdict.reasons:
-        print(f"  {reason}")
+        print(plain(f"  {reason}"))
     print(f"look at {folder}/screening.html: trends with every mask")
     if added:
         if report.verdict.carries != "yes":

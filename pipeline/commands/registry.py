@@ -15,6 +15,7 @@ from pipeline.tracking.publish import publish
 from pipeline.tracking.registry import CHAMPION, fetch, promote, registered, versions
 from pipeline.tracking.signing import trusted, words
 from pipeline.tracking.store import store, store_uri
+from serving.words import plain
 
 HOST = "127.0.0.1"
 CHAMPIONS = "tags.standing LIKE 'champion%'"
@@ -31,22 +32,23 @@ def _list(args: argparse.Namespace) -> None:
                 over = version.tags.get("gate_relative_to", "")  # nothing: the NMPC, as for most cases
                 signer = words(version.tags)
                 row = f"{model.name:40} {version.version:>4}  gate {f'{score} {over}':10} {aliases}"
-                print(f"{row:70}  signed by {signer}" if signer else row)
+                # Whoever can write the store can write its tags.
+                print(plain(f"{row:70}  signed by {signer}" if signer else row))
         if not models:
             print("the registry is empty: `loopwright run` fills it; a clone holds no results to publish until then")
 
 
 def _promote(args: argparse.Namespace) -> None:
     with store() as client:
-        print(promote(client, args.name, args.version, args.alias))
+        print(plain(promote(client, args.name, args.version, args.alias)))
 
 
 def _fetch(args: argparse.Namespace) -> None:
     with store() as client:
         files, signer = fetch(client, args.controller, args.folder, trusted(args.key))
     for path in files:
-        print(path)
-    print(signer, file=sys.stderr)
+        print(plain(str(path)))
+    print(plain(signer), file=sys.stderr)
 
 
 def _serve(args: argparse.Namespace) -> None:

@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.files import write_text
 from pipeline.pictures.numbers import figure, kilobytes, ratio, times
+from serving.words import harmless
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 """Where `make registry` serves the registry, unless another port was asked for."""
@@ -31,9 +32,15 @@ def _environment(escapes: bool) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
+        finalize=_shown,
     )
     environment.filters |= {f.__name__: f for f in (figure, times, ratio, kilobytes, cell, sentence)}
     return environment
+
+
+def _shown(value: Any) -> Any:
+    """A value of a template: what would act on a reader is spelt out, whoever let it come so far. Markup stays."""
+    return harmless(value) if type(value) is str else value
 
 
 def write_pages(out: Path, files: Mapping[str, str]) -> list[Path]:

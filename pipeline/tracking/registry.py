@@ -30,6 +30,7 @@ from pipeline.tracking.signing import Signer
 from pipeline.tracking.store import missing_file
 from serving.errors import ArtifactError, SignatureError
 from serving.sidecar import manifest_in, require_sidecar
+from serving.words import harmless, plain
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
 BY_HAND = "champion_by"
@@ -89,9 +90,10 @@ def register(
     own = {"sha256": digest, "law": law, "case": case, "period_s": str(manifest.period_s)}
     before, at = ({}, run_id) if known is None else (dict(known.tags), str(known.run_id))
     signature = signing.present(before) if signer is None else signer.attach(client, at, path, before)
-    description = card.version_description(validation, gate, run_id, picture, signing.words(signature))
+    description = harmless(card.version_description(validation, gate, run_id, picture, signing.words(signature)))
     analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
-    tags = {**gate.tags(), **analysis, **own, **signature, **tags}  # in this order they are shown
+    shown = {**gate.tags(), **analysis, **own, **signature, **tags}  # in this order they are shown
+    tags = {key: plain(value) for key, value in shown.items()}
     if known is None:
         number, before = _log(client, name, path, run_id, description, tags), tags
         client.set_registered_model_alias(name, CANDIDATE, number)

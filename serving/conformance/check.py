@@ -14,6 +14,7 @@ import numpy as np
 from serving.conformance.kit import KIT, VECTORS
 from serving.conformance.numbers import Array, read, read_all
 from serving.errors import ContractError, LoopwrightError
+from serving.words import plain
 
 OUTPUTS = ("mv", "state_next", "info")
 READS = (1, 2, KIT)  # versions of the kit
@@ -59,7 +60,7 @@ class Verdict:
             lines.append(f"  and {len(self.mistakes) - SHOWN} more")
         if self.note:
             lines.append(f"  {self.note}")
-        return "\n".join(lines)
+        return "\n".join(map(plain, lines))  # the answers' file holds any text
 
     def compare(self, where: str, ours: Array, theirs: Array, scale: Array) -> bool:
         """Take the difference of one vector into account; whether all bits are equal."""

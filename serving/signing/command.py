@@ -9,6 +9,7 @@ from pathlib import Path
 
 from serving.errors import SignatureError
 from serving.signing.reading import contents
+from serving.words import plain
 
 MAX_PASSWORD = 1023  # bytes, of cryptography
 MAX_FILE = 4096  # bytes, of a file with a password
@@ -52,7 +53,7 @@ def run_sign(options: argparse.Namespace) -> None:
     expires = options.expires if options.days is None else datetime.now(UTC).replace(microsecond=0) + options.days
     until = "" if expires is None else f", until {expires:%Y-%m-%d}"
     for file in options.files:
-        print(f"{sign(file, key, expires=expires)}: signed by {key.public.words}{until}")
+        print(plain(f"{sign(file, key, expires=expires)}: signed by {key.public.words}{until}"))
 
 
 def verify_options(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +70,7 @@ def run_verify(options: argparse.Namespace) -> None:
     from serving.signing.verify import verified
 
     found = verified(options.file, options.key, signature=options.signature)
-    print(f"{' and '.join(found.files)}: signed by {found.words}")
+    print(plain(f"{' and '.join(found.files)}: signed by {found.words}"))
 
 
 def password_of(variable: str | None, file: Path | None) -> bytes | None:

@@ -123,7 +123,7 @@ def _ask(options: argparse.Namespace) -> int:
     request = {"do": do, "value": value, "who": options.who, "reason": options.reason}
     if getattr(options, "accept_unproven", False):
         request["accept_unproven"] = True
-    print(ask(settings.journal.file, request)["done"])
+    print(plain(str(ask(settings.journal.file, request)["done"])))
     if do == "swap":
         print(f"once it has the plant: {options.loop} still names the old file; a restart brings that one")
     elif do == "back":
@@ -198,7 +198,7 @@ def _check(options: argparse.Namespace) -> int:
     for cells in table:
         print(plain("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip()))
     if controller.signed is not None:
-        print(f"{controller.path.name}: signed by {controller.signed.words}")
+        print(plain(f"{controller.path.name}: signed by {controller.signed.words}"))
     wrong = [*here.wrong[said:], *(f"{row.signal}: {row.wrong}" for row in rows if row.wrong)]
     notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
     for note in [*notes, *here.notes, *_unproven(manifest), *_warnings(settings), *ending(controller)]:

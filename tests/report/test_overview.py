@@ -11,14 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from jinja2 import DictLoader
+from markupsafe import Markup
 from rich.console import Console
 
 from pipeline.engine.command import run_stage
 from pipeline.errors import PipelineError
 from pipeline.evaluation.standing import Standing, tally
 from pipeline.evaluation.validation import SCHEMA
+from pipeline.report import templating
 from pipeline.report.overview import write_overview
 from pipeline.report.results import show_results
+from pipeline.report.templating import render
 from pipeline.stages.overview import overview
 
 
@@ -237,3 +241,12 @@ def test_the_overview_needs_no_heavy_import() -> None:
     code = f"import sys, pipeline.stages.overview; print({heavy} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert found.stdout.strip() == "set()"
+
+
+def test_a_text_that_acts_on_a_reader_is_spelt_out_in_any_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names with such a text are refused where files are loaded; a page does not rely on it."""
+    pages = dict.fromkeys(("a.html.j2", "a.md.j2"), "<{{ x }}\n{{ y }}>")
+    monkeypatch.setattr(templating, "PackageLoader", lambda _: DictLoader(pages))
+    content = {"x": "T\x1b[2J\u202e<b>\nline", "y": Markup("<i>\n</i>")}
+    assert render("a.md.j2", content) == "<T\\x1b[2J\\u202e<b>\nline\n<i>\n</i>>"
+    assert render("a.html.j2", content) == "<T\\x1b[2J\\u202e&lt;b&gt;\nline\n<i>\n</i>>"

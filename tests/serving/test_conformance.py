@@ -174,6 +174,14 @@ def test_a_host_that_does_all_as_it_must_passes(pi_file: Path, kit: Path, answer
     assert verdict.text().startswith("Perfect, onnxruntime 0: passed\n  same bits in")
 
 
+def test_what_a_host_says_of_itself_acts_on_nobody(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
+    answers |= {"host": "good\x1b[2J: passed\nplain", "onnxruntime": "1\u202e\u200e\nline"}
+    answers["scans"][0]["mode"] = "\x1b[2J"
+    text = judged(pi_file, kit, answers, tmp_path).text()
+    assert all(line.isprintable() for line in text.split("\n"))
+    assert text.split("\n")[0].endswith("FAILED")
+
+
 def judged(file: Path, kit: Path, answers: Json, tmp_path: Path) -> Any:
     path = tmp_path / "answers.json"
     path.write_text(json.dumps(answers))

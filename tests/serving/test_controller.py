@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import traceback
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,11 @@ def test_a_forked_child_does_not_wait_for_a_step_of_another_thread(
         ({"sp": [1.0, 2.0]}, r"sp has the shape \(2,\)"),
         ({"sp": "1.0"}, "sp has the type <U3; it needs numbers"),
         ({"sp": True}, "sp has the type bool"),
+        ({"pv": [True, 300.0]}, "pv has the type bool in part"),
+        ({"pv": (1.0, np.bool_(1))}, "pv has the type bool in part"),
+        ({"pv": [np.array(True), 300.0]}, "pv has the type bool in part"),
+        ({"sp": [True]}, "sp has the type bool"),
+        ({"mv_applied": deque([False])}, "mv_applied has the type bool"),
         ({"sp": 1 + 0j}, "sp has the type complex128"),
         ({"sp": None}, "sp is missing"),
         ({"sp": [[1.0], [1.0, 2.0]]}, "sp is no vector of numbers"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import tomllib
 from dataclasses import replace
@@ -12,8 +13,9 @@ import pytest
 from pipeline.export.controller_file import with_evidence
 from serving import ArtifactError, Controller, Manifest
 from serving.__main__ import main
+from serving.station import command
 from serving.station.template import template
-from serving.words import plain
+from serving.words import harmless, plain
 
 pytest_plugins = ["small_laws"]
 Capture = pytest.CaptureFixture[str]
@@ -145,7 +147,25 @@ def test_a_text_of_a_file_acts_on_nobody_who_reads_it(pi_file: Path, tmp_path: P
     assert line.isprintable()
 
 
-@pytest.mark.parametrize("bad", ["\n", "\r", "\x00", "\x1b[2J", "\x7f", "\x85", "\u2028", "\u202e", "\u2066"])
+def test_what_a_loop_answers_acts_on_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    """Whoever may write the folder of its door can answer in its place."""
+    settings = tmp_path / "loop.toml"
+    settings.write_text(
+        'controller = "a.onnx"\n[server]\nendpoint = "opc.tcp://a:1"\nsecurity = "None"\ninsecure = true\n'
+        '[nodes.pv]\ny = "ns=1;s=y"\n[nodes.mv]\nu = "ns=1;s=u"\n'
+    )
+    monkeypatch.setattr(command, "ask", lambda *_: {"done": FORGED})
+    parser = argparse.ArgumentParser()
+    command.options(parser)
+    assert command.run(parser.parse_args(["mode", "AUTO", "--loop", str(settings)])) == 0
+    assert capsys.readouterr().out == f"{plain(FORGED)}\n"
+
+
+def test_a_text_of_many_lines_keeps_its_lines_alone() -> None:
+    assert harmless("a\n\tb\x1b\u200f\ufeff\r温度\u200c\u00a0") == "a\n\tb\\x1b\\u200f\\ufeff\\r温度\u200c\u00a0"
+
+
+@pytest.mark.parametrize("bad", ["\n", "\x00", "\x1b[2J", "\x85", "\u2028", "\u202e", "\u200e", "\u061c", "\ufeff"])
 @pytest.mark.parametrize("place", ["law", "case", "name", "unit", "info"])
 def test_a_name_that_could_forge_a_line_is_refused(pi_file: Path, bad: str, place: str) -> None:
     row = json.loads(Controller(pi_file).manifest.to_json())
@@ -154,7 +174,9 @@ def test_a_name_that_could_forge_a_line_is_refused(pi_file: Path, bad: str, plac
         Manifest.from_json(json.dumps(row))
 
 
-@pytest.mark.parametrize("name", ["m³/h", "Ölstand", "TIC-101.PV", "温度", "حرارة", "a\u200eb", "a\u00a0b", "%", "°C"])
+@pytest.mark.parametrize(
+    "name", ["m³/h", "Ölstand", "TIC-101.PV", "温度", "حرارة", "می\u200cرود", "a\u00a0b", "%", "°C"]
+)
 def test_a_name_of_any_script_is_none_of_them(pi_file: Path, name: str) -> None:
     row = json.loads(Controller(pi_file).manifest.to_json())
     row["pv"][1].update(name=name, unit=name)

@@ -6,7 +6,7 @@ import html
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from pipeline.hosts.fmu.variables import Variable, variables_of
+from pipeline.hosts.fmu.variables import Variable, in_xml, variables_of
 from serving.controller import Controller
 
 LOG = {
@@ -35,7 +35,7 @@ def token_of(controller: Controller) -> str:
 def words_of(controller: Controller) -> str:
     """One line: what the controller is."""
     m = controller.manifest
-    return f"Controller {m.law} of {m.case}, period {m.period_s:g} s, SHA-256 {controller.sha256}"
+    return in_xml(f"Controller {m.law} of {m.case}, period {m.period_s:g} s, SHA-256 {controller.sha256}")
 
 
 def description(controller: Controller, identifier: str, fmi: int) -> bytes:

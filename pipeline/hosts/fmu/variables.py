@@ -59,7 +59,7 @@ def variables_of(m: Manifest) -> list[Variable]:
             rows.append(_variable(s, reference, group, causality, words))
             reference += 1
     for name in m.info:
-        rows.append(Variable(_plain(f"info.{name}"), reference, "info", "output", "of the law, for people and alarms"))
+        rows.append(Variable(in_xml(f"info.{name}"), reference, "info", "output", "of the law, for people and alarms"))
         reference += 1
     names = [row.name for row in rows]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -72,12 +72,12 @@ def _variable(s: Signal, reference: int, group: str, causality: str, words: str)
     if s.values is not None:
         words += f"; allowed: {', '.join(f'{value:g}' for value in s.values)}"
     start = None if causality == "output" else s.middle
-    unit = "" if s.unit == "-" else _plain(s.unit)
-    return Variable(_plain(f"{group}.{s.name}"), reference, group, causality, words, unit, s.low, s.high, start)
+    unit = "" if s.unit == "-" else in_xml(s.unit)
+    return Variable(in_xml(f"{group}.{s.name}"), reference, group, causality, words, unit, s.low, s.high, start)
 
 
-def _plain(text: str) -> str:
-    """One line of text that XML can hold."""
+def in_xml(text: str) -> str:
+    """A text in one line; HostError where XML cannot hold it."""
     if NOT_IN_XML.search(text):
         raise HostError(f"the name {text!r} has a character that an FMU's description, which is XML, cannot hold")
     return " ".join(text.split())
