@@ -16,7 +16,10 @@ from pipeline.historian.reason import Reason
 from pipeline.metrics import Array
 
 EMPTY = ("", "nan", "null", "none", "na", "n/a", "#n/a", "#nv", "-", "--", "?", "<null>", "1.#qnan", "-1.#ind")
+# What a number looks like: with a point; with a point or a comma and no thousands; with whatever signs.
 PLAIN = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+EITHER_SIGN = re.compile(r"^[+-]?\d+([.,]\d+)?([eE][+-]?\d+)?$")
+NUMBER = re.compile(r"^[+-]?(\d[\d.,]*|[.,]\d+)([eE][+-]?\d+)?$")
 MINUS = (
     "\u2212\u2010\u2011\u2012\u2013\u2014\ufe58\ufe63\uff0d"  # minus, hyphens and dashes that programs write for one
 )
