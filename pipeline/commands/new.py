@@ -117,7 +117,7 @@ def _check_files(name: str, options: argparse.Namespace) -> None:
     absent = next((path for path in options.files if not path.exists()), None)
     if absent is not None and not absent.suffix and any(getattr(options, role) for role in ROLES):
         raise RecordError(
-            f"{absent}: no such file; NAME is {name!r}: --pv and its like take one TAG, and are given again for the next"
+            f"{absent}: no such file; NAME is {name!r}: --pv and its like take one TAG, give them again for another"
         )
 
 

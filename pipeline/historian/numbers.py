@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from pipeline.historian.headers import UNIT
 from pipeline.historian.reason import Reason
 from pipeline.metrics import Array
 
@@ -126,7 +127,11 @@ def _without_unit(text: Any, codes: Codes) -> Any | None:
     parts = pc.extract_regex(text, WITH_UNIT)
     units = pc.value_counts(pc.struct_field(parts, "unit")).to_pylist()
     own = [row for row in units if row["values"] is not None]
-    if len(own) != 1 or 2 * own[0]["counts"] <= np.count_nonzero(codes == Reason.TEXT):
+    if (
+        len(own) != 1
+        or not UNIT.match(own[0]["values"].strip())
+        or 2 * own[0]["counts"] <= np.count_nonzero(codes == Reason.TEXT)
+    ):
         return None
     return pc.coalesce(pc.struct_field(parts, "number"), text)
 

@@ -127,6 +127,7 @@ def test_the_sign_between_thousands_is_no_decimal_sign(content: str, decimal: st
         (["60.3 %", "61.5 kg"], [None, None]),
         (["60.3 %", "61.5"], [None, 61.5]),
         (["5A", "7A"], [None, None]),
+        (["1 Running", "2 Running"], [None, None]),
     ],
 )
 def test_a_unit_behind_every_number(column: list[str], expected: list[float | None]) -> None:
