@@ -201,7 +201,7 @@ def _iso(column: Any) -> Array:
         import pandas as pd  # slower, and it takes what Arrow does not: a decimal comma, a missing minute, nonsense
 
         words = text.to_pandas().str.replace(",", ".", regex=False)
-        ends = words.str.contains(MIDNIGHT).fillna(False).astype(bool)  # 24:00 is the next day's 00:00
+        ends = words.str.contains(MIDNIGHT, na=False)  # 24:00 is the next day's 00:00
         words = words.where(~ends, words.str.replace(MIDNIGHT, "00", regex=True))
         stamps = pd.to_datetime(words, format="ISO8601", errors="coerce", utc=True)
         stamps += pd.to_timedelta(ends.astype(int), "D")
