@@ -417,6 +417,12 @@ def test_a_number_of_the_row_and_a_unit_beside_a_reading(header: tuple[str, ...]
     assert units_of([path]) == (units if header[3] == "Unit" else {})
 
 
+def test_the_state_of_a_pump_is_no_quality_of_readings(tmp_path: Path) -> None:
+    own = [[t, r[0], v, str(int(k % 10 == 0))]
+           for k, r in enumerate(rows()) for t, v in zip(NAMES, r[1:], strict=True)]  # fmt: skip
+    check(write(tmp_path / "x.csv", own, ("Tag", "Time", "Value", "Pump Status")))
+
+
 @pytest.mark.parametrize("header", [("Loop", "Time", "X"), ("Path", "Time", "Reading")])
 def test_a_file_sorted_by_tag(header: tuple[str, ...], tmp_path: Path) -> None:
     data = clean(700)
