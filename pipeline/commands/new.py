@@ -86,6 +86,7 @@ def _run(options: argparse.Namespace) -> int:
     name: str = options.name
     replace: bool = options.replace
     folder = DATA / name
+    _check_files(name, options)
     if replace:
         check_replaceable(name, folder)
     check_name(name, replace=replace)
@@ -109,6 +110,15 @@ def _run(options: argparse.Namespace) -> int:
     if period_s != found.step_s or period_s != float(f"{period_s:.3g}"):
         export = dataclasses.replace(export, period_s=period_s)
     return _write(name, folder, found, options, tags, export=export)
+
+
+def _check_files(name: str, options: argparse.Namespace) -> None:
+    """RecordError for a file that is not there: it may be the second word of an option that takes one."""
+    absent = next((path for path in options.files if not path.exists()), None)
+    if absent is not None and not absent.suffix and any(getattr(options, role) for role in ROLES):
+        raise RecordError(
+            f"{absent}: no such file; NAME is {name!r}: --pv and its like take one TAG, give them again for another"
+        )
 
 
 def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.errors import RecordError
 from pipeline.historian.export import Note
 from pipeline.historian.headers import split_header, tags_of
-from pipeline.historian.quality import QUALITY, is_quality, is_sure
+from pipeline.historian.quality import QUALITY, is_quality, is_sure, names_a_state
 from pipeline.historian.table_head import UNIT_WORDS, kind_of_cell
 from pipeline.historian.time_column import TimeColumn, seconds_of, time_column_of
 from pipeline.metrics import Array
@@ -72,7 +72,9 @@ def layout_of(
     others = [h for h in header if h not in time.columns]
     tag, value = _tag_and_value(others, sample, time, more)
     if tag and value:
-        found = tuple(h for h in others if h not in {tag, value} and _is_quality(h, sample))
+        found = tuple(
+            h for h in others if h not in {tag, value} and _is_quality(h, sample, beside=not names_a_state(h))
+        )
         qualities = {value: found} if found else {}
         unit = next((h for h in others if h.strip().lower() in UNIT_WORDS and _kind(sample.get(h, ())) == "text"), "")
         return Layout("long", time, (value,), qualities, tags_of(header), tag, unit, tuple(notes))
@@ -130,9 +132,9 @@ def _tags_before(text: str) -> set[str]:
     return {text.strip(), text.strip().rstrip(" ._:/-")}
 
 
-def _is_quality(column: str, sample: Mapping[str, Sequence[Any]]) -> bool:
+def _is_quality(column: str, sample: Mapping[str, Sequence[Any]], *, beside: bool = True) -> bool:
     """Whether a column beside a tag, or in a row that is one reading, holds qualities, by its first cells."""
-    return is_quality(column, Counter(_texts(sample.get(column, ()))), beside=True)
+    return is_quality(column, Counter(_texts(sample.get(column, ()))), beside=beside)
 
 
 def _tag_and_value(

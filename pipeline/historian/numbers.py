@@ -12,11 +12,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from pipeline.historian.headers import UNIT
 from pipeline.historian.reason import Reason
 from pipeline.metrics import Array
 
 EMPTY = ("", "nan", "null", "none", "na", "n/a", "#n/a", "#nv", "-", "--", "?", "<null>", "1.#qnan", "-1.#ind")
+# What a number looks like: with a point; with a point or a comma and no thousands; with whatever signs.
 PLAIN = r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$"
+EITHER_SIGN = re.compile(r"^[+-]?\d+([.,]\d+)?([eE][+-]?\d+)?$")
+NUMBER = re.compile(r"^[+-]?(\d[\d.,]*|[.,]\d+)([eE][+-]?\d+)?$")
 MINUS = (
     "\u2212\u2010\u2011\u2012\u2013\u2014\ufe58\ufe63\uff0d"  # minus, hyphens and dashes that programs write for one
 )
@@ -123,7 +127,11 @@ def _without_unit(text: Any, codes: Codes) -> Any | None:
     parts = pc.extract_regex(text, WITH_UNIT)
     units = pc.value_counts(pc.struct_field(parts, "unit")).to_pylist()
     own = [row for row in units if row["values"] is not None]
-    if len(own) != 1 or 2 * own[0]["counts"] <= np.count_nonzero(codes == Reason.TEXT):
+    if (
+        len(own) != 1
+        or not UNIT.match(own[0]["values"].strip())
+        or 2 * own[0]["counts"] <= np.count_nonzero(codes == Reason.TEXT)
+    ):
         return None
     return pc.coalesce(pc.struct_field(parts, "number"), text)
 

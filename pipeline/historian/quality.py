@@ -71,6 +71,12 @@ def is_sure(column: str) -> bool:
     return bool(NEGATIVE.search(match["word"]) or POSITIVE.search(match["word"]))
 
 
+def names_a_state(column: str) -> bool:
+    """Whether a header names the status of something, as Pump Status, and not of a reading."""
+    match = QUALITY.match(column)
+    return match is not None and bool(match["tag"]) and (match["word"] or "").lower() in {"status", "stat"}
+
+
 def meaning_of(column: str, counts: Mapping[str, int]) -> Meaning:
     """What the texts of one column, and how often each stands there, say of quality.
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 from pipeline.historian.date_forms import COMPACT, DATE, HOUR, plain_date
 from pipeline.historian.headers import TIME_UNITS, UNIT
-from pipeline.historian.numbers import plain
+from pipeline.historian.numbers import NUMBER, plain
 
-NUMBER = re.compile(r"^[+-]?(\d[\d.,]*|[.,]\d+)([eE][+-]?\d+)?$")
 ISO_DAY = re.compile(r"^\d{4}-\d\d-\d\d([T ].*)?$")
 LONGEST_UNIT = 14  # characters
 MOSTLY = 0.6  # of the lines have as many cells

@@ -16,11 +16,11 @@ from pipeline.errors import RecordError
 from pipeline.historian.date_forms import ELAPSED, MIDNIGHT, calendar_digits, form_of, other_forms, plain_date
 from pipeline.historian.day_counts import DAY_S, DAYS, SERIAL, UnclearCountError, days_of
 from pipeline.historian.headers import NO_UNITS, SPELLINGS, TIME_UNITS, TimeHeader, time_header
+from pipeline.historian.numbers import EITHER_SIGN
 from pipeline.metrics import Array
 
 ISO = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?\s*(Z|[+-]\d\d:?(\d\d)?)?$", re.IGNORECASE)
 ZONE = re.compile(r"\d\s*(Z|[+-]\d\d:?(\d\d)?)$", re.IGNORECASE)
-NUMERIC = re.compile(r"^[+-]?\d+([.,]\d+)?([eE][+-]?\d+)?$")
 SINCE_1970_S = 1e8  # numbers of seconds from here on (1973) count from 1970; smaller ones from some start
 UTC, UNSTATED = "UTC", "the export states no zone"
 
@@ -83,7 +83,7 @@ def clock_of(name: str, sample: Sequence[Any], where: str, unit: str = "", *, ev
     texts = [str(c).strip() for c in cells]
     header = time_header(name)
     numbers = all(isinstance(c, int | float) and not isinstance(c, bool) for c in cells)
-    if numbers or all(NUMERIC.match(t) for t in texts):
+    if numbers or all(EITHER_SIGN.match(t) for t in texts):
         values = np.array([float(t.replace(",", ".")) for t in texts])
         return _numeric(header, values, where, unit, everywhere=everywhere) if header.named else None
     if _most(texts, ISO):
@@ -201,7 +201,7 @@ def _iso(column: Any) -> Array:
         import pandas as pd  # slower, and it takes what Arrow does not: a decimal comma, a missing minute, nonsense
 
         words = text.to_pandas().str.replace(",", ".", regex=False)
-        ends = words.str.contains(MIDNIGHT).fillna(False).astype(bool)  # 24:00 is the next day's 00:00
+        ends = words.str.contains(MIDNIGHT, na=False)  # 24:00 is the next day's 00:00
         words = words.where(~ends, words.str.replace(MIDNIGHT, "00", regex=True))
         stamps = pd.to_datetime(words, format="ISO8601", errors="coerce", utc=True)
         stamps += pd.to_timedelta(ends.astype(int), "D")

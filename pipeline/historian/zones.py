@@ -94,21 +94,21 @@ class LocalClock:
         for i in range(len(place)):
             back_s = (before[i] - own[i]) * (-1.0 if self.falls else 1.0)
             if entered[i]:
-                least_s = 0.0 if stamps_repeat else np.nextafter(0, 1)
-                second = bool(self.falls) or self._begins_second(local, int(place[i]), twice, usual_s, least_s)
+                begins = place[i] == 0 and self._begins_second(local, twice, usual_s, stamps_repeat=stamps_repeat)
+                second = bool(self.falls) or begins
             elif back_s > SET_BACK_S or (back_s == 0 and usual_s >= HOUR_S and not stamps_repeat):
                 second = not self.falls
             out[i] = second
         self.second = second
         return out
 
-    def _begins_second(self, local: Array, k: int, twice: NDArray[np.bool_], usual_s: float, least_s: float) -> bool:
+    def _begins_second(self, local: Array, twice: NDArray[np.bool_], usual_s: float, *, stamps_repeat: bool) -> bool:
         """Whether the file begins in the second pass: it goes on beyond the hour without a gap, and never back."""
-        if k or np.isfinite(self.last_s) or self.falls:
+        if np.isfinite(self.last_s) or twice.all():
             return False
-        end = int(np.argmin(twice)) if not twice.all() else len(local)
-        steps = np.diff(local[: end + 1])
-        return end < len(local) and bool(np.all(steps >= least_s)) and float(steps[-1]) < usual_s + HOUR_S / 2
+        steps = np.diff(local[: int(np.argmin(twice)) + 1])
+        on = bool(np.all(steps >= 0 if stamps_repeat else steps > 0))
+        return on and float(steps[-1]) < usual_s + HOUR_S / 2
 
     def _offset(self, utc: datetime) -> float:
         offset = utc.astimezone(self.zone).utcoffset()

@@ -407,6 +407,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     "no change": (["tank", "x.csv", *ROLES, "--max-move", "TIC-101.OP=0"], "give a change above 0"),
     "no number": (["tank", "x.csv", *ROLES, "--max-move", "TIC-101.OP=slow"], "'slow' is no finite number"),
     "no file": (["tank", "none.csv", *ROLES], "none.csv: no such file"),
+    "two tags of one option": (["--pv", "PV", "op", "tank", "x.csv"], "tank: no such file; NAME is 'op': --pv"),
     "a folder": (["tank", ".", *ROLES], "is a folder"),
     "a name that a case has": (["taken", "x.csv", *ROLES], "cases has 'taken' already"),
     "no name": (["Tank 1", "x.csv", *ROLES], "cannot be a plant's"),
