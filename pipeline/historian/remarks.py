@@ -14,7 +14,7 @@ from pipeline.historian.export import Export, Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.first_answer import first_answer
 from pipeline.historian.grid import Grid
-from pipeline.historian.linear import Linear
+from pipeline.historian.linear import Linear, lead
 from pipeline.historian.sampling import Sampling, sampling
 from pipeline.historian.tags import SIGNAL_ROLES, Tag
 from pipeline.metrics import Array
@@ -130,21 +130,28 @@ def of_mode(series: Series, values: Array) -> list[Finding]:
 def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Finding]:
     """Moves that a PV answers before they happen, by the quick linear models."""
     found = []
+    inputs = [*record.mv.T, *record.dv.T]
     for i, signal in enumerate(record.mv_signals):
         span = max(float(np.ptp(record.mv[:, i])), 1e-300)
         held = float(np.mean(np.abs(np.diff(record.mv[:, i])) <= 1e-9 * span))
-        early = {name: m.ahead[i] for name, m in models.items() if m is not None and m.ahead[i][0] > AHEAD}
-        # In a loop the MV follows the PV at every row; an MV that holds does not know what comes.
-        if early and held >= HELD:
+        if held < HELD:  # in a loop the MV follows the PV at every row; an MV that holds does not know what comes
+            continue
+        leads = {
+            name: lead(m, y, inputs, i)
+            for (name, m), y in zip(models.items(), record.pv.T, strict=True)
+            if m is not None
+        }
+        early = {name: rows for name, (strength, rows) in leads.items() if strength > AHEAD}
+        if early:
             answers = {
                 n: first_answer(y, record.mv[:, i], record.run) for n, y in zip(models, record.pv.T, strict=True)
             }
             first = [k for n, k in answers.items() if k and not k.feedback]
             if not first:  # an operator moves it against the PV
                 continue
-            lead = max(max(early.values())[1], *(1 - k.last for k in first))
+            rows = max(max(leads[n] for n in early)[1], *(1 - k.last for k in first))
             words = (
-                f"{', '.join(early)} answers about {lead} row{'s' if lead > 1 else ''} before {signal.name} moves: the "
+                f"{', '.join(early)} answers about {rows} row{'s' if rows > 1 else ''} before {signal.name} moves: the "
                 f"export stores {signal.name} late, or an operator moves it at once when the other changes"
             )
             found.append(Finding("shifted", signal.name, words))
