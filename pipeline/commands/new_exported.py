@@ -13,6 +13,7 @@ from pipeline.config.exports import ExportParams
 from pipeline.config.intervals import Interval
 from pipeline.errors import RecordError
 from pipeline.historian.exported import exported
+from pipeline.historian.findings import counted
 from pipeline.historian.guessing import guesses
 from pipeline.historian.reading import read_export, tags_in, units_of
 from pipeline.historian.tags import (
@@ -77,7 +78,7 @@ def propose_tags(name: str, options: argparse.Namespace) -> None:
     for note in export.notes:
         print(plain(f"  {note.column}: {note.words}"))
     roles = {r: [g.tag.tag for g in rows if g.tag.role == r] for r in ROLES}
-    print(f"{path}: {len(rows)} tags with guessed roles; nothing else was written")
+    print(f"{path}: {counted(len(rows), 'tag')} with guessed roles; nothing else was written")
     for role, tags in roles.items():
         print(plain(f"  {role:5} {', '.join(tags) or '-'}"))
     files = " ".join(map(str, options.files))

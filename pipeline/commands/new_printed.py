@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.historian.findings import InputReport, Screening, Verdict
+from pipeline.historian.findings import InputReport, Screening, Verdict, counted
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.drawing import axis_label, ratio_unit
 from serving.words import plain
@@ -15,11 +15,10 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
     """Print the rows kept, what was found, the verdict, and where to look next."""
     print(f"{name}: {report.summary}")
     if report.gaps:
-        many = "s" * (report.gaps != 1)
         length = f"{report.gap_s / 60:.4g} min together"
-        print(f"  {report.gaps} gap{many} without any reading, {length}; a run ends at each")
+        print(f"  {counted(report.gaps, 'gap')} without any reading, {length}; a run ends at each")
     for reason, rows in report.dropped_rows.items():
-        print(f"  {rows:8} rows dropped: {reason.replace('_', ' ')}")
+        print(f"  {counted(rows, 'row').rjust(13 - (rows == 1))} dropped: {reason.replace('_', ' ')}")
     for finding in report.findings:
         print(plain(f"  {finding.tag}: {finding.words}"))
     for line in sayings(report.verdict, {tag.name: tag.unit for tag in report.tags}):

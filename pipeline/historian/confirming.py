@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, counted
 from pipeline.historian.grid import Grid
 from pipeline.historian.linear import Linear, fitted
 from pipeline.historian.reason import Reason
@@ -43,12 +43,14 @@ def confirm(
             continue
         back = _answers(grid, series, model, y, u)
         if back:
-            words = f"{back} of these are answers to moves, by a linear model; they stay"
+            some = counted(back, "of these is an answer", "of these are answers")
+            words = f"{some} to moves, by a linear model, and left in"
             found.append(Finding("answer", tag.tag, words))
         errors = _errors(model, y, u, grid.piece)
         if errors.size:
             _take_out(grid, series, rate, errors)
-            words = f"{len(errors)} readings contradict what was before and after them, by a linear model"
+            some = counted(len(errors), "reading contradicts", "readings contradict")
+            words = f"{some} what was before and after, by a linear model"
             found.append(Finding("outlier", tag.tag, words, True))
     return found
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.character import runs_of
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, counted
 from pipeline.historian.grid import Grid
 from pipeline.historian.reason import Reason
 from pipeline.historian.tags import Tag
@@ -100,7 +100,9 @@ def contradict(
             if new.any():
                 grid.code[tag.tag][new] = Reason.UNLIKE
                 start, end = runs_of(rows)
-                words = f"{WORDS[kind]}, in {int(new.sum())} rows, from row {int(start[0])} to {int(end[-1])}"
+                words = (
+                    f"{WORDS[kind]}, in {counted(int(new.sum()), 'row')}, from row {int(start[0])} to {int(end[-1])}"
+                )
                 found.append(Finding("unlike", tag.tag, words, True))
     return found
 

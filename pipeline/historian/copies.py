@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.historian.character import noisy
 from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, counted
 from pipeline.historian.reason import Reason
 from pipeline.historian.sent_again import row_keys, with_the_same_stamps
 from pipeline.historian.tags import SIGNAL_ROLES, Tag
@@ -42,7 +42,8 @@ def drop_copies(own: Mapping[str, Series], tags: Sequence[Tag]) -> list[Finding]
             elif rows is not None:
                 where[place] = copied(loud[0].value[place], rows[place])
             if n := series.flag(where, Reason.COPY):
-                words = f"{n} readings repeat a block of earlier ones to the last digit; the first of each stays"
+                some = counted(n, "reading repeats", "readings repeat")
+                words = f"{some} a block of earlier ones to the last digit; the first of each stays"
                 found.append(Finding("copy", series.tag, words, True))
     return found
 

@@ -91,8 +91,14 @@ def judged(
     signals = [(s, "mv") for s in record.mv_signals] + [(s, "dv") for s in record.dv_signals]
     u = np.hstack([record.mv, record.dv])
     found = spectra_of(record, models)
+    settling = {n: _settling(m, len(signals)) for n, m in models.items() if m}
+    pvs = dict(zip((s.name for s in record.pv_signals), record.pv.T, strict=True))
+    sure = {
+        n: certain(pvs[n], list(u.T), record.run, {i: rows for i, rows in of.items() if rows})
+        for n, of in settling.items()
+    }
     inputs = [
-        _input(record, models, i, signal, role, u[:, i], {n: s[i] for n, s in found.items()})
+        _input(record, models, i, signal, role, u[:, i], {n: s[i] for n, s in found.items()}, sure)
         for i, (signal, role) in enumerate(signals)
     ]
     correlation = _correlation(u, [s.name for s, _ in signals])
@@ -153,8 +159,9 @@ def _input(
     role: str,
     u: Array,
     known: Mapping[str, Spectrum],
+    certain_of: Mapping[str, Collection[int]],
 ) -> InputReport:
-    """What input ``i`` with the values u (n,) did, and what answered."""
+    """What input ``i`` with the values u (n,) did, and what answered; ``certain_of`` each PV some settling times."""
     moves = moves_of(u, record.run)
     span = float(np.ptp(u)) if len(u) else 0.0
     still = np.abs(np.diff(u)) <= 1e-9 * span if span > 0 else np.ones(max(len(u) - 1, 1))
@@ -163,8 +170,7 @@ def _input(
     answers = {n: m.strength[i] if m else 0.0 for n, m in models.items()}
     seen = {n: m for n, m in models.items() if m and answers[n] > SEEN}
     settling = {n: m.settling(i) for n, m in seen.items()}
-    inputs = [*record.mv.T, *record.dv.T]
-    sure = tuple(n for n, rows in settling.items() if rows and certain(pvs[n], inputs, record.run, i, rows))
+    sure = tuple(n for n in settling if i in certain_of[n])
     first = {n: first_answer(y, u, record.run) for n, y in pvs.items()} if held >= HELD else {}
     median, largest = (float(np.median(moves)), float(moves.max())) if moves.size else (0.0, 0.0)
     return InputReport(
@@ -190,6 +196,11 @@ def _input(
         band_share=max((s.band_share for s in known.values()), default=-1.0),
         coherence={n: s.band_coherence for n, s in known.items()},
     )
+
+
+def _settling(model: Linear, n: int) -> dict[int, int]:
+    """Of the inputs that the PV answers to, of n, in how many rows it settles; 0 where it does not."""
+    return {i: model.settling(i) for i in range(n) if model.strength[i] > SEEN}
 
 
 def _gain(model: Linear, i: int) -> float:

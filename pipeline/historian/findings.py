@@ -8,6 +8,11 @@ from typing import Any
 from pipeline.historian.sampling import Sampling
 
 
+def counted(n: int, one: str, more: str = "") -> str:
+    """A number and what is counted: ``counted(1, "row")`` is "1 row"; ``more`` is the plural where it is no s."""
+    return f"{n} {one if n == 1 else more or f'{one}s'}"
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """Something that a person should know; ``drops`` where readings or rows were left out for it."""

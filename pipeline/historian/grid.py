@@ -19,6 +19,7 @@ from pipeline.metrics import Array
 MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
 THINNED = 1.9  # readings a period from which PVs are averaged
 LEAST_PIECE = 2  # rows
+ENOUGH = 0.3  # of the usual readings of a period, for their mean
 LONG = 1_000_000  # rows
 CHUNK = 500_000  # rows
 
@@ -69,8 +70,8 @@ def resampled(
     good readings no farther apart than the hold; where two or more readings fall into a period, the mean over
     (t - h, t], against aliasing.
     Held ones: the reading that holds at the middle between t and the next row, so that jitter of less than half a
-    period does not matter; the mean over it where they are thinned out. ``done`` is told each tag that needs its
-    readings no more.
+    period does not matter; the mean over it where they are thinned out. ``done`` is called with each tag
+    whose readings are needed no more.
     """
     if not period_s > 0:
         raise RecordError(f"the period is {period_s:g} s; it must be positive")
@@ -135,8 +136,12 @@ def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray
 
 
 def _own_times(t: Array, number: NDArray[np.int64], step_s: float, factor: int) -> Array:
-    """Times of every ``factor``-th row of the stamps t (m,): their own, on a line where a reading is lost."""
-    row = np.arange(0, int(number[-1]) + (factor + 1) // 2, factor, dtype=np.float64)
+    """Times of every ``factor``-th row of the stamps t (m,): their own, on a line where a reading is lost.
+
+    The first stamp is none where the mean up to it would miss too many readings.
+    """
+    first = factor if factor * ENOUGH > 1 else 0
+    row = np.arange(first, int(number[-1]) + (factor + 1) // 2, factor, dtype=np.float64)
     if len(row) == len(t) == number[-1] + 1:
         return t
     return np.interp(row, number, t) + step_s * np.maximum(row - number[-1], 0.0)
@@ -209,7 +214,7 @@ def _mean(at: Array, t: Array, v: Array, h: float, later_s: float = 0.0) -> tupl
     count = np.bincount(row[inside], minlength=len(at))
     total = np.bincount(row[inside], weights=v[inside], minlength=len(at))
     usual = np.median(count[count > 0]) if count.any() else 1.0
-    enough = count >= max(1.0, 0.3 * usual)
+    enough = count >= max(1.0, ENOUGH * usual)
     return np.where(enough, total / np.maximum(count, 1), np.nan), enough & (count < 0.7 * usual)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.config.intervals import Interval
 from pipeline.errors import RecordError
 from pipeline.historian.export import Export, Series
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, counted
 from pipeline.historian.grid import Grid
 from pipeline.historian.reason import Reason
 from pipeline.historian.times import SINCE_1970_S, UNSTATED
@@ -76,7 +76,10 @@ def of_left_out(texts: Sequence[str], rows: Sequence[int]) -> list[Finding]:
     """How many rows each interval left out; one that met none may be mistyped."""
     return [
         Finding(
-            "left_out", text, f"{n} rows left out" if n else "met no row: compare it with the record's times", n > 0
+            "left_out",
+            text,
+            f"{counted(n, 'row')} left out" if n else "met no row: compare it with the record's times",
+            n > 0,
         )
         for text, n in zip(texts, rows, strict=True)
     ]

@@ -38,13 +38,13 @@ class Linear:
     blocks: Blocks
     sd: float  # of the residual, robust
     strength: Mapping[int, float]  # input -> statistic
-    ahead: Mapping[int, tuple[float, int]]  # input -> statistic of lags ahead, and by how many rows they lead
     explained: float  # share of the variance of y(k+1) - y(k)
     rows: NDArray[np.int64]  # (n,) rows k of the fit
     residual: Array  # (n,)
     integrates: bool = False  # a pole at 1 was asked for: sum a_i = 1
     ramp: Mapping[int, float] = field(default_factory=dict)  # input -> sum of its coefficients over its likely error
     sure: bool = False  # a drift would change little, or was taken off
+    slow: int = 0  # knots of the lines in time that took up a drift
 
     def predicted(self, y: Array, u: Sequence[Array], k: NDArray[np.int64]) -> Array:
         """y(k+1) (m,) from the rows up to k (m,) of y (n,) and of each input u (n,); NaN where one is missing.
@@ -108,27 +108,22 @@ def fitted(
         if len(blocks) <= 3:
             return None
         blocks = blocks[:-1]
-    past = np.column_stack([y[rows - i] for i in range(Y_LAGS)])
-    growth = y[rows + 1] - past[:, 0]
     if np.ptp(y[rows + 1]) <= 0:
         return None
-    target, own = (growth, past[:, :-1] - past[:, 1:]) if integrates else (y[rows + 1], past)
     centre = np.array([float(np.mean(c[rows])) for c in u])
-    both = [blocks_of(c - m, rows, (*blocks, *AHEAD)) for c, m in zip(u, centre, strict=True)]
-    inputs, ahead = [b[:, : len(blocks)] for b in both], [b[:, len(blocks) :] for b in both]
-    x = np.column_stack([own, *inputs, *_lines(rows, slow), np.ones(len(rows))])
+    x, target, own = _regressors(y, u, centre, rows, blocks, integrates, slow)
     theta, cov, keep = least_squares(x, target)
     residual = target - x @ theta
     sd = _robust_sd(residual[keep])
-    m, first = len(blocks), own.shape[1]
-    places = {i: slice(first + i * m, first + (i + 1) * m) for i in range(len(u))}
+    m = len(blocks)
+    places = {i: slice(own + i * m, own + (i + 1) * m) for i in range(len(u))}
     strength = {i: _wald(theta[p], cov[p, p]) for i, p in places.items()}
     ramp = {i: float(theta[p].sum() / np.sqrt(max(cov[p, p].sum(), 1e-300))) for i, p in places.items()}
-    moved = np.var(growth[keep])
+    growth = (y[rows + 1] - y[rows])[keep]
+    moved = np.var(growth)
     explained = 1.0 - np.var(residual[keep]) / moved if moved > 0 else 0.0
     b = np.array([theta[p] for p in places.values()]).reshape(len(u), m)
-    early = {i: _early(x, ahead[i], target) for i in range(len(u))}
-    a = np.r_[1.0 + theta[0], np.diff(theta[:first]), -theta[first - 1]] if integrates else theta[:Y_LAGS]
+    a = np.r_[1.0 + theta[0], np.diff(theta[:own]), -theta[own - 1]] if integrates else theta[:Y_LAGS]
     return Linear(
         a,
         b,
@@ -137,13 +132,37 @@ def fitted(
         blocks,
         sd,
         strength,
-        early,
         float(explained),
         rows,
         residual,
         integrates,
         ramp,
+        slow=slow,
     )
+
+
+def _regressors(
+    y: Array, u: Sequence[Array], centre: Array, rows: NDArray[np.int64], blocks: Blocks, integrates: bool, slow: int
+) -> tuple[Array, Array, int]:
+    """The columns (n, m) of a fit over these rows, its target (n,), and how many of the columns are y's own past."""
+    past = np.column_stack([y[rows - i] for i in range(Y_LAGS)])
+    target, own = (y[rows + 1] - past[:, 0], past[:, :-1] - past[:, 1:]) if integrates else (y[rows + 1], past)
+    inputs = [blocks_of(c - m, rows, blocks) for c, m in zip(u, centre, strict=True)]
+    return np.column_stack([own, *inputs, *_lines(rows, slow), np.ones(len(rows))]), target, own.shape[1]
+
+
+def lead(model: Linear, y: Array, u: Sequence[Array], i: int) -> tuple[float, int]:
+    """Whether moves of input ``i`` still to come improve the fit of a model of y (n,) from u, (n,) each.
+
+    Their Wald statistic, and by how many rows the strongest comes before its move.
+    """
+    x, target, _ = _regressors(y, u, model.centre, model.rows, model.blocks, model.integrates, model.slow)
+    ahead = blocks_of(u[i] - model.centre[i], model.rows, AHEAD)
+    theta, cov, _ = least_squares(np.column_stack([x, ahead]), target)
+    m = x.shape[1]
+    t = np.abs(theta[m:]) / np.sqrt(np.maximum(np.diag(cov)[m:], 1e-300))
+    best = int(np.argmax(t)) if np.isfinite(t).all() else 0
+    return _wald(theta[m:], cov[m:, m:]), -AHEAD[best][1] + 1
 
 
 def _lines(rows: NDArray[np.int64], knots: int) -> list[Array]:
@@ -241,15 +260,6 @@ def least_squares(x: Array, target: Array) -> tuple[Array, Array, NDArray[np.boo
 def _wald(theta: Array, cov: Array) -> float:
     value = float(theta @ np.linalg.pinv(cov, hermitian=True) @ theta) / len(theta)
     return value if np.isfinite(value) and value > 0 else 0.0
-
-
-def _early(x: Array, ahead: Array, target: Array) -> tuple[float, int]:
-    """Whether moves still to come improve the fit: their Wald statistic, and the lead [rows] of the strongest."""
-    theta, cov, _ = least_squares(np.column_stack([x, ahead]), target)
-    m = x.shape[1]
-    t = np.abs(theta[m:]) / np.sqrt(np.maximum(np.diag(cov)[m:], 1e-300))
-    best = int(np.argmax(t)) if np.isfinite(t).all() else 0
-    return _wald(theta[m:], cov[m:, m:]), -AHEAD[best][1] + 1
 
 
 def _robust_sd(residual: Array) -> float:

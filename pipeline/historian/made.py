@@ -26,6 +26,7 @@ def judged_record(
     columns = {s.name: getattr(record, r)[:, i] for r, group in groups.items() for i, s in enumerate(group)}
     good = np.zeros(n, np.uint8)
     excerpt = evenly(record)
+    models = models_of(excerpt)
     grid = Grid(h, record.time_s, record.run, columns, dict.fromkeys(columns, good), dict.fromkeys(columns, 0))
     tags = tuple(
         TagReport(
@@ -52,7 +53,7 @@ def judged_record(
         tags=tags,
         modes={},
         findings=tuple(findings),
-        verdict=judged(excerpt, models_of(excerpt), 0, n),
+        verdict=judged(excerpt, models, 0, n),
     )
     series = {name: Series(name, record.time_s, values, good, Counter()) for name, values in columns.items()}
-    return Screened(record, grid, good, series, report)
+    return Screened(record, grid, good, series, report, models=models)

@@ -13,7 +13,7 @@ from pipeline.errors import RecordError
 from pipeline.historian.cells import MV_CONVERSIONS, outliers, unit_slips, usual
 from pipeline.historian.decimal_sign import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding, Verdict
+from pipeline.historian.findings import Finding, Verdict, counted
 from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.numbers import loose_number
 from pipeline.historian.reason import Reason
@@ -41,14 +41,16 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
             words = f"its readings that are text stand at the {side} end of what it reads, so that this end is lost"
             found.append(Finding(ONE_SIDED, tag.tag, words, True))
     if counts.get("quality"):
-        found.append(Finding("quality", tag.tag, f"quality is not good in {counts['quality']} readings", True))
+        found.append(
+            Finding("quality", tag.tag, f"quality is not good in {counted(counts['quality'], 'reading')}", True)
+        )
     if counts.get("duplicate"):
-        words = f"{counts['duplicate']} readings came a second time; the last good one of each stays"
+        words = f"{counted(counts['duplicate'], 'reading')} came a second time; the last good one of each stays"
         found.append(Finding("duplicate", tag.tag, words, True))
     if counts.get("clock"):
         words = (
-            f"{counts['clock']} readings have an ambiguous time: the clock was set back, or zones are mixed; export "
-            "UTC, or name the zone with --time-zone"
+            f"{counted(counts['clock'], 'reading has', 'readings have')} an ambiguous time: the clock was set back, or "
+            "zones are mixed; export UTC, or name the zone with --time-zone"
         )
         found.append(Finding("clock", tag.tag, words, True))
     if series.rounded_s:
@@ -122,7 +124,7 @@ def _out_of_range(series: Series, tag: Tag) -> list[Finding]:
             f"{tag.tag}: {n} of {good} good readings, such as {example:.6g}, are outside its range {low:g} to {high:g} "
             f"{tag.unit}; correct the range or the unit"
         )
-    words = f"{n} readings outside the range {low:g} to {high:g} {tag.unit} that was given"
+    words = f"{counted(n, 'reading')} outside the range {low:g} to {high:g} {tag.unit} that was given"
     return [Finding("range", tag.tag, words, True)] if n else []
 
 
@@ -141,7 +143,8 @@ def _unlike_the_rest(series: Series, tag: Tag) -> list[Finding]:
     alone = outliers(values) if slipped.any() else ~calm
     if alone.any():
         series.code[place[alone]] = Reason.OUTLIER
-        words = f"{int(alone.sum())} readings stand alone, {_example(values[alone])}; usual are {_usual(values)}"
+        some = counted(int(alone.sum()), "reading stands", "readings stand")
+        words = f"{some} alone, {_example(values[alone])}; usual are {_usual(values)}"
         found.append(Finding("outlier", tag.tag, words, True))
     return found
 
@@ -153,7 +156,7 @@ def _slipped(
     if not where.any():
         return []
     series.code[place[where]] = Reason.UNIT_SLIP
-    words = ", ".join(f"{k} in {n} readings" for k, n in kinds.most_common())
+    words = ", ".join(f"{k} in {counted(n, 'reading')}" for k, n in kinds.most_common())
     return [Finding("unit_slip", tag.tag, f"the level jumps as if the unit had changed: {words}", True)]
 
 

@@ -11,10 +11,10 @@ from pipeline.historian.character import quantum, staircase, straight_share
 from pipeline.historian.clock import whole_multiple
 from pipeline.historian.excitation import HELD
 from pipeline.historian.export import Export, Series
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, counted
 from pipeline.historian.first_answer import first_answer
 from pipeline.historian.grid import Grid
-from pipeline.historian.linear import Linear
+from pipeline.historian.linear import Linear, lead
 from pipeline.historian.sampling import Sampling, sampling
 from pipeline.historian.tags import SIGNAL_ROLES, Tag
 from pipeline.metrics import Array
@@ -39,9 +39,8 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
         kind = "by exception, beyond a dead band" if rate.dead_band else "by exception, or compressed (swinging door)"
         line = series.between == "line" or (role in {"pv", "dv"} and not rate.dead_band)
         taken = "drawn on lines" if line else "held"
-        other = (
-            "" if series.between or role == "mode" else f"; {'step' if line else 'line'} in column between says another"
-        )
+        went, word = ("in steps", "step") if line else ("on lines", "line")
+        other = f"; if it went {went}, write {word} into column between" * (not series.between and role != "mode")
         words = (
             f"stored {kind}: a reading every {rate.step_s:.4g} s in the median; {taken} from one to the next{other}; "
             f"used for at most {rate.hold_s:.4g} s"
@@ -77,7 +76,7 @@ def of_rows(series: Sequence[Series], period_s: float, step_s: float) -> list[Fi
     """PVs whose rows lie between readings: stored as lines, or at a rate that is no whole part of the record's."""
     rate = sampling(series[0])
     if rate.irregular and not rate.dead_band and period_s == step_s < rate.step_s:
-        words = f"rows of {period_s:g} s lie on the lines between stored readings; --period says another"
+        words = f"rows of {period_s:g} s lie on the lines between stored readings; another --period changes that"
         return [Finding("drawn", series[0].tag, words)]
     if whole_multiple(period_s, step_s) or rate.irregular:
         return []
@@ -109,7 +108,7 @@ def of_grid(grid: Grid) -> list[Finding]:
     for tag, rows in grid.bridged.items():
         if rows > BRIDGED * len(grid):
             words = (
-                f"{rows} rows ({100 * rows / len(grid):.0f} %) lie between readings that are farther apart than the "
+                f"{counted(rows, 'row')} ({100 * rows / len(grid):.0f} %) between readings farther apart than the "
                 f"period of {grid.period_s:g} s; a longer --period makes less of them up"
             )
             found.append(Finding("bridged", tag, words))
@@ -122,29 +121,36 @@ def of_mode(series: Series, values: Array) -> list[Finding]:
     switches = int(np.count_nonzero(np.diff(known)))
     if not switches:
         return []
-    rows = ", ".join(f"{name} in {int(np.sum(known == i))} rows" for i, name in enumerate(series.categories))
-    words = f"{switches} switches: {rows}; --without-mode leaves the rows of a mode out"
+    rows = ", ".join(f"{name} in {counted(int(np.sum(known == i)), 'row')}" for i, name in enumerate(series.categories))
+    words = f"{counted(switches, 'switch', 'switches')}: {rows}; --without-mode leaves the rows of a mode out"
     return [Finding("mode", series.tag, words)]
 
 
 def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Finding]:
     """Moves that a PV answers before they happen, by the quick linear models."""
     found = []
+    inputs = [*record.mv.T, *record.dv.T]
     for i, signal in enumerate(record.mv_signals):
         span = max(float(np.ptp(record.mv[:, i])), 1e-300)
         held = float(np.mean(np.abs(np.diff(record.mv[:, i])) <= 1e-9 * span))
-        early = {name: m.ahead[i] for name, m in models.items() if m is not None and m.ahead[i][0] > AHEAD}
-        # In a loop the MV follows the PV at every row; an MV that holds does not know what comes.
-        if early and held >= HELD:
+        if held < HELD:  # in a loop the MV follows the PV at every row; an MV that holds does not know what comes
+            continue
+        leads = {
+            name: lead(m, y, inputs, i)
+            for (name, m), y in zip(models.items(), record.pv.T, strict=True)
+            if m is not None
+        }
+        early = {name: rows for name, (strength, rows) in leads.items() if strength > AHEAD}
+        if early:
             answers = {
                 n: first_answer(y, record.mv[:, i], record.run) for n, y in zip(models, record.pv.T, strict=True)
             }
             first = [k for n, k in answers.items() if k and not k.feedback]
             if not first:  # an operator moves it against the PV
                 continue
-            lead = max(max(early.values())[1], *(1 - k.last for k in first))
+            rows = max(max(leads[n] for n in early)[1], *(1 - k.last for k in first))
             words = (
-                f"{', '.join(early)} answers about {lead} row{'s' if lead > 1 else ''} before {signal.name} moves: the "
+                f"{', '.join(early)} answers about {counted(rows, 'row')} before {signal.name} moves: the "
                 f"export stores {signal.name} late, or an operator moves it at once when the other changes"
             )
             found.append(Finding("shifted", signal.name, words))

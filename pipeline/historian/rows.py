@@ -13,7 +13,7 @@ from pipeline.errors import RecordError
 from pipeline.historian.cells import usual
 from pipeline.historian.character import clipped, runs_of, stuck
 from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, counted
 from pipeline.historian.grid import Grid
 from pipeline.historian.missing_codes import PERCENT
 from pipeline.historian.reason import Reason
@@ -56,13 +56,14 @@ def stretches(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, Sampling])
         if new.any():
             code[new] = Reason.STUCK
             start, end = runs_of(still)
-            words = f"repeats one value in {len(start)} stretches, the longest of {int((end - start).max())} rows"
+            some = counted(len(start), "stretch", "stretches")
+            words = f"repeats one value in {some}, the longest of {int((end - start).max())} rows"
             found.append(Finding("stuck", tag.tag, f"{words}, while others move", True))
     return found
 
 
 def _of_ends(tag: Tag, ends: Sequence[tuple[float, int]], *, kept: bool) -> str:
-    places = " and ".join(f"{end:g} in {n} rows" for end, n in ends)
+    places = " and ".join(f"{end:g} in {counted(n, 'row')}" for end, n in ends)
     if kept:
         return f"stands at a limit of the plant: {places}; these rows stay"
     given = [v for v in (tag.low, tag.high) if v is not None and any(abs(v - end) <= 1e-6 * abs(v) for end, _ in ends)]

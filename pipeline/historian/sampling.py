@@ -89,18 +89,25 @@ def proposed_period(series: Sequence[Series], others: Sequence[Series] = ()) -> 
     straight, and says all the same where it was.
     """
     regular = [r.step_s for r in map(sampling, others) if r.step_s and not r.irregular]
-    steps = [s for s in (_step(one, min(regular, default=0.0)) for one in series) if s > 0]
+    stamps = [_stamps(s) for s in series]
+    exact: dict[int, float | None] = {}  # of stamps that several PVs share, looked at once
+    steps = [_step(s, t, min(regular, default=0.0), exact) for s, t in zip(series, stamps, strict=True)]
+    steps = [s for s in steps if s > 0]
     if not steps:
         raise RecordError("no process variable has two readings of different times; export a longer time")
     return max(steps)
 
 
-def _step(series: Series, scan_s: float) -> float:
+def _step(series: Series, stamps: Array, scan_s: float, exact: dict[int, float | None]) -> float:
     rate = sampling(series)
     if rate.irregular and not rate.dead_band:
-        return _part_of_a_line(_stamps(series), scan_s)
-    exact = None if rate.irregular or not rate.step_s else exact_step(_stamps(series))
-    return float(f"{rate.step_s:.6g}") if exact is None else exact
+        return _part_of_a_line(stamps, scan_s)
+    if not rate.irregular and rate.step_s:
+        if id(stamps) not in exact:
+            exact[id(stamps)] = exact_step(stamps)
+        if (step := exact[id(stamps)]) is not None:
+            return step
+    return float(f"{rate.step_s:.6g}")
 
 
 def _part_of_a_line(stamps: Array, scan_s: float) -> float:
@@ -118,4 +125,5 @@ def _part_of_a_line(stamps: Array, scan_s: float) -> float:
 
 def _stamps(series: Series) -> Array:
     """Times (m,) [s] at which the tag was stored: a cell that stays empty until the value changes is no reading."""
-    return series.time_s[(series.code != Reason.DUPLICATE) & (series.code != Reason.EMPTY)]
+    stored = (series.code != Reason.DUPLICATE) & (series.code != Reason.EMPTY)
+    return series.time_s if stored.all() else series.time_s[stored]

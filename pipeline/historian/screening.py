@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,7 @@ class Screened:
     series: Mapping[str, Series]  # the readings of each tag, with their reasons
     report: Screening
     step_s: float = 0.0  # of the export's own readings, where the rows were resampled from some
+    models: Mapping[str, Linear | None] = field(default_factory=dict)  # PV -> the quick one, of ``evenly(record)``
 
 
 def screened(
@@ -168,7 +169,7 @@ def screened(
         verdict=verdict,
         zone=export.zone,
     )
-    return Screened(record, grid, code, own, report, step)
+    return Screened(record, grid, code, own, report, step, models)
 
 
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:

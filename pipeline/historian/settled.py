@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -43,8 +43,8 @@ class StepAnswer:
         return int(self.lag[np.flatnonzero(outside)[-1] + 1]) if outside.any() else int(self.lag[0])
 
 
-def step_answer(y: Array, u: Sequence[Array], run: NDArray[np.int64], i: int, length: int) -> StepAnswer | None:
-    """The answer of y (n,) to input ``i`` of u, (n,) each, over ``length`` rows; None of too few rows.
+def step_answers(y: Array, u: Sequence[Array], run: NDArray[np.int64], length: int) -> list[StepAnswer] | None:
+    """The answer of y (n,) to each input of u, (n,) each, over ``length`` rows; None of too few rows.
 
         y(k+1) - y(k) = sum_j sum_l h_jl (u_j(k-l) - u_j(k-l-1)) + e(k),   e(k) = sum_i a_i e(k-i) + w(k)
 
@@ -65,22 +65,38 @@ def step_answer(y: Array, u: Sequence[Array], run: NDArray[np.int64], i: int, le
     dy, du = lfilter(white, [1.0], dy), [lfilter(white, [1.0], c) for c in du]
     theta, cov = _fit(dy, du, keep, blocks)
     m = len(blocks)
-    own = slice(i * m, (i + 1) * m)
-    ones = np.tril(np.ones((m, m)))
-    spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", ones, cov[own, own], ones), 0.0))
-    return StepAnswer(np.array([b for _, b in blocks]), np.cumsum(theta[own]), spread)
+    ones, lag, found = np.tril(np.ones((m, m))), np.array([b for _, b in blocks]), []
+    for own in (slice(i * m, (i + 1) * m) for i in range(len(u))):
+        spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", ones, cov[own, own], ones), 0.0))
+        found.append(StepAnswer(lag, np.cumsum(theta[own]), spread))
+    return found
 
 
-def certain(y: Array, u: Sequence[Array], run: NDArray[np.int64], i: int, settling: int) -> bool:
-    """Whether y (n,) takes about ``settling`` rows after input ``i``, by an impulse response that need not agree."""
-    found = step_answer(y, u, run, i, int(np.ceil(FOLLOWED * settling)))
-    return found is not None and found.known and 1 / AGREES < (found.settles + 1) / (settling + 1) < AGREES
+def certain(y: Array, u: Sequence[Array], run: NDArray[np.int64], settling: Mapping[int, int]) -> frozenset[int]:
+    """Inputs of u, (n,) each, after which y (n,) takes about ``settling`` rows, by impulse responses of their own.
+
+    One fit for all inputs of which the response is followed for as long.
+    """
+    lengths: dict[int, list[int]] = {}
+    for i, rows in settling.items():
+        lengths.setdefault(_blocks(int(np.ceil(FOLLOWED * rows)))[-1][1], []).append(i)
+    found = set()
+    for length, inputs in lengths.items():
+        answers = step_answers(y, u, run, length)
+        if answers is not None:
+            found |= {i for i in inputs if answers[i].known and _agree(answers[i].settles, settling[i])}
+    return frozenset(found)
+
+
+def _agree(one: int, other: int) -> bool:
+    """Whether two settling times [rows] are the same."""
+    return 1 / AGREES < (one + 1) / (other + 1) < AGREES
 
 
 def grows(y: Array, u: Sequence[Array], run: NDArray[np.int64], i: int) -> bool:
     """Whether y (n,) goes on and on after a step of input ``i``, for certain."""
-    found = step_answer(y, u, run, i, RAMP)
-    if found is None or not found.known:
+    answers = step_answers(y, u, run, RAMP)
+    if answers is None or not (found := answers[i]).known:
         return False
     middle = int(np.searchsorted(found.lag, found.lag[-1] / 2))
     return bool(abs(found.value[-1]) > GROWS * abs(found.value[middle]))

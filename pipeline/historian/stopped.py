@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.historian.findings import Finding
+from pipeline.historian.findings import Finding, counted
 from pipeline.historian.grid import Grid
 from pipeline.historian.missing_codes import apart_zeros
 from pipeline.historian.reason import Reason
@@ -32,11 +32,11 @@ def of_zeros(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
         zero = values == 0.0
         if _contradicted(grid, signals, tag, values, zero):
             grid.code[tag.tag][zero] = Reason.SENTINEL
-            words = f"reads 0 in {n} rows, and the process variables go on as if it did not: a dead sensor"
+            words = f"reads 0 in {counted(n, 'row')}, and the process variables go on as if it did not: a dead sensor"
         else:
             words = (
-                f"reads 0 in {n} rows, far from all other values: they stay, as of a flow that stopped; if its sensor "
-                "was dead then, empty these cells in the export"
+                f"reads 0 in {counted(n, 'row')}, far from all other values: they stay, as of a flow that stopped; if "
+                "its sensor was dead then, empty these cells in the export"
             )
         found.append(Finding("zero", tag.tag, words, bool(grid.code[tag.tag][zero].any())))
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipeline.historian.excitation import SEEN
-from pipeline.historian.findings import Finding, Verdict
+from pipeline.historian.findings import Finding, Verdict, counted
 
 
 def of_answers(pvs: Sequence[str], verdict: Verdict) -> list[Finding]:
@@ -21,8 +21,8 @@ def of_answers(pvs: Sequence[str], verdict: Verdict) -> list[Finding]:
     if len(pvs) > len(mvs):
         first, others = ", ".join(pvs[: len(mvs)]), ", ".join(pvs[len(mvs) :])
         words = (
-            f"will be controlled, the first of {len(pvs)} PVs for {len(mvs)} MVs; {others} will not: to change it, put "
-            "the PVs to control first"
+            f"will be controlled, the first of {counted(len(pvs), 'PV')} for {counted(len(mvs), 'MV')}; {others} will "
+            "not: to change it, put the PVs to control first"
         )
         found.append(Finding("controlled", first, words))
     return found

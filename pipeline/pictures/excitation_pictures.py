@@ -17,7 +17,7 @@ from pipeline.historian.excitation import (
     spectra_of,
 )
 from pipeline.historian.findings import InputReport, Verdict
-from pipeline.historian.screening import Screened, models_of
+from pipeline.historian.screening import Screened
 from pipeline.historian.spectra import Spectrum
 from pipeline.metrics import Array
 from pipeline.pictures.drawing import SIZE, STYLE
@@ -32,7 +32,7 @@ def inputs(found: Screened) -> Canvas:
     """A row an input: the sizes of its moves, its spectrum and coherence over the plant's band, the step response."""
     record = evenly(found.record)
     reports = found.report.verdict.inputs[:MOST_INPUTS]
-    models = models_of(record)
+    models = found.models
     spectra = spectra_of(record, models)
     u = np.hstack([record.mv, record.dv])
     with rc_context(STYLE):

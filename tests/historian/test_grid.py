@@ -132,3 +132,11 @@ def test_a_long_grid_in_chunks_is_the_same_as_in_one(monkeypatch: pytest.MonkeyP
         np.testing.assert_array_equal(chunks.value[tag], whole.value[tag])
         np.testing.assert_array_equal(chunks.code[tag], whole.code[tag])
         assert np.isnan(whole.value[tag]).any()
+
+
+@pytest.mark.parametrize(("n", "factor"), [(3000, 1), (3000, 3), (3000, 4), (3000, 6), (3001, 100)])
+def test_rows_of_several_readings_have_a_value_from_the_first_to_the_last(n: int, factor: int) -> None:
+    t, good = 10.0 * np.arange(n), np.zeros(n, np.uint8)
+    grid, _ = resampled([Series("y", t, t.copy(), good)], [Series("u", t, t.copy(), good)], 10.0 * factor)
+    assert all(np.isfinite(grid.value[tag]).all() for tag in ("y", "u"))
+    assert len(grid) >= n // factor

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.historian.guessing import guesses
-from pipeline.historian.linear import fitted
+from pipeline.historian.linear import fitted, lead
 from pipeline.historian.reading import read_export, units_of
 
 N = 3000
@@ -110,4 +110,4 @@ def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
     u = np.repeat(np.round(np.clip(np.random.default_rng(seed).normal(50, 15, 70), 5, 95), 1), 60)[:4000]
     model = fitted(u, [u], np.zeros(len(u), dtype=np.int64))
     assert model is not None
-    assert max(model.strength[0], model.ahead[0][0]) > 1e3
+    assert lead(model, u, [u], 0)[0] > 1e3

@@ -11,10 +11,11 @@ from dirty_plant import PERIOD_S, START_S, Clean, clean, screen_of
 from scipy.signal import lfilter
 
 from pipeline.commands.new_printed import sayings
+from pipeline.historian import settled
 from pipeline.historian.findings import Finding, InputReport
 from pipeline.historian.loads import load_sd
 from pipeline.historian.screening import spelt
-from pipeline.historian.settled import certain, step_answer
+from pipeline.historian.settled import certain, step_answers
 from pipeline.historian.step_test import GUESSED_H, LARGEST, LONGEST_H, MOST, UNKNOWN_PERIODS, planned
 from pipeline.historian.tags import Tag
 
@@ -71,14 +72,24 @@ def test_another_model_must_agree(rows: int, sure: bool) -> None:
     random = np.random.default_rng(3)
     u = np.repeat(random.uniform(-1, 1, 200), 20)
     y = lfilter([0, 0.1], [1, -0.9], u) + random.normal(0, 0.02, 4000)
-    assert certain(y, [u], np.zeros(4000, np.int64), 0, rows) is sure
+    assert bool(certain(y, [u], np.zeros(4000, np.int64), {0: rows})) is sure
+
+
+def test_inputs_that_settle_alike_share_a_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    random, n = np.random.default_rng(5), 8000
+    u, v = (np.repeat(random.uniform(-20, 20, n // 50), 50) for _ in range(2))
+    y = lfilter([0, 0.1], [1, -0.9], u - 0.5 * v) + random.normal(0, 0.1, n)
+    fits = []
+    monkeypatch.setattr(settled, "step_answers", lambda *given: fits.append(given) or step_answers(*given))
+    assert certain(y, [u, v], np.zeros(n, np.int64), {0: 23, 1: 24}) == {0, 1}
+    assert len(fits) == 1
 
 
 def test_the_answer_and_its_error_are_those_of_the_plant_beside_a_slow_load() -> None:
     random, n = np.random.default_rng(4), 20_000
     u = np.repeat(random.uniform(-20, 20, n // 40), 40)
     y = lfilter([0, 0.1], [1, -0.9], u) + load(n, 5)
-    found = step_answer(y, [u], np.zeros(n, np.int64), 0, 50)
+    (found,) = step_answers(y, [u], np.zeros(n, np.int64), 50) or [None]
     assert found is not None
     truth = 1 - 0.9**found.lag
     assert np.all(np.abs(found.value - truth) < 4 * found.sd + 0.03)

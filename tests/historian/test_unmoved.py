@@ -27,7 +27,7 @@ def test_a_pv_that_no_mv_moves_is_named_and_which_pv_is_controlled(tmp_path: Pat
     unmoved, controlled = found_of(tmp_path, (*TAGS, AMBIENT))
     assert (unmoved.tag, unmoved.words) == (AMBIENT.tag, "answers to no MV: leave its role empty, or make it dv")
     assert controlled.tag == "TIC-101.PV"
-    assert "the first of 2 PVs for 1 MVs; SITE_TI_99.PV will not" in controlled.words
+    assert "the first of 2 PVs for 1 MV; SITE_TI_99.PV will not" in controlled.words
 
 
 def test_pvs_that_the_mv_moves_need_no_words(tmp_path: Path) -> None:
