@@ -11,7 +11,13 @@ from serving.proof import judged
 from serving.trust import ending, signer
 from serving.words import plain
 
-SHOWN = {"scenarios", "units", "locked_up", "as_printed"}  # entries of the evidence that have a place of their own
+SHOWN = {
+    "scenarios",
+    "units",
+    "locked_up",
+    "as_printed",
+    "swings",
+}  # entries of the evidence that have a place of their own
 
 
 def card(controller: Controller) -> str:
@@ -26,7 +32,8 @@ def card(controller: Controller) -> str:
     ]
     if signed := signer(controller):
         lines[3:3] = [f"  signed    by {signed.words}", *(f"            {words}" for words in ending(controller))]
-    lines[1:1] = _locked_up(m.evidence) or [f"  NOT PROVEN: {why}" for why in filter(None, [judged(m).why])]
+    first = _locked_up(m.evidence) or [f"  NOT PROVEN: {why}" for why in filter(None, [judged(m).why])]
+    lines[1:1] = [*first, *_swings(m.evidence), *_doubtful(m.evidence)]
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         lines += _signals(title, m.signals(name))
     lines += _signals("manipulated variables", m.mv)
@@ -69,12 +76,38 @@ def _locked_up(evidence: dict[str, Any]) -> list[str]:
     lines = [
         f"  LOCKED UP in {count} closed loop{'s' if count > 1 else ''} of its validation: do not run it on a plant"
     ]
-    if isinstance(tests, dict):
-        for test, seeds in tests.items():
-            named = ", ".join(f"seed {seed}: {n}" for seed, n in seeds.items()) if isinstance(seeds, dict) else seeds
-            lines.append(f"    {test} ({named})")
+    lines += _by_test(tests)
     if evidence.get("as_printed") is True:
         lines.append("    shipped as printed, to reproduce a paper")
+    return lines
+
+
+def _swings(evidence: dict[str, Any]) -> list[str]:
+    """Tests in which a closed loop swung to the end."""
+    tests = evidence.get("swings")
+    if not isinstance(tests, dict) or not tests:
+        return []
+    counts = [n for seeds in tests.values() if isinstance(seeds, dict) for n in seeds.values() if isinstance(n, int)]
+    count = sum(counts)
+    return [f"  SWINGS to the end in {count} closed loop{'s' * (count != 1)} of its validation", *_by_test(tests)]
+
+
+def _doubtful(evidence: dict[str, Any]) -> list[str]:
+    """What the screening said of the record behind the models of the tests, unless it is good."""
+    grounds = evidence.get("on")
+    if not isinstance(grounds, dict) or grounds.get("data") in (None, "", "yes"):
+        return []
+    reasons = grounds.get("data_reasons")
+    why = "; ".join(map(str, reasons)) if isinstance(reasons, list) else ""
+    return [f"  DATA: can they carry a model: {grounds['data']}" + f" ({why})" * bool(why)]
+
+
+def _by_test(tests: object) -> list[str]:
+    """A line for each test: its data seeds with their closed loops."""
+    lines = []
+    for test, seeds in tests.items() if isinstance(tests, dict) else ():
+        named = ", ".join(f"seed {seed}: {n}" for seed, n in seeds.items()) if isinstance(seeds, dict) else seeds
+        lines.append(f"    {test} ({named})")
     return lines
 
 

@@ -15,6 +15,7 @@ from pipeline.cases.reach import Reach, visited_mv
 from pipeline.config.exports import is_exported
 from pipeline.errors import PlantError, RecordError
 from pipeline.evaluation.case import Array, Case
+from pipeline.evaluation.grounds import RecordVerdict
 from pipeline.plants.identified import IdentifiedArrays
 from pipeline.plants.noise import deviation
 from pipeline.plants.signals import Signals
@@ -114,6 +115,11 @@ class OwnEnsemble(Case):
     def record(self) -> Record:
         """The record of the plant."""
         return Record.read(self.data, self.record_signals)
+
+    @property
+    def record_verdict(self) -> RecordVerdict | None:
+        """What `loopwright new` or stage `screen` said of the record, which lies beside it."""
+        return RecordVerdict.beside(self.data)
 
     @cached_property
     def recorded(self) -> Mapping[str, tuple[float, float]]:

@@ -23,6 +23,8 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
         print(plain(f"  {finding.tag}: {finding.words}"))
     for line in sayings(report.verdict, {tag.name: tag.unit for tag in report.tags}):
         print(plain(f"  {line}"))
+    for loop in report.operated:
+        print(plain(f"how it was run: {loop.words}"))
     print(f"can these data carry a model: {report.verdict.carries}")
     for reason in report.verdict.reasons:
         print(plain(f"  {reason}"))

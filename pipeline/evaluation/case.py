@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
+from pipeline.evaluation.grounds import RecordVerdict
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import rmse
 from pipeline.plants.equations import EquationPlant, equations
@@ -186,6 +187,11 @@ class Case(ABC):
     def recorded(self) -> Mapping[str, tuple[float, float]]:
         """PV or MV -> its lowest and highest value in the plant's record; empty for a plant in equations."""
         return {}
+
+    @property
+    def record_verdict(self) -> RecordVerdict | None:
+        """What the screening of the plant's record said of it; None where there is no such record."""
+        return None
 
     @property
     def record_signals(self) -> Signals:

@@ -25,6 +25,7 @@ SMALLEST_STEP = 0.02  # of the CV's range: a smaller move of the set point has n
 STEP_BAND = 0.02  # settled: within this fraction of the step ...
 RANGE_BAND = 0.002  # ... or of the CV's range, whichever is wider (a disturbance test has no step)
 FAR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
+SWING, CROSSINGS = 0.01, 3  # of the CV's range, changes of side: a loop that swings to the end
 LEFT = 0.25  # of the CV's range: farther beyond its ends no overshoot leads
 
 
@@ -138,6 +139,22 @@ def left_limits(pv: ArrayLike, *, low: ArrayLike, high: ArrayLike) -> bool:
     y, bottom, top = (np.asarray(values, dtype=np.float64) for values in (pv, low, high))
     room = LEFT * (top - bottom)
     return bool(np.any((y < bottom - room) | (y > top + room)))
+
+
+def swings(sp: Array, cv: Array, span: Array) -> NDArray[np.bool_]:
+    """Which controlled variables (n, n_cv) still swing about their set points as the course ends.
+
+    Over the last half of the last hold (the samples since a set point last moved) the error goes from one side to the
+    other at least CROSSINGS times, each time beyond SWING of the range ``span`` (n_cv,).
+    """
+    moved = np.flatnonzero(np.any(np.diff(sp, axis=0) != 0, axis=1))
+    start = int(moved[-1]) + 1 if len(moved) else 0
+    error = (cv - sp)[(start + len(sp)) // 2 :] / span
+    found = np.zeros(error.shape[1], dtype=bool)
+    for i, course in enumerate(error.T):
+        sides = np.sign(course[np.abs(course) > SWING])
+        found[i] = np.count_nonzero(np.diff(sides)) >= CROSSINGS
+    return found
 
 
 def closed_loop_metrics(

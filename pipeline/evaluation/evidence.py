@@ -88,7 +88,10 @@ class Evidence:
     def grounds(self) -> Grounds | None:
         """What tests on identified models rest on; None for a case that is tested on its plant's equations."""
         return grounds_of(
-            self.case, next(iter(self.models.values()), {}), (m.metrics.reached for m in self.laws.values())
+            self.case,
+            next(iter(self.models.values()), {}),
+            {n: self.laws[n].metrics.reached for n in self.laws if not self._withheld(n)}
+            or {n: m.metrics.reached for n, m in self.laws.items()},
         )
 
     @cached_property

@@ -3,10 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self
 
+from pipeline.files import read_json
+from pipeline.records.operated import Operated
+
+SCREENING = "screening.json"
+"""Beside the record of an own plant: what `loopwright new` or stage `screen` found of it."""
 ON_MODELS = "on models identified from your data"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordVerdict:
+    """What the screening said of a plant's record: yes, doubtful or no, the reasons, and how the plant was run."""
+
+    carries: str
+    reasons: tuple[str, ...] = ()
+    operated: tuple[str, ...] = ()
+
+    @classmethod
+    def beside(cls, record: Path) -> Self | None:
+        """The verdict on a record, of the file beside it; None where there is none, as for a record of one's own."""
+        path = record.with_name(SCREENING)
+        if not path.is_file():
+            return None
+        found = read_json(path)
+        verdict = found.get("verdict") or {}
+        loops = (Operated(**loop).words for loop in found.get("operated") or ())
+        return cls(str(verdict.get("carries", "")), tuple(map(str, verdict.get("reasons") or ())), tuple(loops))
+
+    @property
+    def doubt(self) -> str:
+        """Why a model of the record is doubtful, to go on a sentence; empty where nothing speaks against one."""
+        if self.carries in {"", "yes"}:
+            return ""
+        words = "a model of these data is doubtful" if self.carries == "doubtful" else "these data carry no model"
+        return f"{words}: {'; '.join(self.reasons)}" if self.reasons else words
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,7 +48,8 @@ class Grounds:
     """Free-run fit [%] of the models over rows that their fit never saw, by CV, and what lies beyond the data.
 
     ``set_points``, ``loops``: how far set points, and PVs and MVs in closed loops, go beyond the range of the record,
-    in % of that range, by signal; signals that stay within are left out. A fit is None where the run exploded.
+    in % of that range, by signal; signals that stay within are left out. ``farthest``: by signal, the law whose loops
+    go farthest. A fit is None where the run exploded.
     ``unproven``: why the record does not prove the models, each to go on a sentence: ``not proven: ...``.
     """
 
@@ -22,11 +57,23 @@ class Grounds:
     set_points: Mapping[str, float]
     loops: Mapping[str, float]
     unproven: tuple[str, ...] = ()
+    record: RecordVerdict | None = None
+    farthest: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def doubt(self) -> str:
+        """Why a model of the record is doubtful, by its screening; empty where it is not, or nobody screened it."""
+        return "" if self.record is None else self.record.doubt
+
+    @property
+    def operated(self) -> tuple[str, ...]:
+        """How the plant was run in the record, a clause for each loop whose set point is known."""
+        return () if self.record is None else self.record.operated
 
     @property
     def words(self) -> str:
         """Where tests ran and what that is worth, to go on a sentence."""
-        return "; ".join((f"{ON_MODELS} ({self.figures})", *self.unproven))
+        return "; ".join(filter(None, (f"{ON_MODELS} ({self.figures})", self.doubt, *self.unproven)))
 
     @property
     def figures(self) -> str:
@@ -34,13 +81,13 @@ class Grounds:
         fits = ", ".join(f"{name} {'none' if fit is None else f'{fit:.3g} %'}" for name, fit in self.fit.items())
         inside = "set points stay within the data" if not self.set_points else f"set points go {_far(self.set_points)}"
         left = "PVs and MVs do, too" if not self.set_points else "PVs and MVs stay within"
-        loops = left if not self.loops else f"in closed loop {_far(self.loops, 'goes')}"
+        loops = left if not self.loops else f"in closed loop {_far(self.loops, 'goes', self.farthest)}"
         return f"free-run fit over unseen rows: {fits}; {inside}; {loops}"
 
     @property
     def warning(self) -> str:
-        """Sentences: what is not proven, and where set points go beyond the record; empty where there is neither."""
-        sentences = [f"{why[:1].upper()}{why[1:]}." for why in self.unproven]
+        """Sentences: what is doubtful or not proven, and where set points go beyond the record; else empty."""
+        sentences = [f"{why[:1].upper()}{why[1:]}." for why in filter(None, (self.doubt, *self.unproven))]
         return " ".join((*sentences, *self._beyond))
 
     @property
@@ -53,10 +100,15 @@ class Grounds:
     def to_dict(self) -> dict[str, Any]:
         """For the manifest: the figures, and the sentence."""
         figures = asdict(self)
-        unproven = figures.pop("unproven")
-        return {"words": self.words, **figures, **({"unproven": list(unproven)} if unproven else {})}
+        unproven, record, _ = (figures.pop(name) for name in ("unproven", "record", "farthest"))
+        further = {"unproven": list(unproven)} if unproven else {}
+        further |= {"data": record["carries"], "data_reasons": list(record["reasons"])} if record else {}
+        return {"words": self.words, **figures, **further}
 
 
-def _far(of: Mapping[str, float], verb: str = "") -> str:
-    verb = f" {verb}" if verb else ""
-    return ", ".join(f"{name}{verb} {value:.3g} % of its recorded range beyond it" for name, value in of.items())
+def _far(of: Mapping[str, float], verb: str = "", under: Mapping[str, str] | None = None) -> str:
+    verb, law = f" {verb}" if verb else "", under or {}
+    return ", ".join(
+        f"{name}{verb} {value:.3g} % of its recorded range beyond it" + (f" under {law[name]}" if name in law else "")
+        for name, value in of.items()
+    )

@@ -66,7 +66,7 @@ class LawMetrics:
     reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
     lowest and highest value in closed loops without noise, where these run on models of a record; ``replay``: MV ->
-    figures of the shipped file over rows of that record.
+    figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end.
     """
 
     name: str
@@ -83,6 +83,7 @@ class LawMetrics:
     sequences: Mapping[str, Mapping[str, Row]] = field(default_factory=dict)
     reached: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     replay: Mapping[str, Row] = field(default_factory=dict)
+    swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
         """Write the file; ValueError for NaN and infinity."""
@@ -100,7 +101,7 @@ class LawMetrics:
 
 
 def lock_up_text(locked_up: Mapping[str, Mapping[str, int]]) -> str:
-    """Tests with the data seeds that locked up in them: ``held_out (seeds 0, 3), step (seed 1)``."""
+    """Tests with the data seeds that locked up, or swing, in them: ``held_out (seeds 0, 3), step (seed 1)``."""
     return ", ".join(
         f"{test} (seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)})" for test, seeds in locked_up.items()
     )

@@ -20,10 +20,11 @@ Ranges = Mapping[str, tuple[float, float]]
 LEAST = 0.5  # % of a recorded range: what goes less far beyond it stays within
 
 
-def grounds_of(case: Case, models: Mapping[str, Any], reached: Iterable[Ranges]) -> Grounds | None:
+def grounds_of(case: Case, models: Mapping[str, Any], reached: Mapping[str, Ranges]) -> Grounds | None:
     """Grounds of the tests of a case on models; None for a case that is tested on its plant's equations.
 
-    ``models`` is metrics.json of the law's model set, ``reached`` what each law's closed loops reached.
+    ``models`` is metrics.json of the law's model set, ``reached`` what closed loops reached, by law; of one
+    law alone by "".
     """
     if not case.on_models:
         return None
@@ -42,11 +43,15 @@ def grounds_of(case: Case, models: Mapping[str, Any], reached: Iterable[Ranges])
     names = [s.name for s in case.plant.sp_signals]
     wanted = dict(zip(names, zip(asked.min(axis=0).tolist(), asked.max(axis=0).tolist(), strict=True), strict=True))
     unproven = (sign_doubts({"": models}), fit_doubts({"": models})) if case.stand_in == IDENTIFIED else ()
+    left = {law: beyond(ranges, case.recorded) for law, ranges in reached.items()}
+    loops = beyond(widest(reached.values()), case.recorded)
     return Grounds(
         fit,
         beyond(wanted, case.recorded),
-        beyond(widest(reached), case.recorded),
+        loops,
         tuple(why for why in unproven if why),
+        case.record_verdict,
+        {name: max(left, key=lambda law: left[law].get(name, 0.0)) for name in loops if "" not in left},
     )
 
 

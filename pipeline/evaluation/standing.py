@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from pipeline.evaluation.grounds import Grounds
+from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.validation import FILE, Statement, Validation
 from pipeline.files import read_json
@@ -31,6 +32,7 @@ class LawStanding:
     ratio: float | None  # ``Standing.times``, or to the noise floor if the bound is less: ``Standing.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
+    swings: str = ""  # the tests in which a closed loop swings to the end
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,4 +154,5 @@ def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
         ratio=_ratio(validation, row.get(metric)),
         step_us=result.step_us,
         bytes=file.stat().st_size if file.exists() else None,
+        swings=lock_up_text(result.swings),
     )

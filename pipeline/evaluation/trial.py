@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from pipeline.evaluation.case import Case
-from pipeline.evaluation.closed_loop import left_limits, locked_up
+from pipeline.evaluation.closed_loop import left_limits, locked_up, swings
 from pipeline.evaluation.metric import mean_of_draws
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
@@ -36,6 +36,7 @@ class Trial:
     sequences: dict[str, dict[str, Metrics]]  # of the tests with several sequences, by their seeds
     development: float  # the case's metric, mean over the development sequences
     locked_up: dict[str, int]  # test -> closed loops that locked up, of those where any did; DEVELOPED: development
+    swings: dict[str, int]  # the same of closed loops that swing to the end
     curves: dict[str, Trajectory]
     reached: dict[str, tuple[float, float]]  # by closed loops without noise, PVs and MVs; of a case on models alone
 
@@ -52,11 +53,15 @@ class Trial:
 
 @dataclass(frozen=True)
 class Repeated:
-    """One test, repeated with different noise where it is noisy: mean figures, the first loop, lock-ups of all."""
+    """One test, repeated with different noise where it is noisy: mean figures, the first loop.
+
+    And of all the lock-ups, and those that swing to the end.
+    """
 
     metrics: Metrics
     first: Trajectory
     lock_ups: int
+    swings: int
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
@@ -64,7 +69,8 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     draws = range(case.noise_draws if noise else 1)
     loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
-    return Repeated(mean_of_draws(rows), loops[0], sum(stuck(case, test, loop) for loop in loops))
+    lock_ups, swing = (sum(of(case, test, loop) for loop in loops) for of in (stuck, swings_on))
+    return Repeated(mean_of_draws(rows), loops[0], lock_ups, swing)
 
 
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
@@ -103,6 +109,12 @@ def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
     ends = {end: [getattr(s, end) for s in case.plant.sp_signals] for end in ("low", "high")}
     left = case.on_models and left_limits(loop.pv[:, :n], **ends)
     return jammed or left or bool(loop.info[:, -1].any())
+
+
+def swings_on(case: Case, test: Scenario, loop: Trajectory) -> bool:
+    """Whether a controlled variable swings about its set point to the end of the test."""
+    spans = np.array([s.high - s.low for s in case.plant.sp_signals])
+    return bool(swings(loop.sp, loop.pv[:, : test.sp.shape[1]], spans).any())
 
 
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:

@@ -47,7 +47,8 @@ class LawResult:
     """A law's results beside its figures.
 
     ``locked_up``: test -> data seed -> closed loops that locked up. ``as_printed``: a reproduction of a paper's
-    law, which is shipped nevertheless. ``analysis``: by the form's name, ``base`` for the shipped one.
+    law, which is shipped nevertheless. ``analysis``: by the form's name, ``base`` for the shipped one. ``swings``: as
+    ``locked_up``, closed loops that swing to the end.
     """
 
     seeds: int
@@ -56,6 +57,7 @@ class LawResult:
     locked_up: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     as_printed: bool = False
     analysis: Mapping[str, Analysis] = field(default_factory=dict)
+    swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

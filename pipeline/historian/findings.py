@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from pipeline.historian.sampling import Sampling
+from pipeline.records.operated import Operated
 
 
 def counted(n: int, one: str, more: str = "") -> str:
@@ -106,6 +107,7 @@ class Screening:
     findings: tuple[Finding, ...]
     verdict: Verdict
     zone: str = ""  # that dates are in, as in Export
+    operated: tuple[Operated, ...] = ()  # how the loops were run whose set point is known
 
     @property
     def summary(self) -> str:

@@ -26,6 +26,7 @@ from pipeline.historian.left_out import flag_readings, flag_rows, interval_text,
 from pipeline.historian.linear import Linear
 from pipeline.historian.loads import with_load_moves
 from pipeline.historian.modes import check_modes
+from pipeline.historian.operated import operated
 from pipeline.historian.pace import of_period, pace_of
 from pipeline.historian.pulses import pulses
 from pipeline.historian.readings import clean, reasons_of, with_texts_of_one_side
@@ -168,6 +169,7 @@ def screened(
         findings=merged(spelt(findings, tags)),
         verdict=verdict,
         zone=export.zone,
+        operated=operated(grid, code, tags, {t.tag: own[t.tag].categories for t in tags if t.role == "mode"}),
     )
     return Screened(record, grid, code, own, report, step, models)
 

@@ -359,9 +359,12 @@ def info_label(case: Case, name: str) -> str:
     return axis_label(*known.get(name, (name.replace("_", " "), "")))
 
 
-def overview_picture(evidence: Evidence, law: str) -> Canvas:
-    """A law beside the baseline on the first sequence of the test that weighs most, with the figures over all."""
-    scenario, case, baseline = evidence.main_test, evidence.case, evidence.case.baseline
+def overview_picture(evidence: Evidence, law: str, test: str | None = None) -> Canvas:
+    """A law beside the baseline on the first sequence of a test, with the figures over all.
+
+    Without ``test`` it is the one that weighs most.
+    """
+    scenario, case, baseline = test or evidence.main_test, evidence.case, evidence.case.baseline
     own = evidence.loop(Curve(law), scenario)
     if own is None:
         raise NotMeasuredError
@@ -380,8 +383,12 @@ def overview_picture(evidence: Evidence, law: str) -> Canvas:
 
 
 def disturbance_picture(evidence: Evidence, scenario: str) -> Canvas:
-    """The first sequence of a test that moves a measured disturbance, under the best law and the baseline."""
-    laws = dict.fromkeys((evidence.best or "", evidence.case.baseline))
+    """The first sequence of a test that moves a measured disturbance, under the best law and the baseline.
+
+    Of an own plant under all laws: a person chooses among them, and some take the disturbance and some do not.
+    """
+    laws = dict.fromkeys((evidence.best or "", *(evidence.laws if evidence.case.on_models else ())))
+    laws |= {evidence.case.baseline: None}
     drawn = {}
     for law in laws:
         loop = evidence.loop(Curve(law), scenario)

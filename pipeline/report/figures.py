@@ -21,6 +21,7 @@ from pipeline.pictures.model_pictures import candidates_picture, one_step_pictur
 from pipeline.pictures.png import save
 from pipeline.pictures.replay_pictures import replay_picture
 from pipeline.pictures.words import scenario_name
+from pipeline.report.worse import shipped_laws, worst_test
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 MODEL_PICTURES: tuple[tuple[str, Draw, str], ...] = (
@@ -40,14 +41,15 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
 
     The case's own figures are ``figure_05.png`` and so on, with the best controller added;
     ``closed_loop_<law>.png`` shows each law beside the case's baseline on the test that weighs most, and
-    ``closed_loop.png`` the best one; ``candidates_<set>_<part>.png`` the search over a model's
-    size; ``closed_loop_test_<test>.png`` a test that moves measured disturbances; ``own`` are the pictures that only
-    this case has.
+    ``closed_loop.png`` the best one; ``worst_<law>.png`` the test that says most against it;
+    ``candidates_<set>_<part>.png`` the search over a model's size; ``closed_loop_test_<test>.png`` a test that moves
+    measured disturbances; ``own`` are the pictures that only this case has.
     Raises ReportError where two pictures have the same file name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, str] = {}
     where, untuned = main_words(evidence)
+    shipped = shipped_laws(evidence)
 
     def keep(name: str, canvas: Canvas, caption: str) -> None:
         save(canvas, folder / f"{name}.png")
@@ -67,6 +69,10 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                 if name == evidence.best:
                     shutil.copyfile(folder / f"closed_loop_{name}.png", folder / "closed_loop.png")
                     drawn["closed_loop.png"] = f"{law.title} on {untuned}"
+            with suppress(NotMeasuredError):
+                if name in shipped and (test := worst_test(evidence, name)) is not None:
+                    words = scenario_name(test, evidence.case.recipe, evidence.case.test_words)
+                    keep(f"worst_{name}", overview_picture(evidence, name, test), f"{law.title} on {words}")
             with suppress(NotMeasuredError):
                 keep(f"replay_{name}", replay_picture(evidence, name), f"{law.title}, replayed over the record")
         for test, sequences in evidence.tests.items():

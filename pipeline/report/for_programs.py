@@ -64,7 +64,9 @@ def _row(evidence: Evidence, law: str, scenario: str) -> Row:
 
 def _law(evidence: LawEvidence) -> LawResult:
     own = evidence.metrics
-    return LawResult(evidence.seeds, own.lock_ups, evidence.step_us, own.locked_up, own.as_printed, evidence.analyses)
+    return LawResult(
+        evidence.seeds, own.lock_ups, evidence.step_us, own.locked_up, own.as_printed, evidence.analyses, own.swings
+    )
 
 
 def _gate(evidence: Evidence) -> GateRecord:

@@ -13,6 +13,7 @@ from pipeline.evaluation.validation import Statement
 from pipeline.pictures.drawing import axis_label
 from pipeline.pictures.numbers import number, times
 from pipeline.pictures.words import law_name, scenario_name
+from pipeline.report.worse import limit_of
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 UNMEASURED = "not measured"
@@ -96,15 +97,16 @@ def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[Statement]:
     """No worse than the baseline in each test of the gate."""
     for test in evidence.case.weights:
         own, other, floor = evidence.figure(law, test), evidence.figure(baseline, test), evidence.floor(test)
-        if own is None or other is None:
+        limit = limit_of(evidence, test)
+        if own is None or other is None or limit is None:
             continue
         pid, least = law_name(baseline), _with_unit(evidence, floor)
         hidden = f"the {pid} has {_with_unit(evidence, other)}; errors that noise can hide, up to {least}, are equal"
         yield Statement(
             f"{_what(evidence, law, test)}, beside the {pid}",
-            f"{evidence.case.criterion.short} ≤ {_with_unit(evidence, max(other, floor))}",
+            f"{evidence.case.criterion.short} ≤ {_with_unit(evidence, limit)}",
             _with_unit(evidence, own),
-            own <= max(other, floor),
+            own <= limit,
             hidden if other < floor else "",
         )
 

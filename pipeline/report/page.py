@@ -23,6 +23,7 @@ from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_se
 from pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
+from pipeline.report.worse import against, shipped_laws
 
 MOST_HEADLINES = 5
 
@@ -44,7 +45,7 @@ def write_report(evidence: Evidence, claims: Claims, own: Sequence[CasePicture],
 def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own: Collection[str]) -> dict[str, Any]:
     """Everything that the templates show."""
     case, best = evidence.case, evidence.laws.get(evidence.best or "")
-    shipped = [name for name, law in evidence.laws.items() if not (case.on_models and law.withheld)]
+    shipped = shipped_laws(evidence)
     models = [row for name, model in evidence.models.items() for row in model_rows(name, model)]
     # An identified model has a section of its own, with what these rows have no columns for.
     models = [row for row in models if row["kind"] != IDENTIFIED]
@@ -67,7 +68,10 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "warning": "" if evidence.grounds is None else evidence.grounds.warning,
         "pictures": of_kind("figure_"),
         "own_pictures": {k: v for k, v in pictures.items() if k in own},
-        "further_pictures": _loops(evidence, of_kind("closed_loop_")),
+        "further_pictures": [
+            *_loops(evidence, of_kind("closed_loop_")),
+            *([("Tests that say most against a law", worst)] if (worst := of_kind("worst_")) else ()),
+        ],
         "sweeps": of_kind("sweep_") | of_kind("candidates_"),
         # A search over models has no offline optimum: its column would stand empty.
         "offline": evidence.grounds is None,
@@ -82,6 +86,10 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "acceptance": judged.acceptance,
         "met": sum(row.holds is True for row in judged.acceptance),
         "statements": judged.statements,
+        "against": against(evidence),
+        "caveat": _caveat(evidence, judged),
+        "operated": () if evidence.grounds is None else evidence.grounds.operated,
+        "worst_pictures": of_kind("worst_").keys(),
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
         "withheld": by_reason(evidence.withheld),
         "gate_of": _gate_of(evidence),
@@ -100,6 +108,15 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "step_ms": evidence.bound(evidence.main_test, "step_ms_p50"),
         "registry": REGISTRY_URL,
     }
+
+
+def _caveat(evidence: Evidence, judged: Judged) -> str:
+    """What a person who reads of the best controller must know beside it, as sentences; empty if nothing."""
+    missed = [row.what for row in judged.acceptance if row.holds is False]
+    found = [f"Not met: {'; '.join(missed)}."] if missed else []
+    if evidence.grounds is not None and evidence.grounds.doubt:
+        found.append("A model of these data is doubtful, as said below.")
+    return " ".join(found)
 
 
 def _gate_of(evidence: Evidence) -> str:

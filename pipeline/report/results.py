@@ -76,6 +76,8 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         best = next((law.law for law in standings[case].laws if law.best), None)
         if best is not None:
             console.print(f"the best   {where / f'{best}.onnx'}")
+            for line in _beside_the_best(standings[case], shipped):
+                console.print(f"           {line}", style="red", markup=False, soft_wrap=True)
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
     # In quotes where a word has to be put in: a shell takes the brackets for something else.
     one = f"{where / best}.onnx" if best is not None else f"'{where / '<law>.onnx'}'"
@@ -83,6 +85,12 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(f"try one    loopwright simulate {one}")
         console.print(f"read one   loopwright inspect {one}")
     console.print("registry   make registry, then /#/models in the browser")
+
+
+def _beside_the_best(standing: Standing, shipped: Iterable[LawStanding]) -> list[str]:
+    """What a person who takes the best controller must know: requirements missed, loops that swing."""
+    lines = [f"not met: {row.what}" for row in standing.requirements if row.holds is False]
+    return [*lines, *(f"{law.law} swings to the end in {law.swings}" for law in shipped if law.swings)]
 
 
 def without_controller(artifacts: Path, case: str) -> bool:

@@ -24,6 +24,7 @@ from pipeline.config.params import entries, read_section, sections
 from pipeline.config.plants import PlantParams
 from pipeline.engine.command import run_stage
 from pipeline.engine.stage_files import DATA, EVERY
+from pipeline.evaluation.grounds import SCREENING
 from pipeline.files import digest, sha256, write_json
 from pipeline.stages.paths import WORK
 
@@ -69,7 +70,9 @@ def code() -> None:
         write_json(file, listing(Path.cwd(), stage, case))
     # For the engine, which sends a stage's files to a worker: no stage depends on this list.
     simulators = {p.as_posix() for case in all_cases().values() for p in case.reads}  # the list of cases loads them all
-    records = {name: [PlantParams.read(name).data.as_posix()] for name in sections("plants")}
+    found = {name: PlantParams.read(name).data for name in sections("plants")}
+    # A verdict that is not there, as of a record of one's own, is not sent.
+    records = {n: [data.as_posix(), data.with_name(SCREENING).as_posix()] for n, data in found.items()}
     write_json(DATA, {EVERY: sorted(simulators), **records})
     for left in set((WORK / "code").glob("*.json")) - made:  # of a case or an export that is no more
         left.unlink()

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def validate(name: str) -> None:
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))
     source = controller_file(params.case, params.name, BASE, shipped.seed)
-    locked_up = _locked_up(base)
+    locked_up = _of_tests(base, "locked_up")
     how = "locked up or left its limits" if case.on_models else "locked up"
     withheld = f"controllers.{name} {how} on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
     withheld += "numbers or models"
@@ -97,10 +97,12 @@ def validate(name: str) -> None:
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)
     _keep_analysis(params, shipped.seed, folder / "analysis.npz")
-    evidence = _evidence(case, base, shipped, grounds_of(case, models, [metrics.reached]))
+    evidence = _evidence(case, base, shipped, grounds_of(case, models, {"": metrics.reached}))
     if (analysis := metrics.forms[BASE].analysis) is not None:
         evidence["analysis"] = analysis.figures
     evidence["dead_time_periods"] = dead_times(case.plant)
+    if metrics.swings:
+        evidence["swings"] = metrics.swings
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     target = ARTIFACTS / params.case / f"{params.name}.onnx"
@@ -111,10 +113,11 @@ def validate(name: str) -> None:
         with_evidence(source, target, evidence)
 
 
-def _locked_up(base: list[Trial]) -> dict[str, dict[str, int]]:
-    """Test -> data seed -> closed loops that locked up, of those where any did."""
-    tests = dict.fromkeys(test for t in base for test in t.locked_up)
-    return {test: {str(t.seed): t.locked_up[test] for t in base if test in t.locked_up} for test in tests}
+def _of_tests(base: list[Trial], what: Literal["locked_up", "swings"]) -> dict[str, dict[str, int]]:
+    """Test -> data seed -> closed loops that locked up or swing to the end, of those where any did."""
+    counts = {t.seed: t.locked_up if what == "locked_up" else t.swings for t in base}
+    tests = dict.fromkeys(test for of in counts.values() for test in of)
+    return {test: {str(seed): of[test] for seed, of in counts.items() if test in of} for test in tests}
 
 
 def _replayed(case: Case, models: Mapping[str, Any], file: Path, path: Path) -> dict[str, dict[str, float]]:
@@ -166,13 +169,14 @@ def _metrics(
         lock_ups=sum(t.lock_ups for t in base),
         development_lock_ups=sum(t.development_lock_ups for t in base),
         development={str(t.seed): t.development for t in base},
-        locked_up=_locked_up(base),
+        locked_up=_of_tests(base, "locked_up"),
         as_printed=params.as_printed,
         sequences={
             name: {seed: _over_seeds({t.seed: t.sequences[name][seed] for t in base}).median for seed in rows}
             for name, rows in base[0].sequences.items()
         },
         reached=widest(t.reached for t in base),
+        swings=_of_tests(base, "swings"),
     )
 
 

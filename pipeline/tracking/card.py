@@ -86,6 +86,10 @@ def _verdict(gate: Gate) -> str:
     one = "perfect-model NMPC" if gate.reference == "the bound" else gate.reference
     score = f"Gate score {gate.score:.3f} (1 = {one}{beside})"
     if not gate.lock_ups:
+        if gate.swings:
+            return (
+                f"SWINGS to the end in {gate.swings}. {score}, no lock-up.{escape(_no_baseline(gate), quote=False)}\n"
+            )
         return f"{score}, no lock-up.{escape(_no_baseline(gate), quote=False)}\n"
     where = f": {gate.locked_up}" if gate.locked_up else ""
     return f"LOCKED UP in {gate.lock_ups} closed loops{where}; do not run it on a plant. {score}.\n"

@@ -21,7 +21,8 @@ Aliases:
     says why.
 ``champion``
     one in a case: the best version with the lowest score among the case's controllers, or the one
-    that a person promoted.
+    that a person promoted. A controller whose closed loop swings to the end of a test stands behind
+    all that do not.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ class Gate:
     reference: str = "the bound"  # what the score is a multiple of
     times: str = "× NMPC"  # the same, short
     unproven: tuple[str, ...] = ()  # why the record of an own plant does not prove the models of the tests
+    swings: str = ""  # tests, of which data seeds, in which a closed loop swings to the end
 
     @classmethod
     def of(cls, validation: Validation | None, law: str) -> Self:
@@ -75,6 +77,7 @@ class Gate:
             gate.reference,
             gate.times,
             () if validation.grounds is None else validation.grounds.unproven,
+            "" if result is None else lock_up_text(result.swings),
         )
 
     def tags(self) -> dict[str, str]:
@@ -89,6 +92,7 @@ class Gate:
             "unproven": "; ".join(self.unproven) or None,
             "lock_ups": self.lock_ups,
             "locked_up": self.locked_up or None,
+            "swings": self.swings or None,
             **{f"gate_{scenario}": ratio for scenario, ratio in self.ratios.items()},
         }
         return {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in rows.items() if v is not None}
@@ -113,6 +117,10 @@ class Gate:
         """Why the version that has these tags stays the best one; None if this one takes its place."""
         if best.get("gate_id") != self.id:
             return "the best version was measured on another gate; compare them and promote by hand"
+        if self.swings and not best.get("swings"):
+            return f"it swings to the end in {self.swings}, and the best version in no test"
+        if best.get("swings") and not self.swings and self.score is not None:
+            return None
         held = float(best.get("gate_score", "inf"))
         if self.score is None or self.score >= held:
             return f"its gate score {self.score} does not beat the best version's {held:.4g}"
@@ -121,7 +129,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Rank:
-    """Where a law stands among the laws of its case: those that pass the gate first, the lowest score first."""
+    """Where a law stands among the laws of its case: by the gate, then swinging to no end, then the lowest score."""
 
     place: int
     of: int
@@ -131,5 +139,6 @@ class Rank:
     def of_laws(cls, validation: Validation | None) -> dict[str, Self]:
         """The rank of every law that has a score."""
         gates = [Gate.of(validation, law) for law in (validation.gate.laws if validation else ())]
-        scored = sorted((g.refusal() is not None, g.score, g.law, g.refusal()) for g in gates if g.score is not None)
-        return {law: cls(place, len(scored), refusal) for place, (_, _, law, refusal) in enumerate(scored, 1)}
+        scored = [g for g in gates if g.score is not None]
+        scored.sort(key=lambda g: (g.refusal() is not None, bool(g.swings), g.score, g.law))
+        return {g.law: cls(place, len(scored), g.refusal()) for place, g in enumerate(scored, 1)}

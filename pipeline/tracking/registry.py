@@ -189,6 +189,7 @@ def elect_champion(client: MlflowClient, case: str) -> str | None:
         ids = [v.tags.get("gate_id") for v in scored]
         common = max(ids, key=ids.count, default=None)
         able = [v for v in scored if v.tags.get("gate_id") == common]
+        able = [v for v in able if not v.tags.get("swings")] or able
         best = min(able, key=lambda v: float(v.tags["gate_score"]), default=None)
     _crown(client, holders, best)
     return None if best is None else str(best.name)

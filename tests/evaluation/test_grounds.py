@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from own_cases import two_lags
 
 from pipeline.cases import CASES
-from pipeline.evaluation.grounds import Grounds
+from pipeline.evaluation.grounds import Grounds, RecordVerdict
 from pipeline.evaluation.reached import beyond, grounds_of, reached_by, widest
 from pipeline.simulation.simulate import simulate_closed
 
@@ -40,6 +41,32 @@ def test_the_sentence_says_the_fit_and_how_far_the_tests_leave_the_data(grounds:
     assert said in grounds.words
 
 
+def test_what_the_screening_said_of_the_record_is_said_wherever_its_figures_are(tmp_path: Path) -> None:
+    record = tmp_path / "record.parquet"
+    assert RecordVerdict.beside(record) is None
+    loop = {"pv": "T", "unit": "degC", "rows": 9, "automatic": True, "mae": 1.5, "travel": {}, "travel_units": {}}
+    verdict = {"carries": "doubtful", "reasons": ["V hardly moves", "few rows"]}
+    record.with_name("screening.json").write_text(json.dumps({"verdict": verdict, "operated": [loop]}))
+    found = RecordVerdict.beside(record)
+    assert found is not None
+    assert (found.carries, found.reasons) == ("doubtful", ("V hardly moves", "few rows"))
+    grounds = Grounds({"T": 90.0}, {}, {}, record=found)
+    assert grounds.doubt == "a model of these data is doubtful: V hardly moves; few rows"
+    assert grounds.doubt in grounds.words
+    assert grounds.warning == f"A{grounds.doubt[1:]}."
+    assert grounds.to_dict()["data"] == "doubtful"
+    assert "1.5 degC over 9 rows in automatic" in grounds.operated[0]
+    good = Grounds({"T": 90.0}, {}, {}, record=RecordVerdict("yes"))
+    assert (good.doubt, good.warning) == ("", "")
+
+
+def test_who_leaves_the_record_is_named() -> None:
+    assert (
+        "V goes 25 % of its recorded range beyond it under fast"
+        in Grounds({}, {}, {"V": 25.0}, farthest={"V": "fast"}).words
+    )
+
+
 def test_set_points_beyond_the_record_are_a_warning_of_their_own() -> None:
     assert Grounds({"T": 90.0}, {}, {"V": 25.0}).warning == ""
     said = Grounds({"T": 90.0}, {"T": 61.5, "L": 2.0}, {}).warning
@@ -53,10 +80,11 @@ def test_they_come_from_the_models_figures_and_from_the_loops(tmp_path: Path, mo
     test = case.scenarios()["load"][0]
     assert test.plant is not None
     loop = simulate_closed(test.plant, lambda sp, pv, mv: (np.array([1.0, 0.0]), []), test)
-    found = grounds_of(case, models, [reached_by([loop], case)])
+    found = grounds_of(case, models, {"": reached_by([loop], case)})
     assert found is not None
     assert found.fit == {"y0": 90.0, "y1": None}
     assert found.set_points == {}
+    assert found.farthest == {}  # of one law alone nobody asks
     low, high = case.recorded["u0"]
     assert found.loops["u0"] == pytest.approx(100 * (1 - high) / (high - low), rel=0.01)
-    assert grounds_of(CASES["batch_reactor"], {}, []) is None
+    assert grounds_of(CASES["batch_reactor"], {}, {}) is None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import pytest
 from pipeline.cases import CASES
 from pipeline.evaluation import trial, trials
 from pipeline.evaluation.case import Case, Curve, Figure
-from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck
+from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck, swings_on
 from pipeline.evaluation.trials import try_files
 from serving.errors import OutputError
 
@@ -100,6 +100,16 @@ def test_a_loop_at_its_limit_is_locked_up_and_a_start_up_is_not(case: Case) -> N
     loop = close_loop(hard, case, test, None, 0)
     assert (loop.mv[:7] == 1).all()
     assert not stuck(case, test, loop)
+
+
+def test_a_loop_that_swings_to_the_end_is_no_lock_up_and_is_told(case: Case) -> None:
+    test = case.scenarios()["trajectory"][0]
+    sound: Any = Proportional()
+    loop = close_loop(sound, case, test, None, 0)
+    assert not swings_on(case, test, loop)
+    pv, cv = loop.pv.copy(), case.plant.sp_signals[0]
+    pv[:, 0] = cv.middle + 0.02 * (cv.high - cv.low) * np.cos(np.pi * np.arange(len(pv)))
+    assert swings_on(case, test, replace(loop, pv=pv, sp=np.full_like(loop.sp, cv.middle)))
 
 
 def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:

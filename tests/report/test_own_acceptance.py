@@ -15,6 +15,7 @@ from pipeline.evaluation.validation import Statement
 from pipeline.evaluation.verdicts import PLAIN
 from pipeline.report.own_acceptance import own_acceptance
 from pipeline.report.verdicts import acceptance
+from pipeline.report.worse import against, worse_tests, worst_test
 
 NOISE = 0.01
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")
@@ -70,6 +71,20 @@ def test_the_best_law_must_settle_in_every_test() -> None:
     bad = row(evidence(law("predictive", 1.0, spoilt=1.3), None), "largest error at the end")
     assert (good.limit, good.measured, good.holds) == (f"≤ {FAR * 6:g} m", "0.11 m in test spoilt", True)
     assert (bad.measured, bad.holds) == ("0.13 m in test spoilt", False)
+
+
+def test_each_shipped_law_is_judged_and_not_the_best_alone() -> None:
+    other = law("predictive", 3.0, spoilt=1.3, load=0.01)
+    other = replace(other, metrics=replace(other.metrics, swings={"spoilt": {"0": 1}}))
+    found = evidence(other, law("pid", 2.0, spoilt=0.1, load=0.005))
+    assert found.best == "pid"
+    (worse,) = worse_tests(found, "predictive")  # errors below the noise of .01 are equal
+    assert (worse.test, worse.factor) == ("spoilt", pytest.approx(13.0))
+    assert worst_test(found, "predictive") == "spoilt"
+    assert worse_tests(found, "pid") == []
+    (row,) = against(found)
+    assert row["law"] == "predictive"
+    assert "swings to the end in spoilt (seed 0)" in row["words"]
 
 
 def test_the_best_law_must_stay_in_range() -> None:

@@ -82,6 +82,30 @@ def test_lock_ups_are_said_first(pi_file: Path, tmp_path: Path, capsys: Capture)
         assert "LOCKED UP" not in capsys.readouterr().out
 
 
+def test_loops_that_swing_and_data_that_are_doubtful_are_said_first(
+    pi_file: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    evidence = {
+        "lock_ups": 0,
+        "swings": {"spoilt": {"0": 2}, "load": {"0": 1}},
+        "on": {"words": "on models", "data": "doubtful", "data_reasons": ["few rows"]},
+        "scenarios": {"load": {"mae": 0.1}},
+    }
+    with_evidence(pi_file, tmp_path / "x.onnx", evidence)
+    assert main(["inspect", str(tmp_path / "x.onnx")]) == 0
+    assert capsys.readouterr().out.splitlines()[:5] == [
+        "formula for tank",
+        "  SWINGS to the end in 3 closed loops of its validation",
+        "    spoilt (seed 0: 2)",
+        "    load (seed 0: 1)",
+        "  DATA: can they carry a model: doubtful (few rows)",
+    ]
+    for odd in ({"swings": 3, "on": 4}, {"swings": {"load": 3}, "on": {"data": "yes"}}):
+        with_evidence(pi_file, tmp_path / "x.onnx", odd)
+        assert main(["inspect", str(tmp_path / "x.onnx")]) == 0
+        assert "DATA" not in capsys.readouterr().out
+
+
 def test_json(pi_file: Path, capsys: Capture) -> None:
     assert main(["inspect", "--json", str(pi_file)]) == 0
     row = json.loads(capsys.readouterr().out)

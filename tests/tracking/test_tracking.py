@@ -508,6 +508,25 @@ def test_a_case_has_one_champion_and_every_controller_says_where_it_stands(root,
         assert "champion_by" not in client.get_model_version(inverse, "1").tags
 
 
+def test_a_controller_that_swings_is_champion_of_none_that_does_not(root):
+    inverse, pid = f"{CASE}-inverse_dob", f"{CASE}-pid"
+    file = root / "artifacts" / CASE / "validation.json"
+    tree = json.loads(file.read_text())
+    tree["laws"]["inverse_dob"]["swings"] = {"sp_a": {"0": 1}}
+    file.write_text(json.dumps(tree))
+    publish(root)
+    with store() as client:
+        assert holders(client, "champion") == {pid: 1}
+        assert client.get_model_version(inverse, "1").tags["swings"] == "sp_a (seed 0)"
+        assert "SWINGS to the end in sp_a (seed 0)" in client.get_model_version(inverse, "1").description
+        assert client.get_registered_model(pid).tags["standing"] == "champion, 1 of 2"
+    tree["laws"]["pid"]["swings"] = {"sp_a": {"0": 1}}
+    file.write_text(json.dumps(tree))
+    publish(root)
+    with store() as client:
+        assert holders(client, "champion") == {inverse: 1}
+
+
 def test_a_law_that_the_newest_run_withholds_is_no_champion_any_more(root, capsys):
     pid, inverse = f"{CASE}-pid", f"{CASE}-inverse_dob"
     publish(root)

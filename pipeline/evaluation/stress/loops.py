@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.closed_loop import left_limits, locked_up
+from pipeline.evaluation.closed_loop import left_limits, locked_up, swings
 from pipeline.evaluation.stress.draws import Draw, Drawing
 from pipeline.evaluation.stress.faults import Actuators
 from pipeline.plants.side_by_side import advance_rows
@@ -21,8 +21,6 @@ from pipeline.simulation.simulate import Trajectory
 from serving.controller import Controller
 from serving.manifest import Manifest
 from serving.rows import ControllerRows
-
-SWING, CROSSINGS = 0.01, 3  # share of a controlled variable's range, changes of side
 
 
 @dataclass(frozen=True)
@@ -142,22 +140,6 @@ class Stress:
             broke,
             bool(np.any(swings(loop.sp, loop.pv[:, :n_cv], np.array(spans)))),
         )
-
-
-def swings(sp: Array, cv: Array, span: Array) -> NDArray[np.bool_]:
-    """Which controlled variables (n, n_cv) still swing about their set points as the course ends.
-
-    Over the last half of the last hold (the samples since a set point last moved) the error goes from one side to the
-    other at least CROSSINGS times, each time beyond SWING of the range ``span`` (n_cv,).
-    """
-    moved = np.flatnonzero(np.any(np.diff(sp, axis=0) != 0, axis=1))
-    start = int(moved[-1]) + 1 if len(moved) else 0
-    error = (cv - sp)[(start + len(sp)) // 2 :] / span
-    found = np.zeros(error.shape[1], dtype=bool)
-    for i, course in enumerate(error.T):
-        sides = np.sign(course[np.abs(course) > SWING])
-        found[i] = np.count_nonzero(np.diff(sides)) >= CROSSINGS
-    return found
 
 
 def figures_of(outcomes: Sequence[Outcome], name: str) -> Array:
