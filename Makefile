@@ -30,7 +30,7 @@ run: $(STAMP) ## run the whole pipeline: screen, excite, fit, design, validate, 
 	@loopwright run
 
 test: quick ## formatting, lint, types, import rules, tests
-	@bash tools/tests.sh -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+	@bash tools/tests.sh -n $(WORKERS) --dist loadfile --no-loadscope-reorder --ignore=tests/release
 
 check: quick ## the static part of make test
 	lint-imports
@@ -57,8 +57,9 @@ bench: $(STAMP) ## run the benchmarks, about 15 minutes
 	@echo "benchmarks: about 15 minutes; each says beforehand what it measures and how long it takes"
 	@for script in $(filter-out benchmarks/identification.py,$(wildcard benchmarks/[a-z]*.py)); do echo "== $$script"; python $$script || exit 1; done
 
-release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, and check them
+release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, and test them
 	@PYTHON=python bash tools/release.sh
+	python -m pytest tests/release
 
 clean: ## remove what can be rebuilt (the virtual environment stays)
 	rm -rf work timing receipts published.json mlflow.db mlruns mlartifacts .pytest_cache .mypy_cache .ruff_cache build dist

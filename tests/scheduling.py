@@ -36,7 +36,7 @@ KEEP_TIME = (
 )
 LONG = (
     *("test_laws_contract.py", "test_pipeline.py", "test_benchmark_of_monitor.py", "test_real_servers.py"),
-    *("test_screen_by_dvc.py", "test_export_to_controller.py", "test_identified_part.py", "test_release.py"),
+    *("test_screen_by_dvc.py", "test_export_to_controller.py", "test_identified_part.py"),
     *("test_new.py", "test_tracking.py", "test_embed.py", "test_predictive.py", "test_manual_builds.py"),
     *("test_fusion.py", "test_c_host.py", "test_cluster_stages.py", "test_cluster.py", "test_node_host.py"),
     *("test_laws_that_are_refused.py", "test_controller_fmu.py", "test_report.py", "test_graph_audit.py"),
