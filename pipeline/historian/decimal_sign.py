@@ -17,6 +17,7 @@ POINT_DECIMAL = re.compile(r"^\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*$")
 EITHER = re.compile(r"^[+-]?[1-9]\d{0,2}(?P<sign>[.,])\d{3}$")  # 1,234 is 1.234 or 1234
 SMALL = re.compile(r"^[+-]?[1-9]\d{0,2}$")
 CODES = {99, 999}  # of a reading that failed: alone they are no smaller numbers of the same kind
+BESIDE = np.log(1.5)  # numbers of one kind: a code as 500 beside 1.234 is neither
 OTHER = {".": ",", ",": "."}
 
 
@@ -100,4 +101,5 @@ def _by_size(cells: Sequence[str], sign: str) -> str:
     for decimal, scale in ((sign, 1.0), (OTHER[sign], 1000.0)):
         low, high = np.log(scale * numbers.min()), np.log(scale * numbers.max())
         away[decimal] = float(np.median(np.maximum(np.maximum(low - np.log(small), np.log(small) - high), 0)))
-    return min(away, key=away.__getitem__) if len(set(away.values())) > 1 else ""
+    near = min(away, key=away.__getitem__)
+    return near if away[near] < BESIDE < max(away.values()) else ""
