@@ -35,6 +35,9 @@ class Fault(str):
         found.kind, found.subject, found.lasting = kind, subject, lasting or words
         return found
 
+    def __getnewargs__(self) -> tuple[str, str, str, str]:  # type: ignore[override]  # copied and pickled as it is
+        return str(self), self.kind, self.subject, self.lasting
+
 
 def reworded(fault: str, words: str) -> str:
     """The same fault in other words, which are of now: they hold for as long as it lasts."""

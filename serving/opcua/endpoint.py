@@ -251,11 +251,12 @@ class OpcUaEndpoint:
                 patience_s = max(self.answer_s, self.server.connect_s)
                 await self.nameplates.require_spaces(link, patience_s)
                 plan = await Plan.made(link, self.manifest, self.nodes, patience_s)
-                await self.nameplates.look(link, plan, [kind for _, kind in plan.written], patience_s)
+                await self.nameplates.look(link, plan, patience_s)
                 self.connections += 1
                 anew = await self._anew(link)
                 found = await identity(link, self.nodes, self._started_s, patience_s)
-                self._identified(found._replace(spaces=dict(self.nameplates.spaces)))  # also what is not told now
+                spaces, seen = dict(self.nameplates.spaces), self.nameplates.seen(plan)  # also what is not told now
+                self._identified(found._replace(spaces=spaces, seen=seen))
                 if self._outbox:
                     self._outbox.clear()  # what was to be written then is too old now
                     self.unwritten = self.unwritten or "the connection was lost before the MV was sent"

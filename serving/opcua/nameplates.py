@@ -42,17 +42,27 @@ class Plate(NamedTuple):
     limits: str = UNKNOWN
 
 
+class Seen(NamedTuple):
+    """A node as it was seen, by its id in loop.toml; UNKNOWN where its server did not tell."""
+
+    node: str
+    type: str
+    unit: str
+    range: str
+
+
 class Identity(NamedTuple):
     """The other end of a connection: the URI of each namespace that is used by its number, and the nodes it may write.
 
     ``writes`` has each by a key that is the same however host and id are spelt; empty where a server tells too little.
     ``nodes`` has each by its id with its namespace's name, which is the same however the id is spelt. Both give the
-    spelling of loop.toml.
+    spelling of loop.toml. ``seen`` has by row what the loop began with.
     """
 
     spaces: Mapping[int, str]
     writes: Mapping[str, str]
     nodes: Mapping[str, str] = MappingProxyType({})
+    seen: Mapping[str, Seen] = MappingProxyType({})
 
 
 class Nameplates:
@@ -106,26 +116,33 @@ class Nameplates:
         words = f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
         return Fault(words, "type", name)
 
-    async def look(self, link: Link, plan: Plan, written: Sequence[ua.VariantType | None], timeout_s: float) -> None:
-        """See which unit, range and type each node has now; ``written`` are the types of the MVs' nodes (n_mv,).
-
-        EndpointError where nobody answers.
-        """
+    async def look(self, link: Link, plan: Plan, timeout_s: float) -> None:
+        """See which unit, range and type each node has now; EndpointError where nobody answers."""
         rows = plan.measuring()
-        found = await plates(link, [node for _, _, node in rows], timeout_s)
+        nodes = [node for _, _, node in rows]
+        found, kinds = await plates(link, nodes, timeout_s), await link.read(nodes, timeout_s)
         mode = [(n, p, at) for (n, p, _), at in zip(plan.points, plan.asked, strict=False) if n == "mode"]
         declared = await any_number(link, [node for _, _, node in [*rows, *mode]], timeout_s)
-        for (name, point, _), plate in zip(rows, found, strict=True):
-            self._compare(name, point, plate)
         for (name, _, _), free in zip([*rows, *mode], declared, strict=True):
             if free is not None:
                 (self._any_number.add if free else self._any_number.discard)(name)
-        for name, kind in zip((f"MV {n}, written" for n in plan.mv_names), written, strict=True):
-            if kind not in {None, NULL}:
-                self._judge(name, "type", self.typed(name, kind))
+        for (name, point, _), plate, answer in zip(rows, found, kinds, strict=True):
+            self._compare(name, point, plate)
+            changed = self.typed(name, answer.kind)
+            if name.endswith(WRITTEN) and answer.kind not in {None, NULL}:  # the others are judged at each reading
+                self._judge(name, "type", changed)
         self.wrong = {name: why for (name, _), why in reversed(self._wrong.items())}
         self.fault = next((why for (name, _), why in self._wrong.items() if measured(name)), "")
         self.unwritable = next((why for (name, _), why in self._wrong.items() if name.endswith(WRITTEN)), "")
+
+    def seen(self, plan: Plan) -> dict[str, Seen]:
+        """The nodes by row as they were when the loop began."""
+        found = {}
+        for name, point, _ in plan.measuring():
+            kind, plate = self._kinds.get(name), self._plates.get(name, Plate())
+            node = point.node if name.endswith(WRITTEN) else point.read_back or point.node
+            found[name] = Seen(node, UNKNOWN if kind is None else kind.name, *plate)
+        return found
 
     async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
@@ -143,8 +160,7 @@ class Nameplates:
     async def again(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """All that may change without a new connection. ChangedNodeError, EndpointError."""
         await self.require_spaces(link, timeout_s, anew=True)
-        written = await link.read([node for node, _ in plan.written], timeout_s)
-        await self.look(link, plan, [answer.kind for answer in written], timeout_s)
+        await self.look(link, plan, timeout_s)
 
     def _compare(self, name: str, point: Point, now: Plate) -> None:
         """Begin or end the faults of a node's unit and range; what the server does not tell does neither."""
@@ -270,6 +286,17 @@ async def any_number(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -
         return [None for _ in nodes]
     kinds = [None if a.Value is None else a.Value.Value for a in answers]
     return [(k.NamespaceIndex == 0 and k.Identifier in ANY) if isinstance(k, ua.NodeId) else None for k in kinds]
+
+
+def others_since(before: Mapping[str, Seen], now: Mapping[str, Seen]) -> list[str]:
+    """A line for each row whose node has another type, unit or range than before; one of another id is another node."""
+    return [
+        f"{row}: its {what} is {is_now} now and was {was} when the loop last ran"
+        for row, seen in now.items()
+        if row in before and before[row].node == seen.node
+        for what, was, is_now in zip(Seen._fields[1:], before[row][1:], seen[1:], strict=True)
+        if UNKNOWN not in {was, is_now} and was != is_now
+    ]
 
 
 def measured(row: str) -> bool:

@@ -17,12 +17,13 @@ from serving.errors import LoopError
 from serving.guard import implausible
 from serving.journal import Journal, JournalReader
 from serving.manifest import Signal
+from serving.opcua.nameplates import Seen
 from serving.opcua.sampling import Values
 from serving.station.lease import address_of
 
 Array: TypeAlias = NDArray[np.float64]
 
-NAMESPACES = "namespaces"  # what they are kept under
+NAMESPACES, NODES = "namespaces", "nodes"  # what they are kept under
 
 
 def usable(values: Values | None) -> bool:
@@ -73,6 +74,23 @@ def namespaces_before(journal: Path, endpoint: str) -> dict[int, str]:
         same = isinstance(at, str) and (at == endpoint or address_of(at) == address_of(endpoint))
         if same and isinstance(spaces, dict):
             return {int(number): uri for number, uri in spaces.items() if isinstance(uri, str) and uri}
+    return {}
+
+
+def keep_nodes(journal: Journal, seen: Mapping[str, Seen]) -> None:
+    """Write down as what the loop's nodes were seen, for its next run."""
+    journal.keep(NODES, json.dumps(seen))
+
+
+def nodes_before(journal: Path) -> dict[str, Seen]:
+    """The nodes by row as the last run of the loop saw them; empty where a journal tells of none."""
+    with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
+        kept = json.loads(reader.learnt(NODES) or "{}")
+        if isinstance(kept, dict):
+            whole = {
+                row: seen for row, seen in kept.items() if isinstance(seen, list) and len(seen) == len(Seen._fields)
+            }
+            return {row: Seen(*map(str, seen)) for row, seen in whole.items()}
     return {}
 
 

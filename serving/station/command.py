@@ -180,7 +180,8 @@ def _check(options: argparse.Namespace) -> int:
     controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
     manifest = controller.manifest
     from serving.opcua.inspection import Found, inspected
-    from serving.station.beginning import namespaces_before
+    from serving.opcua.nameplates import Seen, others_since
+    from serving.station.beginning import namespaces_before, nodes_before
     from serving.station.rehearsal import rehearsed, require_free
 
     here = rehearsed(settings, controller)
@@ -201,6 +202,9 @@ def _check(options: argparse.Namespace) -> int:
         print(plain(f"{controller.path.name}: signed by {controller.signed.words}"))
     wrong = [*here.wrong[said:], *(f"{row.signal}: {row.wrong}" for row in rows if row.wrong)]
     notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
+    notes += others_since(
+        nodes_before(settings.journal.file), {r.signal: Seen(r.node, r.kind, r.unit, r.limits) for r in rows}
+    )
     for note in [*notes, *here.notes, *_unproven(manifest), *_warnings(settings), *ending(controller)]:
         print(plain(f"note: {note}"))
     for line in wrong:

@@ -24,11 +24,20 @@ from serving.loop import Command, ControlLoop, Mode
 from serving.manifest import Manifest, Signal
 from serving.opcua.certificates import expiries
 from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.nameplates import Identity
+from serving.opcua.nameplates import Identity, others_since
 from serving.opcua.sampling import Values
 from serving.page.process import PageProcess
 from serving.proof import judged
-from serving.station.beginning import another_before, begun_at, keep_namespaces, namespaces_before, near, usable
+from serving.station.beginning import (
+    another_before,
+    begun_at,
+    keep_namespaces,
+    keep_nodes,
+    namespaces_before,
+    near,
+    nodes_before,
+    usable,
+)
 from serving.station.control import Answer, Control
 from serving.station.lease import Lease
 from serving.station.locks import Locks
@@ -118,6 +127,7 @@ class Station:
         self.page: PageProcess | None = None
         self._watchers: list[Callable[[Sample | None, Command], None]] = []
         self.wishes = Wishes()
+        self._seen_before = nodes_before(settings.journal.file)
 
     @property
     def manifest(self) -> Manifest:
@@ -355,7 +365,12 @@ class Station:
         return {"done": f"acknowledged: {entry.event.what}"}
 
     def _identified(self, found: Identity) -> None:
-        """The server is known now: its namespaces are kept, and its nodes locked however others spell them."""
+        """The server is known now: what it tells is kept, and its nodes locked however others spell them."""
+        for line in others_since(self._seen_before, found.seen):
+            self.recorder.note("change", "plant", line)
+        self._seen_before = {}  # from now on another type, unit or range is a fault
+        if found.seen:
+            keep_nodes(self.journal, found.seen)
         if found.spaces:
             keep_namespaces(self.journal, self.settings.server.endpoint, found.spaces)
         self.locks.identified(found, writes=self.loop is not None and self.loop.mode is not Mode.SHADOW)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +42,8 @@ def test_a_fault_is_its_words_and_stays_the_same_in_others() -> None:
         "the sample of PV T is older than 0.5 s",
     )
     fault = Fault("MV u, written: its unit is m now", "unit", "MV u, written")
+    for copied in (copy.deepcopy(fault), pickle.loads(pickle.dumps(fault))):  # as a command is, in a host of others
+        assert (copied, kind_of(copied)) == (fault, kind_of(fault))
     said = told_by(EndpointError(fault), f"the plant cannot be written: {fault}")
     assert (kind_of(said), said) == (kind_of(fault), f"the plant cannot be written: {fault}")
     assert (lasting("a text"), reworded("a text", "other words")) == ("a text", "other words")

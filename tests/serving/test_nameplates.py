@@ -20,12 +20,12 @@ from serving.opcua.ages import Ages
 from serving.opcua.answers import BusyError, LateError
 from serving.opcua.endpoint import OpcUaEndpoint
 from serving.opcua.link import node_id
-from serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity
+from serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity, others_since
 from serving.opcua.plan import Plan
 from serving.opcua.sampling import Sampling, Values
 from serving.opcua.settings import ModeNode, Nodes, Point, Server
 from serving.opcua.values import Reading
-from serving.station.beginning import keep_namespaces, namespaces_before
+from serving.station.beginning import keep_namespaces, keep_nodes, namespaces_before, nodes_before
 from serving.station.wishes import Wishes
 
 pytest_plugins = ["small_laws"]
@@ -107,7 +107,7 @@ def connected(link: Any, made: Nameplates) -> Plan:
     async def act() -> Plan:
         await made.require_spaces(link, 1.0)
         plan = await Plan.made(link, made.manifest, made.nodes, 1.0)
-        await made.look(link, plan, [kind for _, kind in plan.written], 1.0)
+        await made.look(link, plan, 1.0)
         return plan
 
     return asyncio.run(act())
@@ -298,6 +298,28 @@ def test_only_the_unit_or_range_itself_ends_its_fault(told: dict[str, Any], mani
     link.fails, link.units, link.ends = None, {}, {}
     asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
     assert made.fault == ""
+
+
+def test_what_a_node_was_outlives_the_loop_and_another_one_is_told(manifest: Manifest, tmp_path: Path) -> None:
+    """A node that was changed while the loop was down was accepted without a word."""
+    journal, link = Journal(tmp_path / "loop.journal"), MadeUpLink("urn:one")
+    assert nodes_before(tmp_path / "none") == {}
+    first = Nameplates(nodes_of(manifest, "ns=2"), manifest)
+    keep_nodes(journal, first.seen(connected(link, first)))
+    journal.close()
+    before = nodes_before(journal.path)
+    assert before["PV T"] == ("ns=2;s=T", "Double", "K", "0 .. 100")
+    link.units["T"], link.ends["valve"], link.kinds["level"] = "degC", 200.0, INT32
+    second = Nameplates(first.nodes, manifest)
+    told = others_since(before, second.seen(connected(link, second)))
+    assert [line.split(" now")[0] for line in told] == [
+        "PV level: its type is Int32",
+        "PV T: its unit is degC",
+        "MV valve: its range is 0 .. 200",
+        "MV valve, written: its range is 0 .. 200",
+    ]
+    respelt = Nameplates(nodes_of(manifest, "nsu=urn:one"), manifest)
+    assert others_since(before, respelt.seen(connected(link, respelt))) == []
 
 
 def test_a_unit_that_never_was_the_controllers_is_a_fault_of_the_first_connection(manifest: Manifest) -> None:
