@@ -24,7 +24,7 @@ from serving.in_charge import Guards, InCharge
 from serving.mode import LoopMode, Mode, mode_of
 from serving.ranges import within
 from serving.successor import Successor
-from serving.transfer import Transfer
+from serving.transfer import ByHand, Transfer
 from serving.words import first_line
 
 __all__ = ["WARM_LEAD_S", "Command", "ControlLoop", "Mode", "within"]
@@ -48,10 +48,10 @@ class ControlLoop:
     the fallback go on from there, and nothing writes an old MV over it. Nothing is written while the read-back is bad,
     nor, where the MV stands outside its range, until it is back. A plant that reads nothing back gets the old MV.
 
-    Every written MV lies in its range, in every mode and with any guards; a discrete MV has one of its values. The law
-    and the fallback move an MV by at most its ``max_move`` a period; a law that gives more has a fault. ``set_mv`` goes
-    there at once. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range: it is clipped to the
-    range, for the law and for HOLD. A larger excess is a fault.
+    Every written MV lies in its range, in every mode and with any guards; a discrete MV has one of its values. An MV
+    moves by at most its ``max_move`` a period: a law that gives more has a fault, the fallback and an operator's MV
+    (``set_mv``) go on scan by scan. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range: it
+    is clipped to the range, for the law and for HOLD. A larger excess is a fault.
 
     Parameters
     ----------
@@ -132,6 +132,7 @@ class ControlLoop:
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
+        self._hand = ByHand()
 
     # ------------------------------------------------------------------ who is in charge
     @property
@@ -183,6 +184,11 @@ class ControlLoop:
         return self._mv.copy()
 
     @property
+    def mv_wanted(self) -> Array:
+        """Where the MV goes by hand, shape (n_mv,); the last commanded one where it is there."""
+        return self._mv.copy() if self._hand.wanted is None else self._hand.wanted.copy()
+
+    @property
     def fault(self) -> str:
         """The fault that changed the mode to HOLD; empty without one."""
         return self._mode.fault
@@ -198,6 +204,7 @@ class ControlLoop:
             raise LoopError(f"the last sample was refused ({self._blind}), so where the MV stands is not known; wait")
         if mode is not self.mode:
             self._transfer.begin()
+            self._hand.wanted = None
         self._mode.set(mode)
 
     def set_sp(self, sp: ArrayLike) -> None:
@@ -205,15 +212,16 @@ class ControlLoop:
         self._sp = within(sp, self.controller.manifest.sp, "set point")
 
     def set_mv(self, mv: ArrayLike) -> None:
-        """Set the MV (n_mv,) in MANUAL; LoopError outside its range or in another mode.
+        """Set the MV (n_mv,) in MANUAL; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
 
-        LoopError too after a command that did not reach the plant, until it is known where the MV stands.
+        LoopError outside its range, in another mode, and after a command that did not reach the plant, until it is
+        known where the MV stands.
         """
         if self.mode is not Mode.MANUAL:
             raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self.mode}")
         if self._applied.lost:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
-        self._mv = within(mv, self.controller.manifest.mv, "MV")
+        self._mv = self._hand.sent(self._mv, within(mv, self.controller.manifest.mv, "MV"), self.controller.manifest.mv)
 
     def hand_back(self) -> None:
         """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
@@ -234,10 +242,12 @@ class ControlLoop:
             both = shown.silent if doubled else reworded(reason or "", f"{reason}; {shown.silent}")
             return self._missed(both, silent=True)
         if self.found is not None:
-            self._mv = self.found.copy()
+            self._mv, self._hand.wanted = self.found.copy(), None
         if reason:
             return self._missed(reason)
         applied = self._mv if shown.applied is None else shown.applied
+        if shown.applied is None and isnan(self._mv[0]):
+            applied = self._mv = self.mv_wanted  # nobody but the operator says where it stands
         try:
             if shown.applied is None:
                 applied = self._applied.read_back(sample, self._mv)
@@ -255,6 +265,7 @@ class ControlLoop:
             self._mv = np.array(self._transfer.limited(step.mv, applied))  # the host gets step.mv, may write into it
         elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
+        self._mv = self._hand.toward(self._mv, self.controller.manifest.mv)
         before = self.controller
         beside = self._charge.beside(sample, self._sp, applied)
         if self.controller is not before:
@@ -271,6 +282,7 @@ class ControlLoop:
     def _missed(self, reason: str, *, silent: bool = False) -> Command:
         self._blind = reason = reason or "a fault without a reason"
         self._lose(reason)
+        self._mv = self._mv if silent else self._hand.toward(self._mv, self.controller.manifest.mv)
         self._lasting(moves=not silent)
         command = self._command(None, None, reason)
         return replace(command, mv=np.full(len(self._mv), nan)) if silent else command
@@ -280,7 +292,7 @@ class ControlLoop:
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        if self.mode is not Mode.MANUAL:
+        if self.mode is not Mode.MANUAL or self._hand.wanted is not None:
             self._mv = np.array(before if self.found is None else self.found, dtype=np.float64)
         self._applied.lose()
         self._lose(reason)

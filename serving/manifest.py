@@ -71,6 +71,13 @@ class Signal:
         """
         return abs(value - min(max(applied, self.low), self.high)) <= self.most
 
+    def toward(self, mv: float, wanted: float) -> float:
+        """An MV one period nearer to where it is wanted; there, where it moves that fast, or ``mv`` is not known."""
+        if self.max_move is None or self.values is not None or not abs(wanted - mv) > self.max_move:
+            return wanted
+        ahead = mv + math.copysign(self.max_move, wanted - mv)
+        return min(max(ahead, self.low), self.high)  # a sum is rounded
+
     @property
     def middle(self) -> float:
         """A value in the middle of the range; of a discrete signal, the allowed one nearest to it."""

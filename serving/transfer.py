@@ -1,4 +1,4 @@
-"""The way of an MV from where it is to where the law wants it, after a change of mode or of controller."""
+"""The way of an MV from where it is to where somebody wants it: a law that takes over, or an operator."""
 
 from __future__ import annotations
 
@@ -43,3 +43,28 @@ class Transfer:
         ahead = applied + np.clip(move, -self._most, self._most)
         # A sum is rounded, and may leave the range by its last digit.
         return np.where(near, law, np.clip(ahead, np.minimum(law, applied), np.maximum(law, applied)))
+
+
+class ByHand:
+    """Where an operator sent the MV, and the way there: each by at most its ``max_move`` a period, as with any law.
+
+    It counts from the last command, which also a plant without a read-back has. Where nobody knows where the MV
+    stands, it is where the operator says.
+    """
+
+    def __init__(self) -> None:
+        self.wanted: Array | None = None  # shape: (n_mv,); None: it is there, or nobody moves it by hand
+
+    def sent(self, mv: Array, wanted: Array, signals: Sequence[Signal]) -> Array:
+        """Begin the way to ``wanted`` (n_mv,); the MV from now on, which is there already where none is limited."""
+        self.wanted = wanted if any(s.most < np.inf for s in signals) else None
+        return wanted if self.wanted is None else mv
+
+    def toward(self, mv: Array, signals: Sequence[Signal]) -> Array:
+        """The MV (n_mv,) one period nearer."""
+        if self.wanted is None:
+            return mv
+        ahead = np.array([s.toward(*ends) for s, *ends in zip(signals, mv.tolist(), self.wanted.tolist(), strict=True)])
+        if np.array_equal(ahead, self.wanted):
+            self.wanted = None
+        return ahead

@@ -122,14 +122,14 @@ def _sp(request: Request, loop: ControlLoop, _: Opened) -> Change:
 
 def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
     signals = loop.controller.manifest.mv
-    wanted = _numbers(request.value, signals, loop.mv.tolist(), "MV")
+    wanted = _numbers(request.value, signals, loop.mv_wanted.tolist(), "MV")
     within(wanted, signals, "MV")
     if loop.mode is not Mode.MANUAL:
         raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {loop.mode}")
-    what = _moves(loop.mv.tolist(), wanted, signals, "MV")
+    what = _moves(loop.mv_wanted.tolist(), wanted, signals, "MV")
 
     def act(loop: ControlLoop) -> None:
-        loop.set_mv(_numbers(request.value, signals, loop.mv.tolist(), "MV"))
+        loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"))
 
     return Change(act, what, request.who, request.reason)
 

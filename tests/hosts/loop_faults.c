@@ -69,6 +69,52 @@ static int faults(Loop *l) {
   return 0;
 }
 
+/* An operator's MV goes on from scan to scan by at most what the MV may move, also while samples are refused. */
+static int by_hand(Controller *c) {
+  double pv[2] = {0.4, 300}, no_pv[2] = {NAN, 300}, mv[1] = {200}, up[1] = {275}, down[1] = {0};
+  Sample good_one = {pv, NULL, mv, 0.0}, refused = {no_pv, NULL, mv, 0.0}, no_read_back = {pv, NULL, NULL, 0.0};
+  Loop l;
+  c->signals[MV].at[0].max_move = 30;
+  MUST(loop_open(&l, c, MANUAL, 2));
+  loop_scan(&l, &good_one);
+  MUST(loop_set(&l, MV, up) && l.mv[0] == 200);
+  loop_scan(&l, &good_one);
+  MUST(l.mv[0] == 230);
+  loop_unwritten(&l, "the plant cannot be written"); /* no step was made */
+  loop_scan(&l, &no_read_back);
+  MUST(loop_writes(&l) && l.mv[0] == 230);
+  loop_scan(&l, &refused);
+  MUST(l.mv[0] == 260);
+  loop_scan(&l, NULL);
+  loop_scan(&l, &good_one);
+  MUST(l.mv[0] == 275 && !l.by_hand);
+  MUST(loop_set(&l, MV, down));
+  loop_scan(&l, &good_one);
+  loop_set_mode(&l, HOLD);
+  loop_scan(&l, &good_one);
+  loop_set_mode(&l, MANUAL);
+  loop_scan(&l, &good_one);
+  MUST(l.mv[0] == 245); /* a change of mode ends the way */
+  MUST(loop_set(&l, MV, down));
+  loop_scan(&l, &good_one);
+  loop_unwritten(&l, "the plant cannot be written");
+  loop_scan(&l, &good_one);
+  loop_scan(&l, &good_one);
+  MUST(l.mv[0] == 200); /* where it is found it stays */
+  loop_close(&l);
+  MUST(loop_open(&l, c, MANUAL, 2) && loop_set(&l, MV, up) && !loop_writes(&l));
+  loop_scan(&l, &good_one); /* the plant says where it is */
+  MUST(loop_writes(&l) && l.mv[0] == 230);
+  loop_close(&l);
+  MUST(loop_open(&l, c, MANUAL, 2) && loop_set(&l, MV, up));
+  loop_scan(&l, &no_read_back); /* nobody but the operator does */
+  MUST(loop_writes(&l) && l.mv[0] == 275);
+  loop_close(&l);
+  c->signals[MV].at[0].max_move = INFINITY;
+  controller_cold(c);
+  return 0;
+}
+
 /* A command does not arrive and an operator moves the MV meanwhile: nothing is written over it. */
 static int moved(Loop *l, Mode mode) {
   double pv[2] = {0.4, 300}, no_pv[2] = {NAN, 300}, mv[1] = {200}, beyond[1] = {600}, no_number[1] = {NAN};
@@ -139,7 +185,7 @@ int main(int n, char **words) {
   Controller c;
   Loop l = {0};
   bool open = n == 2 && controller_open(&c, words[1]) && loop_open(&l, &c, AUTO, 3);
-  int status = !open ? 2 : start(&c) || faults(&l) || moved(&l, AUTO) || moved(&l, MANUAL) || missing(&l);
+  int status = !open ? 2 : start(&c) || by_hand(&c) || faults(&l) || moved(&l, AUTO) || moved(&l, MANUAL) || missing(&l);
   loop_close(&l);
   controller_close(&c);
   if (!status) puts("all as it must be");

@@ -292,6 +292,60 @@ def test_the_node_loop_survives_whatever_its_plant_returns_and_throws() -> None:
     assert all(0 <= scan["mv"][0] <= 500 for scan in seeing if scan["mv"] is not None)
 
 
+BY_HAND = """
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+const [host, file] = process.argv.slice(1);
+const ort = createRequire(host)("onnxruntime-node");
+const { Controller, Loop } = await import(host.replace("node/host", "javascript/controller"));
+const manifest = JSON.parse(readFileSync(file.replace("onnx", "json")));
+const controller = await Controller.load(ort, readFileSync(file), manifest, "cpu");
+controller.manifest.mv[0].max_move = 30;
+const good = { pv: [0.4, 300], dv: [], mv_applied: [200], age_s: 0 };
+const refused = { ...good, pv: [NaN, 300] }, silent = { ...good, mv_applied: null };
+const told = [];
+const start = async (first) => {
+  const loop = new Loop(controller, { sp: [0.5], mode: "MANUAL" });
+  if (first) await loop.scan(first);
+  return loop;
+};
+const at = async (loop, sample) => told.push((await loop.scan(sample)).mv?.[0] ?? null);
+let loop = await start(good);
+loop.setMv([275]);
+await at(loop, good);
+loop.unwritten("the plant cannot be written");
+await at(loop, silent);
+await at(loop, refused);
+await at(loop, null);
+await at(loop, good);
+loop.setMv([0]);
+await at(loop, good);
+loop.setMode("HOLD");
+loop.setMode("MANUAL");
+await at(loop, good);
+loop.setMv([0]);
+await at(loop, good);
+loop.unwritten("the plant cannot be written");
+await at(loop, good);
+await at(loop, good);
+loop = await start();
+loop.setMv([275]);
+await at(loop, good);
+loop = await start();
+loop.setMv([275]);
+await at(loop, silent);
+console.log(JSON.stringify(told));
+"""
+
+
+def test_the_node_loop_moves_no_mv_by_hand_faster_than_it_may() -> None:
+    host, file = EMBED / "node" / "host.mjs", kit_of(PID) / "pid.onnx"
+    command = [str(NODE), "--input-type=module", "-e", BY_HAND, str(host), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [230, 230, 260, 275, 275, 245, 245, 215, 200, 200, 230, 275]
+
+
 def test_what_an_operator_may_not_set_is_refused_in_node(told: dict[str, Any]) -> None:
     assert len(told["refused"]) == 6
     assert told["refused"][0] == "the MV is set by hand in MANUAL only; the loop is in AUTO"

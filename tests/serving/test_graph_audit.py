@@ -18,7 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 from shipped_files import SHIPPED
 
 from serving import ArtifactError
-from serving.graph_audit import MAX_OPSET, MIN_OPSET, audit, graph_values
+from serving.graph_audit import MAX_NODES, MAX_OPSET, MIN_OPSET, audit, graph_values
 from serving.graph_operators import SIGNATURES
 from serving.graph_work import MAX_WORK, RULES
 from serving.onnx_bytes import SCHEMA, read_model
@@ -265,6 +265,14 @@ def model_bytes(nodes: list[Any], shape: list[int], *, constants: dict[str, Any]
     graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], tensors)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
     return bytes(model.SerializeToString())
+
+
+def test_a_graph_has_no_more_operators_than_load_in_seconds() -> None:
+    names = ["x", *(f"v{k}" for k in range(MAX_NODES - 1)), "y"]
+    chain = [helper.make_node("Add", [a, a], [b]) for a, b in pairwise(names)]
+    assert audit(model_bytes(chain, [1])).nodes == MAX_NODES
+    with pytest.raises(ArtifactError, match="operators; a controller has at most"):
+        audit(model_bytes([*chain, helper.make_node("Add", ["y", "y"], ["z"])], [1]))
 
 
 def hidden(op: str, behind: str, inputs: list[str], constants: dict[str, Any], **attributes: Any) -> bytes:

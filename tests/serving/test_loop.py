@@ -216,7 +216,8 @@ def test_a_law_error_holds_the_applied_mv(make_loop: Callable[..., ControlLoop],
 
 def slow_loop(shared: Controller, **options: Any) -> ControlLoop:
     """A loop whose valve moves by at most 5 % a period, with a law that moves by 1.3 % of an error of 1 m."""
-    return ControlLoop(limited(shared, 5.0), sp=[1.0], mv=[40.0], mode=Mode.AUTO, **options)
+    given = {"mv": [40.0], "mode": Mode.AUTO, **options}
+    return ControlLoop(limited(shared, 5.0), sp=[1.0], **given)
 
 
 def limited(controller: Controller, max_move: float | None) -> Controller:
@@ -241,10 +242,67 @@ def test_a_move_beyond_the_mvs_rate_is_a_fault_and_never_written(shared: Control
     loop.unwritten(before, "the plant cannot be written")
     loop.set_mode(Mode.AUTO)
     assert loop.scan(sample(-2.8, 70.0)).mv[0] == pytest.approx(74.94)
-    # By hand it goes there at once.
+
+
+def test_by_hand_an_mv_is_no_faster_than_it_may_move(shared: Controller) -> None:
+    """It goes on through samples that are refused, and gets where the operator wants it."""
+    loop = slow_loop(shared, mode=Mode.MANUAL)
+    loop.set_mv([52.0])
+    assert (loop.mv.tolist(), loop.mv_wanted.tolist()) == ([40.0], [52.0])
+    assert [loop.scan(sample()).mv[0], loop.scan(sample(math.nan)).mv[0]] == [45.0, 50.0]
+    assert [loop.miss("nothing is read").mv[0], loop.scan(sample()).mv[0]] == [52.0, 52.0]
+    loop.set_mv([0.0])
+    assert loop.scan(sample()).mv[0] == 47.0
+    loop.set_mv([46.0])  # another word on the way
+    assert [loop.scan(sample()).mv[0] for _ in range(2)] == [46.0, 46.0]
+
+
+@pytest.mark.parametrize("mode", [Mode.AUTO, Mode.SHADOW, Mode.HOLD])
+def test_a_change_of_mode_ends_the_way_by_hand(shared: Controller, mode: Mode) -> None:
+    loop = slow_loop(shared, mode=Mode.MANUAL)
+    loop.set_mv([100.0])
+    loop.scan(sample())
+    loop.set_mode(mode)
+    loop.scan(sample(mv=45.0))
     loop.set_mode(Mode.MANUAL)
-    loop.set_mv([10.0])
-    assert loop.scan(sample(-2.8, 70.0)).mv.tolist() == [10.0]
+    stands = loop.mv[0]
+    assert [loop.scan(sample(mv=45.0)).mv[0] for _ in range(3)] == [stands] * 3
+
+
+def test_a_step_by_hand_that_did_not_arrive_is_no_step(shared: Controller) -> None:
+    loop = slow_loop(shared, mode=Mode.MANUAL)
+    loop.set_mv([60.0])
+    before = loop.mv
+    loop.scan(sample())
+    assert loop.unwritten(before, "the plant cannot be written").mv.tolist() == [40.0]
+    assert loop.scan(sample(mv=30.0)).mv.tolist() == [30.0]  # where it is found it stays
+    assert loop.scan(sample(mv=30.0)).mv.tolist() == [30.0]
+    # A plant that reads nothing back has the MV before the lost one.
+    loop = slow_loop(shared, mode=Mode.MANUAL)
+    loop.set_mv([60.0])
+    loop.scan(sample(mv=None))
+    loop.unwritten(before, "the plant cannot be written")
+    assert [loop.scan(sample(mv=None)).mv[0] for _ in range(2)] == [45.0, 50.0]
+
+
+def test_where_nobody_knows_the_mv_the_operator_says_where_it_is(shared: Controller) -> None:
+    loop = slow_loop(shared, mode=Mode.MANUAL, mv=None)
+    loop.set_mv([60.0])
+    assert loop.scan(sample(mv=None)).mv.tolist() == [60.0]
+    loop = slow_loop(shared, mode=Mode.MANUAL, mv=None)
+    loop.set_mv([60.0])
+    assert loop.scan(sample(mv=40.0)).mv.tolist() == [45.0]
+
+
+@given(st.lists(st.tuples(st.floats(0, 100), st.integers(1, 4), st.booleans()), max_size=8))
+def test_no_scan_moves_the_mv_by_hand_faster(shared: Controller, moves: list[tuple[float, int, bool]]) -> None:
+    loop, last = slow_loop(shared, mode=Mode.MANUAL), 40.0
+    for wanted, scans, good in moves:
+        loop.set_mv([wanted])
+        for _ in range(scans):
+            mv = float((loop.scan(sample(mv=last)) if good else loop.miss("nothing is read")).mv[0])
+            assert abs(mv - last) <= 5.0 + 1e-7
+            last = mv
 
 
 def test_a_fallback_is_no_faster_than_the_mv_may_move(shared: Controller) -> None:

@@ -567,6 +567,8 @@ typedef struct {
   bool lost;      /* the last command did not reach the plant, and nothing has told since where the MV stands */
   double max_gap; /* missed periods in a row after which the law starts cold */
   double *sp, *mv, *applied, *before; /* mv is NAN while nobody knows where it stands */
+  double *wanted; /* where an operator sent the MV, while by_hand: it goes there by at most its max_move a period */
+  bool by_hand;
   char reason[WORDS]; /* of the last scan; empty: no fault */
 } Loop;
 
@@ -580,9 +582,10 @@ static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
   l->mv = calloc(c->n_in[MV] + 1, sizeof *l->mv);
   l->applied = calloc(c->n_in[MV] + 1, sizeof *l->applied);
   l->before = calloc(c->n_in[MV] + 1, sizeof *l->before);
+  l->wanted = calloc(c->n_in[MV] + 1, sizeof *l->wanted);
   for (size_t i = 0; l->sp && i < c->n_in[SP]; i++) l->sp[i] = middle(&c->signals[SP].at[i]);
   for (size_t i = 0; l->mv && i < c->n_in[MV]; i++) l->mv[i] = NAN;
-  return l->sp && l->mv && l->applied && l->before;
+  return l->sp && l->mv && l->applied && l->before && l->wanted;
 }
 
 static void loop_close(Loop *l) {
@@ -590,9 +593,10 @@ static void loop_close(Loop *l) {
   free(l->mv);
   free(l->applied);
   free(l->before);
+  free(l->wanted);
 }
 
-/* Set points (SP); or the MV (MV) from an operator in MANUAL, or that the plant has, while it is not known. False, and
+/* Set points (SP); or the MV (MV) from an operator in MANUAL, to which it goes by at most its max_move a period, or that the plant has, while it is not known. False, and
    nothing changed, outside the ranges, for the MV in another mode, and after a command that did not arrive. */
 static bool loop_set(Loop *l, int which, const double *values) {
   const Signals *signals = &l->c->signals[which];
@@ -605,11 +609,29 @@ static bool loop_set(Loop *l, int which, const double *values) {
     if (!may_be(s, values[i], 0) || (s->values && !among(s, values[i])))
       return failed(l->c, "%s = %g %s is not allowed", s->name, values[i], s->unit);
   }
-  memcpy(which == SP ? l->sp : l->mv, values, signals->n * sizeof *values);
+  l->by_hand = l->by_hand && which == SP;
+  for (size_t i = 0; which == MV && l->mode == MANUAL && i < signals->n; i++)
+    l->by_hand = l->by_hand || signals->at[i].max_move < INFINITY;
+  memcpy(which == SP ? l->sp : l->by_hand ? l->wanted : l->mv, values, signals->n * sizeof *values);
   return true;
 }
 
+/* One period nearer to where an operator sent the MV. */
+static void loop_by_hand(Loop *l) {
+  bool there = true;
+  for (size_t k = 0; k < l->c->n_in[MV]; k++) {
+    const Signal *s = &l->c->signals[MV].at[k];
+    double way = l->wanted[k] - l->mv[k];
+    if (fabs(way) > s->max_move)
+      l->mv[k] = fmin(fmax(l->mv[k] + copysign(s->max_move, way), s->low), s->high), there = false;
+    else
+      l->mv[k] = l->wanted[k];
+  }
+  l->by_hand = !there;
+}
+
 static void loop_set_mode(Loop *l, Mode mode) {
+  l->by_hand = l->by_hand && l->mode == mode;
   l->mode = mode;
   l->fault = false;
   l->good = 0;
@@ -634,7 +656,7 @@ static void loop_fault(Loop *l, const char *reason) {
 /* The last MV never reached the plant, and others may move it meanwhile: nothing is written until a scan has found where
    it stands. */
 static void loop_unwritten(Loop *l, const char *reason) {
-  if (l->mode != MANUAL) memcpy(l->mv, l->before, l->c->n_in[MV] * sizeof *l->mv);
+  if (l->mode != MANUAL || l->by_hand) memcpy(l->mv, l->before, l->c->n_in[MV] * sizeof *l->mv);
   l->lost = true;
   loop_fault(l, reason);
 }
@@ -684,15 +706,14 @@ static bool trusted(Controller *c, const Sample *sample) {
 static void loop_found(Loop *l, const double *applied, bool good_one) {
   if (!l->lost || (!applied && !good_one)) return;
   l->lost = applied && implausible(l->c, applied) < l->c->n_in[MV];
+  l->by_hand = l->by_hand && !applied; /* it stays where it is found */
   if (l->lost)
     for (size_t k = 0; k < l->c->n_in[MV]; k++) l->mv[k] = NAN;
   else if (applied)
     clip(l->c, applied, l->mv);
 }
 
-/* One period: l->mv is what to write if loop_writes, l->mode and l->reason say why. sample NULL: the plant cannot be
-   read. */
-static void loop_scan(Loop *l, const Sample *sample) {
+static void loop_take(Loop *l, const Sample *sample) {
   Controller *c = l->c;
   size_t n = c->n_in[MV];
   bool good_one = sample && trusted(c, sample);
@@ -717,6 +738,15 @@ static void loop_scan(Loop *l, const Sample *sample) {
   if (l->fault && ++l->good == l->recover_after) loop_set_mode(l, AUTO);
   if (l->mode == AUTO) memcpy(l->mv, c->out[OUT_MV], n * sizeof *l->mv);
   if (!l->fault) l->reason[0] = 0;
+}
+
+/* One period: l->mv is what to write if loop_writes, l->mode and l->reason say why. sample NULL: the plant cannot be
+   read. */
+static void loop_scan(Loop *l, const Sample *sample) {
+  if (l->by_hand && isnan(l->mv[0]) && !(sample && sample->mv_applied)) /* nobody but the operator says where it is */
+    memcpy(l->mv, l->wanted, l->c->n_in[MV] * sizeof *l->mv);
+  loop_take(l, sample);
+  if (l->by_hand && loop_writes(l)) loop_by_hand(l);
 }
 
 #ifndef LOOPWRIGHT_NO_MAIN

@@ -170,9 +170,11 @@ export class Loop {
     this.lost = false; // the last command did not reach the plant, and nothing has told since where the MV stands
     this.sp = within(sp, controller.manifest.sp, "set point");
     this.mv = this.before = mv && within(mv, controller.manifest.mv, "MV");
+    this.wanted = null; // where an operator sent the MV: it goes there by at most its max_move a period
   }
 
   setMode(mode) {
+    if (mode !== this.mode) this.wanted = null;
     Object.assign(this, { mode, fault: "", good: 0 });
   }
 
@@ -183,7 +185,9 @@ export class Loop {
   setMv(mv) {
     if (this.mode !== "MANUAL") throw new Refused(`the MV is set by hand in MANUAL only; the loop is in ${this.mode}`);
     if (this.lost) throw new Refused("the last MV did not reach the plant, so where the MV stands is not known; wait");
-    this.mv = within(mv, this.controller.manifest.mv, "MV");
+    const signals = this.controller.manifest.mv, wanted = within(mv, signals, "MV");
+    if (signals.some(limits)) this.wanted = wanted;
+    else this.mv = wanted;
   }
 
   // Another controller takes over; it has no past.
@@ -207,6 +211,7 @@ export class Loop {
       reason = `the sample cannot be used: ${wordsOf(error)}`;
     }
     this.#found(given, reason);
+    if (!given?.mv_applied) this.mv ??= this.wanted; // nobody but the operator says where it is
     this.before = this.mv;
     if (!reason && !given.mv_applied && !this.mv) reason = UNKNOWN;
     if (reason) return this.#miss(reason);
@@ -222,13 +227,14 @@ export class Loop {
     this.state = step.state_next;
     if (this.fault && ++this.good === this.recoverAfter) this.setMode("AUTO");
     if (this.mode === "AUTO") this.mv = Array.from(step.mv);
+    this.#byHand();
     return { mode: this.mode, mv: [...this.mv], law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault };
   }
 
   // The command in place of the last one, which never reached the plant. Others may move the MV meanwhile: nothing is
   // written until a scan has found where it stands.
   unwritten(reason) {
-    if (this.mode !== "MANUAL") this.mv = this.before;
+    if (this.mode !== "MANUAL" || this.wanted) this.mv = this.before;
     this.lost = true;
     return this.#miss(reason);
   }
@@ -240,6 +246,7 @@ export class Loop {
     const applied = given?.mv_applied;
     if (!this.lost || (!applied && reason)) return;
     this.lost = Boolean(applied && this.#implausible(applied));
+    if (applied) this.wanted = null; // it stays where it is found
     if (applied) this.mv = this.lost ? null : this.#clipped(applied);
   }
 
@@ -247,7 +254,20 @@ export class Loop {
   #miss(reason) {
     Object.assign(this, { state: this.controller.cold(), good: 0 });
     if (this.mode === "AUTO" || this.fault) Object.assign(this, { mode: "HOLD", fault: reason });
+    if (!this.lost) this.#byHand();
     return { mode: this.mode, mv: this.lost ? null : this.mv && [...this.mv], law: null, info: null, reason };
+  }
+
+  // One period nearer to where an operator sent the MV.
+  #byHand() {
+    if (!this.wanted || !this.mv) return;
+    const wanted = this.wanted;
+    this.mv = this.controller.manifest.mv.map((s, i) => {
+      const way = wanted[i] - this.mv[i];
+      if (!limits(s) || !(Math.abs(way) > s.max_move)) return wanted[i];
+      return Math.min(Math.max(this.mv[i] + Math.sign(way) * s.max_move, s.low), s.high);
+    });
+    if (this.mv.every((value, i) => value === wanted[i])) this.wanted = null;
   }
 
   #refusal({ pv, dv, mv_applied, age_s }) {

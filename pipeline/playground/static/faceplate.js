@@ -36,8 +36,9 @@ export class Faceplate {
       value: simulation.lanes[i].loop.mv[place],
       apply: (value) => {
         const { loop } = this.here;
-        const before = loop.mv[place];
-        loop.setMv(loop.mv.map((v, j) => (j === place ? value : v)));
+        const present = loop.wanted ?? loop.mv; // another MV may be on its way
+        const before = present[place];
+        loop.setMv(present.map((v, j) => (j === place ? value : v)));
         if (value !== before) said(lane, `MV by hand: ${s.name} = ${+value.toPrecision(6)} ${unit(s)}`);
       },
     }));
