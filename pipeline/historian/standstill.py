@@ -13,6 +13,7 @@ from pipeline.historian.character import runs_of
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding
 from pipeline.historian.guessing import seen_range
+from pipeline.historian.missing_codes import CODES
 from pipeline.historian.pace import in_words
 from pipeline.historian.tags import KEEP, Tag
 from pipeline.metrics import Array
@@ -30,7 +31,8 @@ OFF, QUIET = 0.02, 0.05  # of a feed's usual value, and of its band: below both 
 PAD, FAR = 0.25, 1.0  # widths of a signal's band beyond it: away; far away
 BEYOND_MV = 2.0  # how much farther than the MVs, in widths of the band each: no answer goes so far
 ARRIVED, LONG = 0.1, 5.0  # of a PV's way: it has come to rest; and times the way, a rest that no test holds
-MOSTLY = 0.5  # of a stop's rows
+MOSTLY, STILL = 0.5, 0.8  # of a stop's rows: signals are away; MVs rest, where no end says that they do
+MOST_STOPS = 5  # of a feed: one that is off again and again is how the plant is run
 NAMED = 3  # stops whose times are named
 
 
@@ -80,7 +82,8 @@ def stops(
     - A measured disturbance is off, as a feed that stopped; all MVs rest somewhere, and all PVs have left the band
       where they work. A PV is enough where all MVs rest at zero or at an end of their stated range.
     - All MVs rest at such an end, well outside of where they work, and all PVs are far outside of theirs: farther than
-      MVs explain, or for so much longer than they took to get there that it is no test.
+      MVs explain, or for so much longer than they took to get there that it is no test. No measured disturbance is as
+      it never was before.
 
     The warm-up lasts until each signal that was away is back in its band. Other long rests far outside are named with
     the ``--leave-out`` that takes them: the largest move of a record may say most of the plant. ``text_of`` writes a
@@ -96,7 +99,8 @@ def stops(
     value = {tag: _held(own[tag], time_s) for tag in known}
     at_end = _rests([_near(value[t.tag], (0.0, *_stated(t, own[t.tag]))) for t in mvs])
     at_own = _rests([_near(value[t.tag], (value[t.tag].min(), value[t.tag].max())) for t in mvs])
-    off = [rows for t in known.values() if t.role == "dv" for rows in _rests([_is_off(value[t.tag])])]
+    off_by_feed = [_rests([_is_off(value[t.tag])]) for t in known.values() if t.role == "dv"]
+    off = [rows for stretches in off_by_feed if len(stretches) <= MOST_STOPS for rows in stretches]
     if not (at_end or at_own or off):
         return [], []
     rests = _spread_over(len(time_s), [*at_end, *off])
@@ -143,15 +147,15 @@ def _of_rests(pvs: Sequence[Tag], mvs: Sequence[Tag], texts: Sequence[str]) -> l
         return []
     options = " ".join(f"--leave-out {text}" for text in texts[:NAMED])
     words = (
-        f"far outside of where it works while {', '.join(t.tag for t in mvs)} rests at an end: was that a stop of the "
-        f"plant? {options} leaves it out"
+        f"far outside of where it works, with {', '.join(t.tag for t in mvs)} at rest at an end: was that a stop of "
+        f"the plant? {options} leaves it out"
     )
     return [Finding("rest", ", ".join(t.tag for t in pvs), words)]
 
 
 def _held(series: Series, at: Array) -> Array:
     """The values (n,) that hold at these times; the first one before it."""
-    good = series.good
+    good = series.good & ~np.isin(series.value, CODES)
     place = np.searchsorted(series.time_s[good], at, "right") - 1
     return series.value[good][np.maximum(place, 0)]
 
@@ -210,8 +214,11 @@ def _is_stop(plant: _Plant, rows: Rows) -> bool:
     """Whether a rest of all MVs at an end is a stop."""
     away = plant.away(rows)
     pvs = plant.of("pv")
-    if any(t in pvs for t in away) and any(plant.off(t, rows) for t in away if t not in pvs):
-        return True  # a load that is as large as never before is none
+    loads = [t for t in away if t not in pvs]
+    if len(loads) < len(away) and any(plant.off(t, rows) for t in loads):
+        return True
+    if loads:  # one that is as large as never before may explain all
+        return False
     beyond = max(float(np.median(plant.beyond(tag, rows))) for tag in plant.of("mv"))
     if beyond <= PAD:  # it works there: a valve that is closed in cold weather
         return False
@@ -226,7 +233,7 @@ def _without_feed(plant: _Plant, rows: Rows) -> bool:
     for tag in plant.of("mv"):
         u = plant.value[tag]
         v = u[slice(*rows)]
-        if np.mean(np.abs(v - np.median(v)) <= AT_END * float(np.ptp(u))) <= MOSTLY:
+        if np.mean(np.abs(v - np.median(v)) <= AT_END * float(np.ptp(u))) < STILL:
             return False
     return True
 
@@ -237,8 +244,9 @@ def _is_long(plant: _Plant, rows: Rows) -> bool:
     for tag in plant.of("pv"):
         v = plant.value[tag][slice(*rows)]
         end = float(np.median(v[len(v) // 2 :]))
-        on_its_way = np.abs(v - end) > ARRIVED * abs(v[0] - end)
-        took = max(took, int(np.argmin(on_its_way)))
+        way = max(abs(v[0] - end), *(abs(edge - end) for edge in plant.band[tag]))
+        there = np.abs(v - end) <= ARRIVED * way
+        took = max(took, int(np.argmax(there)))
     return rows[1] - rows[0] > LONG * took
 
 

@@ -171,10 +171,11 @@ def test_a_range_that_the_table_guessed_states_no_end(tmp_path: Path) -> None:
         assert bool(stopped(screen_of(data, tmp_path, (TAGS[0], tag, TAGS[2]))).any()) is stops
 
 
-def test_cold_weather_is_no_stop(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("unit", "coldest"), [("degC", 0.1), ("", 0.6)])
+def test_cold_weather_is_no_stop(unit: str, coldest: float, tmp_path: Path) -> None:
     """A cooling valve is closed, and the ambient temperature is nearly 0 degC: the plant works."""
     random, n = np.random.default_rng(3), 3000
-    cold = np.interp(np.arange(n), [0, 1800, 1900, 2100, 2200, n], [15, 14, 0.3, 0.3, 15, 16])
+    cold = np.interp(np.arange(n), [0, 1800, 1900, 2100, 2200, n], [15, 14, coldest, coldest, 15, 16])
     ambient = cold + np.where((np.arange(n) > 1900) & (np.arange(n) < 2100), 0.02, 1.0) * random.normal(0, 1, n)
     y, total, mv, pv = 20.0, 50.0, np.zeros(n), np.zeros(n)
     for k in range(n):
@@ -185,6 +186,13 @@ def test_cold_weather_is_no_stop(tmp_path: Path) -> None:
         pv[k] = round(y + 0.03 * random.normal(), 3)
     assert np.mean(mv[1920:2100] == 0) > 0.9
     data = Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(ambient, 2))
-    for unit in ("degC", ""):
-        found = screen_of(data, tmp_path, (*TAGS[:2], replace(TAGS[2], unit=unit)))
-        assert not stopped(found).any()
+    assert not stopped(screen_of(data, tmp_path, (*TAGS[:2], replace(TAGS[2], unit=unit)))).any()
+
+
+def test_a_feed_that_is_off_again_and_again_is_how_the_plant_is_run(tmp_path: Path) -> None:
+    random, n = np.random.default_rng(4), 4000
+    mv, dv = np.repeat(random.uniform(40, 50, n // 200).round(1), 200), 500 + random.normal(0, 5, n)
+    dv[np.arange(n) % 400 < 60] = 0.0
+    pv = np.round(answer(mv, dv) + random.normal(0, 0.1, n), 3)
+    data = Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(dv, 2))
+    assert not stopped(screen_of(data, tmp_path)).any()
