@@ -8,10 +8,12 @@ import logging
 import sys
 from pathlib import Path
 
-from pipeline.cases import CASES
+from pipeline.cases import CASES, all_cases
 from pipeline.commands.arguments import positive, whole
 from pipeline.config.params import choose
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, PlantError
+from pipeline.evaluation.case import Array, Case
+from pipeline.evaluation.model_evidence import IDENTIFIED
 from pipeline.simulation.faults import FAULTS
 
 
@@ -20,7 +22,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     serve = commands.add_parser("serve", help="serve the plant of a case until Ctrl-C")
     add = serve.add_argument
-    add("case", metavar="CASE", help=", ".join(sorted(CASES)))
+    add("case", metavar="CASE", help=f"{', '.join(sorted(CASES))}, or a plant of your own: its identified model")
     add("--listen", metavar="HOST:PORT", default="127.0.0.1:4840", help="where to listen (127.0.0.1:4840)")
     add("--speed", metavar="X", type=positive(), default=1.0, help="times real time (1)")
     add("--types", choices=["LREAL", "REAL"], default="LREAL", help="of the nodes: 64 bits or 32 (LREAL)")
@@ -38,6 +40,28 @@ def options(parser: argparse.ArgumentParser) -> None:
     fault.add_argument("--endpoint", default="opc.tcp://127.0.0.1:4840", help="the served plant (%(default)s)")
 
 
+def start_of(case: Case) -> tuple[Array, Array]:
+    """State (n_x,) and MVs (n_mv,) that a case begins at: those of its first test, or the rest of an own plant.
+
+    PlantError where an own plant has no model yet. What stands in for an own plant is said on standard error.
+    """
+    if not case.on_models:
+        test = next(iter(case.scenarios().values()))[0]
+        return test.x0, test.mv0
+    if not case.ready:
+        raise PlantError(
+            f"{case.name} has no model to serve yet, or one of an earlier record; `loopwright run {case.name}` makes it"
+        )
+    if case.stand_in == IDENTIFIED:
+        print(
+            f"{case.name}: this is the model that was identified from the record, the one that its controllers were "
+            "designed on, and not the plant; what the model does not know, no loop on it shows",
+            file=sys.stderr,
+            flush=True,
+        )
+    return case.plant.start
+
+
 def run(options: argparse.Namespace) -> None:
     """Serve the plant until Ctrl-C, or spoil a signal of one that is served."""
     from pipeline.simulation.opcua_server import PlantServer, spoil
@@ -47,13 +71,13 @@ def run(options: argparse.Namespace) -> None:
         asyncio.run(spoil(options.endpoint, options.tag, "" if options.kind == "ok" else options.kind))
         print(f"{options.tag}: {options.kind}")
         return
-    case = choose(CASES, options.case, "case")
-    test = next(iter(case.scenarios().values()))[0]
+    case = choose(all_cases(), options.case, "case")
+    x, mv = start_of(case)
     server = PlantServer(
         plant=case.plant,
         endpoint=f"opc.tcp://{options.listen}",
-        x=test.x0.copy(),
-        mv=test.mv0.copy(),
+        x=x.copy(),
+        mv=mv.copy(),
         noise_std=case.noise_std if options.noise else None,
         seed=options.seed,
         speed=options.speed,

@@ -229,7 +229,7 @@ def _reasons(
                 words += f"; {i.name} answers to a PV instead: are the two swapped, or is it a controller's output"
             found.append((2, words))
         if i.against:
-            words = "feedback, by hand or by a controller, and no late column"
+            words = "feedback, by hand or by a controller, and no late column; no doubt by itself"
             found.append((0, f"{i.name} is moved against what {', '.join(i.against)} did before: {words}"))
         found += _band_and_delay(i, record.period_s)
         if 0 < span < NARROW * (i.high - i.low):
