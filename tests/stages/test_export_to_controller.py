@@ -25,7 +25,7 @@ from serving.card import card
 
 ROOT = Path(__file__).parents[2]
 ROLES = ("--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]=0..100", "--dv", "FI-7[kg/h]", "--sp", "TIC-101.SP")
-# `new` proposes it, as the plant settles in 29 minutes; a test has a sixth of the samples.
+# The plant settles in 27 minutes, so that predictive control looks as far; a test has a sixth of the samples.
 PERIOD = ("--period", "60")
 # A third of it gives another controller for each phase of the rows: 1.06 to 1.24 and 1.86 beside its PID's 1.17.
 SMALL = {"kind": "identified", "orders": [2, 4], "units": [4], "minutes": 0.15, "rows": 1500}
