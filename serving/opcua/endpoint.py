@@ -373,7 +373,7 @@ class OpcUaEndpoint:
         if last is None:
             return
         handing = isinstance(last, str)
-        barred = self.nameplates.unwritable or plan.unwritable
+        barred = self.nameplates.unwritable or self._barred
         if not handing and barred:  # it may be so since the MV was passed on
             self._failed(barred)
             return

@@ -253,3 +253,25 @@ def test_what_is_written_as_an_mv_is_written_as_nothing_else(also: str, controll
 
     with pytest.raises(LoopError, match=f"MV a and {also} are one node, ns=2;s=a; give each its own"):
         asyncio.run(Plan.made(Resolving(), manifest, nodes, 1.0))  # type: ignore[arg-type]
+
+
+def test_where_there_are_several_leases_nothing_is_written_and_all_is_read(controller: Controller) -> None:
+    class Several(Folders):
+        async def resolved(self, texts: Sequence[str], _: float) -> list[ua.NodeId]:
+            return [node_id(t, []) for t in texts]
+
+        async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
+            kinds = [self.kind if "lease" in str(n.Identifier) else ua.VariantType.Double for n in nodes]
+            return [Reading(1.0, 0, None, kind) for kind in kinds]
+
+    m = controller.manifest
+    nodes = Nodes(**{g: {s.name: f"ns=2;s=a {s.name}" for s in m.signals(g)} for g in ("pv", "mv", "dv")})
+    plan = asyncio.run(Plan.made(Several("a lease", "a lease too"), m, nodes, 1.0))  # type: ignore[arg-type]
+    assert plan.lease is None
+    assert plan.unwritable.startswith("lease: there are 2 nodes LoopwrightLease beside the MVs")
+    server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
+    endpoint: Any = OpcUaEndpoint(m, server, nodes, max_age_s=1.0)
+    endpoint._barred, endpoint._link, endpoint._told, endpoint._shown = plan.unwritable, object(), 1, 1
+    with pytest.raises(EndpointError, match="lease: there are 2 nodes"):
+        endpoint.write([50.0])
+    assert not endpoint._outbox
