@@ -48,7 +48,7 @@ class Lease:
     def claim(self, nodes: Mapping[str, str]) -> None:
         """Lock nodes by what the server calls them, in place of those claimed before; each is given with its spelling.
 
-        One that another loop has is ``lost``.
+        A node that another loop has locked counts as ``lost``.
         """
         with self._tending, suppress(OSError):  # a lock that cannot be made says nothing of another loop
             for key in [k for k in self._claimed if k not in nodes]:
