@@ -7,6 +7,7 @@ LoopwrightError
 +-- SampleError        a value is not finite, so no manipulated variable may be computed from it
 +-- OutputError        the law gave a value that is not finite, outside its signal's range, or too far from the last one
 +-- LoopError          the loop was asked for something that its configuration does not allow
+    +-- NotProvenError AUTO is asked for a controller that is not proven, and nobody gave a word for it
     +-- EndpointError  the plant's side (server, device) cannot be read or written
 """
 
@@ -39,6 +40,14 @@ class OutputError(LoopwrightError):
 
 class LoopError(LoopwrightError):
     """The control loop was configured or used in a way that is not allowed."""
+
+
+class NotProvenError(LoopError):
+    """A controller that its file does not prove is to write in AUTO, and nobody accepted it; ``why`` it is not."""
+
+    def __init__(self, words: str, why: str) -> None:
+        super().__init__(words)
+        self.why = why
 
 
 class EndpointError(LoopError):

@@ -150,8 +150,8 @@ class Manifest:
         limited = [s.name for s in self.mv if s.most < math.inf]
         if limited and "mv_applied" not in self.inputs:
             raise ArtifactError(
-                f"the manifest limits the moves of {limited[0]!r}, but its law does not read mv_applied, "
-                "from which they count"
+                f"the manifest limits the moves of {limited[0]!r}, which count from mv_applied, "
+                "but its law does not read mv_applied"
             )
 
     def signals(self, name: str) -> tuple[Signal, ...]:

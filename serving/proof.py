@@ -7,7 +7,7 @@ from enum import Enum
 from math import isfinite
 from typing import Any
 
-from serving.errors import LoopError
+from serving.errors import NotProvenError
 from serving.manifest import Manifest
 
 
@@ -61,11 +61,12 @@ def _has_figures(scenarios: Any) -> bool:
 
 
 def require_accepted(manifest: Manifest, accepted: bool) -> Verdict:
-    """The verdict on a controller that is to write in AUTO. LoopError where it is not proven and nobody accepts it."""
+    """The verdict on a controller that is to write in AUTO. NotProvenError where it is not, and nobody accepts it."""
     verdict = judged(manifest)
     if verdict.why and not accepted:
-        raise LoopError(
+        words = (
             f"{manifest.law} is {verdict.words}; AUTO needs your word for it: accept_unproven = true in loop.toml, or "
             "--accept-unproven at `loopwright loop mode` and `loop swap`"
         )
+        raise NotProvenError(words, f"{manifest.law}: {verdict.why}")
     return verdict

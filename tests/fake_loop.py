@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from serving import Controller
+from serving.errors import NotProvenError
 from serving.journal import Event, Journal, Scan
 from serving.page.process import PageProcess
 from serving.page.settings import Page
@@ -33,6 +34,7 @@ class FakeLoop:
         self.writer.event(Event(BEGIN, "change", "anna", "mode SHADOW -> AUTO"))
         self.writer.event(Event(BEGIN + 5, "fault", "loop", "PV T: bad", alarm="fault", raised=True))
         self.changes: list[dict[str, Any]] = []
+        self.unproven = ""  # why its controller is not proven
         groups = {"sp": m.sp, "pv": m.pv, "mv": m.mv, "dv": m.dv}
         self.about = {
             "title": m.law,
@@ -65,6 +67,8 @@ class FakeLoop:
         if request.get("do") == "picture":
             return {"file": None}
         self.changes.append(request)
+        if self.unproven and request.get("value") == "AUTO" and not request.get("accept_unproven"):
+            raise NotProvenError("AUTO needs your word for it", self.unproven)
         return {"error": "out of range"} if request.get("value") == "refuse" else {"done": "well"}
 
     def close(self) -> None:

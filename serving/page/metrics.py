@@ -44,7 +44,7 @@ def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tu
         yield f"{name}_total", "counter", words, [(none, value)]
     yield "last_scan_seconds", "gauge", "Time of the last scan, since 1970.", [(none, state["time"])]
     yield "journal_ok", "gauge", "1 while the journal can be written.", [(none, int(not state.get("journal")))]
-    lost = "Scans and events that the journal never got, because the disk took none."
+    lost = "Scans and events that the journal has lost, or never got because the disk took none."
     yield "journal_lost_total", "counter", lost, [(none, state.get("journal_lost"))]
     for name, key, group, words in GROUPS:
         signals = about["signals"][group]
@@ -65,7 +65,5 @@ def _labels(labels: Mapping[str, Any]) -> str:
     """Labels in braces, with what the format forbids in a value escaped."""
     if not labels:
         return ""
-    escaped = {
-        k: plain(str(v)).replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n") for k, v in labels.items()
-    }
+    escaped = {k: plain(str(v)).replace("\\", r"\\").replace('"', r"\"") for k, v in labels.items()}
     return "{" + ",".join(f'{k}="{v}"' for k, v in escaped.items()) + "}"

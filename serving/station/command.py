@@ -76,7 +76,9 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     mode.add_argument("mode", metavar="MODE", type=str.upper, help=", ".join(Mode))
     for parser in (swap, mode):
         parser.add_argument(
-            "--accept-unproven", action="store_true", help="let a controller into AUTO that its file does not prove"
+            "--accept-unproven",
+            action="store_true",
+            help="let a controller into AUTO although its file does not prove it",
         )
     for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL")):
         values = commands.add_parser(name, help=f"change {words}")

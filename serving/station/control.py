@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from serving.errors import LoopError, LoopwrightError
+from serving.errors import LoopError, LoopwrightError, NotProvenError
 from serving.first_steps import DEADLINE_S
 from serving.station.places import runtime_folder
-from serving.words import first_line, named
+from serving.words import first_line, named, plain
 
 Answer: TypeAlias = dict[str, Any]
 
@@ -117,6 +117,8 @@ class _Handler(socketserver.StreamRequestHandler):
             if not line.endswith(b"\n"):
                 raise LoopError(f"a request is one line of JSON of at most {LONGEST} bytes")
             return self.server.answer(json.loads(line))
+        except NotProvenError as error:  # whoever asked may give the word
+            return {"error": first_line(error), "needs": "accept_unproven", "unproven": plain(error.why)}
         except LoopwrightError as error:
             return {"error": first_line(error)}
         except Exception as error:

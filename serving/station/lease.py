@@ -53,7 +53,7 @@ class Lease:
         way; ``nodes`` by their namespaces alone, and they are locked at this address, which a server that starts anew
         keeps: the loop that writes has them until it ends. Each is given with its spelling.
 
-        One that another loop has is ``lost``.
+        A node that another loop has locked counts as ``lost``.
         """
         wanted = {**{f"at {self._address} {name}": text for name, text in (nodes or {}).items()}, **writes}
         with self._tending:

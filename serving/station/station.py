@@ -274,18 +274,19 @@ class Station:
                 what = f"set point {_shown(wanted[i : i + 1], (s,))}"
                 self._from_plant(partial(loop.set_sp, wanted), what)
 
-    def _set_mode(self, loop: ControlLoop, mode: Mode) -> None:
-        if mode is Mode.AUTO:
-            require_proven(loop, self.settings.accept_unproven)
+    def _set_mode(self, loop: ControlLoop, mode: Mode) -> str:
+        """Set it; what is not proven of a controller that was accepted all the same."""
+        unproven = require_proven(loop, self.settings.accept_unproven) if mode is Mode.AUTO else ""
         loop.set_mode(mode)
+        return f"accepted though {unproven}" if unproven else ""
 
-    def _from_plant(self, act: Callable[[], None], what: str, mode: Mode | None = None) -> None:
+    def _from_plant(self, act: Callable[[], str | None], what: str, mode: Mode | None = None) -> None:
         try:
-            act()
+            reason = act() or ""
         except LoopError as error:
             self.recorder.note("change", "plant", f"refused: {what} ({first_line(error)})")
             return
-        self.recorder.note("change", "plant", what, mode=mode)
+        self.recorder.note("change", "plant", what, reason, mode=mode)
 
     def _observe(self, sample: Sample | None, command: Command) -> None:
         """Write the scan down, and show it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -405,6 +406,10 @@ def test_names_that_xml_cannot_hold_or_that_are_one_twice_are_refused(tmp_path: 
     for names, words in ((("a\x01",), "cannot hold"), (("a b", "a\tb"), "would be named 'info.a b'")):
         with pytest.raises(HostError, match=words):
             variables_of(replace(m, info=names))
+    odd = copy.copy(controller_of(PID))
+    odd.manifest = replace(m, law="pid\uffff")
+    with pytest.raises(HostError, match="cannot hold"):
+        description(odd, "pid", 2)
 
 
 def test_an_fmu_has_sources_licences_and_a_page(tmp_path: Path) -> None:

@@ -554,6 +554,25 @@ def test_an_old_copy_over_the_file_costs_the_rows_that_it_lacks(
     assert 0 < journal.lost == 4040 - len(found)
 
 
+def test_rows_about_a_gap_keep_their_ids_when_they_are_packed(
+    tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that was made again with the rows that are left has one."""
+    monkeypatch.setattr(writer, "FLUSH_S", 0.001)
+    path, given = tmp_path / "loop.journal", scans(FRESH + 2 * BLOCK)
+    journal = written(path, controller, given[:100])
+    with closing(sqlite3.connect(path)) as base:
+        assert within(20, lambda: done(lambda: base.execute("delete from scan where id between 40 and 60")))
+        base.commit()
+    for scan in given[100:]:
+        journal.scan(scan)
+    journal.close()
+    with closing(JournalReader(path)) as reader:
+        found = {id_: scan for id_, _, scan in reader.scans()}
+    assert list(found) == [k + 1 for k in range(len(given)) if not 40 <= k + 1 <= 60]
+    assert all(same(given[id_ - 1], scan) for id_, scan in found.items())
+
+
 def test_a_file_that_somebody_vacuums_is_not_cut(
     tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -147,6 +147,15 @@ def test_only_a_request_of_the_page_itself_with_the_token_changes_anything(
     assert loop.changes[before] == wanted
 
 
+def test_a_word_that_is_missing_is_asked_for_as_a_value(browser: Browser, loop: FakeLoop) -> None:
+    loop.unproven = "pid: it locked up \x1b[2J"
+    status, answer = browser.change({"do": "mode", "value": "AUTO", "who": "anna"})
+    assert (status, answer["needs"], answer["unproven"]) == (409, "accept_unproven", "pid: it locked up \\x1b[2J")
+    accepted = {"do": "mode", "value": "AUTO", "who": "anna", "accept_unproven": True}
+    assert browser.change(accepted) == (200, {"done": "well"})
+    loop.unproven = ""
+
+
 def test_what_is_new_is_sent_and_a_gap_is_filled(browser: Browser, loop: FakeLoop) -> None:
     last = loop.scans
     assert within(10, lambda: _newest(loop) == last)

@@ -73,6 +73,20 @@ def test_a_refusal_is_told_after_the_dialog_was_left(page: Page) -> None:
     expect(page.locator("#confirm")).to_be_enabled()
 
 
+def test_a_controller_that_is_not_proven_needs_a_second_word(page: Page, loop: FakeLoop) -> None:
+    loop.unproven = "pid: its file holds no evidence of closed loops"
+    ask_mode(page, "AUTO")
+    expect(page.locator("#refusal")).to_contain_text(loop.unproven)
+    expect(page.locator("#confirm")).to_have_text("Accept, though not proven")
+    page.click("#cancel")
+    page.click("#modes [data-mode=AUTO]")  # the word is not kept for another change
+    expect(page.locator("#confirm")).to_have_text("Confirm")
+    page.click("#confirm")
+    page.click("#confirm:has-text('Accept')")
+    expect(page.locator("#answer")).to_have_text("Done: well")
+    assert [change.get("accept_unproven") for change in loop.changes] == [None, None, True]
+
+
 def test_a_lost_answer_is_not_called_a_refusal(page: Page) -> None:
     page.route("**/api/change", lambda route: route.abort())
     ask_mode(page, "MANUAL")

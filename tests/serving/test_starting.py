@@ -298,3 +298,18 @@ def test_a_loop_that_learns_from_its_server_that_another_one_writes_its_mv_does_
     alarms = [line for line in events(made) if "ns=2;s=c at opc.tcp://127.0.0.1:1 is written by another loop" in line]
     assert alarms
     assert namespaces_before(made.settings.journal.file, made.settings.server.endpoint) == {2: "urn:plant"}
+
+
+@pytest.mark.parametrize("unproven", ["", "not proven: it locked up in 2 closed loops"])
+def test_auto_by_the_plants_own_node_is_journalled_with_what_was_accepted(
+    unproven: str, make_station: Callable[..., tuple[Station, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, _ = make_station("MANUAL", accept_unproven=True)
+    monkeypatch.setattr(station, "require_proven", lambda loop, accepted: unproven)
+    loop: Any = SimpleNamespace(set_mode=lambda mode: None)
+    made._from_plant(lambda: made._set_mode(loop, Mode.AUTO), "mode AUTO")
+    made._from_plant(lambda: made._set_mode(loop, Mode.MANUAL), "mode MANUAL")
+    made.journal.close()
+    with closing(JournalReader(made.settings.journal.file)) as reader:
+        found = [(e.what, e.reason) for _, e in reader.events()]
+    assert found == [("mode AUTO", f"accepted though {unproven}" if unproven else ""), ("mode MANUAL", "")]

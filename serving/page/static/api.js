@@ -11,9 +11,9 @@ export async function get(path) {
 }
 
 export class Refused extends Error {
-  constructor(message, status) {
+  constructor(message, status, found = {}) {
     super(message);
-    this.status = status;
+    Object.assign(this, { status, needs: found.needs, unproven: found.unproven });
   }
 }
 
@@ -31,7 +31,7 @@ export async function change(wanted, token) {
     // The request may have reached the loop all the same.
     throw new Error('No answer came. It may have been done or not: look at the mode, the values and "What happened".');
   }
-  if (!answer.ok || found.error) throw new Refused(found.error || answer.statusText, answer.status);
+  if (!answer.ok || found.error) throw new Refused(found.error || answer.statusText, answer.status, found);
   return found.done;
 }
 

@@ -19,6 +19,7 @@ export function ask({ title, words, fields = [], request }) {
   $("why").value = "";
   $("refusal").textContent = "";
   $("confirm").disabled = false;
+  accepts(false);
   moves();
   $("dialog").showModal();
   const first = $("dialog").querySelector("#dialog-fields input, #dialog-fields select");
@@ -31,6 +32,12 @@ function field({ name, label, value, min, max, choices, step }) {
     : element("input", { "data-field": name, type: "number", step: step || "any", required: true, min, max, value });
   given.dataset.first = given.value;
   return element("label", {}, label + " ", given);
+}
+
+// A controller that is not proven gets into AUTO by a second word only, which is written down.
+function accepts(unproven) {
+  pending.accept = Boolean(unproven);
+  $("confirm").textContent = unproven ? "Accept, though not proven" : "Confirm";
 }
 
 const inputs = () => [...$("dialog-fields").querySelectorAll("[data-field]")];
@@ -64,7 +71,8 @@ async function confirm(event) {
   $("confirm").disabled = true;
   let said, refused;
   try {
-    said = `Done: ${await change({ ...mine.request(values), who, reason }, token)}`;
+    const accepted = mine.accept && { accept_unproven: true };
+    said = `Done: ${await change({ ...mine.request(values), ...accepted, who, reason }, token)}`;
   } catch (error) {
     refused = error;
     said = error.status ? `Not done: ${error.message}` : error.message;
@@ -73,7 +81,11 @@ async function confirm(event) {
   const open = pending === mine && $("dialog").open;
   if (open) $("confirm").disabled = false;
   if (refused && open) {
-    $("refusal").textContent = said;
+    const unproven = refused.needs === "accept_unproven";
+    accepts(unproven);
+    $("refusal").textContent = unproven
+      ? `Not done: not proven in closed loop. ${refused.unproven}. Accept it, and it moves the plant in AUTO all the same; that is written down.`
+      : said;
     if (refused.status === UNAUTHORIZED) $("token").select();
     return;
   }
