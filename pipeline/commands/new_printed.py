@@ -31,8 +31,9 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
     print(f"look at {folder}/screening.html: trends with every mask")
     if added:
         if report.verdict.carries != "yes":
+            more = f"record more, as the {test.hours:.1f} h of the step test below," if test else "record more"
             print(f"{name} was added in spite of this, and its models may be poor: look at their fit in the report, "
-                  f"or record more and give all files again with --replace")  # fmt: skip
+                  f"or {more} and give all files again with --replace")  # fmt: skip
         print(f"then: loopwright run {name}")
     if test:
         moved = zip(test.names, test.units, test.sizes, strict=True)

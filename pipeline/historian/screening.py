@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import tzinfo
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,7 @@ class Screened:
     series: Mapping[str, Series]  # the readings of each tag, with their reasons
     report: Screening
     step_s: float = 0.0  # of the export's own readings, where the rows were resampled from some
+    local: tzinfo | None = None  # the zone that a person named for the export's dates
 
 
 def screened(
@@ -171,7 +173,7 @@ def screened(
         zone=export.zone,
         operated=operated(grid, code, tags, {t.tag: own[t.tag].categories for t in tags if t.role == "mode"}),
     )
-    return Screened(record, grid, code, own, report, step)
+    return Screened(record, grid, code, own, report, step, export.local)
 
 
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
