@@ -35,7 +35,8 @@ def card(controller: Controller) -> str:
     first = _locked_up(m.evidence) or [f"  NOT PROVEN: {why}" for why in filter(None, [judged(m).why])]
     lines[1:1] = [*first, *_swings(m.evidence), *_doubtful(m.evidence)]
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
-        lines += _signals(title, m.signals(name))
+        idle = " (this law does not take them)" * (name == "dv" and "dv" not in m.inputs)
+        lines += _signals(title + idle, m.signals(name))
     lines += _signals("manipulated variables", m.mv)
     outputs = ["mv"] + ["state_next"] * bool(m.n_state) + ["info"] * bool(m.info)
     lines += ["", f"inputs      {', '.join(m.inputs)}", f"outputs     {', '.join(outputs)}"]

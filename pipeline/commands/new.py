@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.cases.own_entries import entries_of
 from pipeline.commands.arguments import positive, whole
 from pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
@@ -173,7 +175,9 @@ def _write(
     shutil.rmtree(earlier, ignore_errors=True)
     inputs = commanded(verdict.inputs, tags)
     fastest = {t.name: t.max_move_per_min for t in tags if t.max_move_per_min is not None}
-    test = planned(inputs, found.record.mv[-1], report.period_s, fastest) if verdict.carries != "yes" else None
+    # The last row may stand in the middle of an excursion. Of an MV of few values the median is one of them.
+    usual: list[float] = np.quantile(found.record.mv, 0.5, axis=0, method="nearest").tolist()
+    test = planned(inputs, usual, report.period_s, fastest) if verdict.carries != "yes" else None
     with draft_folder_of(folder) as draft:
         if made and not unusable:
             found.record.write(draft / "record.parquet")

@@ -73,6 +73,7 @@ def propose_tags(name: str, options: argparse.Namespace) -> None:
     """Write the table of all tags with guessed roles, for a person to correct, and say so."""
     path = Path(f"{name}-tags.csv")
     export = read_export(options.files, (), (), options.time, options.time_format, options.time_zone)
+    first = not path.exists()
     rows = guesses(export, units_of(options.files))
     write_tags(path, rows)
     for note in export.notes:
@@ -84,4 +85,7 @@ def propose_tags(name: str, options: argparse.Namespace) -> None:
     files = " ".join(map(str, options.files))
     how = (("--time", options.time), ("--time-format", options.time_format), ("--time-zone", options.time_zone))
     given = "".join(f" {option} {shlex.quote(value)}" for option, value in how if value)
-    print(f"{EXPLAINED}\ncorrect the table, then:\n  loopwright new {name} {files} --tags {path}{given}")
+    given += " --replace" * options.replace
+    if first:
+        print(EXPLAINED)
+    print(f"correct the table, then:\n  loopwright new {name} {files} --tags {path}{given}")

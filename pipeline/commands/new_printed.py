@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+<<<<<<< HEAD
 from pipeline.historian.findings import InputReport, Screening, Verdict, counted
+=======
+from pipeline.historian.excitation import HELD
+from pipeline.historian.findings import InputReport, Screening, Verdict
+>>>>>>> h-user
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.drawing import axis_label, ratio_unit
 from serving.words import plain
@@ -31,8 +36,9 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
     print(f"look at {folder}/screening.html: trends with every mask")
     if added:
         if report.verdict.carries != "yes":
+            more = f"record more, as the {test.hours:.1f} h of the step test below," if test else "record more"
             print(f"{name} was added in spite of this, and its models may be poor: look at their fit in the report, "
-                  f"or record more and give all files again with --replace")  # fmt: skip
+                  f"or {more} and give all files again with --replace")  # fmt: skip
         print(f"then: loopwright run {name}")
     if test:
         moved = zip(test.names, test.units, test.sizes, strict=True)
@@ -60,7 +66,8 @@ def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:
             # The report has the gain at the middle of the record, by the models that are fitted later.
             known = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
             words = [known if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
-            words += [_after(first, i.first_possible_s[pv])] if first is not None else []
+            seldom = ", as it seldom rests" * (i.held_share < HELD)
+            words += [f"first answer not seen{seldom}" if first is None else _after(first, i.first_possible_s[pv])]
             words += [_settles(i, pv)] if gain else []
             words += ["gain and settling unreliable: drift or loads"] if gain and pv in verdict.unsure else []
             lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")

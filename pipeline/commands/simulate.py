@@ -19,6 +19,7 @@ from pipeline.config.params import choose
 from pipeline.errors import ParamsError, nearest
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.metric import METRICS
+from pipeline.evaluation.model_evidence import IDENTIFIED
 from pipeline.pictures.loop_picture import History, draw, summary, write_csv
 from pipeline.plants.simulator import Simulator
 from pipeline.simulation.live import SimulatedPlant, view_of
@@ -86,6 +87,12 @@ def run(options: argparse.Namespace) -> None:
         seed=options.seed,
     )
     plant = course.plant  # a scenario may have one of its own
+    if case is not None and case.stand_in == IDENTIFIED and case.on_models and plant is case.plant:
+        others = ", ".join(case.scenarios())
+        print(
+            "on the model that the law was designed on, which flatters it; tests on other models of the record: "
+            f"--scenario {others}"
+        )
     title = f"{controller.manifest.law} on {plant.title}"
     history = close_loop(controller, plant, course, title=title, speed=options.speed)
     print(summary(plant, history, METRICS["mae"] if case is None else case.criterion))

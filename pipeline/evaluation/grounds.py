@@ -17,7 +17,11 @@ ON_MODELS = "on models identified from your data"
 
 @dataclass(frozen=True, slots=True)
 class RecordVerdict:
-    """What the screening said of a plant's record: yes, doubtful or no, the reasons, and how the plant was run."""
+    """What the screening said of a plant's record.
+
+    ``carries``: whether it can carry a model, yes, doubtful or no; ``reasons``: why not yes, a clause each;
+    ``operated``: how the plant was run, a clause for each loop whose set point is known.
+    """
 
     carries: str
     reasons: tuple[str, ...] = ()
@@ -49,7 +53,8 @@ class Grounds:
 
     ``set_points``, ``loops``: how far set points, and PVs and MVs in closed loops, go beyond the range of the record,
     in % of that range, by signal; signals that stay within are left out. ``farthest``: by signal, the law whose loops
-    go farthest. A fit is None where the run exploded.
+    go farthest. ``record``: what its screening said of the record, None without one. A fit is None where the run
+    exploded.
     ``unproven``: why the record does not prove the models, each to go on a sentence: ``not proven: ...``.
     """
 

@@ -142,7 +142,8 @@ def _words(found: Levels) -> str:
         jumps.append((left, int(s), float(theta[-2]), float(theta[-1] / max(float(e.std()), 1e-300))))
     left, s, jump, more = min(jumps)
     if min(ramp, left) > (1 - EXPLAINED) * none:
-        return f"wanders: what the inputs do not explain moves over {found.percent:.0f} % of its span; {WANDERING}"
+        share = f"{found.percent:.0f} % of its usual span"  # more than 100 where the inputs held it against that
+        return f"wanders: what the inputs do not explain moves over {share}; {WANDERING}"
     if ramp < left + 0.05 * none:
         change = float(slope[-1])
         return (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 
 import numpy as np
 from matplotlib.axis import Axis
@@ -18,11 +18,15 @@ TICKS = (4, 12)  # fewest and most
 
 @dataclass(frozen=True, slots=True)
 class ExportTimes:
-    """Times [s] of an export from ``start_s`` to ``end_s``; ``zone`` as in ``Export``, empty of one without dates."""
+    """Times [s] of an export from ``start_s`` to ``end_s``; ``zone`` as in ``Export``, empty of one without dates.
+
+    Dates are drawn in ``local``, the zone that a person named, in which `--leave-out` counts too.
+    """
 
     start_s: float
     end_s: float
     zone: str
+    local: tzinfo = UTC
 
     def at(self, time_s: Array) -> Array:
         """Places (n,) on the axis of times (n,)."""
@@ -42,12 +46,12 @@ class ExportTimes:
         """From when to when, for a sentence."""
         if not self.zone:
             return "The export has no dates: the time counts from its first row."
-        start, end = (datetime.fromtimestamp(t, UTC).strftime("%Y-%m-%d %H:%M:%S") for t in (self.start_s, self.end_s))
+        start, end = (f"{datetime.fromtimestamp(t, self.local):%Y-%m-%d %H:%M:%S}" for t in (self.start_s, self.end_s))
         return f"From {start} to {end}, {self.zone}."
 
     def dress(self, axis: Axis) -> None:
         """Give the axis the ticks of dates, where there are dates."""
         if self.zone:
-            locator = AutoDateLocator(tz=UTC, minticks=TICKS[0], maxticks=TICKS[1])  # type: ignore[no-untyped-call]
+            locator = AutoDateLocator(tz=self.local, minticks=TICKS[0], maxticks=TICKS[1])  # type: ignore[no-untyped-call]
             axis.set_major_locator(locator)
-            axis.set_major_formatter(ConciseDateFormatter(locator, tz=UTC))  # type: ignore[no-untyped-call]
+            axis.set_major_formatter(ConciseDateFormatter(locator, tz=self.local))  # type: ignore[no-untyped-call]

@@ -148,7 +148,7 @@ def _free_run_of(panels: Any, time_s: Array, measured: Array, run: Array, cv: Si
     above.set_ylabel(signal_label(cv))
     below.plot(time, residual[:SHOWN], color=LAW, linewidth=0.8)
     below.set_ylabel(axis_label("residual", cv.unit), fontsize=8.5)
-    below.set_xlabel(words)
+    below.set_xlabel(f"{words}, counted over the rows held out; gaps of the record are closed", fontsize=8.5)
     for axes in (above, below):
         axes.margins(x=0.01)
     known = residual[np.isfinite(residual)]

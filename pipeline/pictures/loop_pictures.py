@@ -32,7 +32,7 @@ from pipeline.pictures.drawing import (
     time_axis,
 )
 from pipeline.pictures.numbers import number, ratio
-from pipeline.pictures.words import curve_label, law_name
+from pipeline.pictures.words import curve_label, law_name, scenario_name
 from pipeline.simulation.scenario import NOISE_SUFFIX
 from serving.manifest import Signal
 
@@ -372,7 +372,8 @@ def overview_picture(evidence: Evidence, law: str, test: str | None = None) -> C
     beside = "" if times is None else f", {ratio(times)} × perfect-model NMPC"
     late, late_s = evidence.figure(law, scenario, case.criterion.late), evidence.late_s(scenario)
     rest = "" if late is None or not late_s else f"; {number(late)} {case.unit}".rstrip() + f" from {late_s:g} s on"
-    title = f"{evidence.laws[law].title}\n{_error(error, case)}{beside}{rest}"
+    where = "" if test is None else f", {scenario_name(test, case.recipe, case.test_words)}"
+    title = f"{evidence.laws[law].title}{where}\n{_error(error, case)}{beside}{rest}"
     drawn = {law_name(law): (own, colour_of(law, evidence.laws, baseline))}
     other = evidence.loop(Curve(baseline), scenario) if law != baseline else None
     if other is not None:

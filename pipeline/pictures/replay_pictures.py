@@ -36,7 +36,7 @@ def replay_picture(evidence: Evidence, law: str) -> Canvas:
         axes.step(time, rows["asked"][:, i], where="post", color=colour, linewidth=1.0, label="asked by the law")
         axes.set_ylabel(signal_label(signal))
     panels[0].set_title(f"{law_name(law)} over the record, nothing fed back")
-    panels[-1].set_xlabel(words)
+    panels[-1].set_xlabel(f"{words}, counted over the rows shown; gaps of the record are closed")
     panels[-1].margins(x=0.01)
     canvas.align_ylabels(panels)
     found = [axes.get_legend_handles_labels() for axes in (panels[0], panels[-1])]

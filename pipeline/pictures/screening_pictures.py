@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,8 @@ def trends(found: Screened) -> Canvas:
 
 def times_of(found: Screened) -> ExportTimes:
     """From the first row to the last one."""
-    return ExportTimes(float(found.grid.time_s[0]), float(found.grid.time_s[-1]), found.report.zone)
+    zone = found.report.zone if found.local is None else str(found.local)
+    return ExportTimes(float(found.grid.time_s[0]), float(found.grid.time_s[-1]), zone, found.local or UTC)
 
 
 def _trend(axes: Axes, found: Screened, tag: TagReport, times: ExportTimes) -> set[Reason]:

@@ -29,6 +29,7 @@ class ModelSection:
     variables: tuple[tuple[str, ...], ...]  # of each controlled variable, see VARIABLES
     answers: tuple[tuple[str, ...], ...]  # of each variable to each input, see ANSWERS
     tried: tuple[tuple[str, ...], ...]  # candidates, see TRIED
+    judged: str = "free run"  # what the candidates' held-out errors are errors of
 
 
 VARIABLES = (
@@ -41,7 +42,7 @@ VARIABLES = (
     "with inputs",
 )
 ANSWERS = ("Variable", "Input", "Gain at the middle", "Sign", "Gain over the range", "First answer after [s]")
-TRIED = ("Start", "States", "Dead times", "Hidden units", "Held-out error", "Spread", "Chosen")
+TRIED = ("Start", "States", "Delays", "Hidden units", "Held-out error", "Spread", "Chosen")
 
 
 def model_section(evidence: Evidence) -> ModelSection | None:
@@ -51,7 +52,8 @@ def model_section(evidence: Evidence) -> ModelSection | None:
         return None
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
     sentences = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs), *_asked(evidence))
-    return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part))
+    judged = str((part.get("structure") or {}).get("judged") or "free run")
+    return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part), judged)
 
 
 def _verdicts(part: Mapping[str, Any]) -> tuple[str, ...]:

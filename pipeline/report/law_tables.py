@@ -18,7 +18,7 @@ def law_row(evidence: Evidence, law: str) -> dict[str, Any]:
     return {
         "name": law,
         "title": measured.title,
-        "setting": given_text(measured.metrics.forms[BASE].setting),
+        "setting": given_text(measured.metrics.forms[BASE].setting) or "defaults",
         "score": evidence.score(law),
         "lock_ups": measured.lock_ups,
         "seeds": measured.seeds,

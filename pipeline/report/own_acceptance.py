@@ -72,7 +72,7 @@ def _in_range(evidence: Evidence, law: str) -> Statement:
         "within " + ", ".join(words(s.name, s.unit, s.low, s.high) for s in pvs),
         ", ".join(words(s.name, s.unit, low, high) for s, low, high in known) or UNMEASURED,
         all(s.low <= low and high <= s.high for s, low, high in known) if known else None,
-        "the range of each variable in params.yaml",
+        "the range of each variable in params.yaml, often that of its transmitter: no limit of operation",
     )
 
 

@@ -20,6 +20,7 @@ from pipeline.pictures.numbers import ratio
 from pipeline.simulation import NOISE_SUFFIX
 
 WIDTH = 120
+LONGEST_HEADS = 40  # letters of the names of laws side by side that a line of 80 has room for, beside the tests
 
 
 def show_results(artifacts: Path, console: Console | None = None, case: str | None = None) -> None:
@@ -37,6 +38,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     standings = {folder.name: Standing.read(folder) for folder in folders}
     if case is not None and case not in standings:
         raise PipelineError(f"{artifacts} holds no case {case!r}; it has {', '.join(standings)}")
+    if case is not None:  # no title of the table, which would be broken to its width
+        own = standings[case]
+        words = f"{case}: {with_unit(own.metric_long, own.unit)}, median over data seeds"
+        console.print(words, style="italic", markup=False, soft_wrap=True)
     console.print(overview(standings.values()) if case is None else _tests(standings[case]))
     for name, standing in standings.items():
         if standing.grounds is not None and standing.grounds.warning and case in (None, name):
@@ -155,13 +160,13 @@ def _tests(standing: Standing) -> Table:
     validation = Validation.read(standing.folder / FILE)
     scenarios, metric, weights = validation.scenarios, validation.metric, validation.gate.weights
     names = [name for name in scenarios if not name.endswith(NOISE_SUFFIX) or name in weights]
-    table = Table(title_justify="left", box=box.SIMPLE)
-    figure = escape(with_unit(standing.metric_long, standing.unit))  # rich would take a unit in brackets for markup
-    table.title = f"{standing.case}: {figure}, median over data seeds"
+    table = Table(box=box.SIMPLE)
     table.add_column("test", no_wrap=True)
-    for name in ("NMPC", *(law.law for law in standing.laws)):
-        # Six names side by side fit a line only if each breaks at its underscores.
-        table.add_column(name.replace("_", "_\n"), justify="right", no_wrap=True)
+    heads = ("NMPC", *(law.law for law in standing.laws))
+    # Many names side by side fit a line only if each breaks at its underscores.
+    broken = sum(map(len, heads)) > LONGEST_HEADS
+    for name in heads:
+        table.add_column(name.replace("_", "_\n") if broken else name, justify="right", no_wrap=True)
 
     def ours(name: str, law: str) -> float | None:
         return scenarios[name].get(law, {}).get(metric)

@@ -52,6 +52,7 @@ class Gate:
     reference: str = "the bound"  # what the score is a multiple of
     times: str = "× NMPC"  # the same, short
     unproven: tuple[str, ...] = ()  # why the record of an own plant does not prove the models of the tests
+    doubt: str = ""  # why a model of the record of an own plant is doubtful, by its screening
     swings: str = ""  # tests, of which data seeds, in which a closed loop swings to the end
 
     @classmethod
@@ -77,6 +78,7 @@ class Gate:
             gate.reference,
             gate.times,
             () if validation.grounds is None else validation.grounds.unproven,
+            "" if validation.grounds is None else validation.grounds.doubt,
             "" if result is None else lock_up_text(result.swings),
         )
 
@@ -90,6 +92,7 @@ class Gate:
             "gate_no_baseline": self.no_baseline or None,
             "gate_relative_to": None if self.reference == "the bound" else self.times,
             "unproven": "; ".join(self.unproven) or None,
+            "data": self.doubt or None,
             "lock_ups": self.lock_ups,
             "locked_up": self.locked_up or None,
             "swings": self.swings or None,

@@ -60,5 +60,5 @@ def test_each_doubt_that_the_page_explains_is_one_that_new_can_print() -> None:
     table = PAGE[PAGE.index("| it says |") : PAGE.index("`--replace` puts")]
     rows = [row.split("|")[1] for row in table.splitlines()[2:] if row.startswith("|")]
     parts = [part.strip(" ,)") for row in rows for part in re.split(r"\.\.\.|;", row)]
-    assert len(rows) == 12
+    assert len(rows) == 13
     assert [part for part in parts if part and part not in source] == []

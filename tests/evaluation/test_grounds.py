@@ -80,10 +80,12 @@ def test_they_come_from_the_models_figures_and_from_the_loops(tmp_path: Path, mo
     test = case.scenarios()["load"][0]
     assert test.plant is not None
     loop = simulate_closed(test.plant, lambda sp, pv, mv: (np.array([1.0, 0.0]), []), test)
+    Path("data/it/screening.json").write_text(json.dumps({"verdict": {"carries": "doubtful", "reasons": ["few rows"]}}))
     found = grounds_of(case, models, {"": reached_by([loop], case)})
     assert found is not None
     assert found.fit == {"y0": 90.0, "y1": None}
     assert found.set_points == {}
+    assert found.doubt == "a model of these data is doubtful: few rows"
     assert found.farthest == {}  # of one law alone nobody asks
     low, high = case.recorded["u0"]
     assert found.loops["u0"] == pytest.approx(100 * (1 - high) / (high - low), rel=0.01)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
@@ -61,3 +61,13 @@ def test_an_export_without_dates_counts_from_its_first_row() -> None:
     assert times.label == "time [h]"
     assert times.words == "The export has no dates: the time counts from its first row."
     assert ExportTimes(5.0, 5.0, "").at(np.array([5.0])) == pytest.approx([0.0])
+
+
+def test_dates_are_drawn_in_the_zone_in_which_a_time_to_leave_out_counts() -> None:
+    zone = timezone(timedelta(hours=1))
+    times = ExportTimes(START_S, START_S + 3600.0, str(zone), zone)
+    assert times.words == "From 2024-03-04 07:00:00 to 2024-03-04 08:00:00, UTC+01:00."
+    axis = Figure().subplots().xaxis
+    times.dress(axis)
+    assert axis.get_major_locator().tz is zone
+    assert ExportTimes(START_S, START_S + 60.0, "UTC").words.startswith("From 2024-03-04 06:00:00")

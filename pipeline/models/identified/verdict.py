@@ -46,7 +46,10 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
     elif selection.nonlinear:
         words = f"nonlinear by a factor of {selection.factor:.3g} in the held-out free run"
     else:
-        words = f"linear is enough: a network changes the held-out free run by a factor of {selection.factor:.3g} only"
+        # Against chance a network must be better by more than its fits differ.
+        factor = selection.factor
+        how = f"{factor:.3g} times smaller only" if factor > 1 else f"{1 / factor:.3g} times as large"
+        words = f"linear is enough: the held-out error of the best network is {how}"
     return {
         "start": s.start,
         "order": s.order,
