@@ -144,7 +144,7 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     assert "not shipped" not in later.getvalue()
     units = Controller("artifacts/it/pid.onnx").manifest.evidence["units"]
     assert units["mae"] == units["mae_median"] == units["max_asse"] == "m"
-    assert "overshoot" not in units  # a plain number
+    assert units["overshoot"] == "of the step"  # a fraction
     # Every setting that was given is shown, a list too.
     assert "| development_seeds = [1], kc = 0.2, mv_rate = null, ti_s = 4.0, tuning = manual |" in page
     # The best law's picture stands at the top, and is shown once.
