@@ -124,12 +124,9 @@ def _out_of_range(series: Series, tag: Tag) -> list[Finding]:
             f"{tag.tag}: {n} of {good} good readings, such as {example:.6g}, are outside its range {low:g} to {high:g} "
             f"{tag.unit}; correct the range or the unit"
         )
-<<<<<<< HEAD
-    words = f"{counted(n, 'reading')} outside the range {low:g} to {high:g} {tag.unit} that was given"
-=======
     # A table that `new` wrote holds guessed ranges, and nobody can tell which of them a person has confirmed.
-    words = f"{n} readings outside the range {low:g} to {high:g} {tag.unit} that was given, or guessed in the tag table"
->>>>>>> h-user
+    some = counted(n, "reading")
+    words = f"{some} outside the range {low:g} to {high:g} {tag.unit} that was given, or guessed in the tag table"
     return [Finding("range", tag.tag, words, True)] if n else []
 
 
