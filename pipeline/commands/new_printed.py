@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-<<<<<<< HEAD
-from pipeline.historian.findings import InputReport, Screening, Verdict, counted
-=======
 from pipeline.historian.excitation import HELD
-from pipeline.historian.findings import InputReport, Screening, Verdict
->>>>>>> h-user
+from pipeline.historian.findings import InputReport, Screening, Verdict, counted
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.drawing import axis_label, ratio_unit
 from serving.words import plain

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-<<<<<<< HEAD
 from dataclasses import dataclass, field, replace
-=======
-from dataclasses import dataclass, replace
 from datetime import tzinfo
->>>>>>> h-user
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +59,8 @@ class Screened:
     series: Mapping[str, Series]  # the readings of each tag, with their reasons
     report: Screening
     step_s: float = 0.0  # of the export's own readings, where the rows were resampled from some
-<<<<<<< HEAD
     models: Mapping[str, Linear | None] = field(default_factory=dict)  # PV -> the quick one, of ``evenly(record)``
-=======
     local: tzinfo | None = None  # the zone that a person named for the export's dates
->>>>>>> h-user
 
 
 def screened(
@@ -180,11 +173,7 @@ def screened(
         zone=export.zone,
         operated=operated(grid, code, tags, {t.tag: own[t.tag].categories for t in tags if t.role == "mode"}),
     )
-<<<<<<< HEAD
-    return Screened(record, grid, code, own, report, step, models)
-=======
-    return Screened(record, grid, code, own, report, step, export.local)
->>>>>>> h-user
+    return Screened(record, grid, code, own, report, step, models, export.local)
 
 
 def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
