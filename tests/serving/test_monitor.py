@@ -431,6 +431,14 @@ def test_a_memory_that_is_any_tree_is_refused(tree: Any) -> None:
     answers_well({**learnt(), "parts": {**learnt()["parts"], "spread": tree}})
 
 
+def regular(tree: list[Any]) -> bool:
+    """Whether it is an array, which a list that was forged before need not be."""
+    try:
+        return bool(np.shape(tree))
+    except ValueError:
+        return False
+
+
 def forged(tree: Any, data: st.DataObject) -> Any:
     """A memory with some value replaced: by a number in all places of an array, or by any tree."""
     if isinstance(tree, dict) and tree:
@@ -438,7 +446,7 @@ def forged(tree: Any, data: st.DataObject) -> Any:
         return {**tree, name: forged(tree[name], data)}
     if isinstance(tree, list) and tree and isinstance(tree[0], dict):
         return [forged(tree[0], data), *tree[1:]]
-    if isinstance(tree, list) and data.draw(st.booleans()):
+    if isinstance(tree, list) and regular(tree) and data.draw(st.booleans()):
         return np.full(np.shape(tree), data.draw(st.floats(-1e100, 1e100))).tolist()
     if isinstance(tree, int) and data.draw(st.booleans()):
         return data.draw(st.integers(0, 10**12))
