@@ -7,6 +7,8 @@ from pathlib import Path
 
 from serving.errors import LoopError
 
+TRIES = 20  # as often a file may be taken away in the moment before it is locked
+
 
 class LockTakenError(LoopError):
     """Another ``locked`` has the lock. ``owner`` is the number of its process, as far as the file tells."""
@@ -26,7 +28,9 @@ def locked(path: Path) -> int:
         import fcntl
     except ModuleNotFoundError:
         raise LoopError("files are locked on Linux and macOS; on Windows run the loop in WSL") from None
+    tries = TRIES
     while True:
+        tries -= 1
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -37,7 +41,9 @@ def locked(path: Path) -> int:
         except OSError:
             os.close(handle)
             raise
-        if _is_at(path, handle):  # else its owner took the file away in the moment before: it keeps nobody out
+        # Else its owner took the file away in the moment before, and it keeps nobody out; or the file system gives a
+        # file another number each time, as some over a network do, and nobody can tell.
+        if _is_at(path, handle) or not tries:
             os.truncate(handle, 0)
             os.write(handle, str(os.getpid()).encode())
             return handle

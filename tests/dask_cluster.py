@@ -48,7 +48,11 @@ class Cluster:
         for process in reversed(self.processes):
             os.killpg(process.pid, signal.SIGTERM)
         for process in self.processes:
-            process.wait(20)
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:  # a worker takes its leave of a scheduler that is gone already
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
 
 
 @pytest.fixture(scope="module", name="cluster")

@@ -247,6 +247,7 @@ def test_a_text_that_acts_on_a_reader_is_spelt_out_in_any_page(monkeypatch: pyte
     """Names with such a text are refused where files are loaded; a page does not rely on it."""
     pages = dict.fromkeys(("a.html.j2", "a.md.j2"), "<{{ x }}\n{{ y }}>")
     monkeypatch.setattr(templating, "PackageLoader", lambda _: DictLoader(pages))
+    monkeypatch.setattr(templating, "_environment", templating._environment.__wrapped__)  # made before, with ours
     content = {"x": "T\x1b[2J\u202e<b>\nline", "y": Markup("<i>\n</i>")}
     assert render("a.md.j2", content) == "<T\\x1b[2J\\u202e<b>\nline\n<i>\n</i>>"
     assert render("a.html.j2", content) == "<T\\x1b[2J\\u202e&lt;b&gt;\nline\n<i>\n</i>>"

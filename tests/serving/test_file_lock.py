@@ -65,3 +65,11 @@ def test_a_system_without_such_locks_is_told_so(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(LoopError, match="files are locked on Linux and macOS; on Windows run the loop in WSL"):
         locked(tmp_path / "lock")
     assert not (tmp_path / "lock").exists()
+
+
+def test_a_file_system_that_numbers_files_anew_still_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os.path, "samestat", lambda *_: False)
+    handle = locked(tmp_path / "lock")
+    with pytest.raises(LockTakenError):
+        locked(tmp_path / "lock")
+    os.close(handle)
