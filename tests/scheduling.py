@@ -87,6 +87,11 @@ def pytest_configure_node(node: WorkerController) -> None:
     node.workerinput["nice"] = NICE if computes(node) else 0
 
 
+def hands_out(config: pytest.Config) -> bool:
+    """Whether this process runs no test, and gives them to workers."""
+    return not hasattr(config, "workerinput") and getattr(config.option, "dist", "no") != "no"
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Called in every process."""
     given = getattr(config, "workerinput", {}).get("nice", 0)

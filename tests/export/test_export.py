@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from conftest import STEPS_OF_GATE
+from quick_laws import STEPS_OF_GATE
 from torch import Tensor
 
 from pipeline.errors import ExportError

@@ -6,8 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from conftest import plant_of
 from identified_models import first_order, made_signals
+from quick_laws import plant_of
 
 from pipeline.errors import LawError
 from pipeline.laws import LAWS

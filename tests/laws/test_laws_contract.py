@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from conftest import QUICK, plant_of, quick_parts, rest_points
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from quick_laws import QUICK, plant_of, quick_parts, rest_points
 from shipped import required
 from torch import Tensor
 

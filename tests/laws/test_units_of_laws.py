@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import CALM, FORMS, QUICK, plant_of, quick_parts, rest_points
+from quick_laws import CALM, FORMS, QUICK, plant_of, quick_parts, rest_points
 
 from pipeline.config.params import parse
 from pipeline.errors import LawError, ParamsError
