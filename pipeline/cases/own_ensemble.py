@@ -93,12 +93,12 @@ class OwnEnsemble(Case):
 
     @cached_property
     def _doubts(self) -> Doubts:
-        """What the record leaves open, by the law's own model: with it tests go wrong on all models."""
+        """Errors that the record leaves open, by the law's own model: with them tests go wrong on all models."""
         with np.load(self._law_file, allow_pickle=False) as file:
             return Doubts.of(file)
 
     def ranges_of(self, plant: Simulator) -> Mapping[str, tuple[float, float]]:
-        """What the record leaves open, of a plant that is a model of it: errors of gain, speed and dead time."""
+        """Errors of gain, speed and dead time that the record leaves open, of a plant that is a model of it."""
         return doubted(plant, self._doubts) if isinstance(plant, OwnPlant) else self.ranges
 
     def _resting(self, plant: OwnPlant) -> OwnPlant:
@@ -108,7 +108,7 @@ class OwnEnsemble(Case):
 
     @cached_property
     def reach(self) -> Reach:
-        """What of its range the record visited, by the law's model."""
+        """The part of its range that the record visited, by the law's model."""
         return Reach(self._model, self.record)
 
     @cached_property
@@ -118,7 +118,7 @@ class OwnEnsemble(Case):
 
     @property
     def record_verdict(self) -> RecordVerdict | None:
-        """What `loopwright new` or stage `screen` said of the record, which lies beside it."""
+        """The verdict of `loopwright new` or stage `screen` on the record, which lies beside it."""
         return RecordVerdict.beside(self.data)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What ``loopwright new`` prints of a screening: findings, what the data say of the plant, verdict, next step."""
+"""Lines that ``loopwright new`` prints of a screening: findings, what data say of the plant, verdict, next step."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
 
 
 def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:
-    """What the data say of the plant, a line a pair, for a person to compare with what is known of it.
+    """Lines on the plant by its data, one a pair, for a person to compare with what is known of it.
 
     ``units`` are those of the signals by name.
     """

@@ -98,7 +98,7 @@ def local_cluster(workers: int | None = None, say: Callable[[str], object] | Non
 
 
 def usual_workers() -> int:
-    """As many workers as WORKERS says, or one a core. Raises PipelineError where it says no number."""
+    """The number of workers that WORKERS says, or one a core. Raises PipelineError where it says no number."""
     asked = os.environ.get(WORKERS, "")
     if asked and not (asked.isdecimal() and int(asked)):
         raise PipelineError(f"{WORKERS} is {asked!r}; it takes how many workers a run has here, 1 or more")
@@ -106,7 +106,7 @@ def usual_workers() -> int:
 
 
 def workers_here(workers: int | None, option: str) -> contextlib.AbstractContextManager[object]:
-    """As many workers on this machine as ``option`` asks for (None: it was left out), until the block ends.
+    """Workers on this machine, as many as ``option`` asks for (None: it was left out), until the block ends.
 
     None for one alone, whose work is done in this process. Raises PipelineError where a cluster's address is set too.
     """

@@ -15,12 +15,7 @@ from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
 from pipeline.errors import PipelineError
 
 PYTHON = (sys.executable, "-P")  # no package comes from the folder in which somebody stands: a numpy.py there would run
-# `python -m dvc`, which looks through what it loads for garbage seldom: that took a fifth of a short command's time.
-COMMAND = (
-    *PYTHON,
-    "-c",
-    "import gc, runpy; gc.set_threshold(200_000); runpy.run_module('dvc', run_name='__main__', alter_sys=True)",
-)
+COMMAND = (*PYTHON, "-m", "dvc")
 DEPENDENCY = re.compile(r'"([^"]+)" -> "([^"]+)";')  # of a line of `dvc dag --dot`
 MARK = "\x1e"  # the ASCII record separator
 # One command of DVC after another, a mark after each: loading DVC takes longer than most of them. What it loads stays:
@@ -67,7 +62,7 @@ def environment() -> dict[str, str]:
 
 
 def ask(*arguments: str, finish: bool = False) -> str:
-    """What ``dvc ARGUMENT...`` prints; PipelineError with the line that says why it failed.
+    """The output of ``dvc ARGUMENT...``; PipelineError with the line that says why it failed.
 
     A Ctrl-C ends DVC at once; with ``finish`` DVC ends its work first, because it writes dvc.lock.
     """
@@ -78,7 +73,7 @@ def ask(*arguments: str, finish: bool = False) -> str:
 
 
 def ask_in_turn(*commands: Sequence[str]) -> list[str]:
-    """What ``dvc ARGUMENT...`` prints for each of some commands, as ``ask`` of each; DVC is loaded once."""
+    """The output of ``dvc ARGUMENT...`` for each of some commands, as ``ask`` of each; DVC is loaded once."""
     code, out, err = _done([*PYTHON, "-c", IN_TURN, json.dumps(commands), MARK])
     *found, rest = out.split(MARK)
     if code:

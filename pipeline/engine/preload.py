@@ -1,4 +1,4 @@
-"""What a worker loads while nothing waits: ``dask worker ADDRESS --nthreads 1 --preload pipeline.engine.preload``.
+"""Libraries loaded by a worker that waits: ``dask worker ADDRESS --nthreads 1 --preload pipeline.engine.preload``.
 
 torch, casadi, pandas and the like take a stage longer to import than most take to work. A worker begins with them as it
 starts and goes on whenever it is idle, so that a task waits for one of them at most. A worker of this machine's own

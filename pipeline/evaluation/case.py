@@ -190,7 +190,7 @@ class Case(ABC):
 
     @property
     def record_verdict(self) -> RecordVerdict | None:
-        """What the screening of the plant's record said of it; None where there is no such record."""
+        """The verdict of the screening on the plant's record; None where there is no such record."""
         return None
 
     @property
