@@ -9,6 +9,8 @@ from pipeline.evaluation.model_evidence import Metrics, identified_part
 from pipeline.evaluation.validation import Statement
 
 MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
+FORESEEN = 10.0  # nats: odds of 20,000 to 1 for a model whose MVs move the PV
+LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
@@ -22,7 +24,7 @@ def statements(models: Mapping[str, Metrics]) -> list[Statement]:
     ``models``: model set -> its metrics.json. Empty where the fit says nothing of it.
     """
     proof = identified_part(models).get("proof") or {}
-    return [*_free_runs(proof), *(row for row, _ in _signs(proof))]
+    return [*_predictions(proof).values(), *(row for row, _ in _signs(proof))]
 
 
 def sign_doubts(models: Mapping[str, Metrics]) -> str:
@@ -38,33 +40,59 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
 
 
 def fit_doubts(models: Mapping[str, Metrics]) -> str:
-    """What the free runs miss, to go on a sentence; empty if they miss little."""
+    """What the predictions miss, to go on a sentence; empty if they miss little."""
     proof = identified_part(models).get("proof") or {}
-    rows = zip(proof.get("free_run") or {}, _free_runs(proof), strict=True)
-    missed = [f"{name} ({row.measured})" for name, row in rows if not row.holds]
+    missed = [f"{name} ({row.measured})" for name, row in _predictions(proof).items() if not row.holds]
     return f"not proven: the model misses most of what {', '.join(missed)} does" if missed else ""
 
 
-def _free_runs(proof: Mapping[str, Any]) -> Iterator[Statement]:
-    for name, found in (proof.get("free_run") or {}).items():
-        missed, limit = found["missed"], MISSED * found["motion"]
-        yield Statement(
+def _predictions(proof: Mapping[str, Any]) -> dict[str, Statement]:
+    """PV -> the row of its free run, or of a closed loop's record of its one-step predictions."""
+    found = {}
+    for name, of in (proof.get("one_step") or {}).items():
+        found[name] = Statement(
+            f"model, what its inputs foresee of {name} beyond its own past, over rows that its fit never saw",
+            f"≥ {FORESEEN:g} nats",
+            f"{of['nats']:.3g} nats: one-step error {of['with_inputs']:.3g} with them, {of['without']:.3g} without",
+            of["nats"] >= FORESEEN,
+            "where they foresee nothing, the MVs moved by the PVs alone, or by what has nothing to do with them",
+        )
+    for name, of in (proof.get("free_run") or {}).items():
+        missed, limit = of["missed"], MISSED * of["motion"]
+        found[name] = Statement(
             f"model, free-run error of {name} beyond the noise, over rows that its fit never saw",
             f"≤ {limit:.3g}, {100 * MISSED:g} % of its motion there",
             "the run explodes" if missed is None else f"{missed:.3g}",
             missed is not None and missed <= limit,
             "where it misses more, loads that nobody measures or another law moved the variable more than the model",
         )
+    return found
 
 
 def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[Statement, str]]:
     """The row of each answer, and PV and MV in words."""
+    one_step = proof.get("one_step") or {}
     for pv, mvs in (proof.get("answers") or {}).items():
+        shown = pv in one_step and one_step[pv]["nats"] >= FORESEEN
         for mv, found in mvs.items():
-            yield _sign(pv, mv, found), f"{pv} to {mv}"
+            yield _sign(pv, mv, found, shown=shown), f"{pv} to {mv}"
 
 
-def _sign(pv: str, mv: str, found: Mapping[str, Any]) -> Statement:
+def _holds(found: Mapping[str, Any], *, shown: bool) -> bool:
+    """Whether nothing speaks against an answer.
+
+    Where the inputs are ``shown`` to foresee the PV over rows that no fit saw, and all models that are as likely have
+    one sign, one-step predictions need not be as certain of it by themselves.
+    """
+    if found["verdict"] == "proven":
+        return True
+    if not shown or found["verdict"] != "uncertain" or found["direct"] is None:
+        return False
+    of_one_sign = found["low"] * found["high"] > 0 and found["direct"] * found["model"] > 0
+    return bool(of_one_sign and abs(found["direct"]) >= LIKELY * found["sd"])
+
+
+def _sign(pv: str, mv: str, found: Mapping[str, Any], *, shown: bool) -> Statement:
     direct = (
         "too few rows for one-step predictions"
         if found["direct"] is None
@@ -75,7 +103,7 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any]) -> Statement:
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         "certain in sign, the same in both halves of the record, and of the size that one-step predictions find",
         f"{found['model']:.3g} ({span}); {direct}",
-        found["verdict"] == "proven",
+        _holds(found, shown=shown),
         _why(pv, mv, found),
     )
 

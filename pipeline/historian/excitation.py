@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.historian.feedback import follows
 from pipeline.historian.findings import InputReport, Verdict
 from pipeline.historian.first_answer import first_answer
 from pipeline.historian.linear import Linear
@@ -58,26 +59,6 @@ def moves_of(u: Array, run: Runs) -> Array:
             pivot, extreme, way = extreme, v, (1 if v > extreme else -1)
     sizes.append(abs(extreme - pivot))
     return np.array([s for s in sizes if s >= reversal])
-
-
-def follows(u: Array, y: Array, run: Runs) -> float:
-    """Share of the variance of u(k) - u(k-1) that y(k) .. y(k-2) explain beyond u's own past: feedback.
-
-    Both (n,); 0 where the input never moves.
-    """
-    k = np.arange(3, len(u))
-    k = k[(run[k] == run[k - 3])]
-    k = k[:: max(1, len(k) // 60_000)]
-    if len(k) < 60:
-        return 0.0
-    move = u[k] - u[k - 1]
-    own = np.column_stack([u[k - 1], u[k - 1] - u[k - 2], u[k - 2] - u[k - 3], np.ones(len(k))])
-    more = np.column_stack([own, y[k], y[k - 1], y[k - 2]])
-    total, both = (_rest(x, move) for x in (own, more))
-    if total <= 1e-12 * float(np.var(u)) or total <= 0:
-        return 0.0
-    share = 1.0 - both / total
-    return float(share) if share * (len(k) - 7) / max(1 - share, 1e-9) / 3 > 10 else 0.0
 
 
 def judged(
@@ -285,8 +266,3 @@ def _correlation(u: Array, names: list[str]) -> dict[str, float]:
         if moving[i] and moving[j]:
             found[f"{names[i]} and {names[j]}"] = float(np.corrcoef(u[:, i], u[:, j])[0, 1])
     return found
-
-
-def _rest(x: Array, target: Array) -> float:
-    theta = np.linalg.lstsq(x / np.maximum(np.abs(x).max(axis=0), 1e-300), target, rcond=None)[0]
-    return float(np.var(target - x / np.maximum(np.abs(x).max(axis=0), 1e-300) @ theta))

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pipeline.historian.cells import unit_slips, usual
 from pipeline.historian.character import smallest_difference
-from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, follows, moves_of
+from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, moves_of
 from pipeline.historian.export import Export, Series
+from pipeline.historian.feedback import follows
 from pipeline.historian.first_answer import first_answer
 from pipeline.historian.grid import resampled
 from pipeline.historian.linear import fitted

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.errors import ModelError
 from pipeline.models.identified.drift import error_beyond_drift
 from pipeline.models.identified.dynamics import Dynamics, Stretch
+from pipeline.models.identified.innovations import Innovations, PredictionError, begun, with_loads
 from pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
 from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
 from pipeline.models.identified.output_error import (
@@ -89,11 +90,13 @@ def fit(problem: Problem, task: Task) -> Fitted | str:
 
     A network that explodes or swings under constant inputs, where the plant settles, counts as exploded.
     """
+    noise, network = task.structure.noise != "none", task.structure.n_hidden > 0
+    kinds = {(False, False): _linear, (False, True): _network, (True, False): _with_noise, (True, True): _bent}
     try:
-        fitted = (_network if task.structure.n_hidden else _linear)(problem, task)
+        fitted = kinds[noise, network](problem, task)
     except ModelError as error:
         return str(error)
-    if task.structure.n_hidden and problem.settles and wild(fitted.model, problem.data.v, problem.data.y.shape[1]):
+    if network and problem.settles and wild(fitted.model.plant, problem.data.v, problem.data.y.shape[1]):
         return replace(fitted, held_out=np.inf)
     return fitted
 
@@ -152,6 +155,41 @@ def _network(problem: Problem, task: Task) -> Fitted:
     return replace(found, work=work + by_way.work + at_once.work + after.work + found.work)
 
 
+def _with_noise(problem: Problem, task: Task) -> Fitted:
+    """A linear model with its noise: the impulse response of the ARX as it is, its filter fitted; or all refined.
+
+    One-step errors say little of what a plant does slowly, and the prior of the ARX says it better than a fit that is
+    free. So the refined model is another candidate, not a better one by itself.
+    """
+    s = task.structure
+    train, held = problem.train(s, task.fold), problem.held(s, task.fold)
+    if task.begun is not None and isinstance(task.begun.model, Innovations):
+        return PredictionError(iterations=task.iterations).fit(task.begun.model, train, held)
+    if task.start is None:
+        raise ModelError("the record shows no impulse response to start from")
+    plant = task.start.realizations.order(s.order)
+    middle = np.concatenate([part.v for part in train]).mean(axis=0)
+    model = begun(replace(plant, c=-plant.b @ middle), train)
+    return PredictionError(iterations=task.iterations).fit(model, train, held, gain_alone=s.noise == "gain")
+
+
+def _bent(problem: Problem, task: Task) -> Fitted:
+    """A network with its noise, begun as its linear model with units that do nothing."""
+    s = task.structure
+    train, held = problem.train(s, task.fold), problem.held(s, task.fold)
+    fitter = PredictionError(iterations=task.iterations, ridge=s.ridge, patience=PATIENCE)
+    if task.begun is not None and isinstance(task.begun.model, Innovations):
+        return fitter.fit(task.begun.model, train, held)
+    base = None if task.base is None else task.base.model
+    if not isinstance(base, Innovations):
+        raise ModelError("the linear model of this network could not be fitted")
+    n_y = problem.data.y.shape[1]
+    states = visited(base, train, 0.0)[:, : base.plant.n_x]
+    inputs = np.concatenate([part.v for part in train])
+    units = with_units(base.plant, states, inputs, s.n_hidden, 1000 * problem.seed + task.seed)
+    return fitter.fit(replace(with_loads(units, n_y), gain=base.gain), train, held)
+
+
 def judged_beyond_drift(problem: Problem, rows: int, task: tuple[Structure, int, Fitted]) -> Fitted:
     """A fit whose held-out error leaves out a gain and a level of each ``rows`` rows; one that exploded stays so."""
     structure, fold, fitted = task
@@ -163,6 +201,8 @@ def judged_beyond_drift(problem: Problem, rows: int, task: tuple[Structure, int,
 def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
     """The fit gone on over all rows, by fewer iterations where more end in a network that does not settle."""
     whole = problem.whole(structure)
+    if isinstance(fitted.model, Innovations):
+        return _with_noise_on_all_rows(problem, structure, fitted, fitted.model)
     for iterations in (30, 8, 2):
         fitter = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
         found = fitter.fit(fitted.model, whole)
@@ -173,14 +213,40 @@ def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitte
     return fitted
 
 
+def _with_noise_on_all_rows(problem: Problem, structure: Structure, fitted: Fitted, model: Innovations) -> Fitted:
+    """A model with its noise over all rows; where only its filter is fitted, from the impulse response of all rows."""
+    whole = problem.whole(structure)
+    if structure.noise == "gain":
+        try:
+            rows = problem.part(structure, slice(None))
+            response = high_order_arx(rows).impulse_response(RESPONSE)
+            plant = Realizations.of(response, rows.v.std(axis=0)).order(structure.order)
+            model = begun(replace(plant, c=-plant.b @ rows.v.mean(axis=0)), whole)
+        except ModelError:  # all rows together show no stable response, though a fold did
+            return fitted
+    for iterations in (15, 4):
+        fitter = PredictionError(iterations=iterations, ridge=structure.ridge)
+        found = fitter.fit(model, whole, gain_alone=structure.noise == "gain")
+        bent = found.model.n_hidden > 0
+        if not (bent and problem.settles and wild(found.model.plant, problem.data.v, problem.data.y.shape[1])):
+            return found
+    return fitted
+
+
 def within_limits(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
     """A linear fit with no pole outside the unit circle: those are put on it, and B and c fitted again.
 
     Others are returned as they are.
     """
     model = fitted.model
-    if model.n_hidden or np.abs(np.linalg.eigvals(model.a)).max() <= 1:
+    if model.n_hidden or np.abs(np.linalg.eigvals(model.plant.a)).max() <= 1:
         return fitted
+    if isinstance(model, Innovations):
+        plant = model.plant
+        a = model.a.copy()
+        a[: plant.n_x, : plant.n_x] = within_unit_circle(plant.a, 1 - 1e-9)
+        fitter = PredictionError(iterations=5)
+        return fitter.fit(replace(model, a=a), problem.whole(structure), gain_alone=True)
     inside = replace(model, a=within_unit_circle(model.a, 1 - 1e-9))
     again = OutputError(iterations=5, correction=structure.correction)
     return again.fit(inside, problem.whole(structure), free=inside.mask(b=True, c=True))

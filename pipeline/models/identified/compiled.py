@@ -39,6 +39,7 @@ def run_rows(
     drive: Array,
     y: Array,
     correction: float,
+    gain: Array,
     x: Array,
     limit: float,
     before: Array,
@@ -48,13 +49,14 @@ def run_rows(
 
         z(k) = matrix x'(k) + drive(k),   x(k+1) = z[:n_x] + W2 tanh(z[n_x:])
 
-    ``matrix`` (n_x + n_h, n_x), ``drive`` (n, n_x + n_h). x' is x, its outputs corrected by ``correction`` (y - x).
+    ``matrix`` (n_x + n_h, n_x), ``drive`` (n, n_x + n_h). x' is x, its outputs corrected by ``correction`` (y - x), all
+    states by ``gain`` (y - x) where there is a gain (n_x, n_y), else (n_x, 0).
     """
     n_x = matrix.shape[1]
     n_h = matrix.shape[0] - n_x
     n_y = y.shape[1]
     x = x.copy()
-    hidden = np.empty(n_h)
+    hidden, corrects = np.empty(n_h), gain.shape[1] > 0
     for k in range(len(drive)):
         for i in range(n_x):
             if not abs(x[i]) < limit:
@@ -63,6 +65,10 @@ def run_rows(
         if correction != 0.0:
             for i in range(n_y):
                 x[i] += correction * (y[k, i] - x[i])
+        if corrects:
+            for i in range(n_x):
+                for j in range(n_y):
+                    x[i] += gain[i, j] * (y[k, j] - before[k, j])
         for i in range(n_x):
             after[k, i] = x[i]
         for h in range(n_h):
@@ -82,11 +88,23 @@ def run_rows(
 
 @compiled
 def propagate(
-    a: Array, w1: Array, w2: Array, z: Array, t: Array, keep: float, parameters: bool, s: Array, jac: Array
+    a: Array,
+    w1: Array,
+    w2: Array,
+    z: Array,
+    t: Array,
+    keep: float,
+    gain: Array,
+    e: Array,
+    parameters: bool,
+    s: Array,
+    jac: Array,
 ) -> None:
     """Sensitivities of the outputs in m rows, written into ``jac`` (m, n_y, P + n_x); ``s`` (n_x, P + n_x) goes on.
 
         S(k+1) = dF/dx S'(k) + dF/dtheta(k),   S' = S but for the outputs: keep S[:n_y]
+
+    With a ``gain`` L (n_x, n_y) and the innovations ``e`` (m, n_y), S' = S - L S[:n_y] + dL/dtheta e; else (n_x, 0).
 
     ``z`` (m, n_x + n_v) holds the states and inputs of the rows, ``t`` (m, n_h) the tanh units there. The columns are
     the parameters in the order of ``Dynamics.vector`` (none without ``parameters``), then the initial state.
@@ -98,11 +116,18 @@ def propagate(
     of_w1 = of_c + n_x
     of_b1 = of_w1 + n_h * n_z
     of_w2 = of_b1 + n_h
+    of_gain = of_w2 + n_x * n_h
     slope, ahead = np.empty((n_x, n_x)), np.empty((n_x, width))
     for k in range(len(z)):
         for i in range(n_y):
             for c in range(width):
                 jac[k, i, c] = s[i, c]
+        for j in range(gain.shape[1]):
+            for i in range(n_x):
+                for c in range(width):
+                    s[i, c] -= gain[i, j] * jac[k, j, c]
+                if parameters:
+                    s[i, of_gain + i * n_y + j] += e[k, j]
         for i in range(n_x):
             for j in range(n_x):
                 total = a[i, j]

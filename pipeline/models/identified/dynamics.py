@@ -53,6 +53,16 @@ class Dynamics(StateEquation):
         """Number of tanh units."""
         return len(self.b1)
 
+    @property
+    def plant(self) -> Dynamics:
+        """The plant alone, without loads of a model of its noise."""
+        return self
+
+    @property
+    def filter_gain(self) -> Array:
+        """Gain (n_x, n_y) by which a run corrects its states; (n_x, 0): a free run."""
+        return np.zeros((self.n_x, 0))
+
     # ------------------------------------------------------------------ parameters as one vector
     def vector(self) -> Array:
         """All parameters (P,), field by field, row by row."""
@@ -75,6 +85,10 @@ class Dynamics(StateEquation):
             value = getattr(self, f.name)
             parts.append(np.broadcast_to(np.asarray(free.get(f.name, False), dtype=bool), value.shape).ravel())
         return np.concatenate(parts)
+
+    def free(self) -> NDArray[np.bool_]:
+        """Mask (P,) of the parameters that a fit changes."""
+        return np.ones(len(self.vector()), dtype=np.bool_)
 
     # ------------------------------------------------------------------ running
     def slopes(self, x: Array, v: Array) -> tuple[Array, Array]:
@@ -107,5 +121,6 @@ class Dynamics(StateEquation):
         drive = np.concatenate([data.v @ self.b.T + self.c, data.v @ self.w1[:, n_x:].T + self.b1], axis=1)
         before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
         y, x = np.ascontiguousarray(data.y), np.asarray(start, dtype=np.float64)
-        kept = run_rows(matrix, np.ascontiguousarray(self.w2), drive, y, correction, x, EXPLODED, before, after)
+        w2, gain = np.ascontiguousarray(self.w2), np.ascontiguousarray(self.filter_gain)
+        kept = run_rows(matrix, w2, drive, y, correction, gain, x, EXPLODED, before, after)
         return (before, after) if kept else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -14,9 +14,10 @@ from pipeline.models.identified.candidates import on_all_rows, within_limits
 from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
+from pipeline.models.identified.innovations import Innovations, innovations, noise_of_filter
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
-from pipeline.models.identified.proof import answers, proof_figures
+from pipeline.models.identified.proof import answers, foreseen, proof_figures
 from pipeline.models.identified.residual_tests import residual_figures
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.selection import Selection
@@ -50,6 +51,9 @@ DRAWS = 12
 
 NEAR = 1.05
 """Held-out error, relative to the chosen one's, up to which a finalist's fits count for the bands."""
+
+NEAR_BY_ROWS = 1.002
+"""The same of one-step errors, of which noise is nearly all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +128,7 @@ class IdentifiedPart(Part):
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
         known = {"noise": noise, "colour": colour, **open_to}
-        model = assembled(fitted.model, structure.delays, scales, problem.data, known, n_mv, source.seed)
+        model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
         for name, phi in zip(runs, colour, strict=True):
@@ -139,7 +143,7 @@ class IdentifiedPart(Part):
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
             "n_train": sum(len(s) for s in whole),
-            "parameters": len(fitted.model.vector()),
+            "parameters": int(np.count_nonzero(fitted.model.free())),
             "member": self.member,
             "outputs": runs,
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
@@ -147,8 +151,8 @@ class IdentifiedPart(Part):
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
             "proof": _proof(searched, record, rows, curves, runs, noise * scales.y_scale),
             "open": {name: values.tolist() for name, values in open_to.items()},
-            "spectral_radius": gains(fitted.model, problem.data)[2],
-            "stability": stability_figures(fitted.model, visited, [s.v for s in whole]),
+            "spectral_radius": gains(fitted.model.plant, problem.data)[2],
+            "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
             "warnings": warnings,
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
             "step_responses": response_figures(curves, structure.delays, rows, scales, pvs, inputs),
@@ -166,7 +170,11 @@ def _proof(
     found, surprise = answers(curves, chosen.structure, problem.data, STEP * rows.v.std(axis=0), problem.n_mv)
     second = [free_run_figures(problem, chosen, scales, list(runs), fold=1)[0]] if 1 in chosen.folds else []
     # What a wrong model misses at every row is no noise: the plant's own past foresees more of it.
-    return proof_figures(found, record, scales, [runs, *second], np.minimum(noise, surprise * scales.y_scale))
+    figures = proof_figures(found, record, scales, [runs, *second], np.minimum(noise, surprise * scales.y_scale))
+    if searched.selection.innovations is None:
+        return figures
+    # A free run of a closed loop holds the loads that the controller fought, and says nothing of the model.
+    return {"answers": figures["answers"], "one_step": foreseen(problem, chosen, list(runs), scales.y_scale)}
 
 
 def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:
@@ -196,16 +204,19 @@ def _residuals(problem: Problem, structure: Structure, model: Dynamics) -> tuple
     if found is None:
         starts = fit_starts(model, whole, 1.0)
         found = residuals(model, starts, whole, 1.0) or [s.y for s in whole]
+    elif isinstance(model, Innovations):
+        return noise_of_filter(model, np.concatenate(found)), found, whole
     return noise_of(found), found, whole
 
 
 def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> list[Array]:
-    """States of the run over each stretch; of one that explodes, the outputs alone with hidden states at zero."""
+    """The plant's states in the run over each stretch; of one that explodes, the outputs, hidden states at zero."""
+    n_x = model.plant.n_x
     runs = [
         model.free_run(x, part, correction) for x, part in zip(fit_starts(model, data, correction), data, strict=True)
     ]
     return [
-        np.pad(part.y, ((0, 0), (0, model.n_x - part.y.shape[1]))) if run is None else run[1]
+        np.pad(part.y, ((0, 0), (0, n_x - part.y.shape[1]))) if run is None else run[1][:, :n_x]
         for run, part in zip(runs, data, strict=True)
     ]
 
@@ -218,16 +229,21 @@ def _bands(selection: Selection) -> Sequence[Dynamics]:
         for t in selection.finalists
         if t.structure.delays == chosen.structure.delays
         and (t.structure.n_hidden > 0) == (chosen.structure.n_hidden > 0)
-        and t.error <= NEAR * chosen.error
+        and t.error <= (NEAR if selection.innovations is None else NEAR_BY_ROWS) * chosen.error
     ]
     fits = [f for t in (chosen, *(t for t in same if t is not chosen)) for f in t.fits.values()]
-    finite = [f.model for f in fits if np.isfinite(f.held_out)]
-    return finite or [chosen.of_fold(0)[0].model]
+    finite = [f.model.plant for f in fits if np.isfinite(f.held_out)]
+    return finite or [chosen.of_fold(0)[0].model.plant]
 
 
 def _as_likely(problem: Problem, structure: Structure, model: Dynamics, seed: int) -> list[Dynamics]:
     """Models that the record's noise could have given instead of this one."""
     whole = problem.whole(structure)
+    errors = innovations(model, whole) if isinstance(model, Innovations) else None
+    if isinstance(model, Innovations) and errors is not None:
+        size = np.sqrt(np.mean(errors**2, axis=0))
+        near, parts = model.rescaled(size), [replace(s, y=s.y / size) for s in whole]
+        return [of.rescaled(1 / size).plant for of in drawn(near, fit_starts(near, parts), parts, DRAWS, seed=seed)]
     starts = fit_starts(model, whole, structure.correction)
     return drawn(model, starts, whole, DRAWS, structure.correction, seed)
 

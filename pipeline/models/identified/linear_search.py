@@ -64,7 +64,7 @@ class LinearSearch:
             if order <= MOST_STATES:
                 structures.extend(Structure("lagged", order, (y_lags, v_lags), d) for d in options)
         offered = [replace(s, correction=correction) for s in self.rounds.affordable(structures, SHORT, 0.3)]
-        tasks = [Task(s, 0, SHORT, start=self._start(s, 0)) for s in offered]
+        tasks = [Task(s, 0, SHORT, start=self.start(s, 0)) for s in offered]
         trials, reasons = self.rounds.trials(tasks, "linear models, first fits")
         finite = [t for t in trials if np.isfinite(t.error)]
         if not finite:
@@ -84,7 +84,7 @@ class LinearSearch:
         kept.extend(t for t in (*balanced[:2], *lagged[:2], *small) if t not in kept)
         folds = range(len(self.rounds.problem.folds))
         tasks = [
-            Task(t.structure, k, LONG, start=self._start(t.structure, k), begun=t.fits.get((k, 0)))
+            Task(t.structure, k, LONG, start=self.start(t.structure, k), begun=t.fits.get((k, 0)))
             for t in kept
             for k in folds
         ]
@@ -99,7 +99,7 @@ class LinearSearch:
             self.rounds.starts([replace(s, order=0, correction=0.0) for s in structures if s.start == "balanced"])
         )
         tasks = [
-            Task(s, k, SHORT + LONG, start=self._start(s, k))
+            Task(s, k, SHORT + LONG, start=self.start(s, k))
             for s in structures
             for k in range(len(self.rounds.problem.folds))
         ]
@@ -122,7 +122,7 @@ class LinearSearch:
         """The same candidates, trained with another correction of their runs."""
         folds = range(len(self.rounds.problem.folds))
         tasks = [
-            Task(replace(t.structure, correction=correction), k, SHORT + LONG, start=self._start(t.structure, k))
+            Task(replace(t.structure, correction=correction), k, SHORT + LONG, start=self.start(t.structure, k))
             for t in trials
             for k in folds
         ]
@@ -130,7 +130,8 @@ class LinearSearch:
             self.rounds.trials(tasks, "linear models again, with a slow correction of their error")[0]
         )
 
-    def _start(self, structure: Structure, fold: int) -> Start | None:
+    def start(self, structure: Structure, fold: int) -> Start | None:
+        """Where the balanced candidates of a fold start from; None without an impulse response."""
         shift = (structure.delays, structure.same_row, fold)
         found = (start for (s, k), start in self.starts.items() if (s.delays, s.same_row, k) == shift)
         return next((start for start in found if isinstance(start, Start)), None)

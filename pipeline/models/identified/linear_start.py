@@ -46,6 +46,15 @@ class HighOrder:
                 h[i] = (self.b[i] if i < n else 0.0) + np.einsum("jab,jbc->ac", self.a[: len(past)], past)
         return h
 
+    def one_step_errors(self, data: ScaledRecord) -> Array:
+        """Errors (n, n_y) of its one-step predictions of the rows that have a whole past, about their mean."""
+        n = len(self.a)
+        k = np.concatenate([np.arange(i + n - 1, j - 1) for i, j in data.bounds()])
+        errors = data.y[k + 1].copy()
+        for i in range(n):
+            errors -= data.y[k - i] @ self.a[i].T + data.v[k - i] @ self.b[i].T
+        return np.asarray(errors - errors.mean(axis=0))
+
 
 def high_order_arx(data: ScaledRecord, lags: int | None = None) -> HighOrder:
     """The ARX whose coefficients fall off smoothly and exponentially with the lag, each output by itself.

@@ -143,11 +143,15 @@ class OutputError:
         *,
         free: NDArray[np.bool_] | None = None,
         starts: Sequence[Array] | None = None,
+        judge: Callable[[Dynamics], float] | None = None,
     ) -> Fitted:
-        """The fitted model. ``free`` (P,) masks the parameters that may change; ``held`` rows choose the iterate."""
-        free = np.ones(len(model.vector()), dtype=bool) if free is None else free
+        """The fitted model. ``free`` (P,) masks the parameters that may change; ``held`` rows choose the iterate.
+
+        ``judge`` gives the error of a model over them; None: of its free runs.
+        """
+        free = model.free() if free is None else free
         starts = fit_starts(model, data, self.correction) if starts is None else list(starts)
-        judge = self._judge(held)
+        judge = self._judge(held) if judge is None else judge
         n = sum(s.y.size for s in data)
         loss = squares(model, starts, data, self.correction)
         best = Fitted(model, starts, float(np.sqrt(loss / n)), judge(model), 0)

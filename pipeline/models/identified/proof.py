@@ -14,9 +14,12 @@ from typing import Any
 import numpy as np
 
 from pipeline.historian.direct import DirectModel
-from pipeline.historian.excitation import follows
+from pipeline.historian.feedback import follows
+from pipeline.models.identified.innovations import innovations
+from pipeline.models.identified.linear_start import high_order_arx
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.structure import Structure
+from pipeline.models.identified.structure import Problem, Structure
+from pipeline.models.identified.trial import Trial
 from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 
@@ -118,6 +121,36 @@ def _answer(of_models: Array, direct: Sequence[DirectModel | None], j: int, firs
         return Answer(model, low, high, first, last)
     known = tuple(value / sd for value, sd in (half for half in halves if half is not None))
     return Answer(model, low, high, first, last, whole[0], whole[1], known)
+
+
+def foreseen(problem: Problem, chosen: Trial, names: Sequence[str], y_scale: Array) -> dict[str, dict[str, float]]:
+    """PV -> what the inputs foresee of it over rows that no fit saw: one-step errors [PV] with and without them.
+
+    ``with_inputs`` and ``without`` are rms errors of two ARX alike, one of all signals, one of the PVs alone; ``model``
+    is that of the model with its noise, ``rows`` their number, and ``nats`` the log-likelihood that the inputs gain.
+    Where the MVs move by the PVs alone, or by nothing that has to do with them, they gain none.
+    """
+    parts, n_y = [], problem.data.y.shape[1]
+    for k, fold in enumerate(problem.folds):
+        rows = problem.part(chosen.structure, slice(None))
+        alone = replace(rows, v=rows.v[:, :0])
+        model = chosen.of_fold(k)[0].model
+        errors = innovations(model, problem.held(chosen.structure, k))
+        both = [high_order_arx(of.rows(fold.train)).one_step_errors(of.rows(fold.held)) for of in (rows, alone)]
+        parts.append([np.full((1, n_y), np.inf) if errors is None else errors, *both])
+    found = [np.concatenate(of) for of in zip(*parts, strict=True)]
+    model_sd, with_sd, without_sd = (np.sqrt(np.mean(e**2, axis=0)) for e in found)
+    n = len(found[2])
+    return {
+        name: {
+            "model": float(model_sd[i] * y_scale[i]),
+            "with_inputs": float(with_sd[i] * y_scale[i]),
+            "without": float(without_sd[i] * y_scale[i]),
+            "rows": n,
+            "nats": float(n * np.log(without_sd[i] / with_sd[i])),
+        }
+        for i, name in enumerate(names)
+    }
 
 
 def proof_figures(

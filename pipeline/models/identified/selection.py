@@ -12,6 +12,7 @@ from pipeline.models.identified.curvature import curved
 from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
+from pipeline.models.identified.noise_search import NATS, NoiseSearch, nats
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.row_convention import may_act_in_its_row
 from pipeline.models.identified.structure import Problem
@@ -46,15 +47,19 @@ class Selection:
     spent: float  # nominal seconds
     settles: bool  # whether the linear model comes to rest by itself
     drifts: bool  # whether gain or level move inside the record
+    innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
 
     @property
     def nonlinear(self) -> bool:
         """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``.
 
-        In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides.
+        In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides. Of
+        one-step errors noise is nearly all, and their log-likelihood decides.
         """
         if self.network is None:
             return False
+        if self.innovations is not None:
+            return self.innovations > NATS
         uncertain = 0.0 if self.drifts else self.network.spread / np.sqrt(self.network.seeds)
         return bool(self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error)
 
@@ -88,6 +93,8 @@ def select(
     plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no candidate can be
     fitted.
     """
+    if rounds.problem.fed_back and correction is None:
+        return by_innovations(rounds, orders, units)
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
     linear = search.finish(search.first_round(orders, given, lagged))
@@ -124,6 +131,21 @@ def select(
     return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles, drifting)
 
 
+def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) -> Selection:
+    """The search among models with their noise, judged by one-step errors over held-out rows: for closed loops.
+
+    Free runs would rank them by how they read the controller backwards, and by the loads that nobody measures.
+    """
+    search = NoiseSearch.of(rounds)
+    linear = search.linear(orders)
+    settles = not _integrates(linear[0])
+    search = replace(search, rounds=replace(rounds, problem=replace(rounds.problem, settles=settles)))
+    networks = search.networks(linear, units)
+    best = best_of(networks)
+    gained = 0.0 if best is None else nats(rounds.problem, linear[0], best)
+    return Selection(linear[0], best, [*linear, *networks], rounds.budget.spent, settles, False, gained)
+
+
 def _trained(trial: Trial) -> float:
     return trial.of_fold(trial.folds[0])[0].trained
 
@@ -137,7 +159,7 @@ def _with_correction(trial: Trial, correction: float) -> Trial:
 
 
 def _integrates(trial: Trial) -> bool:
-    poles = np.linalg.eigvals(trial.of_fold(trial.folds[0])[0].model.a)
+    poles = np.linalg.eigvals(trial.of_fold(trial.folds[0])[0].model.plant.a)
     return bool(np.abs(poles).max() > INTEGRATES)
 
 

@@ -55,13 +55,14 @@ def sensitivity_sums(
 
         S(k+1) = dF/dx S'(k) + dF/dtheta(x'(k), v(k)),   S' = S but for the outputs: (1 - correction) S[:n_y]
 
-    and those of the initial state the same without the last term.
+    and those of the initial state the same without the last term; with a filter's gain L, S' = S - L S[:n_y] + dL e.
     """
     n_free, n_x = int(free.sum()), model.n_x
     sums = Equations(np.zeros((n_free, n_free)), np.zeros(n_free))
     columns = np.concatenate([free, np.ones(n_x, dtype=bool)])
     # Another layout in memory would be compiled anew, which takes seconds.
     a, w1, w2 = (np.ascontiguousarray(matrix) for matrix in (model.a, model.w1, model.w2))
+    gain = np.ascontiguousarray(model.filter_gain)
     for start, stretch in zip(starts, data, strict=True):
         run = model.free_run(start, stretch, correction)
         if run is None:
@@ -78,13 +79,14 @@ def sensitivity_sums(
             z = np.concatenate([from_states[rows], stretch.v[rows]], axis=1)
             history = np.empty((len(z), n_y, width))
             t = np.tanh(z @ model.w1.T + model.b1)
-            propagate(a, w1, w2, z, t, 1 - correction, n_free > 0, s, history)
+            missed = stretch.y[rows] - predicted[rows, :n_y]
+            propagate(a, w1, w2, z, t, 1 - correction, gain, missed, n_free > 0, s, history)
             jac = history.reshape(-1, width)
             if 0 < n_free < len(free):
                 jac = jac[:, columns]
             with np.errstate(over="ignore", invalid="ignore"):
                 own += jac.T @ jac
-                blocks.append(jac.T @ (stretch.y[rows] - predicted[rows, :n_y]).ravel())
+                blocks.append(jac.T @ missed.ravel())
         if not np.all(np.isfinite(own)):
             return None
         right = np.sum(blocks, axis=0)

@@ -16,7 +16,8 @@ class Structure:
     ``start`` balanced: realization of ``order`` states; lagged: companion form of ``lags`` (of the outputs, of the
     inputs). ``delays`` are the dead times of the inputs in periods. ``correction`` is the share of the output's error
     that each sample of the training run takes back: for drift and integrating levels. ``same_row`` says that the MVs
-    of a row act on the outputs of that row, not of the next one: a logger that stores them late.
+    of a row act on the outputs of that row, not of the next one: a logger that stores them late. ``noise`` says what a
+    fit by one-step errors changes: the filter's ``gain`` alone, or ``all``; ``none``: a free run is fitted.
     """
 
     start: Literal["balanced", "lagged"]
@@ -27,6 +28,7 @@ class Structure:
     ridge: float = 0.0
     correction: float = 0.0
     same_row: bool = False
+    noise: Literal["none", "gain", "all"] = "none"
 
     @property
     def base(self) -> Structure:
@@ -45,7 +47,8 @@ class Problem:
     """The scaled record of ``n_mv`` MVs, its folds, the seed, and how candidates are judged.
 
     ``judged`` is the correction of the free runs over held-out rows, the same for all candidates. ``settles`` says
-    that the plant comes to rest by itself, as its linear model does; a network that does not is rejected.
+    that the plant comes to rest by itself, as its linear model does; a network that does not is rejected. ``fed_back``
+    says that the MVs follow the outputs.
     """
 
     data: ScaledRecord
@@ -54,6 +57,7 @@ class Problem:
     seed: int = 0
     judged: float = 0.0
     settles: bool = False
+    fed_back: bool = False
 
     def part(self, structure: Structure, rows: slice) -> ScaledRecord:
         """Some rows, the inputs shifted to where they act in this structure."""

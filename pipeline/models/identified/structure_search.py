@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from pipeline.historian.feedback import fed_back
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative
 from pipeline.models.identified.selection import Selection, select
@@ -42,7 +43,9 @@ class StructureSearch(Groundwork[Searched]):
         n_y = len(source.signals.pv if self.all_measured else source.signals.sp)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
-        problem = Problem(data, folds(record), len(source.signals.mv), source.seed, self.correction or 0.0)
+        n_mv, seen = len(source.signals.mv), source.data(self.kind)
+        back = fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
+        problem = Problem(data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back)
         budget = Budget(60 * (MINUTES * n_y if self.minutes is None else self.minutes), len(data), n_y)
         least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))
         orders = range(max(least, n_y), max(most, n_y) + 1)

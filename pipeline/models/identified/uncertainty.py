@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,14 +19,17 @@ WORSE = 1.3
 """Free-run error over that of the fitted model above which a drawn one is no more as likely."""
 
 
+Model = TypeVar("Model", bound=Dynamics)
+
+
 def drawn(
-    model: Dynamics,
+    model: Model,
     starts: Sequence[Array],
     data: Sequence[Stretch],
     count: int,
     correction: float = 0.0,
     seed: int = 0,
-) -> list[Dynamics]:
+) -> list[Model]:
     """At most ``count`` models drawn about ``model``, which is fitted to ``data`` from ``starts``.
 
         theta* = theta + (J'J)^+ sum_b xi_b (J_b' r_b - mean),   xi_b ~ N(0, 1)
@@ -35,7 +39,8 @@ def drawn(
 
     Source: H. White, Maximum likelihood estimation of misspecified models, Econometrica 50 (1982) 1, eq. 3.2.
     """
-    sums = sensitivity_sums(model, starts, data, np.ones(len(model.vector()), dtype=bool), correction)
+    free = model.free()
+    sums = sensitivity_sums(model, starts, data, free, correction)
     found = residuals(model, starts, data, correction)
     if sums is None or found is None or len(sums.of_blocks) < 3:
         return []
@@ -52,7 +57,9 @@ def drawn(
     for _ in range(count):
         step = spread @ rng.normal(size=len(blocks))
         for _ in range(5):
-            candidate = model.with_vector(model.vector() + step)
+            theta = model.vector()
+            theta[free] += step
+            candidate = model.with_vector(theta)
             runs = residuals(candidate, starts, data, correction)
             if runs is not None and sum(float(np.vdot(r, r)) for r in runs) < limit:
                 models.append(candidate)

@@ -60,7 +60,8 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
         "correction": s.correction,
         "same_row": s.same_row,
         "drifts": selection.drifts,
-        "judged": "free run" + (" beyond a gain and a level of each part of the record" if selection.drifts else ""),
+        "noise": s.noise,
+        "judged": _judged(selection),
         "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
         "held_out_spread": chosen.spread,
@@ -71,6 +72,12 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
         "verdict": "; but ".join((words, *unseen[:1])) + "".join(f"; {more}" for more in unseen[1:]),
         "nominal_seconds": selection.spent,
     }
+
+
+def _judged(selection: Selection) -> str:
+    if selection.innovations is not None:
+        return "one-step errors with a model of the loads, for the MVs follow the PVs"
+    return "free run" + (" beyond a gain and a level of each part of the record" if selection.drifts else "")
 
 
 def free_run_figures(
@@ -84,8 +91,9 @@ def free_run_figures(
     """
     best = trial.of_fold(fold)[0]
     held = problem.held(trial.structure, fold)
-    starts = fit_starts(best.model, held, problem.judged)
-    runs = [best.model.free_run(x, s, problem.judged) for x, s in zip(starts, held, strict=True)]
+    plant = best.model.plant
+    starts = fit_starts(plant, held, problem.judged)
+    runs = [plant.free_run(x, s, problem.judged) for x, s in zip(starts, held, strict=True)]
     actual = np.concatenate([s.y for s in held])
     n_y = actual.shape[1]
     predicted = np.concatenate(

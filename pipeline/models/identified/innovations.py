@@ -1,0 +1,234 @@
+"""A model with its noise: the innovations form, with a load at each output and a filter's gain, by prediction errors.
+
+A free run is misled where loads wander or a controller acts: the load is most of its error, and under feedback the
+controller, read backwards, explains it best. The errors of one-step predictions are not, if the model of the noise can
+be right.
+
+Source: L. Ljung, System identification, 2nd ed., 1999, sections 4.3 (innovations form), 8.5 and 13.4 (feedback).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from pipeline.errors import ModelError
+from pipeline.models.identified.dynamics import Dynamics, Stretch
+from pipeline.models.identified.output_error import Fitted, OutputError
+from pipeline.plants.simulator import Array
+
+LOADS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+"""Variances of a load's change a row, over that of the measurement, from which a fit may begin."""
+
+ERRORS = (0.03, 1.0)
+"""Variances of the states' errors, over that of the measurement."""
+
+BURN_IN = 0.1
+LEAST, MOST = 20, 300
+"""Rows at the beginning of a stretch that do not count while the filter forgets its start: a share, and its ends."""
+
+LEAST_NOISE = 0.01
+"""Share of an innovation's variance that is at least measurement noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovations(Dynamics):
+    """The state equation with loads and the gain of its filter.
+
+        x' = x + L e,   e = y - x[:n_y],   x+ = F(x', v)
+
+    The last n_y states are loads: random walks d that are added to the outputs' own rows of the plant's equation.
+    """
+
+    gain: Array  # (n_x, n_y) L
+
+    @property
+    def filter_gain(self) -> Array:
+        """L."""
+        return self.gain
+
+    @property
+    def n_loads(self) -> int:
+        """Number of loads."""
+        return int(self.gain.shape[1])
+
+    @property
+    def plant(self) -> Dynamics:
+        """The plant without its loads."""
+        n = self.n_x - self.n_loads
+        w1 = np.concatenate([self.w1[:, :n], self.w1[:, self.n_x :]], axis=1)
+        return Dynamics(self.a[:n, :n], self.b[:n], self.c[:n], w1, self.b1, self.w2[:n])
+
+    def free(self) -> NDArray[np.bool_]:
+        """Mask (P,) of what a fit changes: all but how the loads go on and where they act."""
+        of_plant = np.arange(self.n_x) < self.n_x - self.n_loads
+        of_input = np.concatenate([of_plant, np.ones(self.n_v, dtype=np.bool_)])
+        column = of_plant[:, None]
+        return self.mask(a=column & of_plant, b=column, c=of_plant, w1=of_input[None, :], b1=True, w2=column, gain=True)
+
+    def rescaled(self, size: Array) -> Innovations:
+        """The model of the outputs and the loads over ``size`` (n_y,)."""
+        n_y = len(size)
+        unit = np.ones(self.n_x)
+        unit[:n_y], unit[self.n_x - n_y :] = size, size
+        w1 = self.w1.copy()
+        w1[:, : self.n_x] *= unit
+        return Innovations(
+            self.a * unit / unit[:, None],
+            self.b / unit[:, None],
+            self.c / unit,
+            w1,
+            self.b1,
+            self.w2 / unit[:, None],
+            self.gain * size / unit[:, None],
+        )
+
+
+def with_loads(plant: Dynamics, n_y: int) -> Innovations:
+    """The plant with a load at each of its ``n_y`` outputs, and no gain yet."""
+    n, n_x = plant.n_x, plant.n_x + n_y
+    a = np.eye(n_x)
+    a[:n, :n] = plant.a
+    a[:n_y, n:] = np.eye(n_y)
+    w1 = np.concatenate([plant.w1[:, :n], np.zeros((plant.n_hidden, n_y)), plant.w1[:, n:]], axis=1)
+    none = np.zeros((n_y, 1))
+    return Innovations(
+        a,
+        np.concatenate([plant.b, none * np.zeros(plant.n_v)]),
+        np.concatenate([plant.c, np.zeros(n_y)]),
+        w1,
+        plant.b1,
+        np.concatenate([plant.w2, none * np.zeros(plant.n_hidden)]),
+        np.zeros((n_x, n_y)),
+    )
+
+
+def filter_gain(a: Array, n_y: int, errors: float, loads: float) -> Array | None:
+    """Stationary gain L (n_x, n_y) of the Kalman filter of x+ = A x + w, y = x[:n_y] + e; None without one.
+
+    e has variance 1, w ``errors`` in the states of the plant and ``loads`` in its last n_y states, the loads.
+    """
+    q = np.full(len(a), errors)
+    q[len(a) - n_y :] = loads
+    c = np.eye(n_y, len(a))
+    try:
+        p = linalg.solve_discrete_are(a.T, c.T, np.diag(q), np.eye(n_y))
+    except (linalg.LinAlgError, ValueError):
+        return None
+    return np.asarray(p[:, :n_y] @ np.linalg.inv(p[:n_y, :n_y] + np.eye(n_y)))
+
+
+def innovations(model: Dynamics, data: Sequence[Stretch]) -> Array | None:
+    """One-step errors (n, n_y) over rows that count; None where the filter explodes.
+
+    The filter starts from the first outputs with all else at zero, and ``BURN_IN`` of each stretch, 20 to 300 rows,
+    goes by before its errors count; of a stretch that is no longer the second half does.
+    """
+    found = []
+    n_y = data[0].y.shape[1]
+    for stretch in data:
+        run = model.free_run(np.r_[stretch.y[0], np.zeros(model.n_x - n_y)], stretch)
+        if run is None:
+            return None
+        begins = min(int(np.clip(BURN_IN * len(stretch), LEAST, MOST)), len(stretch) // 2)
+        found.append((stretch.y - run[0][:, :n_y])[begins:])
+    return np.concatenate(found)
+
+
+def typical(errors: Array | None) -> float:
+    """Geometric mean over the outputs of the rms of errors (n, n_y): their log variances count alike."""
+    if errors is None:
+        return np.inf
+    return float(np.exp(np.mean(np.log(np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-12)))))
+
+
+def begun(plant: Dynamics, data: Sequence[Stretch]) -> Innovations:
+    """The plant with the loads and the gain that foresee the rows best, of a small grid.
+
+    ModelError where the filter explodes with all of them.
+    """
+    n_y = data[0].y.shape[1]
+    model = with_loads(plant, n_y)
+    best, least = None, np.inf
+    for errors in ERRORS:
+        for loads in LOADS:
+            gain = filter_gain(model.a, n_y, errors, loads)
+            if gain is None:
+                continue
+            trial = replace(model, gain=gain)
+            size = typical(innovations(trial, data))
+            if size < least:
+                best, least = trial, size
+    if best is None:
+        raise ModelError("no filter of the model follows the record; record more samples or calmer operation")
+    return best
+
+
+# ---------------------------------------------------------------------- the fit
+@dataclass(frozen=True, kw_only=True)
+class PredictionError:
+    """Levenberg-Marquardt on one-step errors, each output's over its own deviation, so that slow ones count as fast.
+
+    Held-out rows choose the iterate by ``typical``, in the units of the data.
+    """
+
+    iterations: int
+    ridge: float = 0.0
+    patience: int = 8
+
+    def fit(
+        self, model: Innovations, data: Sequence[Stretch], held: Sequence[Stretch] = (), *, gain_alone: bool = False
+    ) -> Fitted:
+        """The fitted model; with ``gain_alone`` nothing but the filter's gain changes.
+
+        ModelError where the filter explodes over the data.
+        """
+        errors = innovations(model, data)
+        if errors is None:
+            raise ModelError("the filter of the model explodes over its own training rows; record more samples")
+        size = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-9)
+        near, whole = model.rescaled(size), float(np.exp(np.mean(np.log(size))))
+        train, late = ([replace(s, y=s.y / size) for s in of] for of in (data, held))
+
+        def judge(trial: Dynamics) -> float:
+            return whole * typical(innovations(trial, late)) if late else np.inf
+
+        free = near.mask(gain=True) if gain_alone else near.free()
+        fitter = OutputError(iterations=self.iterations, ridge=self.ridge, patience=self.patience)
+        found = fitter.fit(near, train, late, free=free, judge=judge)
+        if not isinstance(found.model, Innovations):  # the type of what went in
+            raise TypeError(type(found.model).__name__)
+        unit = np.ones(model.n_x)
+        unit[: len(size)] = unit[model.n_x - len(size) :] = size
+        model, starts = _about_mean_loads(found.model.rescaled(1 / size), [x * unit for x in found.starts], data)
+        return replace(found, model=model, starts=starts, trained=typical(innovations(model, data)))
+
+
+def _about_mean_loads(
+    model: Innovations, starts: Sequence[Array], data: Sequence[Stretch]
+) -> tuple[Innovations, list[Array]]:
+    """The same model with the mean of its loads in the plant's own constant, so that the plant rests as the record."""
+    n, n_y = model.n_x - model.n_loads, model.n_loads
+    runs = [model.free_run(x, part) for x, part in zip(starts, data, strict=True)]
+    if any(run is None for run in runs):
+        return model, list(starts)
+    mean = np.concatenate([run[1][:, n:] for run in runs if run is not None]).mean(axis=0)
+    c, shift = model.c.copy(), np.concatenate([np.zeros(n), mean])
+    c[:n_y] += mean
+    return replace(model, c=c), [x - shift for x in starts]
+
+
+def noise_of_filter(model: Innovations, errors: Array) -> Array:
+    """Standard deviation (n_y,) of the measurement noise from one-step errors e (n, n_y).
+
+    The filter's gain at the outputs is L = P (P + R)^-1 and the variance of e is P + R; so R = (I - L) cov(e).
+    """
+    n_y = errors.shape[1]
+    covariance = errors.T @ errors / max(len(errors), 1)
+    left = (np.eye(n_y) - model.gain[:n_y]) @ covariance
+    # A filter that believes the measurement wholly still leaves the digits of the transmitter.
+    return np.asarray(np.sqrt(np.maximum(np.diag(left), LEAST_NOISE * np.diag(covariance))))

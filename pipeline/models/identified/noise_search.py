@@ -1,0 +1,111 @@
+"""The search among models with their noise: filters of the ARX's impulse response, refined ones, and networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.errors import ModelError
+from pipeline.models.identified.candidates import Task
+from pipeline.models.identified.linear_search import LinearSearch
+from pipeline.models.identified.rounds import Rounds
+from pipeline.models.identified.structure import Problem, Structure
+from pipeline.models.identified.trial import Trial
+
+ITERATIONS = 20
+"""Of a linear fit."""
+
+NATS = 5.0
+"""Log-likelihood of the held-out rows by which a network must be better than the best linear model."""
+
+LATER = (1, 2)
+"""Rows on offer beyond the dead time that the impulse response shows: a sixth of the answer is over by then."""
+
+LARGEST = 12
+"""Most states of the plant on offer: the impulse response of a record in closed loop shows no more."""
+
+UNITS_OF, SEEDS, RIDGE = 3, 3, 1.0
+"""Linear candidates that carry networks, seeds of each, and the weight of the ridge."""
+
+TRAINED = 60
+"""Iterations of a network's fit."""
+
+
+def nats(problem: Problem, worse: Trial, better: Trial) -> float:
+    """Log-likelihood of the held-out rows by which one trial is better than another, n_y n log(e/e')."""
+    rows = sum(f.held.stop - f.held.start for f in problem.folds)
+    return float(problem.data.y.shape[1] * rows * np.log(worse.error / better.error))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseSearch:
+    """The search among models with their noise of one problem; ``linears`` finds their impulse responses."""
+
+    rounds: Rounds
+    linears: LinearSearch
+
+    @classmethod
+    def of(cls, rounds: Rounds) -> NoiseSearch:
+        """With the impulse responses without dead time, with the one that the first fold shows, and a little more.
+
+        A dead time that is known spares a model of few states the lags that would have to imitate it.
+        """
+        linears = LinearSearch.of(rounds)
+        offered = list(dict.fromkeys(s.delays for s, _ in linears.starts))
+        none = Structure("balanced", 0, (0, 0), offered[0])
+        later = [tuple(d + more for d in offered[-1]) for more in LATER]
+        return cls(
+            rounds, replace(linears, starts=linears.starts | rounds.starts([replace(none, delays=d) for d in later]))
+        )
+
+    def linear(self, orders: Sequence[int]) -> list[Trial]:
+        """The linear candidates over all folds, the best first; ModelError where none can be fitted."""
+        delays = list(dict.fromkeys(s.delays for s, _ in self.linears.starts))
+        structures = [
+            Structure("balanced", n, (0, 0), d, noise=noise)
+            for n in orders
+            if n <= LARGEST
+            for d in delays
+            for noise in ("gain", "all")
+        ]
+        tasks = [Task(s, k, ITERATIONS, start=self.linears.start(s, k)) for s in structures for k in self._folds]
+        trials, reasons = self.rounds.trials(tasks, "linear models with their noise")
+        whole = [t for t in trials if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
+        if not whole:
+            why = reasons[0] if reasons else "every filter over held-out rows explodes"
+            raise ModelError(f"no linear model fits the record: {why}")
+        return self.ranked(whole)
+
+    def networks(self, linear: Sequence[Trial], units: Sequence[int]) -> list[Trial]:
+        """Networks on the best linear candidates, trained over all folds from several seeds."""
+        bases = linear[:UNITS_OF]
+        offers = [(replace(t.structure, n_hidden=n, ridge=RIDGE, noise="all"), t) for t in bases for n in units[:2]]
+        tasks = [
+            Task(s, k, TRAINED, seed, base=t.fits[k, 0])
+            for s, t in offers
+            for seed in range(SEEDS)
+            for k in self._folds
+        ]
+        costs = np.cumsum([self.rounds.budget.of(t.structure, t.iterations) for t in tasks])
+        affordable = [t for t, cost in zip(tasks, costs, strict=True) if cost <= self.rounds.budget.left()]
+        trials, _ = self.rounds.trials(affordable, "neural networks with their noise")
+        return sorted((t for t in trials if len(t.folds) == len(self._folds)), key=lambda t: t.error)
+
+    def ranked(self, trials: Sequence[Trial]) -> list[Trial]:
+        """Best first, by the log-likelihood of the held-out rows less one nat a state.
+
+        One-step errors hardly tell orders apart, and a state less is one less to mislead. A refined model goes before
+        the ARX's response as it is, whose tail still holds what the prior made of noise.
+        """
+        best = min(trials, key=lambda t: t.error)
+
+        def cost(t: Trial) -> float:
+            return nats(self.rounds.problem, t, best) + t.structure.order + (t.structure.noise == "gain")
+
+        return sorted(trials, key=cost)
+
+    @property
+    def _folds(self) -> range:
+        return range(len(self.rounds.problem.folds))
