@@ -29,7 +29,7 @@ class Dryer(ClosedPlant):
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 0.0, 150.0),)
     sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 80.0, 105.0),)
     loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("TIC-101", 0.15, 420.0),)
-    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 5.0, 360),)
+    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 6.5, 360),)
     measured_disturbances: ClassVar[tuple[Measured, ...]] = (Measured("feed", "FI-7", "t/h", 6, 14, 180, 8, 0.05),)
 
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
@@ -87,7 +87,7 @@ class Crest(ClosedPlant):
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 0.0, 120.0),)
     sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 52.0, 76.0),)
     loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("TIC-301", 0.48, 90.0, 0.0, 58.0),)
-    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 7.0, 180),)
+    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 8.0, 180),)
 
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
         """dx/dt [degC/s]: the sensor, the chamber, and three lags of the draught."""
@@ -166,7 +166,7 @@ class Growth(ClosedPlant):
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("g/l", 0.0, 4.0),)
     sp_signals: ClassVar[tuple[Signal, ...]] = (signal("g/l", 0.4, 1.4),)
     loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("QIC-601", 8.0, 4_000.0),)
-    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 0.08, 260),)
+    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 0.11, 260),)
     measured_disturbances: ClassVar[tuple[Measured, ...]] = (
         Measured("strength", "QI-602", "g/l", 7, 13, 200, 6, 0.03),
     )

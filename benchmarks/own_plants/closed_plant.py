@@ -5,9 +5,9 @@ Each wandering load and each measured disturbance is a parameter of the equation
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from loops import HELD_OUT, LoopTest, tests_of
@@ -73,7 +73,13 @@ class ClosedPlant(OwnPlant):
 
     def known(self, scenario: Scenario) -> Array:
         """The measured disturbances of a test (n, n_dv), with their transmitters' noise."""
-        return transmitted(self, scenario.changes, scenario.samples, np.random.default_rng((scenario.seed or 0) + 2))
+        return self.shown(scenario.changes, scenario.samples, np.random.default_rng((scenario.seed or 0) + 2))
+
+    def shown(self, courses: Mapping[str, Array], n: int, rng: np.random.Generator) -> Array:
+        """What the transmitters show of the measured disturbances among courses by parameter, (n, n_dv)."""
+        noise = rng.standard_normal((n, len(self.measured_disturbances)))
+        found = [courses[m.parameter] + m.noise * noise[:, i] for i, m in enumerate(self.measured_disturbances)]
+        return np.column_stack(found) if found else np.empty((n, 0))
 
 
 def wandered(of: Wander, n: int, rng: np.random.Generator) -> Array:
@@ -98,13 +104,6 @@ def led(of: Measured, n: int, rng: np.random.Generator) -> Array:
         course[k] = at
         at += share * (level - at)
     return course
-
-
-def transmitted(plant: ClosedPlant, courses: Any, n: int, rng: np.random.Generator) -> Array:
-    """What the transmitters of the measured disturbances show of courses by parameter, (n, n_dv)."""
-    noise = rng.standard_normal((n, len(plant.measured_disturbances)))
-    shown = [courses[m.parameter] + m.noise * noise[:, i] for i, m in enumerate(plant.measured_disturbances)]
-    return np.column_stack(shown) if shown else np.empty((n, 0))
 
 
 def operated(plant: ClosedPlant, n: int, rng: np.random.Generator) -> Array:

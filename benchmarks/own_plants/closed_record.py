@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from closed_plant import ClosedPlant, OldLoop, operated, transmitted
+from closed_plant import ClosedPlant, OldLoop, operated
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -60,14 +60,28 @@ class ClosedRecord:
 def closed_record_of(plant: ClosedPlant, rows: int, seed: int = 0) -> ClosedRecord:
     """Rows under the old loops, with times in manual; the same seed gives the same rows."""
     rng = np.random.default_rng(seed)
-    sp, courses = operated(plant, rows, rng), plant.drift(rows, rng)
-    manual, hand = hands(plant, rows, rng)
-    names = plant.parameter_names()
+    sp = operated(plant, rows, rng)
+    return recorded(plant, sp, *hands(plant, rows, rng), rng)
+
+
+def recorded(
+    plant: ClosedPlant,
+    sp: Array,
+    manual: NDArray[np.bool_],
+    hand: Array,
+    rng: np.random.Generator,
+    valves: Array | None = None,
+) -> ClosedRecord:
+    """Rows under set points (n, n_cv) and old loops; in manual (n, n_mv) the hand adds its moves (n, n_mv).
+
+    Where ``valves`` (n_mv,) are given, these act on the plant, and what the loops ask for does not.
+    """
+    rows, courses, names = len(sp), plant.drift(len(sp), rng), plant.parameter_names()
     p = np.tile(plant.parameters(), (rows, 1))
     for name, values in courses.items():
         p[:, names.index(name)] = values
     noise = plant.noise_std * rng.standard_normal((rows, len(plant.pv_signals)))
-    dv = transmitted(plant, courses, rows, rng)
+    dv = plant.shown(courses, rows, rng)
     first = plant.with_parameters({key: float(values[0]) for key, values in courses.items()})
     x, mv = first.rest(sp[0])
     law, step = OldLaw(plant.loops, plant.period_s), plant.stepper()
@@ -79,7 +93,7 @@ def closed_record_of(plant: ClosedPlant, rows: int, seed: int = 0) -> ClosedReco
         asked, state, _ = law(*given, none, torch.from_numpy(mv), state)
         mv = np.where(manual[k], np.clip(mv + hand[k], 2.0, 98.0), asked.numpy())
         op[k] = np.round(mv, 2)
-        x = step(x, op[k], plant.dv_nominal, p[k])
+        x = step(x, op[k] if valves is None else valves, plant.dv_nominal, p[k])
     return ClosedRecord(sp, true + noise, op, manual, dv, true, courses)
 
 

@@ -68,7 +68,7 @@ class Blender(ClosedPlant):
         OldLoop("QIC-121", 0.55, 80.0), OldLoop("QIC-122", 0.38, 80.0), OldLoop("QIC-123", 0.25, 105.0),
     )  # fmt: skip
     wanders: ClassVar[tuple[Wander, ...]] = (
-        Wander("wander", 6.0, 220), Wander("wander2", 7.0, 300), Wander("wander3", 6.0, 260),
+        Wander("wander", 7.0, 220), Wander("wander2", 7.0, 300), Wander("wander3", 6.0, 260),
     )  # fmt: skip
 
     def output(self, x: Any) -> Any:
@@ -158,7 +158,7 @@ class Evaporator(ClosedPlant):
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 0.0, 60.0),)
     sp_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 17.0, 26.0),)
     loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("DIC-151", 0.7, 180.0),)
-    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 0.8, 240),)
+    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 1.0, 240),)
     measured_disturbances: ClassVar[tuple[Measured, ...]] = (Measured("feed", "FI-152", "t/h", 8, 12, 200, 5, 0.03),)
 
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
