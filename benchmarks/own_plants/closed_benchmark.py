@@ -152,7 +152,9 @@ def summary(rows: list[tuple[Scores, Scores]]) -> str:
         lines.append(f"ahead of the {other}: {', '.join(ahead)}")
     ratios = [best[FIRST][0] / others["NMPC"][FIRST][0] for others, best in pairs]
     if ratios:
-        lines.append(f"over the NMPC on set points: {statistics.median(ratios):.2f} in the median, {max(ratios):.2f} at worst")
+        lines.append(
+            f"over the NMPC on set points: {statistics.median(ratios):.2f} in the median, {max(ratios):.2f} at worst"
+        )
     return "\n".join(lines)
 
 

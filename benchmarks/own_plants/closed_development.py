@@ -36,7 +36,9 @@ class Dryer(ClosedPlant):
         """dx/dt [degC/s]: the sensor, the drum, and the ways of the hot gas (8 lags) and of the feed (4 lags)."""
         gas = self.loaded(mv)[0] - 50
         heated = 92 + 1.2 * x[2] - 0.004 * x[2] * x[2] - 3.0 * (x[10] - 10) + self.wander
-        return column((x[1] - x[0]) / 40, (heated - x[1]) / 420, *lags(x[2:10], gas, 26.0), *lags(x[10:], self.feed, 30.0))
+        return column(
+            (x[1] - x[0]) / 40, (heated - x[1]) / 420, *lags(x[2:10], gas, 26.0), *lags(x[10:], self.feed, 30.0)
+        )
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,12 @@ class Sump(ClosedPlant):
     noise: ClassVar[tuple[float, ...]] = (0.3, 0.2)
     hold: ClassVar[int] = 70
     every: ClassVar[float] = 220
+    in_manual: ClassVar[tuple[int, int]] = (20, 50)
     state_signals: ClassVar[tuple[Signal, ...]] = states(7)
     mv_signals: ClassVar[tuple[Signal, ...]] = valves(2)
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 0, 100, "level"), signal("g/l", 0, 100, "strength"))
     sp_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 35, 65, "level"), signal("g/l", 38, 62, "strength"))
-    loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("LIC-201", -1.0, 400.0), OldLoop("QIC-202", 0.45, 130.0))
+    loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("LIC-201", -1.2, 500.0), OldLoop("QIC-202", 0.45, 130.0))
     wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 5.0, 200), Wander("wander2", 8.0, 260))
 
     def output(self, x: Any) -> Any:
@@ -66,14 +69,14 @@ class Sump(ClosedPlant):
         """dx/dt: the drain valve behind two lags, the steam behind three; the inflow wanders, and so does the steam."""
         u1, u2 = self.loaded(mv)
         drain, steam = x[2] - 50, x[4] + self.wander2 - 50
-        level = 0.006 * (self.wander - drain - 0.45 * steam)
+        level = 0.004 * (self.wander - drain - 0.45 * steam)
         strength = 50 + 0.8 * steam + 0.004 * steam * steam - 0.35 * drain - 0.25 * self.wander
         return column(level, (strength - x[1]) / 120, *lags(x[2:4], u1, 8.0), *lags(x[4:], u2, 12.0))
 
 
 @dataclass(frozen=True)
 class Crest(ClosedPlant):
-    """A burner's draught: more air heats until it cools. The gain turns its sign at 62 %, the PI works below."""
+    """A burner's draught: more air heats until it cools. The gain turns its sign at 60 %, the PI works below."""
 
     wander: float = field(default=0.0, metadata={"unit": "%"})
     name: ClassVar[str] = "crest"
@@ -81,17 +84,17 @@ class Crest(ClosedPlant):
     noise: ClassVar[tuple[float, ...]] = (0.15,)
     hold: ClassVar[int] = 60
     every: ClassVar[float] = 160
-    hand_moves: ClassVar[tuple[float, float]] = (4.0, 22.0)
+    hand_moves: ClassVar[tuple[float, float]] = (6.0, 34.0)
     state_signals: ClassVar[tuple[Signal, ...]] = states(5)
     mv_signals: ClassVar[tuple[Signal, ...]] = valves()
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 0.0, 120.0),)
-    sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 52.0, 76.0),)
-    loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("TIC-301", 0.48, 90.0, 0.0, 58.0),)
-    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 8.0, 180),)
+    sp_signals: ClassVar[tuple[Signal, ...]] = (signal("degC", 60.0, 78.0),)
+    loops: ClassVar[tuple[OldLoop, ...]] = (OldLoop("TIC-301", 0.48, 90.0, 0.0, 56.0),)
+    wanders: ClassVar[tuple[Wander, ...]] = (Wander("wander", 6.5, 180),)
 
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
         """dx/dt [degC/s]: the sensor, the chamber, and three lags of the draught."""
-        draught = x[2] + self.wander - 62
+        draught = x[2] + self.wander - 60
         steady = 80 - 48 * draught * draught / (2_600 + draught * draught)
         return column((x[1] - x[0]) / 12, (steady - x[1]) / 90, *lags(x[2:], self.loaded(mv)[0], 8.0))
 
@@ -116,7 +119,9 @@ class Foam(ClosedPlant):
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
         """dx/dt [kg/s]."""
         u = ca.fmax(0.0, x[2] + self.wander) / 100
-        return column((x[1] - x[0]) / 25, (110 * (0.4 * u + 0.6 * u * u) - x[1]) / 80, *lags(x[2:], self.loaded(mv)[0], 8.0))
+        return column(
+            (x[1] - x[0]) / 25, (110 * (0.4 * u + 0.6 * u * u) - x[1]) / 80, *lags(x[2:], self.loaded(mv)[0], 8.0)
+        )
 
 
 @dataclass(frozen=True)

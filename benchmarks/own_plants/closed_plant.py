@@ -64,6 +64,7 @@ class ClosedPlant(OwnPlant):
     wanders: ClassVar[tuple[Wander, ...]]
     measured_disturbances: ClassVar[tuple[Measured, ...]] = ()
     every: ClassVar[float]  # samples from one set point of the operator to the next, in the mean
+    in_manual: ClassVar[tuple[int, int]] = (35, 120)  # fewest and most samples of one time in manual
     hand_moves: ClassVar[tuple[float, float]] = (2.0, 6.0)  # [%] of the MV in manual
 
     def drift(self, n: int, rng: np.random.Generator) -> dict[str, Array]:

@@ -115,9 +115,7 @@ def read(file: Path, options: Sequence[str]) -> Read:
     found = screened_export(export, tags)
     record, why = found.record, refusal(found, tags, anyway=False)
     n = min(len(record.pv_signals), len(record.mv_signals))
-    signals = Signals(
-        record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals
-    )
+    signals = Signals(record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals)
     return Read(record, signals, "" if why is None else why.why, found.report.verdict.carries)
 
 

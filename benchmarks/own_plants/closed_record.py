@@ -18,7 +18,6 @@ from pipeline.plants.simulator import Array
 
 START = datetime(2025, 2, 3, 0, 0, 0)
 IN_MANUAL = 0.085  # share of the rows, in the mean
-MANUAL = (2.0, 6.0)  # of ``every`` samples of a set point over 10: shortest and longest time in manual
 HAND_MOVES = 4  # in one time in manual, in the mean
 
 
@@ -101,7 +100,7 @@ def hands(plant: ClosedPlant, rows: int, rng: np.random.Generator) -> tuple[NDAr
     """Rows in manual of each loop (rows, n_mv), and what the hand adds to the MV there [%]."""
     n_mv = len(plant.mv_signals)
     manual, hand = np.zeros((rows, n_mv), dtype=np.bool_), np.zeros((rows, n_mv))
-    shortest, longest = (max(8, int(share * plant.every / 10)) for share in MANUAL)
+    shortest, longest = plant.in_manual
     mean = (shortest + longest) / 2
     for j in range(n_mv):
         for first in np.arange(0.0, rows, mean / IN_MANUAL):  # once in each such stretch

@@ -26,6 +26,7 @@ class Boiler(ClosedPlant):
     noise: ClassVar[tuple[float, ...]] = (0.3,)
     hold: ClassVar[int] = 80
     every: ClassVar[float] = 240
+    in_manual: ClassVar[tuple[int, int]] = (20, 50)
     state_signals: ClassVar[tuple[Signal, ...]] = states(4)
     mv_signals: ClassVar[tuple[Signal, ...]] = valves()
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 0.0, 100.0),)
