@@ -12,6 +12,7 @@ DEVELOPMENT in sight; those of UNTOUCHED are reported as they come.
 ``python benchmarks/own_plants --closed PLANT ... [--rows N] [--fit]``: the plants whose records were taken in closed
 loop, and what the product makes of the file of a historian (``closed_benchmark.py``); ``--closed development`` is the
 half that may be looked at while a method is chosen. 3 to 5 minutes of two cores a plant, with ``--fit`` 1 to 2.
+``--refused [KIND ...]``: records of which no controller may come, and how many slip through (``closed_refused.py``).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 import torch
 from closed_benchmark import PLANTS, closed_main
 from closed_development import CLOSED_DEVELOPMENT
+from closed_refused import KINDS, MINUTES, refused_main
 from closed_untouched import CLOSED_UNTOUCHED
 from development import DEVELOPMENT
 from loops import Score, closed, scores, tests_of
@@ -112,16 +114,23 @@ def main(argv: list[str]) -> int:
     parser.add_argument("plants", nargs="*", choices=[[], *plants], help="(default: all)")
     parser.add_argument("--rows", type=int, help=f"of the record ({ROWS}, of --closed {CLOSED_ROWS})")
     parser.add_argument("--tuning", choices=["search", "given"], default="search", help="of the law (search)")
-    parser.add_argument("--closed", nargs="*", choices=[*PLANTS, *GROUPS], metavar="PLANT",
-        help="plants in closed-loop records instead, through `new` and `run`: " + ", ".join([*PLANTS, *GROUPS]))  # fmt: skip
-    parser.add_argument("--fit", action="store_true", help="of --closed: model and predictive law alone, no stages")
-    parser.add_argument("--seed", type=int, default=0, help="of the records of --closed (0)")
+    add = parser.add_argument
+    closed = [*PLANTS, *GROUPS]
+    what = "plants in closed-loop records instead, through `new` and `run`"
+    add("--closed", nargs="*", choices=closed, metavar="PLANT", help=f"{what}: {', '.join(closed)} (development)")
+    add("--fit", action="store_true", help="of --closed: model and predictive law alone, no stages")
+    add("--seed", type=int, default=0, help="of the records of --closed (0)")
+    add("--refused", nargs="*", choices=[*KINDS], metavar="KIND", help=f"records to refuse: {', '.join(KINDS)} (all)")
+    add("--count", type=int, default=20, help="of each kind of --refused (20)")
+    add("--minutes", type=float, default=MINUTES, help=f"of the search for a model of --refused ({MINUTES:g})")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     if options.closed is not None:
         names = [n for name in options.closed or ["development"] for n in GROUPS.get(name, [name])]
         rows = options.rows or CLOSED_ROWS
         return closed_main(names, rows, fit=options.fit, seed=options.seed, pid_of=pid_of)
+    if options.refused is not None:
+        return refused_main(options.refused or list(KINDS), options.count, options.minutes)
     options.rows = options.rows or ROWS
     print(HEAD)
     found = []

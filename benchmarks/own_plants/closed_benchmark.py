@@ -10,13 +10,13 @@ import hashlib
 import inspect
 import json
 import statistics
-import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import closed_plant
+import closed_product
 import closed_record
 import loops
 import plant as plant_module
@@ -61,6 +61,12 @@ def yardstick_of(plant: ClosedPlant) -> str:
     return digest_of([inspect.getsource(type(plant)), *(inspect.getsource(m) for m in OWN_CODE)])
 
 
+@cache
+def product_digest() -> str:
+    """Digest of the product, and of how it is called here."""
+    return digest_of(["pipeline", "serving", inspect.getsource(closed_product)])
+
+
 def kept(name: str, make: Callable[[], Any]) -> Any:
     """What the store has under a name, or what is made now."""
     path = FOLDER / f"{name}.json"
@@ -97,7 +103,7 @@ def others_of(plant: ClosedPlant, pid_of: Callable[[ClosedPlant], ControlLaw | N
 
 def ours_of(plant: ClosedPlant, rows: int, *, fit: bool, seed: int = 0) -> dict[str, Any]:
     """What the product makes of the record: ``scores`` by controller, what it ``said``, and ``seconds``."""
-    code = digest_of(["pipeline", "serving", inspect.getsource(sys.modules[by_run.__module__])])
+    code = product_digest()
     way = "fit" if fit else "run"
     key = f"{plant.name}-closed-{yardstick_of(plant)}-{rows}-{seed}-{way}-{code}"
 

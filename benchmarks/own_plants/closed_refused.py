@@ -10,15 +10,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from closed_benchmark import kept, product_digest, yardstick_of
 from closed_development import CLOSED_DEVELOPMENT
 from closed_plant import ClosedPlant
 from closed_product import fitted, read
 from closed_record import ClosedRecord, closed_record_of, recorded, roles, write_export
 from numpy.typing import NDArray
+from store import FOLDER
 
 from pipeline.errors import PipelineError
 from pipeline.plants.simulator import Array
@@ -83,25 +86,22 @@ def verdict(plant: ClosedPlant, record: ClosedRecord, folder: Path, minutes: flo
     return {"by": by, "why": doubts or f"new said {found.verdict}", "seconds": time.process_time() - began}
 
 
-def refused_main(
-    kinds: Sequence[str], count: int, minutes: float, kept: Callable[..., Any], key: Callable[..., str]
-) -> int:
+def refused_main(kinds: Sequence[str], count: int, minutes: float) -> int:
     """Print how many of each kind are refused by whom, and which slip through."""
-    for kind in kinds or KINDS:
+    code = product_digest()
+    for kind in kinds:
         found: dict[str, list[str]] = {"new": [], "proof": [], "error": [], "slips": []}
-        for i in range(count):
-            plant, seed = SINGLE[i % len(SINGLE)](), i
-            name = key(plant, kind, i, minutes)
-
-            def make(plant: ClosedPlant = plant, seed: int = seed, name: str = name) -> dict[str, Any]:
-                from store import FOLDER
-
-                return verdict(plant, KINDS[kind](plant, ROWS, seed), FOLDER / f"{name}-export", minutes)
-
-            said = kept(name, make)
+        for seed in range(count):
+            plant = SINGLE[seed % len(SINGLE)]()
+            name = f"{plant.name}-{kind.replace(' ', '-')}-{seed}-{minutes:g}-{yardstick_of(plant)}-{code}"
+            said = kept(name, partial(_said, plant, kind, seed, minutes, FOLDER / f"{name}-export"))
             found[said["by"]].append(f"{plant.name} {seed}: {said['why']}")
         by = ", ".join(f"{who} {len(rows)}" for who, rows in found.items() if who != "slips")
-        print(f"{kind}: {len(found['slips'])} of {count} slip through (refused by {by})")
+        print(f"{kind}: {len(found['slips'])} of {count} slip through (refused by {by})", flush=True)
         for row in found["slips"]:
             print(f"  {row}")
     return 0
+
+
+def _said(plant: ClosedPlant, kind: str, seed: int, minutes: float, folder: Path) -> dict[str, Any]:
+    return verdict(plant, KINDS[kind](plant, ROWS, seed), folder, minutes)

@@ -6,6 +6,7 @@ import csv
 import importlib
 import sys
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ import torch
 FOLDER = Path(__file__).parents[2] / "benchmarks" / "own_plants"
 MODULES = (
     "plant", "loops", "record", "store", "closed_plant", "closed_development", "closed_untouched", "closed_record",
-    "closed_product", "closed_refused",
+    "closed_product", "closed_benchmark", "closed_refused",
 )  # fmt: skip
 ROWS = 600
 
@@ -54,7 +55,10 @@ def test_the_twelve_cover_what_they_shall(own: Any) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["dryer", "sump", "crest", "foam", "sticking", "growth", "boiler", "blender", "sluice", "fouling", "evaporator", "belt"],
+    [
+        "dryer", "sump", "crest", "foam", "sticking", "growth",
+        "boiler", "blender", "sluice", "fouling", "evaporator", "belt",
+    ],
 )  # fmt: skip
 def test_a_record_repeats_and_the_old_loop_holds_its_plant(own: Any, name: str) -> None:
     plant = plants(own)[name]
@@ -111,7 +115,7 @@ def test_the_export_is_what_the_product_reads(own: Any, tmp_path: Path) -> None:
     assert head == ["Timestamp", "TIC-101.SP", "TIC-101.PV", "TIC-101.OP", "TIC-101.MODE", "FI-7"]
     assert len(rows) == ROWS
     times = [datetime.fromisoformat(row[0]) for row in rows]
-    assert {(b - a).total_seconds() for a, b in zip(times, times[1:], strict=False)} == {plant.period_s}
+    assert {(b - a).total_seconds() for a, b in pairwise(times)} == {plant.period_s}
     assert {row[4] for row in rows} <= {"AUTO", "MAN"}
     np.testing.assert_allclose([float(row[2]) for row in rows], record.pv[:, 0], atol=0.01)
     with own.closed_record.truth_beside(file).open(newline="") as lines:
@@ -179,3 +183,37 @@ def test_measured_disturbances_reach_the_controller_and_wandering_loads_do_not(o
     assert set(changes) == {"load", "wander", "feed"}
     np.testing.assert_allclose(shown[:, 0], changes["feed"], atol=0.3)
     assert np.abs(changes["load"]).max() == own.loops.LOAD
+
+
+@pytest.mark.parametrize("kind", ["regulation", "follower", "wrong tags", "shuffled"])
+def test_records_that_must_be_refused_are_what_they_are_said_to_be(own: Any, kind: str) -> None:
+    plant = plants(own)["crest"]
+    rows, normal = 400, own.closed_record.closed_record_of(plant, 400, 3)
+    record, again = (own.closed_refused.KINDS[kind](plant, rows, 3) for _ in range(2))
+    np.testing.assert_array_equal(record.pv, again.pv)
+    if kind in {"regulation", "follower"}:
+        assert len(np.unique(record.sp)) == 1
+        assert not record.manual.any()
+        assert np.ptp(record.op) > 1.0
+    if kind == "wrong tags":
+        np.testing.assert_array_equal(record.op, normal.op)
+        assert abs(np.corrcoef(record.true[:, 0], normal.true[:, 0])[0, 1]) < 0.9
+    if kind == "shuffled":
+        np.testing.assert_array_equal(np.sort(record.pv, axis=0), np.sort(normal.pv, axis=0))
+        assert np.abs(np.diff(record.true[:, 0])).mean() > 3 * np.abs(np.diff(normal.true[:, 0])).mean()
+
+
+def test_what_moves_with_a_pv_and_moves_nothing_leaves_the_plant_to_its_loads(own: Any) -> None:
+    plant = plants(own)["dryer"]
+    follower = own.closed_refused.KINDS["follower"](plant, 400, 0)
+    courses = plant.drift(400, np.random.default_rng(0))
+    first = plant.with_parameters({key: float(values[0]) for key, values in courses.items()})
+    x, _ = first.rest(follower.sp[0])
+    p = np.tile(plant.parameters(), (400, 1))
+    for key, values in courses.items():
+        p[:, plant.parameter_names().index(key)] = values
+    step, valves, y = plant.stepper(), plant.rest(follower.sp[0])[1], np.empty(400)
+    for k in range(400):
+        y[k] = plant.measured(x)[0]
+        x = step(x, valves, plant.dv_nominal, p[k])
+    np.testing.assert_allclose(follower.true[:, 0], y, atol=1e-9)
