@@ -129,6 +129,7 @@ class Sticking(ClosedPlant):
     """A heater whose valve sticks: it stays until the command is 1.5 % off, then goes on to the command."""
 
     wander: float = field(default=0.0, metadata={"unit": "degC"})
+    stick: float = field(default=1.5, metadata={"unit": "%"})
     name: ClassVar[str] = "sticking"
     title: ClassVar[str] = "Valve that sticks"
     noise: ClassVar[tuple[float, ...]] = (0.1,)
@@ -145,12 +146,17 @@ class Sticking(ClosedPlant):
     def derivative(self, x: Any, mv: Any, dv: Any) -> Any:
         """dx/dt: sensor, heater, two lags; the valve x4, and x5, which is 1 while the valve moves."""
         off = self.loaded(mv)[0] - x[4]
-        loose = 0.5 * (1 + ca.tanh((ca.fabs(off) - 1.5 + 1.3 * x[5]) / 0.08))
+        loose = 0.5 * (1 + ca.tanh((ca.fabs(off) - self.stick * (1 - 0.87 * x[5])) / 0.08))
         steady = 20 + 0.9 * x[2] - 0.0025 * x[2] * x[2] + self.wander
         return column(
             (x[1] - x[0]) / 12, (steady - x[1]) / 80, (x[3] - x[2]) / 10, (x[4] - x[3]) / 10,
             x[5] * off / 3.0, (loose - x[5]) / 2.0,
         )  # fmt: skip
+
+    @property
+    def bounding(self) -> ClosedPlant:
+        """The heater with a valve that does not stick: no solver plans through the valve's."""
+        return self.with_parameters({"stick": 0.0})
 
 
 @dataclass(frozen=True)

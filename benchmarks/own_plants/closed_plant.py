@@ -67,6 +67,11 @@ class ClosedPlant(OwnPlant):
     in_manual: ClassVar[tuple[int, int]] = (35, 120)  # fewest and most samples of one time in manual
     hand_moves: ClassVar[tuple[float, float]] = (2.0, 6.0)  # [%] of the MV in manual
 
+    @property
+    def bounding(self) -> ClosedPlant:
+        """The plant of the NMPC that no controller can beat: this one, or one that can do whatever this can."""
+        return self
+
     def drift(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
         """The courses (n,) of what moves by itself."""
         wandering = {w.parameter: getattr(self, w.parameter) + wandered(w, n, rng) for w in self.wanders}
