@@ -40,6 +40,8 @@ ROOT = Path(__file__).parents[2]
 OWN_CODE = (plant_module, loops, closed_plant, closed_record)
 PID_CODE = ("pipeline/laws/pid", "pipeline/tuning", "pipeline/plants")
 
+LINE = 160  # letters of what was said that are shown
+
 Scores = dict[str, dict[str, list[float]]]
 """Controller -> test -> [MAE, travel]."""
 
@@ -148,11 +150,10 @@ def text_of(plant: ClosedPlant, rows: int, way: str, others: Scores, ours: Mappi
         lines.append(f"  {name:22}" + "".join(cells) + f"{score[FIRST][0] / bound:12.2f}")
     if not ours["scores"]:
         lines.append("  ours: nothing is shipped")
-    lines += [f"  withheld: {line}" for line in ours["withheld"]]
-    if way == "fit" or not ours["scores"]:
-        lines += [f"  {line}" for line in ours["said"][-6:]]
-    elif ours["project"]:
-        lines.append(f"  {ours['project']}")
+    said = [f"withheld: {line}" for line in ours["withheld"]]
+    if not said and (way == "fit" or not ours["scores"]):
+        said = ours["said"][-4:]
+    lines += [f"  {line[:LINE]}" for line in [*said, ours["project"]] if line]
     return "\n".join(lines)
 
 

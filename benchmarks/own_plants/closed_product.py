@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
 from closed_plant import ClosedPlant
 from closed_record import roles
@@ -70,7 +69,7 @@ class Shipped:
         for i in range(len(mv)):
             given = {"sp": sp[i], "pv": pv[i], "dv": dv[i], "mv_applied": mv[i], "state": state[i]}
             try:
-                step = self.controller.step(**{name: np.array(value) for name, value in given.items()})
+                step = self.controller.step(**{name: value.numpy() for name, value in given.items()})
             except OutputError:
                 self.refused += 1
                 continue

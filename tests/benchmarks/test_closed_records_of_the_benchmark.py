@@ -217,3 +217,57 @@ def test_what_moves_with_a_pv_and_moves_nothing_leaves_the_plant_to_its_loads(ow
         y[k] = plant.measured(x)[0]
         x = step(x, valves, plant.dv_nominal, p[k])
     np.testing.assert_allclose(follower.true[:, 0], y, atol=1e-9)
+
+
+def test_a_shipped_file_steps_each_test_as_the_runtime_does(own: Any) -> None:
+    law = own.closed_product.Shipped(FOLDER.parents[1] / "artifacts" / "thiosulfate_cstr" / "pid.onnx")
+    controller, rng = law.controller, np.random.default_rng(0)
+    ranges = {role: controller.manifest.signals(role) for role in ("sp", "pv", "dv", "mv")}
+    drawn = {
+        role: torch.tensor([[rng.uniform(s.low, s.high) for s in group] for _ in range(3)], dtype=torch.float64)
+        for role, group in ranges.items()
+    }
+    state = torch.zeros(3, law.n_state, dtype=torch.float64)
+    for _ in range(2):
+        moved, after, _ = law(drawn["sp"], drawn["pv"], drawn["dv"], drawn["mv"], state)
+        for i in range(3):
+            sp, pv, mv = (drawn[role][i].numpy() for role in ("sp", "pv", "mv"))
+            step = controller.step(sp=sp, pv=pv, mv_applied=mv, state=state[i].numpy())
+            np.testing.assert_array_equal(moved[i], step.mv)
+            np.testing.assert_array_equal(after[i], step.state)
+        state = after
+    assert law.refused == 0
+
+
+def test_the_summary_counts_over_all_plants(own: Any) -> None:
+    first = own.closed_benchmark.FIRST
+
+    def score(value: float) -> dict[str, list[float]]:
+        return {**{test: [value, 1.0] for test in own.closed_benchmark.TESTS}, first: [value]}
+
+    others = {"old loop": score(10.0), "tuned PID": score(4.0), "NMPC": {first: [2.0]}}
+    rows = [
+        (others, {"predictive": score(3.0), "pid": score(9.0)}),
+        (others, {"pid": score(5.0)}),
+        (others, {}),
+    ]
+    lines = own.closed_benchmark.summary(rows).splitlines()
+    assert lines[0].startswith("a controller for 2 of 3")
+    assert "set points 2 of 3" in lines[1]
+    assert "set points 1 of 3" in lines[2]
+    assert "2.00 in the median, 2.50 at worst" in lines[3]
+
+
+def test_the_tuned_pid_keeps_within_the_ends_of_the_old_loops_output(own: Any) -> None:
+    plant = plants(own)["crest"]
+
+    class Wild:
+        n_state = 0
+
+        def __call__(self, sp: Any, pv: Any, dv: Any, mv: Any, state: Any) -> Any:
+            return mv + 1e3 * torch.sign(sp - pv), state, pv[..., :0]
+
+    law = own.closed_benchmark.Within(Wild(), plant)
+    low, high, mv = torch.tensor([[0.0]]), torch.tensor([[90.0]]), torch.tensor([[40.0]])
+    assert float(law(high, low, low, mv, low)[0]) == plant.loops[0].high
+    assert float(law(low, high, low, mv, low)[0]) == plant.loops[0].low
