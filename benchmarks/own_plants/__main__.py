@@ -8,6 +8,11 @@ state. Figures: mean absolute error in % of the set points' range, on random set
 MVs, and after upsets at the outputs, none of which anyone has seen, of the true output under measurement noise (of the
 NMPC without noise); travel in % of the MVs' range a sample, on set points. The method was chosen with the plants of
 DEVELOPMENT in sight; those of UNTOUCHED are reported as they come.
+
+``python benchmarks/own_plants --closed PLANT ... [--rows N] [--fit]``: the plants whose records were taken in closed
+loop, and what the product makes of the file of a historian (``closed_benchmark.py``); ``--closed development`` is the
+half that may be looked at while a method is chosen. 3 to 5 minutes of two cores a plant, with ``--fit`` 1 to 2.
+``--refused [KIND ...]``: records of which no controller may come, and how many slip through (``closed_refused.py``).
 """
 
 from __future__ import annotations
@@ -21,6 +26,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from closed_benchmark import PLANTS, closed_main
+from closed_development import CLOSED_DEVELOPMENT
+from closed_refused import KINDS, MINUTES, refused_main
+from closed_untouched import CLOSED_UNTOUCHED
 from development import DEVELOPMENT
 from loops import Score, closed, scores, tests_of
 from plant import OwnPlant
@@ -32,6 +41,12 @@ from pipeline.laws import LAWS
 from pipeline.laws.base import ControlLaw
 from pipeline.plants.spoilt import SpoiltPlant
 
+ROWS, CLOSED_ROWS = 8_000, 12_000
+GROUPS = {
+    "development": [p.name for p in CLOSED_DEVELOPMENT],
+    "untouched": [p.name for p in CLOSED_UNTOUCHED],
+    "all": list(PLANTS),
+}
 HEAD = (
     f"{'':12} {'set points: nMAE [%]':^40} | {'travel':^11} | {'loads':^11} | {'upsets':^11} | {'fit':>5} {'law':>5}\n"
     f"{'plant':12} {'PID':>7} {'NMPC':>7} {'ours':>7} {'/NMPC':>8} {'/PID':>7} | {'PID':>5} {'ours':>5} |"
@@ -97,10 +112,26 @@ def main(argv: list[str]) -> int:
     plants = {p.name: p for p in (*DEVELOPMENT, *UNTOUCHED)}
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("plants", nargs="*", choices=[[], *plants], help="(default: all)")
-    parser.add_argument("--rows", type=int, default=8_000, help="of the record (8000)")
+    parser.add_argument("--rows", type=int, help=f"of the record ({ROWS}, of --closed {CLOSED_ROWS})")
     parser.add_argument("--tuning", choices=["search", "given"], default="search", help="of the law (search)")
+    add = parser.add_argument
+    closed = [*PLANTS, *GROUPS]
+    what = "plants in closed-loop records instead, through `new` and `run`"
+    add("--closed", nargs="*", choices=closed, metavar="PLANT", help=f"{what}: {', '.join(closed)} (development)")
+    add("--fit", action="store_true", help="of --closed: model and predictive law alone, no stages")
+    add("--seed", type=int, default=0, help="of the records of --closed (0)")
+    add("--refused", nargs="*", choices=[*KINDS], metavar="KIND", help=f"records to refuse: {', '.join(KINDS)} (all)")
+    add("--count", type=int, default=20, help="of each kind of --refused (20)")
+    add("--minutes", type=float, default=MINUTES, help=f"of the search for a model of --refused ({MINUTES:g})")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
+    if options.closed is not None:
+        names = [n for name in options.closed or ["development"] for n in GROUPS.get(name, [name])]
+        rows = options.rows or CLOSED_ROWS
+        return closed_main(names, rows, fit=options.fit, seed=options.seed, pid_of=pid_of)
+    if options.refused is not None:
+        return refused_main(options.refused or list(KINDS), options.count, options.minutes)
+    options.rows = options.rows or ROWS
     print(HEAD)
     found = []
     for name in options.plants or plants:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
 from plant import OwnPlant
+from torch import Tensor
 
-from pipeline.laws.base import ControlLaw
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
 
@@ -85,8 +86,17 @@ def _test(
     return LoopTest(scenario, np.zeros_like(sp))
 
 
+class Steps(Protocol):
+    """What closes a loop: a law, or what steps as one."""
+
+    n_state: int
+
+    def __call__(self, sp: Tensor, pv: Tensor, dv: Tensor, mv: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One step; shapes as in ControlLaw."""
+
+
 @torch.no_grad()
-def closed(laws: ControlLaw, plant: OwnPlant, tests: list[LoopTest], count: int | None = None) -> tuple[Array, Array]:
+def closed(laws: Steps, plant: OwnPlant, tests: list[LoopTest], count: int | None = None) -> tuple[Array, Array]:
     """True outputs (count, tests, n, n_cv) and MVs (count, tests, n, n_mv); without a count those of one law.
 
     ``laws`` are ``count`` laws side by side. Measurement noise by each test's seed, the same for all laws.
@@ -101,19 +111,19 @@ def closed(laws: ControlLaw, plant: OwnPlant, tests: list[LoopTest], count: int 
     x = np.tile(np.stack([t.x0 for t in scenarios]), (c, 1))  # (c b, n_x)
     mv = torch.from_numpy(np.tile(np.stack([t.mv0 for t in scenarios]), (c, 1, 1)))
     state = torch.zeros(c, b, laws.n_state, dtype=torch.float64)
-    none = torch.zeros(c, b, 0, dtype=torch.float64)
+    dv = torch.from_numpy(np.stack([plant.known(t) for t in scenarios]))
     sp = torch.from_numpy(np.stack([t.sp for t in scenarios]))
     upset = np.stack([t.upset for t in tests])
     y, u = np.empty((c, b, n, n_pv)), np.empty((c, b, n, n_mv))
     for k in range(n):
         y[:, :, k] = plant.measured(x).reshape(c, b, n_pv) + upset[:, k]
         pv = torch.from_numpy(y[:, :, k] + noise[:, k])
-        wanted = sp[:, k].expand(c, -1, -1)
+        wanted, known = (v[:, k].expand(c, -1, -1) for v in (sp, dv))
         if count is None:
-            one, after, _ = laws(wanted[0], pv[0], none[0], mv[0], state[0])
+            one, after, _ = laws(wanted[0], pv[0], known[0], mv[0], state[0])
             mv, state = one[None], after[None]
         else:
-            mv, state, _ = laws(wanted, pv, none, mv, state)
+            mv, state, _ = laws(wanted, pv, known, mv, state)
         u[:, :, k] = mv.numpy()
         table = np.tile(p[:, k], (c, 1))
         x = np.array(advance(x.T, u[:, :, k].reshape(c * b, n_mv).T, np.zeros((0, c * b)), table.T)).T

@@ -13,6 +13,7 @@ from scipy.optimize import root
 from pipeline.errors import PlantError
 from pipeline.plants.equations import EquationPlant
 from pipeline.plants.simulator import Array
+from pipeline.simulation.scenario import Scenario
 from serving.manifest import Signal
 
 SETTLE = 3_000  # samples to come to rest
@@ -53,6 +54,10 @@ class OwnPlant(EquationPlant):
     def drift(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
         """Parameters (n,) that change by themselves, in the record and in use."""
         return {}
+
+    def known(self, scenario: Scenario) -> Array:
+        """What a controller is given of the measured disturbances of a test (n, n_dv): there are none."""
+        return np.zeros((scenario.samples, 0))
 
     @property
     def start(self) -> tuple[Array, Array]:

@@ -1,0 +1,199 @@
+"""The product's way from the file of a historian to a controller: all of it, as a user goes, or the fit alone."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from closed_plant import ClosedPlant
+from closed_record import roles
+from loops import Steps
+from torch import Tensor
+
+from pipeline.commands import new
+from pipeline.commands.new_exported import asked, given_tags
+from pipeline.evaluation.proof import sign_doubts
+from pipeline.historian.exported import screened_export, with_units
+from pipeline.historian.guessing import controlled_first
+from pipeline.historian.refusal import refusal
+from pipeline.historian.tags import named
+from pipeline.laws import LAWS
+from pipeline.models.identified.identified import Identified
+from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.part import Source
+from pipeline.plants.signals import Signals
+from pipeline.records.record import Record
+from serving.controller import Controller
+from serving.errors import OutputError
+
+ROOT = Path(__file__).parents[2]
+PROJECT = ("dvc.yaml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore")
+
+
+class Paced:
+    """A law whose period is longer than the plant's sampling: between two of its steps the MV stays."""
+
+    def __init__(self, law: Steps, periods: float) -> None:
+        self.law, self.periods, self.n_state = law, periods, law.n_state + 1
+
+    def __call__(self, sp: Tensor, pv: Tensor, dv: Tensor, mv: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One sample; shapes as of any law."""
+        k = float(state[..., 0].max())
+        count = state[..., :1] + 1
+        if k and int(k / self.periods + 1e-9) == int((k - 1) / self.periods + 1e-9):
+            return mv, torch.cat([count, state[..., 1:]], dim=-1), pv[..., :0]
+        moved, after, _ = self.law(sp, pv, dv, mv, state[..., 1:])
+        return moved, torch.cat([count, after], dim=-1), pv[..., :0]
+
+
+class Shipped:
+    """A shipped file, stepped by the runtime as on a plant; where it refuses a step the MV stays, which is counted."""
+
+    def __init__(self, file: Path) -> None:
+        self.controller = Controller(file)
+        self.n_state, self.refused = self.controller.manifest.n_state, 0
+
+    def __call__(self, sp: Tensor, pv: Tensor, dv: Tensor, mv: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One step of each test (tests, ...), one after the other."""
+        moved, after = mv.clone(), state.clone()
+        for i in range(len(mv)):
+            given = {"sp": sp[i], "pv": pv[i], "dv": dv[i], "mv_applied": mv[i], "state": state[i]}
+            try:
+                step = self.controller.step(**{name: value.numpy() for name, value in given.items()})
+            except OutputError:
+                self.refused += 1
+                continue
+            moved[i], after[i] = torch.from_numpy(step.mv), torch.from_numpy(step.state)
+        return moved, after, pv[..., :0]
+
+
+@dataclass(frozen=True, slots=True)
+class Delivered:
+    """What came of a file: controllers by name, what was said, and the processor time [s]."""
+
+    laws: dict[str, Steps]
+    said: list[str]
+    seconds: float
+    files: dict[str, Path] = field(default_factory=dict)
+
+
+def paced(plant: ClosedPlant, law: Steps, period_s: float) -> Steps:
+    """The law at its own period on the plant."""
+    periods = period_s / plant.period_s
+    return law if abs(periods - 1) < 1e-6 else Paced(law, periods)
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """A file as `loopwright new` reads it: the record, and why it is not used, empty where it is."""
+
+    record: Record
+    signals: Signals
+    refused: str
+    verdict: str
+
+
+def read(file: Path, options: Sequence[str]) -> Read:
+    """``file`` as `loopwright new NAME FILE` with these options; RecordError where there is no record at all."""
+    parser = argparse.ArgumentParser()
+    new.options(parser)
+    given = parser.parse_args(["plant", str(file), *options])
+    tags, _ = given_tags(given)
+    export = asked(given, tags)
+    tags = with_units(controlled_first(named(tags)), export)
+    found = screened_export(export, tags)
+    record, why = found.record, refusal(found, tags, anyway=False)
+    n = min(len(record.pv_signals), len(record.mv_signals))
+    signals = Signals(record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals)
+    return Read(record, signals, "" if why is None else why.why, found.report.verdict.carries)
+
+
+def fitted(found: Read, minutes: float | None = None) -> tuple[Identified, str]:
+    """The model of a record as stage `fit` makes it with all defaults, and what its proof holds against it.
+
+    ``minutes`` is the budget of its search; None: the default.
+    """
+    learnt = IdentifiedPart(minutes=minutes).learn(Source(found.record, found.signals))
+    parts = {"identified": {"kind": "identified", "per_seed": {"0": learnt.metrics}}}
+    return learnt.model, sign_doubts({"": {"parts": parts}})
+
+
+def by_fit(plant: ClosedPlant, file: Path) -> Delivered:
+    """The predictive law on a model of the record: no tests, no gates; what they would have said is told."""
+    began = time.process_time()
+    found = read(file, roles(plant))
+    said = [f"new: {found.verdict}{f', refused: {found.refused}' if found.refused else ''}"]
+    model, doubts = fitted(found)
+    said += [f"proof: {doubts or 'holds'}"]
+    predictive = LAWS["predictive"]
+    law = predictive.design(predictive.Params(tuning="search"), {"identified": model}, found.signals, None).eval()
+    law = paced(plant, law, found.signals.period_s)
+    return Delivered({"predictive": law}, said, time.process_time() - began)
+
+
+def by_run(plant: ClosedPlant, file: Path, project: Path) -> Delivered:
+    """`loopwright new` and `loopwright run` in a fresh project, and the files that are shipped there."""
+    _fresh(project)
+    began = resource.getrusage(resource.RUSAGE_CHILDREN)
+    shutil.copy(file, project / file.name)
+    code, said = _loopwright(project, "new", plant.name, file.name, *roles(plant))
+    if code == 0:
+        code, more = _loopwright(project, "run", plant.name)
+        said += more
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
+    files = {path.stem: path for path in sorted((project / "artifacts" / plant.name).glob("*.onnx"))}
+    (project / "said.txt").write_text("\n".join(said), encoding="utf-8")
+    return Delivered({name: shipped(plant, path) for name, path in files.items()}, said, seconds, files)
+
+
+def shipped(plant: ClosedPlant, file: Path) -> Steps:
+    """A shipped file as a law for the plant; its signals must come in the plant's order."""
+    law = Shipped(file)
+    manifest = law.controller.manifest
+    wanted = {"pv": [f"{o.tag}.PV" for o in plant.loops], "mv": [f"{o.tag}.OP" for o in plant.loops]}
+    for role, names in wanted.items():
+        found = [s.name for s in manifest.signals(role)]
+        assert found == names, f"{file}: {role} is {found}, not {names}"
+    return paced(plant, law, manifest.period_s)
+
+
+def withheld(project: Path, name: str) -> list[str]:
+    """Why a controller of a finished run is not shipped, a line each."""
+    why = []
+    for path in sorted((project / "work" / name / "controllers").glob("*/metrics.json")):
+        text = json.loads(path.read_text()).get("withheld")
+        why += [f"{path.parent.name}: {text}"] if text else []
+    return why
+
+
+def _fresh(project: Path) -> None:
+    """A project of nothing but the product's sources."""
+    shutil.rmtree(project, ignore_errors=True)
+    (project / ".dvc").mkdir(parents=True)
+    for package in ("pipeline", "serving"):
+        shutil.copytree(ROOT / package, project / package)
+    for name in PROJECT:
+        shutil.copy(ROOT / name, project / name)
+    subprocess.run(["git", "init", "--quiet"], check=True, cwd=project)
+    (project / "params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
+
+
+def _loopwright(project: Path, *words: str) -> tuple[int, list[str]]:
+    """Exit status of a command and the lines that it printed."""
+    own = {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(project)}
+    done = subprocess.run(
+        [sys.executable, "-m", "pipeline", *words],
+        cwd=project, env={**os.environ, **own}, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    return done.returncode, [f"$ loopwright {' '.join(words)}", *done.stdout.splitlines()]
