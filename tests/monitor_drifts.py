@@ -22,8 +22,8 @@ FILE = Path(__file__).parents[1] / "benchmarks" / "monitor.py"
 BLOCKS = {"thiosulfate_cstr": 10}
 # Of what differs from the run before, but for the drift: set points and noise. The first is also looked at without it.
 SEEDS: dict[str, tuple[int, ...]] = {"ph_neutralization_15s": (8, 9, 10, 11)}
-# Parameter, share, the verdicts that tell it, periods within which one does. A weaker buffer makes the loop of 15 s
-# miss its set points and move its MV more, and both charts see it in the same few blocks: the noise says which is first.
+# Parameter, share, the verdicts that tell it, periods within which one does. With less buffer the loop of 15 s
+# misses its set points and moves its MV more, and both charts see it in the same blocks: the noise says which is first.
 DRIFTS = {
     "thiosulfate_cstr": ("k0", -0.2, ("T_j at rest",), 1_000),
     "ph_neutralization": ("q1", 0.2, ("q3 moves",), 200),
