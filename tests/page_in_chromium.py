@@ -29,19 +29,27 @@ def served(tmp_path_factory: pytest.TempPathFactory, pi_file: Path) -> Iterator[
     made.close()
 
 
+@pytest.fixture(scope="module")
+def bare(served: tuple[FakeLoop, str, str]) -> tuple[str, str]:
+    """What the loop is and how it stands, before any test."""
+    return json.dumps(served[0].about), json.dumps(served[0].state)
+
+
 @pytest.fixture
-def loop(served: tuple[FakeLoop, str, str]) -> Iterator[FakeLoop]:
-    """Two set points with more digits than are shown, and an MV of three values."""
-    made = served[0]
-    about, state = json.dumps(made.about), dict(made.state)
+def loop(served: tuple[FakeLoop, str, str], bare: tuple[str, str]) -> FakeLoop:
+    """Two set points with more digits than are shown, and an MV of three values.
+
+    It stands so from one moment to the next: a page that is opened now may be answered what was asked for another one
+    before, and a loop that stood in between at its first scan would have it draw the trend up to there.
+    """
+    made, (about, state) = served[0], map(json.loads, bare)
     sp = [{"name": name, "unit": "K", "low": 0.0, "high": 1.0} for name in ("a", "b")]
-    made.about["signals"] = {"sp": sp, "pv": sp, "dv": [], "mv": [{**sp[0], "name": "u", "values": THIRDS}]}
-    made.state.update(sp=[0.6123456, 0.3456789], pv=[0.5, 0.4], mv=[1 / 3], applied=[1 / 3], time=BEGIN + 100)
+    signals = {"sp": sp, "pv": sp, "dv": [], "mv": [{**sp[0], "name": "u", "values": THIRDS}]}
+    stands = {"sp": [0.6123456, 0.3456789], "pv": [0.5, 0.4], "mv": [1 / 3], "applied": [1 / 3], "time": BEGIN + 100}
+    made.about, made.state = {**about, "signals": signals}, {**state, **stands}
+    made.unproven = ""
     made.changes.clear()
-    yield made
-    made.about = json.loads(about)
-    made.state.clear()
-    made.state.update(state)
+    return made
 
 
 @pytest.fixture

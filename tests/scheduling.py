@@ -35,7 +35,7 @@ KEEP_TIME = (
     *("test_watching.py", "test_starting.py"),
 )
 LONG = (
-    *("test_laws_contract.py", "test_pipeline.py", "test_benchmark_of_monitor.py", "test_real_servers.py"),
+    *("test_laws_contract.py", "test_pipeline.py", "test_real_servers.py", "test_drifts_of_every_case.py"),
     *("test_screen_by_dvc.py", "test_export_to_controller.py", "test_identified_part.py"),
     *("test_new.py", "test_tracking.py", "test_embed.py", "test_predictive.py", "test_manual_builds.py"),
     *("test_fusion.py", "test_c_host.py", "test_cluster_stages.py", "test_cluster.py", "test_node_host.py"),

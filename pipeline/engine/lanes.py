@@ -11,7 +11,7 @@ once those beside it have ended. Results are those of one lane.
 What the lanes write comes line by line to one output, with each stage announced by its number among those ``of``
 which the run may have to run. After SIGINT or SIGTERM no line comes any more, and no stage begins. DVC itself is not
 interrupted while it may be writing down a finished stage: the run's door shuts, by which the stage that runs ends and
-the next is refused, so that DVC ends by itself.
+the next is refused, so that DVC ends by itself. What DVC wrote before the signal says whether it had begun a stage.
 """
 
 from __future__ import annotations
@@ -74,6 +74,7 @@ class _Lanes:
         self.announcements = announcements
         self.bars = Bars(Console())
         self.stopped, self.patience_ends = 0, float("inf")  # the signal that ended the run; when DVC is ended, too
+        self.told = False  # whether those that run no stage were ended, once the run was to end
         self.running = dict[subprocess.Popen[bytes], _Lane]()
         for asked in (signal.SIGINT, signal.SIGTERM):
             if signal.getsignal(asked) != signal.SIG_IGN:
@@ -89,12 +90,15 @@ class _Lanes:
                     waiting.register(process.stdout, selectors.EVENT_READ, process)  # type: ignore[arg-type]
                 if self.stopped and time.monotonic() > self.patience_ends:
                     self._end(self.running)
-                for key, _ in waiting.select(0.5):
+                stopping = bool(self.stopped) and not self.told
+                for key, _ in waiting.select(0 if stopping else 0.5):
                     if self._passed_on(key.data):
                         continue
                     waiting.unregister(key.fileobj)
                     code = self._ended(key.data)
                     first = first or code
+                if stopping:  # a pipe holds no more than was just read of it
+                    self._end_idle()
         return 128 + self.stopped if self.stopped else first
 
     def _begun(self, arguments: list[str]) -> subprocess.Popen[bytes]:
@@ -150,6 +154,10 @@ class _Lanes:
             return
         self.bars = Bars(Console())
         self.stopped, self.patience_ends = number, time.monotonic() + GRACE_S
+
+    def _end_idle(self) -> None:
+        """End DVC where no stage ran that it may be writing down, or where nothing else ends its stage."""
+        self.told = True
         served = DOOR in os.environ  # by a process that ends the stages
         self._end([process for process, lane in self.running.items() if not (served and lane.ran)])
 

@@ -23,6 +23,7 @@ _REPLACED: dict[Any, tuple[OpOverload, Callable[..., tuple[tuple[Any, ...], dict
     aten.__and__.Tensor: (aten.bitwise_and.Tensor, lambda x, other: ((x, other), {})),
     aten.to.dtype: (aten._to_copy.default, lambda x, dtype: ((x,), {"dtype": dtype})),
 }
+_IDENTITY = aten.eye.default  # which the trace writes where a law makes one
 _DROPPED = {aten._assert_tensor_metadata.default}  # by the exporter, after
 _operators = cache(ONNXRegistry.from_torchlib)
 _decomposed = _fx_passes.decompose_with_registry
@@ -46,6 +47,9 @@ def nothing_twice() -> Iterator[None]:
 
 def _decomposed_if_needed(exported_program: ExportedProgram, registry: ONNXRegistry) -> ExportedProgram:
     """The program without the operations that ONNX lacks; traced again where it has others than those named here."""
+    for node in exported_program.graph.find_nodes(op="call_function", target=_IDENTITY):
+        if len(node.args) == 1:
+            _spell_out_identity(node)
     calls = [node for node in exported_program.graph.nodes if node.op == "call_function"]
     replaced = [node for node in calls if node.target in _REPLACED and len(node.args) == 2 and not node.kwargs]
     if not all(node in replaced or _kept(node, registry) for node in calls):
@@ -54,6 +58,27 @@ def _decomposed_if_needed(exported_program: ExportedProgram, registry: ONNXRegis
         node.target, operands = _REPLACED[node.target]
         node.args, node.kwargs = operands(*node.args)
     return exported_program
+
+
+def _spell_out_identity(node: torch.fx.Node) -> None:
+    """Put in place of an identity matrix what torch makes of it when it traces again: where rows meet columns."""
+    graph, fake = node.graph, node.meta["val"].fake_mode
+
+    def call(operator: OpOverload, *operands: Any, **more: Any) -> torch.fx.Node:
+        made: torch.fx.Node = graph.call_function(operator, operands, more)
+        made.meta.update(node.meta)
+        with fake:
+            made.meta["val"] = operator(
+                *(o.meta["val"] if isinstance(o, torch.fx.Node) else o for o in operands), **more
+            )
+        return made
+
+    counted = {"dtype": torch.uint8, "device": node.meta["val"].device, "pin_memory": False}
+    with graph.inserting_before(node):
+        rows, columns = (call(aten.arange.default, *node.args, **counted) for _ in range(2))
+        met = call(aten.eq.Tensor, call(aten.unsqueeze.default, rows, -1), columns)
+        node.replace_all_uses_with(call(aten._to_copy.default, met, dtype=node.meta["val"].dtype))
+    graph.erase_node(node)
 
 
 def _kept(node: torch.fx.Node, registry: ONNXRegistry) -> bool:

@@ -17,15 +17,17 @@ from pipeline.engine.start import DOOR
 ROOT = Path(__file__).parents[2]
 # In place of DVC: says what it was asked, then what the name of its last stage tells it to do.
 DVC = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 asked = [a for a in sys.argv[1:] if not a.startswith("-")][1:]
+last = asked[-1] if asked else ""
+if last == "unheard":  # what is written from here on is not read until the lanes go on
+    os.kill(os.getppid(), signal.SIGSTOP)
 with open("asked", "a") as file:
     print(*sys.argv[1:], file=file)
 print("Stage 'code' didn't change, skipping", flush=True)
 print("ran", *asked, flush=True)
 print("Running stage 'fit@x':", flush=True)
-last = asked[-1] if asked else ""
 if last.startswith("meets-"):
     Path(last).touch()
     other = Path("meets-b" if last == "meets-a" else "meets-a")
@@ -34,11 +36,16 @@ if last.startswith("meets-"):
         if time.monotonic() > end:
             sys.exit("alone")
         time.sleep(0.01)
-if last == "waits":
+if last in ("waits", "unheard"):
     import subprocess
     stage = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])  # holds the output open
     Path("pid").write_text(str(stage.pid))
     stage.wait()
+    if last == "unheard":
+        import fcntl, termios
+        while any(fcntl.ioctl(1, termios.FIONREAD, bytes(4))):
+            time.sleep(0.01)
+    Path("written").touch()  # as dvc.lock would be
     print("ERROR: failed to reproduce 'fit@x'", flush=True)
     while "--keep-going" in sys.argv:
         time.sleep(0.01)
@@ -110,16 +117,24 @@ def test_lanes_that_are_ended_end_the_stages_that_run(folder: Path, asked: signa
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
 @pytest.mark.parametrize("further", [[], ["--keep-going"]])
+@pytest.mark.parametrize(("stage", "lines"), [("waits", ["ran waits", "stage 1 of 1: fit x"]), ("unheard", [])])
 def test_dvc_ends_by_itself_where_its_stage_is_ended(
-    folder: Path, further: list[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path, further: list[str], stage: str, lines: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A signal in the middle of writing dvc.lock would cost the finished stages; what it then says is of no use."""
+    """A signal in the middle of writing dvc.lock would cost the finished stages; what it then says is of no use.
+
+    So it is where the lanes had no time to read, before the signal, that the stage had begun.
+    """
     monkeypatch.setenv(DOOR, "which shuts, so that stages end")
-    process = begin(folder, "repro", *further, "waits")
+    process = begin(folder, "repro", *further, stage)
+    assert process.stdout is not None
+    told = [process.stdout.readline().rstrip() for _ in lines]
     pid = folder / "pid"
     assert within(30, lambda: pid.exists() and bool(pid.read_text()))
     process.send_signal(signal.SIGTERM)
     os.kill(int(pid.read_text()), signal.SIGTERM)  # as the shutting door does
+    process.send_signal(signal.SIGCONT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM
-    assert (out.splitlines(), err) == (["ran waits", "stage 1 of 1: fit x"], "")
+    assert (told, out, err) == (lines, "", "")
+    assert (folder / "written").exists()

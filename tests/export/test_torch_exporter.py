@@ -22,7 +22,8 @@ Make = Callable[..., ControlLaw]
 def replaced(law: Any, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
     """One of each operation that is replaced."""
     both = (sp > 0.3) & (pv[:1] > 0.4)
-    return law.limited(1.0 - both.to(torch.float64) * sp + pv[:1], mv_applied), state, pv[:1]
+    one_and_none = torch.eye(2, dtype=torch.float64) @ torch.cat([sp, pv[:1]])
+    return law.limited(1.0 - both.to(torch.float64) * one_and_none[:1] + one_and_none[1:], mv_applied), state, pv[:1]
 
 
 def written_in_place(law: Any, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
@@ -33,7 +34,7 @@ def written_in_place(law: Any, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: T
 
 def lacking(law: Any, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
     return (
-        law.limited(sp + torch.eye(1, dtype=torch.float64)[0] * pv[:1], mv_applied),
+        law.limited(sp + torch.eye(1, 1, dtype=torch.float64)[0] * pv[:1], mv_applied),
         state,
         pv[:1],
     )

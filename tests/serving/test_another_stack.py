@@ -219,9 +219,10 @@ def _fault_and_restart(settings: Path, server: NodeServer) -> None:
 
 
 def test_a_channel_that_lasts_some_seconds_is_renewed_under_the_loop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: NodeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """This server forgets a token after five quarters of its lifetime, and takes nothing more under it."""
+    shutil.copytree(server.folder / "pki", tmp_path / "pki")  # its keys, which take seconds to make
     server = NodeServer(tmp_path, str(LIFETIME_MS))
     server.start()
     loop = RunningLoop(settings_of(server, monkeypatch, PATIENT_SPEED))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
-import shlex
 import shutil
 import signal
 import subprocess
@@ -17,7 +17,7 @@ import pytest
 import yaml
 from processes import within
 
-from pipeline.engine.dvc import COMMAND
+from pipeline.engine.dvc import COMMAND, PYTHON
 from pipeline.engine.start import STAGES
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
@@ -37,10 +37,29 @@ ENVIRONMENT = {
     "LOOPWRIGHT_WORKERS": "1",  # each loads its libraries for seconds, and these stages are small
     STAGES: "excite,fit,design,validate",
 }
+# Runs DVC with one list of arguments after another, each in a process of its own that begins with DVC loaded: loading
+# takes as long as most of what it does. Another program than DVC is run as it is.
+WARM = """
+import json, os, subprocess, sys
+import dvc.cli, dvc.cli.parser, dvc.commands.repro, dvc.commands.status, dvc.repo.reproduce, dvc.repo.status
+for line in sys.stdin:
+    program, *arguments = json.loads(line)
+    child = os.fork() if program == "dvc" else None
+    if child == 0:
+        os.dup2(1, 2)
+        code = dvc.cli.main(arguments)
+        sys.stdout.flush()
+        os._exit(code)
+    if child is None:
+        code = subprocess.run([program, *arguments], stderr=subprocess.STDOUT).returncode
+    else:
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    print("ended with", code, flush=True)
+"""
 
 
 class Copy:
-    """A copy of the repository in which DVC runs, in a shell whose stages share one cluster."""
+    """A copy of the repository in which DVC runs, in a shell (see WARM) whose stages share one cluster."""
 
     def __init__(self, path: Path, shell: subprocess.Popen[str]) -> None:
         self.path, self.shell = path, shell
@@ -52,11 +71,11 @@ class Copy:
         assert found.returncode == 0, found.stdout
         return found.stdout
 
-    def warm(self, command: str) -> tuple[str, int]:
+    def warm(self, *command: str) -> tuple[str, int]:
         """Run a command in the shell; what it printed and its exit status."""
         assert self.shell.stdin is not None
         assert self.shell.stdout is not None
-        self.shell.stdin.write(f"{command} 2>&1; echo ended with $?\n")
+        self.shell.stdin.write(f"{json.dumps(command)}\n")
         self.shell.stdin.flush()
         said = ""
         while not (end := re.search(r"^ended with (\d+)$", said, re.MULTILINE)):
@@ -65,11 +84,14 @@ class Copy:
             said += line
         return said[: end.start()], int(end[1])
 
+    def dvc(self, *arguments: str) -> str:
+        said, code = self.warm("dvc", *arguments)
+        assert code == 0, said
+        return said
+
     def repro(self, *targets: str) -> set[str]:
         """Run the pipeline, or what some stages need; the stages that ran, by name."""
-        said, code = self.warm(shlex.join([*COMMAND, "repro", *targets]))
-        assert code == 0, said
-        return set(re.findall(r"Running stage '([^']+)'", said))
+        return set(re.findall(r"Running stage '([^']+)'", self.dvc("repro", *targets)))
 
     def edit(self, keys: Sequence[str], value: object) -> None:
         path = self.path / "params.yaml"
@@ -110,7 +132,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
     tree["cases"][CASE]["held_out_seeds"] = tree["cases"][CASE]["held_out_seeds"][:1]
     (path / "params.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     subprocess.run(["git", "init", "--quiet"], cwd=path, check=True)
-    warm = [sys.executable, "-m", "pipeline.engine.with_cluster", "bash"]
+    warm = [sys.executable, "-m", "pipeline.engine.with_cluster", *PYTHON, "-c", WARM]
     with subprocess.Popen(
         warm, cwd=path, env=ENVIRONMENT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as shell:
@@ -136,7 +158,7 @@ def test_every_output_is_there(copy: Copy) -> None:
 
 def test_a_second_run_does_nothing(copy: Copy) -> None:
     assert copy.repro() == set()
-    assert "up to date" in copy.run(*COMMAND, "status")
+    assert "up to date" in copy.dvc("status")
 
 
 def test_another_number_reruns_its_own_design_and_validation_only(copy: Copy) -> None:
@@ -169,7 +191,7 @@ def test_a_run_killed_in_the_middle_loses_nothing(copy: Copy) -> None:
     ran = copy.repro(*LAWS)
     assert {f"fit@{CASE}-linearized", f"design@{PID}"} <= ran
     assert not {s for s in ran if s.startswith("excite") or s.endswith(("-inverse", "-inc"))}
-    assert "up to date" in copy.run(*COMMAND, "status", "--with-deps", *LAWS)
+    assert "up to date" in copy.dvc("status", "--with-deps", *LAWS)
     assert (copy.path / "artifacts" / CASE / "inc.onnx").read_bytes() == before
 
 
@@ -214,7 +236,7 @@ def _marked(variable: bytes) -> list[str]:
 
 def test_a_mistake_in_the_parameters_is_one_line(copy: Copy) -> None:
     copy.edit(("controllers", PID, "narowing"), 2.0)
-    said, code = copy.warm(f"python -m pipeline.engine.start design {PID}")
+    said, code = copy.warm("python", "-m", "pipeline.engine.start", "design", PID)
     assert code == 2
     assert said.count("\n") == 1
     assert f"controllers.{PID}: unknown key 'narowing'" in said

@@ -32,6 +32,8 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
             items, outputs = listed(reading)
             after = choose(items.choices, [item for _, item in outputs if isinstance(item, Item)])
             candidates.append((after, items, outputs, reading))
+            if not reading.without_factors:  # the next would be the same
+                break
     after, items, outputs, _ = min(candidates, key=lambda c: c[0])
     if after > (1 - LEAST_SHARE) * candidates[0][3].price_before:
         return model

@@ -18,8 +18,8 @@ LEAST_GAIN = 0.01  # ns
 def choose(choices: list[Choice], roots: list[Item]) -> float:
     """Choose a form for each value; the price of all [ns]."""
     found = []
-    for preference in PREFERENCES:
-        account = _with(preference, choices, roots)
+    for kinds in dict.fromkeys(_preferred(preference, choices) for preference in PREFERENCES):
+        account = _with(kinds, choices, roots)
         _sweep(account, choices)
         found.append((account.total, [c.kind for c in choices]))
         _without(account, roots)
@@ -55,10 +55,15 @@ def _improve(account: Account, choice: Choice) -> None:
         account.choose(choice, best)
 
 
-def _with(preference: tuple[str, ...], choices: list[Choice], roots: list[Item]) -> Account:
+def _preferred(preference: tuple[str, ...], choices: list[Choice]) -> tuple[str, ...]:
+    """The kind of form of each choice that comes first."""
+    return tuple(next((k for k in preference if k in c.forms), next(iter(c.forms))) for c in choices)
+
+
+def _with(kinds: tuple[str, ...], choices: list[Choice], roots: list[Item]) -> Account:
     account = Account()
-    for choice in choices:
-        account.choose(choice, next((kind for kind in preference if kind in choice.forms), next(iter(choice.forms))))
+    for choice, kind in zip(choices, kinds, strict=True):
+        account.choose(choice, kind)
     for root in roots:
         account.need(root)
     return account

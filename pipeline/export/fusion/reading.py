@@ -23,14 +23,17 @@ GUARDS = frozenset({"Where", "Clip", "Min", "Max", "Tanh", "Sigmoid", "Softmax",
 
 
 class Reading:
-    """The graph, read. ``price_before`` is what its operators cost [ns]; without ``factors`` products keep theirs."""
+    """The graph, read. ``price_before`` is what its operators cost [ns]; without ``factors`` products keep theirs.
+
+    ``without_factors`` says whether any product had one to lose, so that the two readings may differ.
+    """
 
     def __init__(self, model: onnx.ModelProto, *, factors: bool) -> None:
         graph = model.graph
         found, _ = graph_values(read_model(model.SerializeToString())["graph"])
         self._shapes = {name: v.shape for name, v in found.items()}
         self._types = {OWN: DOUBLE, **{name: v.dtype for name, v in found.items()}}
-        self._factors = factors
+        self._factors, self.without_factors = factors, False
         self._known: dict[Any, Value] = {}
         self._computed: dict[Any, list[Value]] = {}
         self._sliced: set[str] = set()
@@ -123,7 +126,9 @@ class Reading:
             if found is not None:
                 return [found]
         if self._factors and op in ("Mul", "Div"):
+            known = len(self.values)
             operands, factor = normal_form.without_factors(self, op, operands, shapes[0])
+            self.without_factors |= factor is not None or len(self.values) > known
         if op == "Min":
             op, operands, attributes = normal_form.clipped(self, operands, attributes, shapes[0])
         key = (op, tuple(map(_key, operands)), tuple(sorted((k, str(v)) for k, v in attributes.items())))
