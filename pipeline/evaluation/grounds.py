@@ -64,6 +64,7 @@ class Grounds:
     unproven: tuple[str, ...] = ()
     record: RecordVerdict | None = None
     farthest: Mapping[str, str] = field(default_factory=dict)
+    ahead: int | None = None  # samples that the fit was predicted ahead at most, of a record in closed loop; None: all
 
     @property
     def doubt(self) -> str:
@@ -87,7 +88,8 @@ class Grounds:
         inside = "set points stay within the data" if not self.set_points else f"set points go {_far(self.set_points)}"
         left = "PVs and MVs do, too" if not self.set_points else "PVs and MVs stay within"
         loops = left if not self.loops else f"in closed loop {_far(self.loops, 'goes', self.farthest)}"
-        return f"free-run fit over unseen rows: {fits}; {inside}; {loops}"
+        how = "free-run fit" if self.ahead is None else f"fit of predictions up to {self.ahead} samples ahead"
+        return f"{how} over unseen rows: {fits}; {inside}; {loops}"
 
     @property
     def warning(self) -> str:
@@ -105,8 +107,9 @@ class Grounds:
     def to_dict(self) -> dict[str, Any]:
         """For the manifest: the figures, and the sentence."""
         figures = asdict(self)
-        unproven, record, _ = (figures.pop(name) for name in ("unproven", "record", "farthest"))
+        unproven, record, _, ahead = (figures.pop(name) for name in ("unproven", "record", "farthest", "ahead"))
         further = {"unproven": list(unproven)} if unproven else {}
+        further |= {} if ahead is None else {"ahead": ahead}
         further |= {"data": record["carries"], "data_reasons": list(record["reasons"])} if record else {}
         return {"words": self.words, **figures, **further}
 

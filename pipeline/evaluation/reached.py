@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.model_evidence import IDENTIFIED
+from pipeline.evaluation.model_evidence import IDENTIFIED, identified_part
 from pipeline.evaluation.proof import fit_doubts, sign_doubts
 from pipeline.plants.simulator import Array
 from pipeline.simulation.simulate import Trajectory
@@ -52,6 +52,7 @@ def grounds_of(case: Case, models: Mapping[str, Any], reached: Mapping[str, Rang
         tuple(why for why in unproven if why),
         case.record_verdict,
         {name: max(left, key=lambda law: left[law].get(name, 0.0)) for name in loops if "" not in left},
+        (identified_part({"": models}).get("structure") or {}).get("rows_ahead"),
     )
 
 

@@ -132,19 +132,21 @@ def free_run_picture(evidence: Evidence) -> Canvas:
     cvs = evidence.case.plant_class.sp_signals[: measured.shape[1]]
     canvas = Canvas(figsize=(SIZE[0] * 1.15, 0.9 + 3.0 * len(cvs)), layout="constrained")
     panels = canvas.subplots(2 * len(cvs), 2, squeeze=False, width_ratios=(3, 1), height_ratios=(2, 1) * len(cvs))
+    rows = (identified_part(evidence.models).get("structure") or {}).get("rows_ahead")
+    label = "free run of the model" if rows is None else f"predicted by the model up to {rows} samples ahead"
     for i, cv in enumerate(cvs):
-        _free_run_of(panels[2 * i : 2 * i + 2], arrays["time_s"], measured[:, i], run[:, i], cv)
+        _free_run_of(panels[2 * i : 2 * i + 2], arrays["time_s"], measured[:, i], run[:, i], cv, label)
     legend_below(canvas, *panels[0][0].get_legend_handles_labels())
     fit_labels(canvas)
     return canvas
 
 
-def _free_run_of(panels: Any, time_s: Array, measured: Array, run: Array, cv: Signal) -> None:
+def _free_run_of(panels: Any, time_s: Array, measured: Array, run: Array, cv: Signal, label: str) -> None:
     (above, beside), (below, spread) = panels
     time, words = time_axis(time_s[:SHOWN])
     residual = measured - run
     above.plot(time, measured[:SHOWN], color="black", linewidth=0.9, label="measured")
-    above.plot(time, run[:SHOWN], color=PALETTE[0], linewidth=1.2, label="free run of the model")
+    above.plot(time, run[:SHOWN], color=PALETTE[0], linewidth=1.2, label=label)
     above.set_ylabel(signal_label(cv))
     below.plot(time, residual[:SHOWN], color=LAW, linewidth=0.8)
     below.set_ylabel(axis_label("residual", cv.unit), fontsize=8.5)

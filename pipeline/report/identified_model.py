@@ -34,7 +34,7 @@ class ModelSection:
 
 VARIABLES = (
     "Variable",
-    "Free-run fit",
+    "Fit",
     "RMSE",
     "RMSE low, middle, high",
     "Noise",

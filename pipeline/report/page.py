@@ -190,8 +190,10 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
             rows.append((f"{number(late)} {unit}".rstrip(), words))
     rows = [*rows[:MOST_HEADLINES], *_of_each_cv(evidence, best, name_of(evidence.main_test))]
     if evidence.grounds is not None:
+        rows_ahead = evidence.grounds.ahead
+        how = "free-run fit" if rows_ahead is None else f"fit up to {rows_ahead} samples ahead"
         rows += [
-            ("none" if fit is None else f"{fit:.3g} %", f"free-run fit of {name} by the models, over unseen rows")
+            ("none" if fit is None else f"{fit:.3g} %", f"{how} of {name} by the models, over unseen rows")
             for name, fit in evidence.grounds.fit.items()
         ]
     late_s = evidence.late_s(evidence.main_test)

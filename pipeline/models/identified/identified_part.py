@@ -70,7 +70,10 @@ class IdentifiedPart(Part):
     given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
     one core (None: 2, and 2 more for each further output), counted in nominal work so that results are reproducible;
     the best so far is kept. ``rows`` is the most rows that are fitted; of longer records the stretches in which the
-    inputs move most.
+    inputs move most, and three times as many where the MVs follow the outputs.
+
+    Where the MVs follow the outputs, and no ``correction`` is given, models with their noise are fitted and judged by
+    one-step errors in place of free runs.
     """
 
     model: ClassVar[type[Model]] = Identified

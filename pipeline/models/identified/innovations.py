@@ -31,6 +31,9 @@ BURN_IN = 0.1
 LEAST, MOST = 20, 300
 """Rows at the beginning of a stretch that do not count while the filter forgets its start: a share, and its ends."""
 
+AHEAD = 30
+"""Rows that figures of a model with its noise are predicted ahead, at most: about as far as a controller looks."""
+
 LEAST_NOISE = 0.01
 """Share of an innovation's variance that is at least measurement noise."""
 
@@ -131,12 +134,38 @@ def innovations(model: Dynamics, data: Sequence[Stretch]) -> Array | None:
     found = []
     n_y = data[0].y.shape[1]
     for stretch in data:
-        run = model.free_run(np.r_[stretch.y[0], np.zeros(model.n_x - n_y)], stretch)
+        run = _filtered(model, stretch)
         if run is None:
             return None
-        begins = min(int(np.clip(BURN_IN * len(stretch), LEAST, MOST)), len(stretch) // 2)
-        found.append((stretch.y - run[0][:, :n_y])[begins:])
+        found.append((stretch.y - run[:, :n_y])[_begins(stretch) :])
     return np.concatenate(found)
+
+
+def ahead(model: Innovations, stretch: Stretch, rows: int = AHEAD) -> tuple[Array, Array]:
+    """(measured, predicted) (n, n_y) over the rows that count, predicted 1 to ``rows`` rows ahead in turn.
+
+    Every ``rows`` rows a run without correction begins from the filter's state. Not finite where one explodes.
+    """
+    n_y, begins = stretch.y.shape[1], _begins(stretch)
+    states, free = _filtered(model, stretch), replace(model, gain=np.zeros_like(model.gain))
+    predicted = np.full((len(stretch), n_y), np.nan)
+    for first in range(begins, len(stretch) if states is not None else 0, rows):
+        part = slice(first, first + rows)
+        run = None if states is None else free.free_run(states[first], Stretch(stretch.y[part], stretch.v[part]))
+        if run is not None:
+            predicted[part] = run[0][:, :n_y]
+    return stretch.y[begins:], predicted[begins:]
+
+
+def _filtered(model: Dynamics, stretch: Stretch) -> Array | None:
+    """States (n, n_x) foreseen by the filter from the first outputs, all else at zero; None where it explodes."""
+    run = model.free_run(np.r_[stretch.y[0], np.zeros(model.n_x - stretch.y.shape[1])], stretch)
+    return None if run is None else run[0]
+
+
+def _begins(stretch: Stretch) -> int:
+    """The first row that counts."""
+    return min(int(np.clip(BURN_IN * len(stretch), LEAST, MOST)), len(stretch) // 2)
 
 
 def typical(errors: Array | None) -> float:

@@ -23,6 +23,9 @@ NATS = 5.0
 LATER = (1, 2)
 """Rows on offer beyond the dead time that the impulse response shows: a sixth of the answer is over by then."""
 
+KEPT = 8
+"""Candidates of the first fold that are fitted on the others too."""
+
 LARGEST = 12
 """Most states of the plant on offer: the impulse response of a record in closed loop shows no more."""
 
@@ -35,7 +38,7 @@ TRAINED = 60
 
 def nats(problem: Problem, worse: Trial, better: Trial) -> float:
     """Log-likelihood of the held-out rows by which one trial is better than another, n_y n log(e/e')."""
-    rows = sum(f.held.stop - f.held.start for f in problem.folds)
+    rows = sum(problem.folds[k].held.stop - problem.folds[k].held.start for k in worse.folds)
     return float(problem.data.y.shape[1] * rows * np.log(worse.error / better.error))
 
 
@@ -61,7 +64,7 @@ class NoiseSearch:
         )
 
     def linear(self, orders: Sequence[int]) -> list[Trial]:
-        """The linear candidates over all folds, the best first; ModelError where none can be fitted."""
+        """The best linear candidates over all folds, the best first; ModelError where none can be fitted."""
         delays = list(dict.fromkeys(s.delays for s, _ in self.linears.starts))
         structures = [
             Structure("balanced", n, (0, 0), d, noise=noise)
@@ -70,28 +73,35 @@ class NoiseSearch:
             for d in delays
             for noise in ("gain", "all")
         ]
-        tasks = [Task(s, k, ITERATIONS, start=self.linears.start(s, k)) for s in structures for k in self._folds]
+        affordable = self.rounds.affordable(structures, ITERATIONS, 0.5)
+        tasks = [Task(s, 0, ITERATIONS, start=self.linears.start(s, 0)) for s in affordable]
         trials, reasons = self.rounds.trials(tasks, "linear models with their noise")
-        whole = [t for t in trials if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
-        if not whole:
+        finite = [t for t in trials if np.isfinite(t.error)]
+        if not finite:
             why = reasons[0] if reasons else "every filter over held-out rows explodes"
             raise ModelError(f"no linear model fits the record: {why}")
-        return self.ranked(whole)
+        shortlist = self.ranked(finite)[:KEPT]
+        further = [
+            Task(t.structure, k, ITERATIONS, start=self.linears.start(t.structure, k))
+            for t in shortlist
+            for k in self._folds[1:]
+        ]
+        others = {t.structure: t.fits for t in self.rounds.trials(further, "the best of them on all rows")[0]}
+        whole = [Trial(t.structure, {**t.fits, **others.get(t.structure, {})}) for t in shortlist]
+        whole = [t for t in whole if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
+        return self.ranked(whole) if whole else shortlist
 
     def networks(self, linear: Sequence[Trial], units: Sequence[int]) -> list[Trial]:
         """Networks on the best linear candidates, trained over all folds from several seeds."""
         bases = linear[:UNITS_OF]
         offers = [(replace(t.structure, n_hidden=n, ridge=RIDGE, noise="all"), t) for t in bases for n in units[:2]]
         tasks = [
-            Task(s, k, TRAINED, seed, base=t.fits[k, 0])
-            for s, t in offers
-            for seed in range(SEEDS)
-            for k in self._folds
+            Task(s, k, TRAINED, seed, base=t.fits[k, 0]) for s, t in offers for seed in range(SEEDS) for k in t.folds
         ]
         costs = np.cumsum([self.rounds.budget.of(t.structure, t.iterations) for t in tasks])
         affordable = [t for t, cost in zip(tasks, costs, strict=True) if cost <= self.rounds.budget.left()]
         trials, _ = self.rounds.trials(affordable, "neural networks with their noise")
-        return sorted((t for t in trials if len(t.folds) == len(self._folds)), key=lambda t: t.error)
+        return sorted((t for t in trials if t.folds == linear[0].folds), key=lambda t: t.error)
 
     def ranked(self, trials: Sequence[Trial]) -> list[Trial]:
         """Best first, by the log-likelihood of the held-out rows less one nat a state.

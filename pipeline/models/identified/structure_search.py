@@ -14,6 +14,9 @@ from pipeline.models.part import Groundwork, Source
 MINUTES = 2.0
 """Budget for each output, in minutes of one core."""
 
+MORE = 3
+"""Times as many rows of a record in closed loop: little of it tells of the plant, and one-step errors are quick."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Searched:
@@ -39,12 +42,12 @@ class StructureSearch(Groundwork[Searched]):
 
     def done(self, source: Source, label: str) -> Searched:
         """The search over the source's record; ModelError where it cannot carry a model."""
-        record = informative(source.data(self.kind), self.rows)
-        n_y = len(source.signals.pv if self.all_measured else source.signals.sp)
+        seen = source.data(self.kind)
+        n_y, n_mv = len(source.signals.pv if self.all_measured else source.signals.sp), len(source.signals.mv)
+        back = fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
+        record = informative(seen, MORE * self.rows if back else self.rows)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
-        n_mv, seen = len(source.signals.mv), source.data(self.kind)
-        back = fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
         problem = Problem(data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back)
         budget = Budget(60 * (MINUTES * n_y if self.minutes is None else self.minutes), len(data), n_y)
         least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))

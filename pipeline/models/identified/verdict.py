@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.metrics import fit_percent
 from pipeline.models.identified.assembly import dead_periods, step_responses
-from pipeline.models.identified.dynamics import Dynamics
+from pipeline.models.identified.dynamics import Dynamics, Stretch
+from pipeline.models.identified.innovations import AHEAD, Innovations, ahead
 from pipeline.models.identified.output_error import fit_starts
 from pipeline.models.identified.rests import central_map, settle, steady_gain
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
@@ -62,6 +63,7 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
         "drifts": selection.drifts,
         "noise": s.noise,
         "judged": _judged(selection),
+        "rows_ahead": None if selection.innovations is None else AHEAD,
         "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
         "held_out_spread": chosen.spread,
@@ -85,21 +87,16 @@ def free_run_figures(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 
+    Of a model with its noise the runs begin anew from its filter every ``AHEAD`` rows: a run over all of them would
+    hold the loads that the controller fought, and say nothing of the model.
     ``free_run_rmse`` and the PV's own deviation ``held_sd`` in its unit, ``fit_percent``, ``rmse_by_third``: where the
     PV was low, in the middle and high, and ``outside_training``: the share of these rows in which it left the range of
     the training rows, where the error says nothing of the other rows.
     """
     best = trial.of_fold(fold)[0]
     held = problem.held(trial.structure, fold)
-    plant = best.model.plant
-    starts = fit_starts(plant, held, problem.judged)
-    runs = [plant.free_run(x, s, problem.judged) for x, s in zip(starts, held, strict=True)]
-    actual = np.concatenate([s.y for s in held])
-    n_y = actual.shape[1]
-    predicted = np.concatenate(
-        [np.full(s.y.shape, np.nan) if r is None else r[0][:, :n_y] for r, s in zip(runs, held, strict=True)]
-    )
-    actual, predicted = (z * scales.y_scale + scales.y_center for z in (actual, predicted))
+    pairs = _ahead(best.model, held) if isinstance(best.model, Innovations) else _free(problem, best.model, held)
+    actual, predicted = (np.concatenate(of) * scales.y_scale + scales.y_center for of in zip(*pairs, strict=True))
     trained = (
         np.concatenate([part.y for part in problem.train(trial.structure, fold)]) * scales.y_scale + scales.y_center
     )
@@ -117,6 +114,18 @@ def free_run_figures(
             "rmse_by_third": [float(np.sqrt(np.mean(e**2))) if len(e) else None for e in thirds],
         }
     return figures, {"measured": actual, "free run": predicted}
+
+
+def _free(problem: Problem, model: Dynamics, held: Sequence[Stretch]) -> list[tuple[Array, Array]]:
+    """(measured, free run) (n, n_y) of each stretch."""
+    runs = zip(fit_starts(model, held, problem.judged), held, strict=True)
+    found = [(s, model.free_run(x, s, problem.judged)) for x, s in runs]
+    return [(s.y, np.full(s.y.shape, np.nan) if r is None else r[0][:, : s.y.shape[1]]) for s, r in found]
+
+
+def _ahead(model: Innovations, held: Sequence[Stretch]) -> list[tuple[Array, Array]]:
+    """(measured, predicted some rows ahead) (n, n_y) of each stretch."""
+    return [ahead(model, s) for s in held]
 
 
 # ---------------------------------------------------------------------- what the plant does
