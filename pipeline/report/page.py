@@ -89,6 +89,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "against": against(evidence),
         "caveat": _caveat(evidence, judged),
         "operated": () if evidence.grounds is None else evidence.grounds.operated,
+        "old_controllers": () if evidence.grounds is None else [one.words for one in evidence.grounds.old_controllers],
         "worst_pictures": of_kind("worst_").keys(),
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
         "withheld": by_reason(evidence.withheld),
