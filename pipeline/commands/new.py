@@ -196,7 +196,7 @@ def _write(
             record, simulator = folder / "record.parquet", folder / copy_name(made.plant.path)
             plant |= {"data": record.as_posix(), "source": [dict(f) for f in report.files]}
             plant |= {"simulator": simulator.as_posix()}
-        entries = entries_of(name, plant, export)
+        entries = entries_of(name, plant, export, report.old_controllers)
         try:
             lost = wishes_lost(name, entries)
             add_entries(entries, replace=options.replace, remove=[("exports", name)] if options.replace else ())

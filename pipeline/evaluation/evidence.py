@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -248,17 +249,27 @@ class Evidence:
     def best(self) -> str | None:
         """The law with the lowest error on the development sequences; no scored test is used.
 
-        A law that locked up on one of them, or that is not shipped, is left out. Without development figures the gate
-        score decides.
+        A law that locked up on one of them, or that is not shipped, is left out, and one that does not beat the loop
+        that the plant was run by before. Without development figures the gate score decides.
         """
         errors = {n: law.development for n, law in self.laws.items() if not self._withheld(n)}
         if all(error is None for error in errors.values()):
             errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
         scores = {n: e for n, e in errors.items() if e is not None}
-        return min(scores, key=lambda n: scores[n], default=None)
+        limit = scores.pop(self.case.old_loop, math.inf)
+        return min((n for n in scores if scores[n] < limit), key=lambda n: scores[n], default=None)
+
+    @property
+    def old_loop(self) -> str:
+        """The law that the plant was run by before, with its figures here; empty where none is known."""
+        return self.case.old_loop if self.case.old_loop in self.laws else ""
 
     def _withheld(self, law: str) -> bool:
         return self.case.on_models and self.laws[law].withheld
+
+    def _beats_old_loop(self, errors: Mapping[str, float]) -> str:
+        own, old = (f"{errors[law]:.3g} {self.case.unit}".rstrip() for law in (str(self.best), self.old_loop))
+        return f"its {self.case.criterion.short} over the development sequences is {own}, the old loop's {old}"
 
     @property
     def why_best(self) -> str:
@@ -267,6 +278,8 @@ class Evidence:
         errors = {n: law.development for n, law in shown.items() if law.development is not None}
         if self.best is None:
             return ""
+        if set(errors) - {self.best} == {self.old_loop}:
+            return f"no other law of ours is shipped, and {self._beats_old_loop(errors)}"
         if set(errors) == {self.best}:
             return "no other law is shipped"
         if not errors:

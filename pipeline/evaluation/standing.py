@@ -55,6 +55,7 @@ class Standing:
     reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
     grounds: Grounds | None = None  # what tests on models of the plant's record rest on
     times: str = "× NMPC"  # what ratios are to
+    old_loop: str = ""  # the law that the plant was run by before
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -89,12 +90,20 @@ class Standing:
             reproduced=(sum(judged), len(judged)),
             grounds=validation.grounds,
             times=validation.gate.times,
+            old_loop=validation.old_loop,
         )
 
     @property
     def best(self) -> LawStanding | None:
         """The best law of the case."""
         return next((law for law in self.laws if law.best), None)
+
+    @property
+    def over_old_loop(self) -> float | None:
+        """Share by which the best law's figure is below that of the old loop; None where one of them is missing."""
+        old = next((law.figure for law in self.laws if law.law == self.old_loop), None)
+        own = None if self.best is None else self.best.figure
+        return None if own is None or not old else 1 - own / old
 
 
 def withheld_in(folder: Path) -> dict[str, str]:

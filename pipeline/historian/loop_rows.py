@@ -24,6 +24,7 @@ class LoopRows:
     sp: Tag
     pv: Tag
     own_mvs: tuple[Tag, ...]  # the MV of the same name; where no name tells, all of them
+    same_name: bool  # whether a name tells
     automatic: bool  # whether a mode says which rows these are
     rows: NDArray[np.bool_]  # of the grid
     piece: NDArray[np.int64]  # (n,) counts up where rows are left out: what the MV did meanwhile is not this loop's
@@ -49,7 +50,7 @@ def loops(
             continue
         kept = np.flatnonzero(rows)
         piece = grid.piece[rows] + np.cumsum(np.diff(kept, prepend=kept[0] - 1) > 1)
-        yield LoopRows(sp, pv, tuple(mvs) if mv is None else (mv,), known, rows, piece)
+        yield LoopRows(sp, pv, tuple(mvs) if mv is None else (mv,), mv is not None, known, rows, piece)
 
 
 def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:

@@ -167,7 +167,7 @@ def _law(found: Fitted | None, loop: LoopRows, mv: Tag) -> OldController:
     signals = loop.pv.name, mv.name, loop.pv.unit, mv.unit
     if found is None:
         few = f"{np.count_nonzero(loop.rows)} rows are too few in which the loop is at work and the MV moves"
-        return OldController(*signals, 0.0, 0.0, 0.0, 0.0, 0, 0, 0, 0.0, few)
+        return OldController(*signals, 0.0, 0.0, 0.0, 0.0, 0, 0, 0, 0.0, loop.same_name, few)
     kc, on_sp, integral, derivative = (float(v) for v in found.numbers)
     return OldController(
         *signals,
@@ -179,6 +179,7 @@ def _law(found: Fitted | None, loop: LoopRows, mv: Tag) -> OldController:
         rows=found.windows.moved.size,
         window_rows=found.windows.moved.shape[1],
         share=found.share,
+        same_name=loop.same_name,
         doubt=_doubt(found),
     )
 

@@ -26,6 +26,7 @@ class OldController:
     rows: int  # of the windows that it was fitted on and scored on
     window_rows: int
     share: float  # of the MV's movement within a window, explained in windows that the fit never saw; at most 1
+    same_name: bool = False  # whether PV and MV belong together by the names of their tags
     doubt: str = ""  # why it is not believed, a clause; empty where it is
 
     @property

@@ -61,6 +61,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "noise": f"true output, noisy measurement{draws}",
         "floor": _floor(evidence),
         "best": best,
+        "old_loop_stands": bool(evidence.old_loop and shipped) and best is None,
         "nothing_shipped": bool(evidence.withheld or evidence.laws) and not shipped,
         "shown_law": evidence.best or next(iter(shipped), None),
         "seeds": "" if best is None else _seeds(best.seeds),
@@ -198,11 +199,37 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     late_s = evidence.late_s(evidence.main_test)
     compared = case.criterion.late if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, compared) for law in (best, case.baseline))
+    if evidence.old_loop and not evidence.no_baseline:
+        return [*over_old_loop(evidence, best), *rows]
     if own and other and own < other:
         where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
         lower = f"lower {case.criterion.long} than the {law_name(case.baseline)} on {where}"
         rows.append((f"{100 * (1 - own / other):.0f} %", lower))
     return rows
+
+
+def over_old_loop(evidence: Evidence, law: str) -> list[tuple[str, str]]:
+    """By how much a law's error is below that of the loop that the plant was run by before, and its travel beside it.
+
+    Empty where no test has both.
+    """
+    case, old, words = evidence.case, evidence.old_loop, []
+    for test in sorted(case.weights, key=lambda name: -case.weights[name]):
+        own, other = evidence.figure(law, test), evidence.figure(old, test)
+        if own is not None and other:
+            words.append((100 * (1 - own / other), scenario_name(test, case.recipe, case.test_words)))
+    if not words:
+        return []
+    (first, where), *rest = words
+    further = "".join(f"; {abs(share):.0f} % {_less(share)} on {test}" for share, test in rest)
+    own, other = (evidence.figure(name, evidence.main_test, "mv_travel") for name in (law, old))
+    travel = f". Its MV travel is {number(own / other)} times the old loop's" if own is not None and other else ""
+    lower = f"{_less(first)} {case.criterion.short} than the old loop on {where}{further}{travel}"
+    return [(f"{abs(first):.0f} %", lower)]
+
+
+def _less(share: float) -> str:
+    return "lower" if share >= 0 else "higher"
 
 
 def _of_each_cv(evidence: Evidence, law: str, where: str) -> list[tuple[str, str]]:

@@ -54,6 +54,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         given = _given(artifacts.parent / PARAMS_FILE, name)
         # A file that a controller left which has been taken out since says nothing.
         current = {law: why for law, why in withheld.items() if given is None or law in given}
+        current.pop(standing.old_loop, None)  # it is shown, and was never to be shipped
         for laws, why in by_reason(current).items():
             line = f"{name}: {laws} {'are' if ', ' in laws else 'is'} not shipped, {why}"
             console.print(line, style="red", markup=False, soft_wrap=True)
@@ -81,6 +82,9 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         best = next((law.law for law in standings[case].laws if law.best), None)
         if best is not None:
             console.print(f"the best   {where / f'{best}.onnx'}")
+            if (share := standings[case].over_old_loop) is not None:
+                words = f"{100 * abs(share):.0f} % {'lower' if share >= 0 else 'higher'} {standings[case].metric}"
+                console.print(f"           {words} than the old loop on {standings[case].test}", markup=False)
             for line in _beside_the_best(standings[case], shipped):
                 console.print(f"           {line}", style="red", markup=False, soft_wrap=True)
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
