@@ -15,7 +15,7 @@ from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
 from pipeline.cases.own_entries import OLD_LOOP
 from pipeline.cases.own_model import OwnPlant, Untrained, errors_of
-from pipeline.config.params import sections
+from pipeline.config.params import sections_of
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
@@ -215,7 +215,11 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
         "__module__": base.__module__,
         **({"gate": GATE_WITH_MEASURED} if dv else {}),
-        **({"old_loop": OLD_LOOP, "baseline": OLD_LOOP} if f"{name}-{OLD_LOOP}" in sections("controllers") else {}),
+        **(
+            {"old_loop": OLD_LOOP, "baseline": OLD_LOOP}
+            if f"{name}-{OLD_LOOP}" in sections_of("controllers", name)
+            else {}
+        ),
     }
     return type("OwnPlantCase", (base,), own | further)((9001, 9002, 9003))
 

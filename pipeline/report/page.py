@@ -24,6 +24,8 @@ from pipeline.report.law_tables import analyses, further_figures, law_row, scena
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
 from pipeline.report.worse import against, shipped_laws
+from pipeline.tuning.pid_forms import PidForms
+from pipeline.tuning.rules import PidSettings
 
 MOST_HEADLINES = 5
 
@@ -90,7 +92,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "against": against(evidence),
         "caveat": _caveat(evidence, judged),
         "operated": () if evidence.grounds is None else evidence.grounds.operated,
-        "old_controllers": () if evidence.grounds is None else [one.words for one in evidence.grounds.old_controllers],
+        "old_controllers": _old_controllers(evidence),
         "worst_pictures": of_kind("worst_").keys(),
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
         "withheld": by_reason(evidence.withheld),
@@ -206,6 +208,19 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
         lower = f"lower {case.criterion.long} than the {law_name(case.baseline)} on {where}"
         rows.append((f"{100 * (1 - own / other):.0f} %", lower))
     return rows
+
+
+def _old_controllers(evidence: Evidence) -> list[str]:
+    """The law of each loop of the record, a clause each; of one that is believed in all forms of control systems."""
+    words = []
+    spans = {s.name: s.high - s.low for s in (*evidence.case.record_signals.pv, *evidence.case.record_signals.mv)}
+    for law in () if evidence.grounds is None else evidence.grounds.old_controllers:
+        forms = ""
+        if law.believed and law.pv in spans and law.mv in spans:
+            of = PidForms.of(PidSettings(law.kc, law.ti_s, law.td_s), spans[law.pv], spans[law.mv])
+            forms = f"; {of.words(law.pv_unit, law.mv_unit)}"
+        words.append(law.words + forms)
+    return words
 
 
 def over_old_loop(evidence: Evidence, law: str) -> list[tuple[str, str]]:

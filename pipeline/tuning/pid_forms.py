@@ -39,22 +39,27 @@ class PidForms:
         return cls(kc, ti, td, kc / ti, kc * td, series, 100 * mv_span / pv_span / abs(kc))
 
     def words(self, pv_unit: str, mv_unit: str) -> str:
-        """All forms in one clause."""
+        """The forms beside the ideal one, in one clause."""
         per = f"{mv_unit or '1'}/({pv_unit or '1'})"
-        ideal = f"ideal: Kc {self.kc:.4g} {per}, {_times(self.ti_s, self.td_s)}"
         kd = f", Kd {self.kd:.4g} {per} s" if self.td_s else ""
-        parallel = f"parallel: Kp {self.kc:.4g} {per}, Ki {self.ki:.4g} {per}/s{kd}"
+        parallel = f"parallel form: Kp {self.kc:.4g} {per}, Ki {self.ki:.4g} {per}/s{kd}"
         if not self.td_s:
-            series = "series: as ideal"
+            series = "series form: as the ideal one"
         elif self.series is None:
-            series = "series: none, as Ti is less than 4 Td"
+            series = "series form: none, as Ti is less than 4 Td"
         else:
             kc, ti, td = self.series
-            series = f"series: Kc {kc:.4g} {per}, {_times(ti, td)}"
-        return f"{ideal}; {parallel}; {series}; proportional band: {self.band_percent:.4g} % of the ranges"
+            series = f"series form: Kc {kc:.4g} {per}, {_times(ti, td)}"
+        band = f"proportional band {self.band_percent:.4g} % of the ranges in params.yaml"
+        return f"{parallel}; {series}; {band}; {_minutes(self.ti_s, self.td_s)}"
 
 
 def _times(ti_s: float, td_s: float) -> str:
-    """Integral and derivative time, in seconds and minutes."""
-    integral = f"Ti {ti_s:.4g} s ({ti_s / 60:.3g} min)" if isfinite(ti_s) else "no integral part"
-    return f"{integral}, Td {td_s:.4g} s ({td_s / 60:.3g} min)" if td_s else integral
+    """Integral and derivative time."""
+    return f"Ti {ti_s:.4g} s, Td {td_s:.4g} s" if isfinite(ti_s) else f"no integral part, Td {td_s:.4g} s"
+
+
+def _minutes(ti_s: float, td_s: float) -> str:
+    """The times of the ideal form in minutes, and repeats a minute."""
+    integral = f"Ti {ti_s / 60:.4g} min or {60 / ti_s:.4g} repeats a minute" if isfinite(ti_s) else "no integral part"
+    return f"{integral}, Td {td_s / 60:.4g} min" if td_s else integral

@@ -26,7 +26,7 @@ def test_ideal_parallel_and_series_form_have_one_transfer_function(kc: float, ti
 def test_a_derivative_time_above_a_quarter_of_the_integral_time_has_no_series_form() -> None:
     forms = PidForms.of(PidSettings(1.0, 100.0, 30.0), 200.0, 100.0)
     assert forms.series is None
-    assert "series: none" in forms.words("degC", "%")
+    assert "series form: none" in forms.words("degC", "%")
 
 
 def test_the_proportional_band_is_the_share_of_the_pvs_range_that_moves_the_mv_over_its_own() -> None:

@@ -261,13 +261,12 @@ class PID(ControlLaw):
             cv, mv = self.signals.sp[i], self.signals.mv[j]
             integral = f"Ti {s.ti_s:.4g} s" if isfinite(s.ti_s) else "no integral part"
             derivative = f"Td {s.td_s:.4g} s with a filter of {s.filter_s:.4g} s" if s.td_s else "no derivative"
+            forms = PidForms.of(s, cv.high - cv.low, mv.high - mv.low)
             words.append(
                 f"{mv.name} by {cv.name}: Kc {s.kc:.4g} {mv.unit}/({cv.unit}), {integral}, {derivative}, set-point "
                 f"weight {s.set_point_weight:.4g}, anti-windup within {s.tracking_time_s:.4g} s "
-                "(ideal form; derivative of the process variable)."
+                f"(ideal form; derivative of the process variable); {forms.words(cv.unit, mv.unit)}."
             )
-            forms = PidForms.of(s, cv.high - cv.low, mv.high - mv.low)
-            words.append(f"{mv.name} by {cv.name}, in the forms of control systems: {forms.words(cv.unit, mv.unit)}.")
         return tuple(words)
 
 
