@@ -100,6 +100,11 @@ class Evidence:
         """The case's tests, cached: each call of ``scenarios`` computes the steady states again."""
         return self.case.scenarios()
 
+    @property
+    def daily(self) -> tuple[str, ...]:
+        """Tests that replay the plant's record."""
+        return tuple(name for name, tests in self.tests.items() if tests[0].replayed)
+
     @cached_property
     def scenarios(self) -> dict[str, str]:
         """Title of each scenario, without those with noise."""
@@ -250,14 +255,21 @@ class Evidence:
         """The law with the lowest error on the development sequences; no scored test is used.
 
         A law that locked up on one of them, or that is not shipped, is left out, and one that does not beat the loop
-        that the plant was run by before. Without development figures the gate score decides.
+        that the plant was run by before, there and where the record is replayed. Without development figures the gate
+        score decides.
         """
         errors = {n: law.development for n, law in self.laws.items() if not self._withheld(n)}
         if all(error is None for error in errors.values()):
             errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
         scores = {n: e for n, e in errors.items() if e is not None}
         limit = scores.pop(self.case.old_loop, math.inf)
-        return min((n for n in scores if scores[n] < limit), key=lambda n: scores[n], default=None)
+        better = [n for n in scores if scores[n] < limit and self._works_better(n)]
+        return min(better, key=lambda n: scores[n], default=None)
+
+    def _works_better(self, law: str) -> bool:
+        """Whether the law is no worse than the old loop where the record is replayed; true where that was not run."""
+        pairs = [tuple(self.figure(n, test) for n in (law, self.old_loop)) for test in self.daily if self.old_loop]
+        return all(own is None or old is None or own <= old for own, old in pairs)
 
     @property
     def old_loop(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from pipeline.historian.grid import Grid
 from pipeline.historian.guessing import loop_of
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
+from pipeline.records.set_points import SetPoints
 
 AUTOMATIC = re.compile(r"a|aut.*|r?cas.*|kas.*", re.IGNORECASE)  # names of modes in which a controller moves the MV
 
@@ -51,6 +52,19 @@ def loops(
         kept = np.flatnonzero(rows)
         piece = grid.piece[rows] + np.cumsum(np.diff(kept, prepend=kept[0] - 1) > 1)
         yield LoopRows(sp, pv, tuple(mvs) if mv is None else (mv,), mv is not None, known, rows, piece)
+
+
+def set_points(
+    grid: Grid, code: NDArray[np.uint8], tags: Sequence[Tag], modes: Mapping[str, Sequence[str]], worked: Container[str]
+) -> SetPoints:
+    """The set points in the rows of the record, of loops whose mode is known or whose PV is among those ``worked`` on.
+
+    Of the others nobody knows whether their set points were followed.
+    """
+    known = [loop for loop in loops(grid, code, tags, modes) if loop.automatic or loop.pv.name in worked]
+    columns = [np.where(loop.rows, grid.value[loop.sp.tag], np.nan)[code == 0] for loop in known]
+    values = np.column_stack(columns) if columns else np.empty((int(np.count_nonzero(code == 0)), 0))
+    return SetPoints(tuple(loop.pv.name for loop in known), values.astype(np.float64))
 
 
 def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:

@@ -229,16 +229,22 @@ def over_old_loop(evidence: Evidence, law: str) -> list[tuple[str, str]]:
     Empty where no test has both.
     """
     case, old, words = evidence.case, evidence.old_loop, []
-    for test in sorted(case.weights, key=lambda name: -case.weights[name]):
+    names = partial(scenario_name, recipe=case.recipe, own=case.test_words)
+    for test in (*sorted(case.weights, key=lambda name: -case.weights[name]), *evidence.daily):
         own, other = evidence.figure(law, test), evidence.figure(old, test)
         if own is not None and other:
-            words.append((100 * (1 - own / other), scenario_name(test, case.recipe, case.test_words)))
+            words.append((100 * (1 - own / other), names(test)))
     if not words:
         return []
     (first, where), *rest = words
     further = "".join(f"; {abs(share):.0f} % {_less(share)} on {test}" for share, test in rest)
-    own, other = (evidence.figure(name, evidence.main_test, "mv_travel") for name in (law, old))
-    travel = f". Its MV travel is {number(own / other)} times the old loop's" if own is not None and other else ""
+    moved = (*evidence.daily, evidence.main_test)[0]
+    own, other = (evidence.figure(name, moved, "mv_travel") for name in (law, old))
+    travel = (
+        f". Its MV travel is {number(own / other)} times the old loop's on {names(moved)}"
+        if own is not None and other
+        else ""
+    )
     lower = f"{_less(first)} {case.criterion.short} than the old loop on {where}{further}{travel}"
     return [(f"{abs(first):.0f} %", lower)]
 

@@ -39,7 +39,7 @@ def worse_tests(evidence: Evidence, law: str) -> list[Worse]:
     if not evidence.case.on_models or law == evidence.case.baseline:
         return []
     found = []
-    for test in evidence.case.weights:
+    for test in (*evidence.case.weights, *evidence.daily):
         own, limit = evidence.figure(law, test), limit_of(evidence, test)
         if own is not None and limit is not None and own > limit:
             found.append(Worse(test, own, limit))
