@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import cycle
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -130,7 +131,7 @@ class OwnCase(OwnEnsemble):
         """The test with set points and loads of the record, a window on each plant; empty where none is long enough."""
         sp, found, recorded = self.set_points, [], []
         parts = [] if sp is None else spread(windows(self.record, sp, self.hold), len(members))
-        for plant, rows in zip(members, parts, strict=False):
+        for plant, rows in zip(members, cycle(parts), strict=False):
             one = None if sp is None else day(plant, self.record, sp, rows, same_row=self.same_row)
             if one is None:
                 continue
