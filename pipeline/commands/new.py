@@ -209,6 +209,9 @@ def _write(
     if not unusable:
         shutil.rmtree(WORK / name, ignore_errors=True)  # models of a plant that was replaced need not suit this one
     tell(name, folder, report, test, not unusable)
+    if not (made or report.operated):
+        print("the old controller is not known, as no set point is named: with --sp TAG, and --mode TAG, it stands in "
+              "every table")  # fmt: skip
     for line in confirmed(found.record.mv_signals, tags):
         print(line)
     for limit in limits:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
@@ -56,6 +56,7 @@ class Standing:
     grounds: Grounds | None = None  # what tests on models of the plant's record rest on
     times: str = "× NMPC"  # what ratios are to
     old_loop: str = ""  # the law that the plant was run by before
+    over_old_loop: Mapping[str, float] = field(default_factory=dict)  # test -> 1 - best law's figure / old loop's
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -91,19 +92,13 @@ class Standing:
             grounds=validation.grounds,
             times=validation.gate.times,
             old_loop=validation.old_loop,
+            over_old_loop=_over_old_loop(validation),
         )
 
     @property
     def best(self) -> LawStanding | None:
         """The best law of the case."""
         return next((law for law in self.laws if law.best), None)
-
-    @property
-    def over_old_loop(self) -> float | None:
-        """Share by which the best law's figure is below that of the old loop; None where one of them is missing."""
-        old = next((law.figure for law in self.laws if law.law == self.old_loop), None)
-        own = None if self.best is None else self.best.figure
-        return None if own is None or not old else 1 - own / old
 
 
 def withheld_in(folder: Path) -> dict[str, str]:
@@ -131,6 +126,16 @@ def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:
     """How many hold, of those that were measured."""
     verdicts = [row.holds for row in rows if row.holds is not None]
     return sum(verdicts), len(verdicts)
+
+
+def _over_old_loop(validation: Validation) -> dict[str, float]:
+    """Test without noise -> share by which the best law's figure is below the old loop's, of tests that have both."""
+    shares = {}
+    for test, rows in validation.scenarios.items():
+        own, old = (rows.get(law or "", {}).get(validation.metric) for law in (validation.best, validation.old_loop))
+        if own is not None and old and not test.endswith(NOISE_SUFFIX):
+            shares[test] = 1 - own / old
+    return shares
 
 
 def _ratio(validation: Validation, own: float | None) -> float | None:

@@ -12,6 +12,8 @@ class OldController:
         mv(k) - mv(k-1) = Kc [ p(k) - p(k-1) + (h/Ti) (r(k) - y(k)) - (Td/h) (y(k) - 2 y(k-1) + y(k-2)) ],  p = b r - y
 
     with the period h of the record; y is the PV of ``late_rows`` rows before.
+    ``pv``, ``mv``: the names of its signals, in ``pv_unit`` and ``mv_unit``; ``ti_s``, ``td_s`` [s]: integral and
+    derivative time, of the ideal form; ``window_rows``: rows of a window, over which movements are compared.
     """
 
     pv: str

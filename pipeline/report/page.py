@@ -211,10 +211,17 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
 
 
 def _old_controllers(evidence: Evidence) -> list[str]:
-    """The law of each loop of the record, a clause each; of one that is believed in all forms of control systems."""
-    words = []
+    """The law of each loop of the record, a clause each; of one that is believed in all forms of control systems.
+
+    Where the record has no set point that is said; empty where nobody screened it.
+    """
+    grounds, words = evidence.grounds, list[str]()
+    if grounds is None or grounds.record is None:
+        return words
+    if evidence.case.stand_in == IDENTIFIED and not grounds.operated:
+        return ["it is not known, as no set point of the record is named (`--sp` of `loopwright new`)"]
     spans = {s.name: s.high - s.low for s in (*evidence.case.record_signals.pv, *evidence.case.record_signals.mv)}
-    for law in () if evidence.grounds is None else evidence.grounds.old_controllers:
+    for law in grounds.old_controllers:
         forms = ""
         if law.believed and law.pv in spans and law.mv in spans:
             of = PidForms.of(PidSettings(law.kc, law.ti_s, law.td_s), spans[law.pv], spans[law.mv])

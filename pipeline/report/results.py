@@ -82,9 +82,8 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         best = next((law.law for law in standings[case].laws if law.best), None)
         if best is not None:
             console.print(f"the best   {where / f'{best}.onnx'}")
-            if (share := standings[case].over_old_loop) is not None:
-                words = f"{100 * abs(share):.0f} % {'lower' if share >= 0 else 'higher'} {standings[case].metric}"
-                console.print(f"           {words} than the old loop on {standings[case].test}", markup=False)
+            if line := _beside_the_old_loop(standings[case]):
+                console.print(f"           {line}", markup=False, soft_wrap=True)
             for line in _beside_the_best(standings[case], shipped):
                 console.print(f"           {line}", style="red", markup=False, soft_wrap=True)
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
@@ -94,6 +93,17 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(f"try one    loopwright simulate {one}")
         console.print(f"read one   loopwright inspect {one}")
     console.print("registry   make registry, then /#/models in the browser")
+
+
+def _beside_the_old_loop(standing: Standing) -> str:
+    """By how much the best law is better or worse than the loop that the plant was run by before, test by test."""
+    found = [(test, 100 * share) for test, share in standing.over_old_loop.items()]
+    parts = [
+        f"{word} {standing.metric} than the old loop: {', '.join(f'{t} {abs(s):.0f} %' for t, s in rows)}"
+        for word, rows in (("lower", [r for r in found if r[1] >= 0]), ("higher", [r for r in found if r[1] < 0]))
+        if rows
+    ]
+    return "; ".join(parts)
 
 
 def _beside_the_best(standing: Standing, shipped: Iterable[LawStanding]) -> list[str]:
