@@ -34,9 +34,8 @@ def entries_of(
     own = {"case": name, "model": MODEL_SET}
     data = screened_record(name).as_posix() if export else plant["data"]
     loops = loops_of(plant, old)
-    pairs = {"pairs": {law.mv: law.pv for law in loops}} if len(loops) > 1 else {}
     believed = bool(loops) and all(law.believed for law in loops)
-    before = {f"{name}-{OLD_LOOP}": {**own, "name": OLD_LOOP, **_as_pid(loops), **pairs}} if believed else {}
+    before = {f"{name}-{OLD_LOOP}": {**own, "name": OLD_LOOP, **_as_pid(loops), **_pairs(loops)}} if believed else {}
     return {
         **({"exports": {name: export.to_dict()}} if export else {}),
         "plants": {name: dict(plant)},
@@ -44,7 +43,7 @@ def entries_of(
         "models": {f"{name}-{MODEL_SET}": {**own, "data": data, "parts": parts}},
         "controllers": {
             f"{name}-predictive": {**own, "name": "predictive", "law": "predictive", "tuning": "search"},
-            f"{name}-pid": {**own, "name": "pid", "law": "pid", **pairs},
+            f"{name}-pid": {**own, "name": "pid", "law": "pid", **_pairs(loops)},
             **before,
         },
     }
@@ -59,6 +58,11 @@ def loops_of(plant: Mapping[str, Any], old: Sequence[OldController]) -> tuple[Ol
     known = {law.pv: law for law in old if law.same_name or law.believed}
     loops = tuple(known[s["name"]] for s in plant["pv"][:n] if s["name"] in known)
     return loops if len({law.mv for law in loops}) == n else ()
+
+
+def _pairs(loops: Sequence[OldController]) -> dict[str, dict[str, str]]:
+    """The pairs of several loops; a mapping of its own each time, or YAML would write a reference to the first."""
+    return {"pairs": {law.mv: law.pv for law in loops}} if len(loops) > 1 else {}
 
 
 def _as_pid(loops: Sequence[OldController]) -> dict[str, Any]:

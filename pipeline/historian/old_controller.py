@@ -173,7 +173,7 @@ def _law(found: Fitted | None, loop: LoopRows, mv: Tag) -> OldController:
         *signals,
         kc=kc,
         ti_s=kc / integral if integral else 0.0,
-        td_s=derivative / kc if kc else 0.0,
+        td_s=abs(derivative / kc) if derivative else 0.0,
         set_point_weight=abs(on_sp / kc) if kc else 0.0,
         late_rows=found.late,
         rows=found.windows.moved.size,

@@ -129,6 +129,7 @@ def test_the_old_loop_is_a_controller_where_each_of_its_laws_is_believed() -> No
     found = entries_with(old("B", "U", 2.0), old("A", "V", -1.23456))
     before = found["it-old_loop"]
     assert before["pairs"] == {"V": "A", "U": "B"} == found["it-pid"]["pairs"]
+    assert "&" not in yaml.safe_dump(found)  # params.yaml knows no references
     assert (before["kc"], before["ti_s"], before["tuning"]) == ([-1.235, 2.0], [100.0, 100.0], "manual")
     parse(PID.Params, {k: v for k, v in before.items() if k not in {"case", "model", "name", "law"}}, "it-old_loop")
 
