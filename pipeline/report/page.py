@@ -95,7 +95,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "old_controllers": _old_controllers(evidence),
         "worst_pictures": of_kind("worst_").keys(),
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
-        "withheld": by_reason(evidence.withheld),
+        "withheld": by_reason({law: why for law, why in evidence.withheld.items() if law != case.old_loop}),
         "gate_of": _gate_of(evidence),
         "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),
         "no_baseline": because(evidence.no_baseline) if evidence.no_baseline else "",
