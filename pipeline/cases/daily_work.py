@@ -13,6 +13,7 @@ from pipeline.records.record import Record
 from pipeline.records.set_points import stretches
 
 MOST, LEAST = 2_000, 200  # rows of a window
+ROWS = 6_000  # of all windows
 BEFORE = 300  # rows, at most, over which the model's state finds itself before a window
 
 
@@ -48,9 +49,11 @@ def windows(record: Record, sp: Array, hold: int) -> list[slice]:
     return found
 
 
-def spread(found: Sequence[slice], n: int) -> list[slice]:
-    """``n`` of the windows, spread evenly over the record; fewer where there are no more."""
-    n = min(n, len(found))
+def spread(found: Sequence[slice]) -> list[slice]:
+    """Windows of ``ROWS`` rows at most, spread evenly over the record."""
+    if not found:
+        return []
+    n = min(len(found), ROWS // max(rows.stop - rows.start for rows in found))
     return [found[(2 * i + 1) * len(found) // (2 * n)] for i in range(n)]
 
 

@@ -128,10 +128,10 @@ class OwnCase(OwnEnsemble):
         }
 
     def _daily(self, members: Sequence[OwnPlant]) -> dict[str, tuple[Scenario, ...]]:
-        """The test with set points and loads of the record, a window on each plant; empty where none is long enough."""
+        """The test with set points and loads of the record, on each plant in turn; empty without long windows."""
         sp, found, recorded = self.set_points, [], []
-        parts = [] if sp is None else spread(windows(self.record, sp, self.hold), len(members))
-        for plant, rows in zip(members, cycle(parts), strict=False):
+        parts = [] if sp is None else spread(windows(self.record, sp, self.hold))
+        for plant, rows in zip(cycle(members), parts, strict=False):
             one = None if sp is None else day(plant, self.record, sp, rows, same_row=self.same_row)
             if one is None:
                 continue

@@ -110,8 +110,11 @@ def test_windows_lie_within_a_run_and_within_what_is_known() -> None:
     assert all(LEAST <= rows.stop - rows.start <= MOST for rows in found)
     assert all(np.isfinite(long[rows]).all() for rows in found)
     assert [rows.stop for rows in found] == [2001, 3999, 6101, 8101, 8999]
-    assert spread(found, 2) == [found[1], found[3]]
-    assert spread(found[:1], 2) == found[:1]
+    assert spread(found) == [found[0], found[2], found[4]]  # of 6,000 rows
+    assert spread(found[:1]) == found[:1]
+    assert spread([]) == []
+    short = [slice(k, k + 300) for k in range(0, 9000, 400)]
+    assert len(spread(short)) == 20
 
 
 def test_stretches_end_at_runs_and_at_what_is_not_known() -> None:
