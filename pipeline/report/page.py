@@ -172,11 +172,13 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     """The figures at the top of the page: value and words.
 
     They compare the best controller with the bound on the main test and on each test of its
-    requirements, say how well the models fit that it was tested on, and compare it with the case's baseline.
+    requirements, say how well the models fit that it was tested on, and compare it with the case's baseline. Where no
+    law is the best beside the loop that the plant was run by before, each shipped one is compared with that.
     """
     best, case = evidence.best, evidence.case
     if best is None:
-        return []
+        found = [(law, row) for law in shipped_laws(evidence) for row in over_old_loop(evidence, law)]
+        return [(share, f"{law}: {words}") for law, (share, words) in found]
     needs = [n for n in case.requirements if n.law in (None, best) and not n.low and not n.setting]
     pairs = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
     name_of = partial(scenario_name, recipe=case.recipe, own=case.test_words)
@@ -201,8 +203,8 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     late_s = evidence.late_s(evidence.main_test)
     compared = case.criterion.late if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, compared) for law in (best, case.baseline))
-    if evidence.old_loop and not evidence.no_baseline:
-        return [*over_old_loop(evidence, best), *rows]
+    if old_loop := over_old_loop(evidence, best):
+        return [*old_loop, *rows]
     if own and other and own < other:
         where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
         lower = f"lower {case.criterion.long} than the {law_name(case.baseline)} on {where}"
@@ -236,6 +238,8 @@ def over_old_loop(evidence: Evidence, law: str) -> list[tuple[str, str]]:
     Empty where no test has both.
     """
     case, old, words = evidence.case, evidence.old_loop, []
+    if not old or evidence.no_baseline:
+        return []
     names = partial(scenario_name, recipe=case.recipe, own=case.test_words)
     for test in (*sorted(case.weights, key=lambda name: -case.weights[name]), *evidence.daily):
         own, other = evidence.figure(law, test), evidence.figure(old, test)

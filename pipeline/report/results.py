@@ -86,6 +86,8 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
                 console.print(f"           {line}", markup=False, soft_wrap=True)
             for line in _beside_the_best(standings[case], shipped):
                 console.print(f"           {line}", style="red", markup=False, soft_wrap=True)
+        elif any(law.law == standings[case].old_loop for law in standings[case].laws) and shipped:
+            console.print("           no controller beats the old loop in all tests", style="bold red")
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
     # In quotes where a word has to be put in: a shell takes the brackets for something else.
     one = f"{where / best}.onnx" if best is not None else f"'{where / '<law>.onnx'}'"

@@ -152,6 +152,8 @@ def test_a_law_is_best_only_where_it_beats_the_old_loop() -> None:
     poor = beside_the_old_loop(law("predictive", 1.2), law("old_loop", 1.1))
     assert (good.best, poor.best) == ("predictive", None)
     assert "the old loop's 1.1" in good.why_best
+    worse = beside_the_old_loop(law("predictive", 1.0, spoilt=0.3), law("old_loop", 1.1, spoilt=0.2))
+    assert worse.best is None
     stuck = beside_the_old_loop(law("predictive", 1.2), law("old_loop", 1.1, lock_ups=1))
     assert stuck.best == "predictive"  # nobody keeps a loop that gets stuck
 
@@ -166,4 +168,7 @@ def test_the_old_loop_is_no_shipped_law_and_the_headline_says_by_how_much_it_is_
     assert share == "75 %"
     assert words.startswith("lower MAE than the old loop on held-out set points; ")
     assert "50 % higher on load" in words
-    assert headline(found)[0] == (share, words)
+    assert found.best is None
+    assert headline(found) == [(share, f"predictive: {words}")]
+    good = beside_the_old_loop(law("predictive", 1.0, held_out=0.2), law("old_loop", 2.0, held_out=0.8))
+    assert headline(good)[0] == over_old_loop(good, "predictive")[0]

@@ -73,6 +73,7 @@ def test_a_law_that_does_not_beat_it_is_shipped_and_not_called_best() -> None:
     assert "**No controller beats the old loop**" in page
     assert "has a higher MAE than the old loop in " in page
     assert "the best" not in terminal
+    assert "no controller beats the old loop in all tests" in terminal
     assert "does not beat the old loop's" in str(Gate.of(found, "pid").refusal())
 
 
