@@ -40,7 +40,8 @@ class PidForms:
 
     def words(self, pv_unit: str, mv_unit: str) -> str:
         """The forms beside the ideal one, in one clause."""
-        per = f"{mv_unit or '1'}/({pv_unit or '1'})"
+        below = f"({pv_unit})" if "/" in pv_unit else pv_unit or "1"
+        per = f"{mv_unit or '1'}/{below}"
         kd = f", Kd {self.kd:.4g} {per} s" if self.td_s else ""
         parallel = f"parallel form: Kp {self.kc:.4g} {per}, Ki {self.ki:.4g} {per}/s{kd}"
         if not self.td_s:
