@@ -16,11 +16,14 @@ from pipeline.config.exports import is_exported
 from pipeline.errors import PlantError, RecordError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.grounds import RecordVerdict
+from pipeline.evaluation.model_evidence import identified_part
+from pipeline.files import read_json
 from pipeline.plants.identified import IdentifiedArrays
 from pipeline.plants.noise import deviation
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
+from pipeline.records.set_points import SetPoints
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
@@ -127,6 +130,20 @@ class OwnEnsemble(Case):
         groups = ((self.signals.pv, self.record.pv), (self.signals.mv, self.record.mv))
         pairs = [(s, v) for signals, values in groups for s, v in zip(signals, values.T, strict=True)]
         return {s.name: (float(v.min()), float(v.max())) for s, v in pairs}
+
+    @cached_property
+    def same_row(self) -> bool:
+        """Whether an MV of the record acts on the outputs of its own row, by the models."""
+        figures = self.models.parent / "metrics.json"
+        known = identified_part({"": read_json(figures)}) if figures.is_file() else {}
+        return bool((known.get("structure") or {}).get("same_row"))
+
+    @cached_property
+    def set_points(self) -> Array | None:
+        """The set points (n, n_cv) under which the record was made, NaN out of automatic; None where one is unknown."""
+        found = SetPoints.beside(self.data)
+        known = None if found is None else found.of([s.name for s in self.signals.sp])
+        return known if known is not None and len(known) == len(self.record) else None
 
     @property
     def replayed(self) -> tuple[Record, int]:

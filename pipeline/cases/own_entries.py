@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pipeline.cases.own_ensemble import LAW_PART, MODEL_SET
 from pipeline.config.exports import ExportParams, screened_record
+from pipeline.records.old_controller import OldController
 
 MEMBER_NUMBERS = (1, 2)
+OLD_LOOP = "old_loop"
+"""The plant's own controller, as its record shows it, among the controllers of params.yaml."""
 
 
-def entries_of(name: str, plant: Mapping[str, Any], export: ExportParams | None = None) -> dict[str, dict[str, Any]]:
-    """The entries of params.yaml for an own plant: its section, its tests, its models, and two controllers.
+def entries_of(
+    name: str,
+    plant: Mapping[str, Any],
+    export: ExportParams | None = None,
+    old: Sequence[OldController] = (),
+) -> dict[str, dict[str, Any]]:
+    """The entries of params.yaml for an own plant: its section, its tests, its models, and its controllers.
 
-    With ``export`` its files too, of which stage `screen` makes the record; without, ``plant`` says where that is.
+    These are two of ours, and with believed ``old`` ones of all controlled variables the loop that they make up. With
+    ``export`` its files too, of which stage `screen` makes the record; without, ``plant`` says where that is.
     """
     from pipeline.models.identified.structure_search import MINUTES  # here, because torch takes seconds to load
 
@@ -24,6 +33,9 @@ def entries_of(name: str, plant: Mapping[str, Any], export: ExportParams | None 
     parts = {LAW_PART: {"kind": LAW_PART, **minutes}, **members}
     own = {"case": name, "model": MODEL_SET}
     data = screened_record(name).as_posix() if export else plant["data"]
+    loops = loops_of(plant, old)
+    believed = bool(loops) and all(law.believed for law in loops)
+    before = {f"{name}-{OLD_LOOP}": {**own, "name": OLD_LOOP, **_as_pid(loops), **_pairs(loops)}} if believed else {}
     return {
         **({"exports": {name: export.to_dict()}} if export else {}),
         "plants": {name: dict(plant)},
@@ -31,6 +43,30 @@ def entries_of(name: str, plant: Mapping[str, Any], export: ExportParams | None 
         "models": {f"{name}-{MODEL_SET}": {**own, "data": data, "parts": parts}},
         "controllers": {
             f"{name}-predictive": {**own, "name": "predictive", "law": "predictive", "tuning": "search"},
-            f"{name}-pid": {**own, "name": "pid", "law": "pid"},
+            f"{name}-pid": {**own, "name": "pid", "law": "pid", **_pairs(loops)},
+            **before,
         },
     }
+
+
+def loops_of(plant: Mapping[str, Any], old: Sequence[OldController]) -> tuple[OldController, ...]:
+    """The old loop of each controlled variable, in their order; none unless each is known and has an MV of its own.
+
+    Its MV is known by the names of the tags, or where its law is believed.
+    """
+    n = plant.get("controlled") or min(len(plant["pv"]), len(plant["mv"]))
+    known = {law.pv: law for law in old if law.same_name or law.believed}
+    loops = tuple(known[s["name"]] for s in plant["pv"][:n] if s["name"] in known)
+    return loops if len({law.mv for law in loops}) == n else ()
+
+
+def _pairs(loops: Sequence[OldController]) -> dict[str, dict[str, str]]:
+    """The pairs of several loops; a mapping of its own each time, or YAML would write a reference to the first."""
+    return {"pairs": {law.mv: law.pv for law in loops}} if len(loops) > 1 else {}
+
+
+def _as_pid(loops: Sequence[OldController]) -> dict[str, Any]:
+    """Settings of law `pid`: a number for one loop, a list for several."""
+    fields = ("kc", "ti_s", "td_s", "set_point_weight")
+    numbers = {name: [float(f"{getattr(law, name):.4g}") for law in loops] for name in fields}
+    return {"law": "pid", "tuning": "manual", **{k: v[0] if len(v) == 1 else v for k, v in numbers.items()}}

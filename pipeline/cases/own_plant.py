@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import cycle
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from pipeline.cases.daily_work import day, spread, windows
 from pipeline.cases.loads import held_load, load_size, whole_load
 from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
+from pipeline.cases.own_entries import OLD_LOOP
 from pipeline.cases.own_model import OwnPlant, Untrained, errors_of
+from pipeline.config.params import sections_of
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.closed_loop import closed_loop_metrics
@@ -26,6 +30,7 @@ from serving.manifest import Signal
 
 LOAD_AT = 5  # sample at which a load or a step of a measured disturbance begins
 LOADED = "load"  # the test with loads that nobody measures
+DAILY = "daily"  # the test with the record's own set points and loads
 MEASURED = "measured"  # the test with steps of the measured disturbances
 PERCENT = "% of range"
 GATE = {"held_out": 0.5, "held_out_noise": 0.2, LOADED: 0.15, "spoilt": 0.15}
@@ -45,6 +50,7 @@ class OwnCase(OwnEnsemble):
     on_models: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 1
     unforeseen: ClassVar[bool] = True
+    test_words: ClassVar[Mapping[str, str]] = {DAILY: "daily work"}
 
     @property
     def noise_std(self) -> Array:
@@ -118,7 +124,29 @@ class OwnCase(OwnEnsemble):
             "spoilt": tuple(self._test("spoilt", spoilt, wrong[s], p, s, errors[i]) for s, p, i in pairs),
             **self._loads([(p, i == 0) for _, p, i in pairs]),
             **self._measured([(p, i == 0) for _, p, i in pairs]),
+            **self._daily(members),
         }
+
+    def _daily(self, members: Sequence[OwnPlant]) -> dict[str, tuple[Scenario, ...]]:
+        """The test with set points and loads of the record, on each plant in turn; empty without long windows."""
+        sp, found, recorded = self.set_points, [], []
+        parts = [] if sp is None else spread(windows(self.record, sp, self.hold))
+        for plant, rows in zip(cycle(members), parts, strict=False):
+            one = None if sp is None else day(plant, self.record, sp, rows, same_row=self.same_row)
+            if one is None:
+                continue
+            loads = {f"load_{s.name}": one.load[:, i] for i, s in enumerate(plant.pv_signals)}
+            test = Scenario(DAILY, "", one.sp, one.x0, one.mv0, loads, plant=plant, replayed=True, dv=one.dv)
+            found.append(test)
+            recorded.append(self.score(test, one.pv, one.mv)[self.metric])
+        if not found:
+            return {}
+        old = f"{np.mean(recorded):.3g} {METRICS[self.metric].unit_of(self.cv_unit)}".rstrip()
+        title = (
+            f"Daily work: set points and loads of {sum(map(len, (t.sp for t in found)))} rows of the record, noise and "
+            f"all; in the record itself the {METRICS[self.metric].short} was {old}"
+        )
+        return {DAILY: tuple(replace(test, title=title) for test in found)}
 
     def _loads(self, pairs: Sequence[tuple[OwnPlant, bool]]) -> dict[str, tuple[Scenario, ...]]:
         """The test with a load on each CV, on plants, upwards or not; without those that the MVs cannot hold."""
@@ -213,6 +241,11 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
         "__module__": base.__module__,
         **({"gate": GATE_WITH_MEASURED} if dv else {}),
+        **(
+            {"old_loop": OLD_LOOP, "baseline": OLD_LOOP}
+            if f"{name}-{OLD_LOOP}" in sections_of("controllers", name)
+            else {}
+        ),
     }
     return type("OwnPlantCase", (base,), own | further)((9001, 9002, 9003))
 

@@ -196,7 +196,7 @@ def _write(
             record, simulator = folder / "record.parquet", folder / copy_name(made.plant.path)
             plant |= {"data": record.as_posix(), "source": [dict(f) for f in report.files]}
             plant |= {"simulator": simulator.as_posix()}
-        entries = entries_of(name, plant, export)
+        entries = entries_of(name, plant, export, report.old_controllers)
         try:
             lost = wishes_lost(name, entries)
             add_entries(entries, replace=options.replace, remove=[("exports", name)] if options.replace else ())
@@ -209,6 +209,9 @@ def _write(
     if not unusable:
         shutil.rmtree(WORK / name, ignore_errors=True)  # models of a plant that was replaced need not suit this one
     tell(name, folder, report, test, not unusable)
+    if not (made or report.operated):
+        print("the old controller is not known, as no set point is named: with --sp TAG, and --mode TAG, it stands in "
+              "every table")  # fmt: skip
     for line in confirmed(found.record.mv_signals, tags):
         print(line)
     for limit in limits:

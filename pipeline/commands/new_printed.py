@@ -26,6 +26,8 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
         print(plain(f"  {line}"))
     for loop in report.operated:
         print(plain(f"how it was run: {loop.words}"))
+    for law in report.old_controllers:
+        print(plain(f"the old controller: {law.words}"))
     print(f"can these data carry a model: {report.verdict.carries}")
     for reason in report.verdict.reasons:
         print(plain(f"  {reason}"))

@@ -46,7 +46,7 @@ def limits_kept(plant: str, tags: Sequence[Tag]) -> tuple[tuple[Tag, ...], list[
 def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Settings that a person may have written and the new ``entries`` lack, as ``SECTION.NAME: key: value``.
 
-    Of a plant's controllers, and of how its export files are read.
+    Of a plant's controllers, where they may have other values too, and of how its export files are read.
     """
     if plant not in sections("plants"):
         return []
@@ -54,5 +54,6 @@ def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]]) -> list[st
     for section in ("controllers", "exports"):
         for name, new in entries.get(section, {}).items():
             old = read_section(section, name) if name in sections(section) else {}
-            found += [f"{section}.{name}: {key}: {value}" for key, value in old.items() if key not in new]
+            lost = [key for key in old if key not in new or (section == "controllers" and old[key] != new[key])]
+            found += [f"{section}.{name}: {key}: {old[key]}" for key in lost]
     return found

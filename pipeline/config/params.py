@@ -63,7 +63,8 @@ def entries(kind: str, case: str, field: str, path: Path = PARAMS_FILE) -> tuple
 
 def sections_of(kind: str, case: str, path: Path = PARAMS_FILE) -> tuple[str, ...]:
     """Names of the sections of one kind that belong to ``case``, in their order."""
-    return tuple(str(name) for name, e in (_tree(path).get(kind) or {}).items() if e.get("case") == case)
+    found = (_tree(path).get(kind) or {}).items()
+    return tuple(str(name) for name, e in found if isinstance(e, dict) and e.get("case") == case)
 
 
 def _entry(tree: Mapping[str, Any], key: str, where: str) -> Any:

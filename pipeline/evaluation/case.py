@@ -115,6 +115,7 @@ class Case(ABC):
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC sees a parameter change one sample late
     disclosure: ClassVar[str] = ""  # for the report: the scored figures that influenced settings
     baseline: ClassVar[str] = "pid"  # the law that a champion must beat, and that reports compare with
+    old_loop: ClassVar[str] = ""  # the law that the plant was run by before: none is best that does not beat it
     data_seeds: ClassVar[int] = 5  # required of the best law; 1 if no model is trained on data
     effort: ClassVar[Effort] = Effort()  # horizon and resolution of the bounds' search
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from pipeline.files import read_json
+from pipeline.records.old_controller import OldController
 from pipeline.records.operated import Operated
 
 SCREENING = "screening.json"
@@ -20,12 +21,14 @@ class RecordVerdict:
     """What the screening said of a plant's record.
 
     ``carries``: whether it can carry a model, yes, doubtful or no; ``reasons``: why not yes, a clause each;
-    ``operated``: how the plant was run, a clause for each loop whose set point is known.
+    ``operated``: how the plant was run, a clause for each loop whose set point is known; ``old_controllers``: the law
+    of each of them.
     """
 
     carries: str
     reasons: tuple[str, ...] = ()
     operated: tuple[str, ...] = ()
+    old_controllers: tuple[OldController, ...] = ()
 
     @classmethod
     def beside(cls, record: Path) -> Self | None:
@@ -36,7 +39,9 @@ class RecordVerdict:
         found = read_json(path)
         verdict = found.get("verdict") or {}
         loops = (Operated(**loop).words for loop in found.get("operated") or ())
-        return cls(str(verdict.get("carries", "")), tuple(map(str, verdict.get("reasons") or ())), tuple(loops))
+        reasons = tuple(map(str, verdict.get("reasons") or ()))
+        laws = tuple(OldController(**law) for law in found.get("old_controllers") or ())
+        return cls(str(verdict.get("carries", "")), reasons, tuple(loops), laws)
 
     @property
     def doubt(self) -> str:
@@ -75,6 +80,11 @@ class Grounds:
     def operated(self) -> tuple[str, ...]:
         """How the plant was run in the record, a clause for each loop whose set point is known."""
         return () if self.record is None else self.record.operated
+
+    @property
+    def old_controllers(self) -> tuple[OldController, ...]:
+        """The old law of each loop whose set point is known, believed or not."""
+        return () if self.record is None else self.record.old_controllers
 
     @property
     def words(self) -> str:

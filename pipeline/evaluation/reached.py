@@ -39,7 +39,7 @@ def grounds_of(case: Case, models: Mapping[str, Any], reached: Mapping[str, Rang
         {},
     )
     fit = {s.name: (outputs.get(s.name) or {}).get("fit_percent") for s in case.plant.sp_signals}
-    asked = np.concatenate([test.sp for tests in case.tests().values() for test in tests])
+    asked = np.concatenate([test.sp for tests in case.tests().values() for test in tests if not test.replayed])
     names = [s.name for s in case.plant.sp_signals]
     wanted = dict(zip(names, zip(asked.min(axis=0).tolist(), asked.max(axis=0).tolist(), strict=True), strict=True))
     unproven = (sign_doubts({"": models}), fit_doubts({"": models})) if case.stand_in == IDENTIFIED else ()

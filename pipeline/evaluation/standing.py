@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
@@ -55,6 +55,8 @@ class Standing:
     reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
     grounds: Grounds | None = None  # what tests on models of the plant's record rest on
     times: str = "× NMPC"  # what ratios are to
+    old_loop: str = ""  # the law that the plant was run by before
+    over_old_loop: Mapping[str, float] = field(default_factory=dict)  # test -> 1 - best law's figure / old loop's
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -89,6 +91,8 @@ class Standing:
             reproduced=(sum(judged), len(judged)),
             grounds=validation.grounds,
             times=validation.gate.times,
+            old_loop=validation.old_loop,
+            over_old_loop=_over_old_loop(validation),
         )
 
     @property
@@ -122,6 +126,16 @@ def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:
     """How many hold, of those that were measured."""
     verdicts = [row.holds for row in rows if row.holds is not None]
     return sum(verdicts), len(verdicts)
+
+
+def _over_old_loop(validation: Validation) -> dict[str, float]:
+    """Test without noise -> share by which the best law's figure is below the old loop's, of tests that have both."""
+    shares = {}
+    for test, rows in validation.scenarios.items():
+        own, old = (rows.get(law or "", {}).get(validation.metric) for law in (validation.best, validation.old_loop))
+        if own is not None and old and not test.endswith(NOISE_SUFFIX):
+            shares[test] = 1 - own / old
+    return shares
 
 
 def _ratio(validation: Validation, own: float | None) -> float | None:

@@ -76,6 +76,8 @@ class Trials:
                 if form != BASE and (kind == DEVELOPED or (kind == "scored" and not self.case.variants_run(sequences))):
                     continue
                 for noise in self._noises(form, kind):
+                    if noise and sequences[0].replayed:
+                        continue
                     found += [Piece(form, seed, path, kind, name, i, noise) for i in range(len(sequences))]
         return found
 

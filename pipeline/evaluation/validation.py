@@ -122,7 +122,8 @@ class Titles:
 class Validation:
     """The whole file. ``metric`` is the one that laws are compared by, ``main`` the test that weighs most.
 
-    ``on_models``: the tests ran on models of the plant's record; ``grounds`` are what they then rest on.
+    ``old_loop``: the law that the plant was run by before. ``on_models``: the tests ran on models of the plant's
+    record; ``grounds`` are what they then rest on.
     ``scenarios``: test -> law -> figures, medians over the data seeds, with ``<criterion>_min`` and
     ``<criterion>_max`` over the seeds and their number, ``seeds``; ``bounds``: test -> bound -> figures.
     """
@@ -140,6 +141,7 @@ class Validation:
     claims: tuple[Statement, ...]
     paper: tuple[PaperResult, ...]
     on_models: bool = False
+    old_loop: str = ""
     grounds: Grounds | None = None
 
     def to_json(self) -> str:

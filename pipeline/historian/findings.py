@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from pipeline.historian.sampling import Sampling
+from pipeline.records.old_controller import OldController
 from pipeline.records.operated import Operated
 
 
@@ -108,6 +109,7 @@ class Screening:
     verdict: Verdict
     zone: str = ""  # that dates are in, as in Export
     operated: tuple[Operated, ...] = ()  # how the loops were run whose set point is known
+    old_controllers: tuple[OldController, ...] = ()  # the law of each of them, as the record shows it
 
     @property
     def summary(self) -> str:

@@ -72,7 +72,7 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
         moved = [g for g in moved if not _is_flow(g)] or moved  # a feed that others set, where a valve is there
         found = [g.as_role("mv", "guessed: moves in steps") if g in moved else g for g in found]
     if not any(g.tag.role == "pv" for g in found):
-        loops = {loop for g in found if g.tag.role in {"mv", "sp"} and (loop := _loop(g.tag.tag))}
+        loops = {loop for g in found if g.tag.role in {"mv", "sp"} and (loop := loop_of(g.tag.tag))}
         free = [g for g in found if not g.tag.role and g.good > 0 and g.step >= 0 and g.tag.low is not None]
         free = [g for g in free if g.look is not Look.LABEL]
         own = [g for g in free if g.tag.tag in loops] or [g for g in free if not _is_flow(g)][:1] or free[:1]
@@ -87,7 +87,7 @@ def _parameter(tag: str) -> str:
     return ATTRIBUTE.sub(r"\1", tag)
 
 
-def _loop(tag: str) -> str:
+def loop_of(tag: str) -> str:
     """The loop that a tag belongs to by its name, as TIC-1 of TIC-1.SP and TIC-1/SP.CV; empty where it names none."""
     match = LOOP.match(_parameter(tag))
     return match["loop"] if match else ""
@@ -106,8 +106,8 @@ def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
 
     An outflow through an MV's valve follows the MV, and a feed disturbs: neither is what a controller shall hold.
     """
-    held = {loop for g in found if g.tag.role in {"sp", "mv", "mode"} and (loop := _loop(g.tag.tag))}
-    alone = [g for g in found if g.tag.role == "pv" and _is_flow(g) and (_loop(g.tag.tag) or g.tag.tag) not in held]
+    held = {loop for g in found if g.tag.role in {"sp", "mv", "mode"} and (loop := loop_of(g.tag.tag))}
+    alone = [g for g in found if g.tag.role == "pv" and _is_flow(g) and (loop_of(g.tag.tag) or g.tag.tag) not in held]
     if all(g in alone for g in found if g.tag.role == "pv"):
         return list(found)
     note = "a flow without a loop of its own: role pv if it is to be controlled"
@@ -116,10 +116,10 @@ def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
 
 def _cascaded(guess: Guess, found: Sequence[Guess]) -> Guess:
     """The guess; an MV where it is the set point of a loop of which nothing else is there: a lower loop follows it."""
-    loop = _loop(guess.tag.tag)
+    loop = loop_of(guess.tag.tag)
     if guess.tag.role != "sp" or not loop or guess.tag.low is None:
         return guess
-    if any(loop in {_loop(g.tag.tag), g.tag.tag} for g in found if g is not guess):
+    if any(loop in {loop_of(g.tag.tag), g.tag.tag} for g in found if g is not guess):
         return guess
     return guess.as_role("mv", "guessed: the set point of a loop of which nothing else is here")
 
@@ -154,8 +154,8 @@ def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
 
 def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:
     """The tags, the PVs whose loop has a set point before the others."""
-    loops = {loop for t in tags if t.role == "sp" and (loop := _loop(t.tag))}
-    return tuple(sorted(tags, key=lambda t: t.role == "pv" and _loop(t.tag) not in loops)) if loops else tuple(tags)
+    loops = {loop for t in tags if t.role == "sp" and (loop := loop_of(t.tag))}
+    return tuple(sorted(tags, key=lambda t: t.role == "pv" and loop_of(t.tag) not in loops)) if loops else tuple(tags)
 
 
 def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] = ()) -> list[Guess]:

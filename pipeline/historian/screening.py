@@ -27,6 +27,7 @@ from pipeline.historian.left_out import flag_readings, flag_rows, interval_text,
 from pipeline.historian.linear import Linear
 from pipeline.historian.loads import with_load_moves
 from pipeline.historian.modes import check_modes
+from pipeline.historian.old_controller import old_controllers
 from pipeline.historian.operated import operated
 from pipeline.historian.pace import of_period, pace_of
 from pipeline.historian.pulses import pulses
@@ -150,6 +151,7 @@ def screened(
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
     )
+    modes = {t.tag: own[t.tag].categories for t in tags if t.role == "mode"}
     lengths = np.bincount(record.run) if len(record) else np.zeros(1, dtype=np.int64)
     report = Screening(
         plant=plant,
@@ -171,7 +173,8 @@ def screened(
         findings=merged(spelt(findings, tags)),
         verdict=verdict,
         zone=export.zone,
-        operated=operated(grid, code, tags, {t.tag: own[t.tag].categories for t in tags if t.role == "mode"}),
+        operated=operated(grid, code, tags, modes),
+        old_controllers=old_controllers(grid, code, tags, modes),
     )
     return Screened(record, grid, code, own, report, step, models, export.local)
 

@@ -27,7 +27,7 @@ def model_bounds(case: Case, kept: Path) -> Bounds:
 
     The noise does not reach the NMPC, which is given the state: a test with noise has the bound of that without.
     """
-    tests = {name: rows for name, rows in case.tests().items() if all(map(_on_model, rows))}
+    tests = {name: rows for name, rows in case.tests().items() if all(map(_on_model, rows)) and not rows[0].replayed}
     known, keys = _read(kept), {(name, i): _key(test) for name, rows in tests.items() for i, test in enumerate(rows)}
     work = [item for item, key in keys.items() if key not in known]
     # Sequences of one model follow each other: a process builds the problem of a model once.

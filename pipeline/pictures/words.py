@@ -11,7 +11,7 @@ from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import BASE
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
-WORDS = frozenset({"predictive", "two"})
+WORDS = frozenset({"old", "predictive", "two"})
 """Words in the names of laws that are no abbreviations."""
 
 

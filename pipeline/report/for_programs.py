@@ -47,6 +47,7 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
             for row in rows
         ),
         on_models=case.on_models,
+        old_loop=case.old_loop,
         grounds=evidence.grounds,
     )
 

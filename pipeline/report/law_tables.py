@@ -37,15 +37,17 @@ def scenario_rows(evidence: Evidence) -> list[dict[str, Any]]:
     mv, *others = case.plant_class.mv_signals
     together = case.cv_unit if len(case.plant_class.sp_signals) > 1 else ""  # with several CVs all are shares of ranges
     unit = axis_label(", all MVs together", together) if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
-    travel = _row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")
+    travel = [_row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")]
     if case.on_models:  # a person compares it with the old loop, whose record has another length
-        travel = _a_minute(evidence, mv.unit if not others else together, travel)
-    return [*rows, travel | {"winner": None}]
+        travel += [_row(evidence, name, evidence.scenarios[name], "mv_travel") for name in evidence.daily]
+        travel = [_a_minute(evidence, mv.unit if not others else together, row) for row in travel]
+    return [*rows, *(row | {"winner": None} for row in travel)]
 
 
 def _a_minute(evidence: Evidence, unit: str, row: dict[str, Any]) -> dict[str, Any]:
     """The row of the MVs' travel, in a minute of the test: [unit/min]."""
-    tests = evidence.tests[evidence.main_test.removesuffix(NOISE_SUFFIX)]
+    bare = str(row["name"]).removesuffix(NOISE_SUFFIX)
+    tests = evidence.tests[bare]
     minutes = sum(len(test.sp) for test in tests) / len(tests) * evidence.case.plant.period_s / 60.0
 
     def each(value: float | None) -> float | None:
@@ -56,7 +58,7 @@ def _a_minute(evidence: Evidence, unit: str, row: dict[str, Any]) -> dict[str, A
     words = "MV travel" + ", all MVs together" * (len(evidence.case.plant_class.mv_signals) > 1)
     own = unit.replace("deg", "°")
     per = "1/min" if unit in NO_UNIT else f"{own} a minute" if " " in own else f"{own}/min"
-    return row | bounds | {"cells": cells, "title": f"{words} [{per}]: {evidence.main_title}"}
+    return row | bounds | {"cells": cells, "title": f"{words} [{per}]: {evidence.scenarios[bare]}"}
 
 
 def further_figures(evidence: Evidence) -> list[dict[str, Any]]:

@@ -47,7 +47,7 @@ def _settles(evidence: Evidence, law: str) -> Statement:
     """The largest error at the end of a hold, in the test where it is largest."""
     cvs = evidence.case.plant_class.sp_signals
     limit = FAR * (cvs[0].high - cvs[0].low if len(cvs) == 1 else 100.0)  # of several CVs errors are in % of ranges
-    found = {name: evidence.figure(law, name, "max_asse") for name in evidence.scenarios}
+    found = {name: evidence.figure(law, name, "max_asse") for name in evidence.scenarios if name not in evidence.daily}
     ends = {name: value for name, value in found.items() if value is not None}
     worst = max(ends, key=lambda name: ends[name], default=None)
     return Statement(
@@ -95,7 +95,7 @@ def _bears_noise(evidence: Evidence, law: str) -> Statement | None:
 
 def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[Statement]:
     """No worse than the baseline in each test of the gate."""
-    for test in evidence.case.weights:
+    for test in (*evidence.case.weights, *evidence.daily):
         own, other, floor = evidence.figure(law, test), evidence.figure(baseline, test), evidence.floor(test)
         limit = limit_of(evidence, test)
         if own is None or other is None or limit is None:

@@ -24,6 +24,8 @@ from pipeline.report.law_tables import analyses, further_figures, law_row, scena
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
 from pipeline.report.worse import against, shipped_laws
+from pipeline.tuning.pid_forms import PidForms
+from pipeline.tuning.rules import PidSettings
 
 MOST_HEADLINES = 5
 
@@ -61,6 +63,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "noise": f"true output, noisy measurement{draws}",
         "floor": _floor(evidence),
         "best": best,
+        "old_loop_stands": bool(evidence.old_loop and shipped) and best is None,
         "nothing_shipped": bool(evidence.withheld or evidence.laws) and not shipped,
         "shown_law": evidence.best or next(iter(shipped), None),
         "seeds": "" if best is None else _seeds(best.seeds),
@@ -89,9 +92,10 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "against": against(evidence),
         "caveat": _caveat(evidence, judged),
         "operated": () if evidence.grounds is None else evidence.grounds.operated,
+        "old_controllers": _old_controllers(evidence),
         "worst_pictures": of_kind("worst_").keys(),
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
-        "withheld": by_reason(evidence.withheld),
+        "withheld": by_reason({law: why for law, why in evidence.withheld.items() if law != case.old_loop}),
         "gate_of": _gate_of(evidence),
         "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),
         "no_baseline": because(evidence.no_baseline) if evidence.no_baseline else "",
@@ -168,11 +172,13 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     """The figures at the top of the page: value and words.
 
     They compare the best controller with the bound on the main test and on each test of its
-    requirements, say how well the models fit that it was tested on, and compare it with the case's baseline.
+    requirements, say how well the models fit that it was tested on, and compare it with the case's baseline. Where no
+    law is the best beside the loop that the plant was run by before, each shipped one is compared with that.
     """
     best, case = evidence.best, evidence.case
     if best is None:
-        return []
+        found = [(law, row) for law in shipped_laws(evidence) for row in over_old_loop(evidence, law)]
+        return [(share, f"{law}: {words}") for law, (share, words) in found]
     needs = [n for n in case.requirements if n.law in (None, best) and not n.low and not n.setting]
     pairs = [(evidence.main_test, "nmpc"), *((n.scenario, n.times or "nmpc") for n in needs if n.metric == case.metric)]
     name_of = partial(scenario_name, recipe=case.recipe, own=case.test_words)
@@ -199,11 +205,65 @@ def headline(evidence: Evidence) -> list[tuple[str, str]]:
     late_s = evidence.late_s(evidence.main_test)
     compared = case.criterion.late if late_s else case.metric
     own, other = (evidence.figure(law, evidence.main_test, compared) for law in (best, case.baseline))
+    if old_loop := over_old_loop(evidence, best):
+        return [*old_loop, *rows]
     if own and other and own < other:
         where = name_of(evidence.main_test) + (f", from {late_s:g} s on" if late_s else "")
         lower = f"lower {case.criterion.long} than the {law_name(case.baseline)} on {where}"
         rows.append((f"{100 * (1 - own / other):.0f} %", lower))
     return rows
+
+
+def _old_controllers(evidence: Evidence) -> list[str]:
+    """The law of each loop of the record, a clause each; of one that is believed in all forms of control systems.
+
+    Where the record has no set point that is said; empty where nobody screened it.
+    """
+    grounds, words = evidence.grounds, list[str]()
+    if grounds is None or grounds.record is None:
+        return words
+    if evidence.case.stand_in == IDENTIFIED and not grounds.operated:
+        return ["it is not known, as no set point of the record is named (`--sp` of `loopwright new`)"]
+    spans = {s.name: s.high - s.low for s in (*evidence.case.record_signals.pv, *evidence.case.record_signals.mv)}
+    for law in grounds.old_controllers:
+        forms = ""
+        if law.believed and law.pv in spans and law.mv in spans:
+            of = PidForms.of(PidSettings(law.kc, law.ti_s, law.td_s), spans[law.pv], spans[law.mv])
+            forms = f"; {of.words(law.pv_unit, law.mv_unit)}"
+        words.append(law.words + forms)
+    return words
+
+
+def over_old_loop(evidence: Evidence, law: str) -> list[tuple[str, str]]:
+    """By how much a law's error is below that of the loop that the plant was run by before, and its travel beside it.
+
+    Empty where no test has both.
+    """
+    case, old, words = evidence.case, evidence.old_loop, []
+    if not old or evidence.no_baseline:
+        return []
+    names = partial(scenario_name, recipe=case.recipe, own=case.test_words)
+    for test in (*sorted(case.weights, key=lambda name: -case.weights[name]), *evidence.daily):
+        own, other = evidence.figure(law, test), evidence.figure(old, test)
+        if own is not None and other:
+            words.append((100 * (1 - own / other), names(test)))
+    if not words:
+        return []
+    (first, where), *rest = words
+    further = "".join(f"; {abs(share):.0f} % {_less(share)} on {test}" for share, test in rest)
+    moved = (*evidence.daily, evidence.main_test)[0]
+    own, other = (evidence.figure(name, moved, "mv_travel") for name in (law, old))
+    travel = (
+        f". Its MV travel is {number(own / other)} times the old loop's on {names(moved)}"
+        if own is not None and other
+        else ""
+    )
+    lower = f"{_less(first)} {case.criterion.short} than the old loop on {where}{further}{travel}"
+    return [(f"{abs(first):.0f} %", lower)]
+
+
+def _less(share: float) -> str:
+    return "lower" if share >= 0 else "higher"
 
 
 def _of_each_cv(evidence: Evidence, law: str, where: str) -> list[tuple[str, str]]:

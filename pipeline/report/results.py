@@ -54,6 +54,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         given = _given(artifacts.parent / PARAMS_FILE, name)
         # A file that a controller left which has been taken out since says nothing.
         current = {law: why for law, why in withheld.items() if given is None or law in given}
+        current.pop(standing.old_loop, None)  # it is shown, and was never to be shipped
         for laws, why in by_reason(current).items():
             line = f"{name}: {laws} {'are' if ', ' in laws else 'is'} not shipped, {why}"
             console.print(line, style="red", markup=False, soft_wrap=True)
@@ -81,8 +82,12 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         best = next((law.law for law in standings[case].laws if law.best), None)
         if best is not None:
             console.print(f"the best   {where / f'{best}.onnx'}")
+            if line := _beside_the_old_loop(standings[case]):
+                console.print(f"           {line}", markup=False, soft_wrap=True)
             for line in _beside_the_best(standings[case], shipped):
                 console.print(f"           {line}", style="red", markup=False, soft_wrap=True)
+        elif any(law.law == standings[case].old_loop for law in standings[case].laws) and shipped:
+            console.print("           no controller beats the old loop in all tests", style="bold red")
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
     # In quotes where a word has to be put in: a shell takes the brackets for something else.
     one = f"{where / best}.onnx" if best is not None else f"'{where / '<law>.onnx'}'"
@@ -90,6 +95,17 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(f"try one    loopwright simulate {one}")
         console.print(f"read one   loopwright inspect {one}")
     console.print("registry   make registry, then /#/models in the browser")
+
+
+def _beside_the_old_loop(standing: Standing) -> str:
+    """By how much the best law is better or worse than the loop that the plant was run by before, test by test."""
+    found = [(test, 100 * share) for test, share in standing.over_old_loop.items()]
+    parts = [
+        f"{word} {standing.metric} than the old loop: {', '.join(f'{t} {abs(s):.0f} %' for t, s in rows)}"
+        for word, rows in (("lower", [r for r in found if r[1] >= 0]), ("higher", [r for r in found if r[1] < 0]))
+        if rows
+    ]
+    return "; ".join(parts)
 
 
 def _beside_the_best(standing: Standing, shipped: Iterable[LawStanding]) -> list[str]:

@@ -39,7 +39,7 @@ def worse_tests(evidence: Evidence, law: str) -> list[Worse]:
     if not evidence.case.on_models or law == evidence.case.baseline:
         return []
     found = []
-    for test in evidence.case.weights:
+    for test in (*evidence.case.weights, *evidence.daily):
         own, limit = evidence.figure(law, test), limit_of(evidence, test)
         if own is not None and limit is not None and own > limit:
             found.append(Worse(test, own, limit))
@@ -48,7 +48,8 @@ def worse_tests(evidence: Evidence, law: str) -> list[Worse]:
 
 def shipped_laws(evidence: Evidence) -> list[str]:
     """Laws whose file is shipped."""
-    return [n for n, law in evidence.laws.items() if not (evidence.case.on_models and law.withheld)]
+    laws = {n: law for n, law in evidence.laws.items() if n != evidence.old_loop}
+    return [n for n, law in laws.items() if not (evidence.case.on_models and law.withheld)]
 
 
 def worst_test(evidence: Evidence, law: str) -> str | None:

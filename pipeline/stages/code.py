@@ -26,6 +26,7 @@ from pipeline.engine.command import run_stage
 from pipeline.engine.stage_files import DATA, EVERY
 from pipeline.evaluation.grounds import SCREENING
 from pipeline.files import digest, sha256, write_json
+from pipeline.records.set_points import SET_POINTS
 from pipeline.stages.paths import WORK
 
 PACKAGES = ("pipeline", "serving")
@@ -72,7 +73,8 @@ def code() -> None:
     simulators = {p.as_posix() for case in all_cases().values() for p in case.reads}  # the list of cases loads them all
     found = {name: PlantParams.read(name).data for name in sections("plants")}
     # A verdict that is not there, as of a record of one's own, is not sent.
-    records = {n: [data.as_posix(), data.with_name(SCREENING).as_posix()] for n, data in found.items()}
+    beside_it = (SCREENING, SET_POINTS)
+    records = {n: [p.as_posix() for p in (data, *map(data.with_name, beside_it))] for n, data in found.items()}
     write_json(DATA, {EVERY: sorted(simulators), **records})
     for left in set((WORK / "code").glob("*.json")) - made:  # of a case or an export that is no more
         left.unlink()

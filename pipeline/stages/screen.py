@@ -14,6 +14,7 @@ from pipeline.files import write_json
 from pipeline.historian.agreement import as_stated, check_agreement, check_period, limits_of, within_stated
 from pipeline.historian.excerpt import evenly
 from pipeline.historian.exported import screened_export, signal_tags, with_units
+from pipeline.historian.loop_rows import set_points
 from pipeline.historian.refusal import refusal
 from pipeline.report.screening import write_page
 
@@ -43,6 +44,9 @@ def screen(name: str) -> None:
     path = screened_record(name)
     shutil.rmtree(path.parent, ignore_errors=True)
     record.write(path)
+    modes = {t.tag: found.series[t.tag].categories for t in tags if t.role == "mode"}
+    believed = {law.pv for law in report.old_controllers if law.believed}
+    set_points(found.grid, found.code, tags, modes, believed).write(path)
     write_json(path.with_name("screening.json"), report.to_dict())
     rows = {"rows": len(record), "digest": record.digest()}
     write_json(path.with_name("metrics.json"), {"record": SCREENED, "files": report.files, "per_seed": {"0": rows}})

@@ -38,7 +38,12 @@ class TunedPairing:
 
 
 def choice_words(
-    chosen: TunedPairing, others: Sequence[TunedPairing], cvs: Sequence[Signal], mvs: Sequence[Signal]
+    chosen: TunedPairing,
+    others: Sequence[TunedPairing],
+    cvs: Sequence[Signal],
+    mvs: Sequence[Signal],
+    *,
+    given: bool = False,
 ) -> tuple[str, str]:
     """Two notes: the pairs of several loops with what a relative gain is, and by which rule they were chosen."""
     held = (
@@ -48,6 +53,8 @@ def choice_words(
     rule = (
         f"Rule of the pairs: a pairing needs {ALLOWED} (gains at rest near the start; of an integrating CV, slopes). "
     )
+    if given:
+        return held, "Rule of the pairs: they were given, as the loops of the record are."
     if not others:
         return held, f"{rule}This is the only one."
     errors = ", ".join(f"{other.error:.3g} % for {other.words(cvs, mvs)}" for other in others)
@@ -79,6 +86,11 @@ def relative_gains(gain: Array) -> Array:
             "fewer variables, or give another MV"
         )
     return np.asarray(scaled * np.linalg.inv(scaled).T)
+
+
+def gains_of(gain: Array, pairs: Pairs) -> Array:
+    """The relative gains (n_cv, n_cv) of given pairs, by the CVs; ``gain`` and errors as of ``pairings``."""
+    return relative_gains(gain[:, [mv for _, mv in sorted(pairs)]])
 
 
 def pairings(gain: Array) -> list[tuple[Pairs, Array]]:

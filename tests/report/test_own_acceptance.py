@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 from own_cases import controllers_of_a_lag
 
+from pipeline.cases.own_plant import OwnCase
 from pipeline.evaluation.closed_loop import FAR
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
 from pipeline.evaluation.validation import Statement
 from pipeline.evaluation.verdicts import PLAIN
 from pipeline.report.own_acceptance import own_acceptance
+from pipeline.report.page import headline, over_old_loop
 from pipeline.report.verdicts import acceptance
-from pipeline.report.worse import against, worse_tests, worst_test
+from pipeline.report.worse import against, shipped_laws, worse_tests, worst_test
 
 NOISE = 0.01
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")
@@ -129,3 +131,44 @@ def test_without_a_pid_beside_it_nothing_is_compared() -> None:
 def test_where_every_law_locks_up_only_that_is_said() -> None:
     rows = own_acceptance(evidence(law("predictive", 1.0, lock_ups=1), law("pid", 2.0, lock_ups=1)))
     assert [r.holds for r in rows] == [False, False]
+
+
+@pytest.fixture
+def run_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cases whose plant was run by a loop that the record shows."""
+    for name in ("old_loop", "baseline"):
+        monkeypatch.setattr(OwnCase, name, "old_loop")
+
+
+def beside_the_old_loop(ours: LawEvidence, old: LawEvidence) -> Evidence:
+    case = controllers_of_a_lag({}, noise=NOISE)
+    bounds = {test: {"nmpc": {"mae": 0.08}} for test in TESTS}
+    return Evidence(case, bounds, {"predictive": ours, "old_loop": old}, {}, own_data=True)
+
+
+@pytest.mark.usefixtures("run_before")
+def test_a_law_is_best_only_where_it_beats_the_old_loop() -> None:
+    good = beside_the_old_loop(law("predictive", 1.0), law("old_loop", 1.1))
+    poor = beside_the_old_loop(law("predictive", 1.2), law("old_loop", 1.1))
+    assert (good.best, poor.best) == ("predictive", None)
+    assert "the old loop's 1.1" in good.why_best
+    worse = beside_the_old_loop(law("predictive", 1.0, spoilt=0.3), law("old_loop", 1.1, spoilt=0.2))
+    assert worse.best is None
+    stuck = beside_the_old_loop(law("predictive", 1.2), law("old_loop", 1.1, lock_ups=1))
+    assert stuck.best == "predictive"  # nobody keeps a loop that gets stuck
+
+
+@pytest.mark.usefixtures("run_before")
+def test_the_old_loop_is_no_shipped_law_and_the_headline_says_by_how_much_it_is_beaten() -> None:
+    found = beside_the_old_loop(
+        law("predictive", 1.0, held_out=0.2, load=0.3), law("old_loop", 2.0, held_out=0.8, load=0.2)
+    )
+    assert shipped_laws(found) == ["predictive"]
+    ((share, words),) = over_old_loop(found, "predictive")
+    assert share == "75 %"
+    assert words.startswith("lower MAE than the old loop on held-out set points; ")
+    assert "50 % higher on load" in words
+    assert found.best is None
+    assert headline(found) == [(share, f"predictive: {words}")]
+    good = beside_the_old_loop(law("predictive", 1.0, held_out=0.2), law("old_loop", 2.0, held_out=0.8))
+    assert headline(good)[0] == over_old_loop(good, "predictive")[0]

@@ -18,12 +18,14 @@ from undrawn import draw_nothing
 from pipeline.__main__ import main
 from pipeline.cases.own_entries import entries_of
 from pipeline.config.exports import ExportParams, screened_record
-from pipeline.config.params import ModelParams
+from pipeline.config.params import ModelParams, parse
 from pipeline.engine.command import run_stage
 from pipeline.evaluation.case import Case
 from pipeline.files import sha256
+from pipeline.laws.pid.pid import PID
 from pipeline.models.identified.structure_search import MINUTES, StructureSearch
 from pipeline.models.part import groundworks
+from pipeline.records.old_controller import OldController
 from pipeline.stages.check import mistakes
 from pipeline.stages.code import listing
 from pipeline.stages.fit import parts_of
@@ -111,6 +113,42 @@ def test_the_budget_of_the_search_is_written_and_is_its_default() -> None:
     (search,) = groundworks(read.values())  # one for all members
     assert isinstance(search, StructureSearch)
     assert search.minutes == MINUTES
+
+
+def old(pv: str, mv: str, kc: float, doubt: str = "", same_name: bool = True) -> OldController:
+    return OldController(pv, mv, "degC", "%", kc, 100.0, 0.0, 1.0, 0, 500, 20, 0.99, same_name, doubt)
+
+
+def entries_with(*loops: OldController) -> dict[str, dict[str, Any]]:
+    signals = {name: {"name": name, "unit": "", "low": 0.0, "high": 1.0} for name in ("A", "B", "U", "V")}
+    plant = {"pv": [signals["A"], signals["B"]], "mv": [signals["U"], signals["V"]], "data": "x.parquet"}
+    return entries_of("it", plant, old=loops)["controllers"]
+
+
+def test_the_old_loop_is_a_controller_where_each_of_its_laws_is_believed() -> None:
+    found = entries_with(old("B", "U", 2.0), old("A", "V", -1.23456))
+    before = found["it-old_loop"]
+    assert before["pairs"] == {"V": "A", "U": "B"} == found["it-pid"]["pairs"]
+    assert "&" not in yaml.safe_dump(found)  # params.yaml knows no references
+    assert (before["kc"], before["ti_s"], before["tuning"]) == ([-1.235, 2.0], [100.0, 100.0], "manual")
+    parse(PID.Params, {k: v for k, v in before.items() if k not in {"case", "model", "name", "law"}}, "it-old_loop")
+
+
+def test_the_loops_of_the_record_say_the_pairs_where_their_laws_are_not_known() -> None:
+    found = entries_with(old("A", "V", 0.0, "by hand"), old("B", "U", 1.0))
+    assert "it-old_loop" not in found
+    assert found["it-pid"]["pairs"] == {"V": "A", "U": "B"}
+
+
+def test_no_pairs_are_said_where_a_loop_is_missing_or_two_share_an_mv() -> None:
+    for loops in (
+        (old("A", "U", 1.0),),
+        (old("A", "U", 1.0), old("B", "U", 1.0)),
+        (old("A", "U", 1.0), old("B", "V", 1.0, "by hand", same_name=False)),
+    ):
+        found = entries_with(*loops)
+        assert set(found) == {"it-predictive", "it-pid"}
+        assert "pairs" not in found["it-pid"]
 
 
 @pytest.mark.usefixtures("drawn")

@@ -206,6 +206,36 @@ def test_the_analysis_names_the_pairs_and_their_relative_gains() -> None:
     assert "This is the only one" in why  # the others' relative gains are -0.33
 
 
+def test_pairs_that_are_given_are_tuned_and_no_others() -> None:
+    """Without them the other pairing is taken, see below."""
+    plant = two_ways()
+    quick = {"development_seeds": (1,), "development_set_points": 2, "development_hold": 60}
+    law = PID.design(PID.Params(pairs={"u1": "y1", "u0": "y0"}, **quick), {}, plant.signals, plant)
+    assert law.pairs == ((0, 0), (1, 1))
+    assert [one.pairs for one in law.pairings] == [law.pairs]
+    assert "they were given" in law.analysis(plant).notes[-1]
+
+
+def test_numbers_of_several_loops_are_those_of_their_pairs() -> None:
+    plant = two_ways()
+    own = {"pairs": {"u1": "y0", "u0": "y1"}, "kc": (2.0, -3.0), "ti_s": (20.0, 30.0), "td_s": 1.0}
+    params = PID.Params(tuning="manual", **own)  # type: ignore[arg-type]
+    PID.check_settings(params, plant.signals)
+    law = PID.design(params, {}, plant.signals, plant)
+    assert law.pairs == ((1, 0), (0, 1))
+    assert [(s.kc, s.ti_s, s.td_s) for s in law.loops] == [(-3.0, 30.0, 1.0), (2.0, 20.0, 1.0)]
+    with pytest.raises(LawError, match="kc of the PID has 2 entries"):
+        PID.Params(tuning="manual", kc=(1.0, 2.0), ti_s=3.0)
+    with pytest.raises(LawError, match="kc of the PID has 2 entries"):
+        PID.Params(pairs={"u0": "y0", "u1": "y1"}, kc=(1.0, 2.0))
+
+
+@pytest.mark.parametrize("pairs", [{"u0": "y0"}, {"u0": "y0", "u9": "y1"}, {"u0": "y0", "u1": "y0"}])
+def test_pairs_that_leave_a_variable_without_an_mv_are_refused(pairs: dict[str, str]) -> None:
+    with pytest.raises(LawError, match="pairs of the PID are"):
+        PID.check_settings(PID.Params(pairs=pairs), two_ways().signals)
+
+
 def test_the_analysis_says_why_the_pairs_were_taken() -> None:
     """Both pairings have positive relative gains, .6 and .4; that of the smaller error in closed loop is taken."""
     plant = two_ways()

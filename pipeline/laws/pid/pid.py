@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.errors import LawError
 from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
-from pipeline.laws.pid.tuned import by_simulation, linearization, require_numbers, tuned
+from pipeline.laws.pid.tuned import by_simulation, given_pairs, linearization, require_numbers, tuned
 from pipeline.laws.rates import Rates
 from pipeline.laws.stuck_actuator import never_given, stood_still
 from pipeline.models.base import Model
@@ -22,6 +23,7 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.tuning.loop_search import Loops
 from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, choice_words, pairings
+from pipeline.tuning.pid_forms import PidForms
 from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
@@ -46,7 +48,8 @@ class PID(ControlLaw):
     proportional action that the actuator never received (``never_given``).
 
     Of several loops each has its own numbers; of the two pairings with relative gains nearest to 1 (``pairings``) the
-    pairs are those of the smaller error in closed loop. An MV that no loop moves stays where it is.
+    pairs are those of the smaller error in closed loop, unless they are given. An MV that no loop moves stays where it
+    is.
 
     Source: the PID that [inverse_rbf, section 4.3] compares with; the tracking
     is that of Astrom and Hagglund, Advanced PID Control, section 3.5.
@@ -65,7 +68,9 @@ class PID(ControlLaw):
         ``criterion``, ``mae`` (mean absolute error) or ``itae`` (time-weighted); over a plant that is known by
         simulation alone, and over one with several loops, it chooses all numbers; ``imc`` and ``simc`` use
         ``lambda_s`` [s] (None: a robust value); ``itae`` is the minimum-ITAE rule for a set-point step;
-        ``manual`` uses ``kc`` [mv/pv], ``ti_s`` [s], ``td_s`` [s] and the derivative filter ``filter_s`` [s].
+        ``manual`` uses ``kc`` [mv/pv], ``ti_s`` [s], ``td_s`` [s] and the derivative filter ``filter_s`` [s]; of
+        several loops it takes a list of these numbers, and of ``set_point_weight``, an entry for each of ``pairs``.
+        ``pairs``: MV -> the CV that it holds, of several loops; None: pairs are chosen.
         ``tracking_s`` [s]: tracking time; None is sqrt(Ti Td). ``set_point_weight``: None is 1, or
         optimized with the filter. ``operating_cv`` [pv]: steady state of the linearization if the model
         set has no part ``linearized``; None is the middle of the set-point range.
@@ -79,12 +84,13 @@ class PID(ControlLaw):
 
         tuning: Literal["optimized", "imc", "simc", "itae", "manual"] = "optimized"
         criterion: Literal["mae", "itae"] = "mae"
-        kc: float | None = None
-        ti_s: float | None = None
-        td_s: float = 0.0
+        pairs: Mapping[str, str] | None = None
+        kc: float | tuple[float, ...] | None = None
+        ti_s: float | tuple[float, ...] | None = None
+        td_s: float | tuple[float, ...] = 0.0
         filter_s: float = 0.0
         tracking_s: float | None = None
-        set_point_weight: float | None = None
+        set_point_weight: float | tuple[float, ...] | None = None
         lambda_s: float | None = None
         operating_cv: float | None = None
         development_seeds: tuple[int, ...] = (1, 2, 3)
@@ -97,10 +103,22 @@ class PID(ControlLaw):
         def __post_init__(self) -> None:
             self.given()
 
-        def given(self) -> PidSettings:
-            """The settings that stand here, 1 for those that a tuning finds; raises LawError for wrong numbers."""
-            kc, ti_s, weight = (1.0 if v is None else v for v in (self.kc, self.ti_s, self.set_point_weight))
-            return PidSettings(kc, ti_s, self.td_s, self.filter_s, weight, self.tracking_s)
+        def given(self) -> tuple[PidSettings, ...]:
+            """The settings of each loop that stand here, 1 for those that a tuning finds; LawError for wrong ones."""
+            listed = {
+                name: (1.0 if value is None else value)
+                for name in ("kc", "ti_s", "td_s", "set_point_weight")
+                for value in (getattr(self, name),)
+            }
+            n = len(self.pairs or {}) or 1
+            for name, value in listed.items():
+                if isinstance(value, tuple) and (len(value) != n or self.tuning != "manual"):
+                    raise LawError(
+                        f"{name} of the PID has {len(value)} entries; give one number, or with tuning `manual` one "
+                        f"for each of `pairs`, which has {len(self.pairs or {})}"
+                    )
+            each = zip(*(v if isinstance(v, tuple) else (v,) * n for v in listed.values()), strict=True)
+            return tuple(PidSettings(kc, ti, td, self.filter_s, b, self.tracking_s) for kc, ti, td, b in each)
 
     kc: Tensor  # (..., loops)
     integral: Tensor  # h/Ti
@@ -115,6 +133,7 @@ class PID(ControlLaw):
 
     examined_cv: tuple[float, float] | None = None
     pairings: tuple[TunedPairing, ...] = ()  # of several loops, those that were tuned; the first is this law's
+    pairs_given: bool = False
 
     def __init__(
         self,
@@ -162,20 +181,23 @@ class PID(ControlLaw):
         """The PID tuned as ``params`` says, on part ``linearized`` or on the plant; raises LawError."""
         found = tuned(params, models, signals, plant, partial(cls, signals, mv_rate=params.mv_rate))
         law = cls(signals, found.settings, params.mv_rate, found.pairs)
-        law.examined_cv, law.pairings = params.examined_cv, found.pairings
+        law.examined_cv, law.pairings, law.pairs_given = params.examined_cv, found.pairings, params.pairs is not None
         return law
 
     @classmethod
     def check_settings(cls, params: Any, signals: Signals) -> None:
         """Raise LawError for rates that do not fit the signals, or a tuning that lacks numbers or takes one loop."""
         super().check_settings(params, signals)
-        if params.tuning != "optimized" or params.operating_cv is not None:
+        given = given_pairs(params, signals) is not None and params.tuning == "manual"
+        if not given and (params.tuning != "optimized" or params.operating_cv is not None):
             require_single_loop(signals, cls.name)
         require_numbers(params)
 
     @classmethod
     def check(cls, params: Any, models: Mapping[str, Model], plant: Simulator) -> None:
         """Raise LawError where the tuning does not apply to the linearized plant; no closed loop is run."""
+        if given_pairs(params, plant.signals) is not None:
+            return
         if by_simulation(params, plant):
             pairings(StepResponses.near_start(plant).share)
         elif params.tuning == "optimized":
@@ -227,7 +249,10 @@ class PID(ControlLaw):
         cvs, (chosen, *others) = self.signals.sp, self.pairings
         gains = zip(chosen.pairs, chosen.relative_gains, strict=True)
         figures = {f"relative_gain_{cvs[i].name}": gain for (i, _), gain in gains}
-        return Analysis(figures, notes=(*self._in_words(), *choice_words(chosen, others, cvs, self.signals.mv)))
+        return Analysis(
+            figures,
+            notes=(*self._in_words(), *choice_words(chosen, others, cvs, self.signals.mv, given=self.pairs_given)),
+        )
 
     def _in_words(self) -> tuple[str, ...]:
         """The settings of each loop, as somebody types them into another PID."""
@@ -236,10 +261,11 @@ class PID(ControlLaw):
             cv, mv = self.signals.sp[i], self.signals.mv[j]
             integral = f"Ti {s.ti_s:.4g} s" if isfinite(s.ti_s) else "no integral part"
             derivative = f"Td {s.td_s:.4g} s with a filter of {s.filter_s:.4g} s" if s.td_s else "no derivative"
+            forms = PidForms.of(s, cv.high - cv.low, mv.high - mv.low)
             words.append(
                 f"{mv.name} by {cv.name}: Kc {s.kc:.4g} {mv.unit}/({cv.unit}), {integral}, {derivative}, set-point "
                 f"weight {s.set_point_weight:.4g}, anti-windup within {s.tracking_time_s:.4g} s "
-                "(ideal form; derivative of the process variable)."
+                f"(ideal form; derivative of the process variable); {forms.words(cv.unit, mv.unit)}."
             )
         return tuple(words)
 

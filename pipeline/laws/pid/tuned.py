@@ -18,7 +18,7 @@ from pipeline.plants.simulator import Array, Simulator
 from pipeline.tuning import rules
 from pipeline.tuning.development import DevelopmentLoops
 from pipeline.tuning.loop_search import Loops, searched
-from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, pairings
+from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
 from pipeline.tuning.reduction import LagWithDeadTime, start_lag
 from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
@@ -56,7 +56,12 @@ class HoldsLinearization(Protocol):
 
 def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None, law_of: LawOf) -> Tuned:
     """The numbers that ``params`` of the PID ask for; raises LawError where their tuning does not apply."""
-    p, given = params, params.given()
+    p, (given, *_) = params, params.given()
+    pairs = given_pairs(p, signals)
+    if p.tuning == "manual" and pairs is not None:
+        require_numbers(p)
+        of = dict(zip(p.pairs, p.given(), strict=True))
+        return Tuned(tuple(of[signals.mv[j].name] for _, j in pairs), pairs)
     if plant is not None and by_simulation(p, plant):
         return _searched(p, signals, plant, law_of)
     require_single_loop(signals, "pid")
@@ -91,6 +96,24 @@ def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Sim
     return Tuned(replace(settings, **rest))
 
 
+def given_pairs(params: Any, signals: Signals) -> Pairs | None:
+    """The pairs that ``params`` name, in the order of the MVs; None where they name none, or there is one MV.
+
+    Raises LawError unless each CV has one MV.
+    """
+    if params.pairs is None:
+        return None
+    cvs, mvs = ([s.name for s in group] for group in (signals.sp, signals.mv))
+    named = dict(params.pairs)
+    if sorted(named.values()) != sorted(cvs) or not set(named) <= set(mvs):
+        raise LawError(
+            f"pairs of the PID are {named}; give each of {', '.join(cvs)} an MV of its own, as in MV: CV; there are "
+            f"{', '.join(mvs)}"
+        )
+    found = tuple((cvs.index(named[mv]), j) for j, mv in enumerate(mvs) if mv in named)
+    return found if len(mvs) > 1 else None
+
+
 def require_numbers(params: Any) -> None:
     """Raise LawError where the tuning ``manual`` lacks its numbers."""
     if params.tuning == "manual" and (params.kc is None or params.ti_s is None):
@@ -98,7 +121,7 @@ def require_numbers(params: Any) -> None:
 
 
 def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> Tuned:
-    """The cheapest numbers in closed loop over the plant and its variations, of the best two pairings."""
+    """The cheapest numbers in closed loop over the plant and its variations, of the given or the best two pairings."""
     responses = StepResponses.near_start(plant)
     hold = params.development_hold or int(np.clip(2 * responses.settling, *HOLDS))
     drawn = (params.development_seeds, params.development_set_points, hold)
@@ -106,7 +129,9 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
     percent = 100 / (signals.sp[0].high - signals.sp[0].low)
     found: list[tuple[float, Loops, TunedPairing]] = []
     weighted = params.criterion == "itae"
-    for pairs, table in pairings(responses.share)[:2]:
+    given = given_pairs(params, signals)
+    tables = dict(pairings(responses.share)[:2]) if given is None else {given: gains_of(responses.share, given)}
+    for pairs, table in tables.items():
 
         def cost(rows: Sequence[Loops], pairs: Pairs = pairs) -> Array:
             law = law_of(list(rows), pairs=pairs)
@@ -114,7 +139,7 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
             return np.asarray(np.mean(each, axis=0))
 
         processes = [responses.process(*pair) for pair in pairs]
-        tried = searched(processes, signals.period_s, cost, params.given(), params.set_point_weight)
+        tried = searched(processes, signals.period_s, cost, params.given()[0], params.set_point_weight)
         gains = tuple(float(table[cv, cv]) for cv, _ in pairs)
         found.append((*tried, TunedPairing(pairs, gains, percent * tried[0], weighted)))
     # The first of equal ones: sorting keeps their order.

@@ -1,0 +1,82 @@
+"""The loops of an export: which set point, PV, mode and MV belong together, and the rows in which each was at work."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.historian.grid import Grid
+from pipeline.historian.guessing import loop_of
+from pipeline.historian.tags import Tag
+from pipeline.metrics import Array
+from pipeline.records.set_points import SetPoints
+
+AUTOMATIC = re.compile(r"a|aut.*|r?cas.*|kas.*", re.IGNORECASE)  # names of modes in which a controller moves the MV
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopRows:
+    """One loop over the rows (n,) of the record in which it is automatic, or over all where no mode is known."""
+
+    sp: Tag
+    pv: Tag
+    own_mvs: tuple[Tag, ...]  # the MV of the same name; where no name tells, all of them
+    same_name: bool  # whether a name tells
+    automatic: bool  # whether a mode says which rows these are
+    rows: NDArray[np.bool_]  # of the grid
+    piece: NDArray[np.int64]  # (n,) counts up where rows are left out: what the MV did meanwhile is not this loop's
+
+
+def loops(
+    grid: Grid, code: NDArray[np.uint8], tags: Sequence[Tag], modes: Mapping[str, Sequence[str]]
+) -> Iterator[LoopRows]:
+    """The loops whose set point is known. ``code`` (n,) is 0 in rows of the record, ``modes`` are names by tag."""
+    sps, pvs, mvs = ([t for t in tags if t.role == role] for role in ("sp", "pv", "mv"))
+    for place, sp in enumerate(sps):
+        pv = _partner(sp, pvs, place)
+        mode = _partner(sp, [t for t in tags if t.role == "mode"], 0 if len(sps) == 1 else -1)
+        if pv is None:
+            continue
+        mv = _partner(sp, mvs, -1)
+        rows = (code == 0) & ~np.isnan(grid.value[sp.tag])
+        auto = _automatic(grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
+        known = auto is not None and bool(np.any(rows & auto))
+        if auto is not None and known:
+            rows = rows & auto
+        if not rows.any():
+            continue
+        kept = np.flatnonzero(rows)
+        piece = grid.piece[rows] + np.cumsum(np.diff(kept, prepend=kept[0] - 1) > 1)
+        yield LoopRows(sp, pv, tuple(mvs) if mv is None else (mv,), mv is not None, known, rows, piece)
+
+
+def set_points(
+    grid: Grid, code: NDArray[np.uint8], tags: Sequence[Tag], modes: Mapping[str, Sequence[str]], worked: Container[str]
+) -> SetPoints:
+    """The set points in the rows of the record, of loops whose mode is known or whose PV is among those ``worked`` on.
+
+    Of the others nobody knows whether their set points were followed.
+    """
+    known = [loop for loop in loops(grid, code, tags, modes) if loop.automatic or loop.pv.name in worked]
+    columns = [np.where(loop.rows, grid.value[loop.sp.tag], np.nan)[code == 0] for loop in known]
+    values = np.column_stack(columns) if columns else np.empty((int(np.count_nonzero(code == 0)), 0))
+    return SetPoints(tuple(loop.pv.name for loop in known), values.astype(np.float64))
+
+
+def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:
+    """The tag of the same loop by its name; else the one at a place, -1: none."""
+    own = loop_of(sp.tag)
+    for tag in tags:
+        if own and loop_of(tag.tag) == own:
+            return tag
+    return tags[place] if 0 <= place < len(tags) else None
+
+
+def _automatic(mode: Array, names: Sequence[str]) -> NDArray[np.bool_] | None:
+    """Rows (n,) whose mode is an automatic one; None where no mode of the tag is known as such."""
+    known = [i for i, name in enumerate(names) if AUTOMATIC.fullmatch(name.strip())]
+    return np.isin(mode, known) if known else None
