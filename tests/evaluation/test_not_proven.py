@@ -51,6 +51,43 @@ def test_models_of_which_the_fit_says_nothing_have_no_rows() -> None:
     assert sign_doubts({}) == fit_doubts({}) == ""
 
 
+def in_closed_loop(nats: float, **answer: Any) -> dict[str, Any]:
+    """metrics.json of a model of a record in closed loop."""
+    found = models(**answer)
+    proof = found["parts"]["identified"]["per_seed"]["0"]["proof"]
+    del proof["free_run"]
+    proof["one_step"] = {"y0": {"model": 0.1, "with_inputs": 0.1, "without": 0.12, "rows": 900, "nats": nats}}
+    return {"": found}
+
+
+def test_in_closed_loop_the_inputs_must_foresee_something() -> None:
+    assert [row.holds for row in statements(in_closed_loop(10.0))] == [True, True]
+    assert [row.holds for row in statements(in_closed_loop(9.9))] == [False, True]
+    assert fit_doubts(in_closed_loop(9.9))
+    assert fit_doubts(in_closed_loop(10.0)) == ""
+
+
+UNCERTAIN = {"verdict": "uncertain", "direct": 1.0, "sd": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("nats", "answer", "ships"),
+    [
+        (50.0, {}, True),  # two standard deviations, and all models of one sign
+        (9.9, {}, False),
+        (50.0, {"sd": 0.7}, False),
+        (50.0, {"low": -0.1}, False),
+        (50.0, {"direct": -1.0}, False),
+        (50.0, {"direct": None, "sd": None}, False),
+        (50.0, {"verdict": "opposite"}, False),
+    ],
+)
+def test_what_is_foreseen_makes_up_for_a_sign_that_is_nearly_certain(
+    nats: float, answer: dict[str, Any], ships: bool
+) -> None:
+    assert (sign_doubts(in_closed_loop(nats, **{**UNCERTAIN, **answer})) == "") is ships
+
+
 @pytest.mark.parametrize("missed", [0.51, None])
 def test_a_free_run_that_misses_most_is_a_failure(missed: float | None) -> None:
     found = {"": models(missed)}

@@ -38,7 +38,7 @@ from pipeline.laws.predictive.predictive import Predictive
 from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
 from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import LOOPS, Outcome, Trials
-from pipeline.laws.predictive.tuning import FORGETS, TRAVEL, judged, searched, tuned
+from pipeline.laws.predictive.tuning import FORGETS, TRAVEL, Candidate, calmest, judged, searched, tuned
 from pipeline.models.identified.identified import Identified
 from pipeline.models.static.mlp import MLP
 from serving import Controller
@@ -397,6 +397,11 @@ def test_the_search_takes_what_costs_least() -> None:
     assert tried[0].numbers == start
     assert tried[0].cost == pytest.approx(1.0)
     assert len({tuple(c.numbers.values()) for c in tried}) == len(tried)
+
+
+def test_of_numbers_that_cost_nearly_the_same_the_calmest_are_taken() -> None:
+    made = [Candidate({}, cost, travel=travel) for cost, travel in ((1.0, 3.0), (1.04, 1.0), (1.049, 2.0), (1.06, 0.1))]
+    assert calmest(made) is made[1]
 
 
 @pytest.mark.parametrize(

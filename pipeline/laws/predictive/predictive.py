@@ -21,7 +21,7 @@ from pipeline.laws.predictive.settling import horizon_for, mvs_of, refuse_unstab
 from pipeline.laws.predictive.sight import Sight
 from pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
 from pipeline.laws.predictive.trials import Trials
-from pipeline.laws.predictive.tuning import Candidate, in_words, tuned
+from pipeline.laws.predictive.tuning import Candidate, calmest, in_words, tuned
 from pipeline.models.affine_map import AffineMap
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
@@ -200,7 +200,7 @@ class Predictive(ControlLaw):
         """The numbers that a search chose, and its cost at first and at last; nothing else without one."""
         if not self.tried:
             return Analysis(notes=self.remarks)
-        best, damping = min(self.tried, key=lambda c: c.cost), float(self.planner.damping)
+        best, damping = calmest(self.tried), float(self.planner.damping)
         first = self.tried[0].cost
         figures = {**best.numbers, "damping": damping, "cost": best.cost, "cost_given": first, "tried": len(self.tried)}
         rows = sorted(self.tried, key=lambda c: c.cost)

@@ -17,6 +17,7 @@ TRAVEL = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
 NEAR = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
 COARSE = [(s, c) for s in (0.5, 1.0, 2.0) for c in (0.4, 1.0, 2.5)]  # factors of speed and caution
 FINE = [(s, c) for s in (0.7, 1.0, 1.4) for c in (0.6, 1.0, 1.6)]
+CALM = 0.05  # of the least cost, that less travel may cost: a valve wears, and the model is not the plant
 HORIZONS = (0.7, 1.3)
 JUMPS = (0.3, 0.1, 0.03)
 DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
@@ -65,10 +66,16 @@ def judged(outcome: Outcome, given: Outcome, numbers: Sequence[Numbers]) -> list
     return [Candidate(dict(n), *map(float, figures)) for n, *figures in rows]
 
 
+def calmest(tried: Sequence[Candidate]) -> Candidate:
+    """Of the numbers that cost at most ``CALM`` more than the cheapest, those of the least travel."""
+    limit = (1 + CALM) * min(c.cost for c in tried)
+    return min((c for c in tried if c.cost <= limit), key=lambda c: (c.travel, c.cost))
+
+
 def searched(
     trials: Tries, law_of: Callable[[Mapping[str, float]], ControlLaw], start: Numbers
 ) -> tuple[Candidate, list[Candidate]]:
-    """The best numbers by a search from ``start``, and all that were tried, the start first.
+    """The calmest of the best numbers by a search from ``start``, and all that were tried, the start first.
 
     Speed and caution together on a coarse grid, then the horizon, then the jumps, then a finer grid. Numbers far from
     the start must gain more: the loops' model is the law's own, and what they gain by little may be lost on the plant.
@@ -99,7 +106,7 @@ def searched(
         tried_all([{"horizon": float(np.clip(round(at["horizon"] * factor), 8, 60))}])
     tried_all([{"jumps": at["jumps"] * factor} for factor in JUMPS])
     tried_all(grid(FINE))
-    return best, tried
+    return calmest(tried), tried
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +147,8 @@ def in_words(tried: Sequence[Candidate]) -> str:
         f"{len(tried)} sets of numbers were tried in closed loops over the model with errors of gain, pace and dead "
         f"time, with loads and noise; the cost fell from {first:.3g} to {last:.3g}. It is the mean of the errors at "
         "set points and under loads, each over that with the first numbers, .05 for a travel of 1 % of the MVs' range "
-        "a sample, and a little for numbers far from the first. The cheapest is taken."
+        f"a sample, and a little for numbers far from the first. Of those within {100 * CALM:.0f} % of the cheapest, "
+        "those of the least travel are taken; a higher `speed` moves more and errs less, as the table shows."
     )
 
 

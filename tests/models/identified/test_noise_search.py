@@ -1,0 +1,53 @@
+"""Records in closed loop: models with their noise are searched, and their inputs must foresee the PV."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from closed_loop_records import LOOPS, SIGNALS
+
+from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.part import Learnt, Source
+
+QUICK = IdentifiedPart(units=(), orders=(2, 3))
+MOVED = "calm, many set points"
+AT_REST = "calm, set point at rest"
+
+
+@cache
+def learnt(name: str, seed: int = 0) -> Learnt:
+    return QUICK.learn(Source(LOOPS[name].record(2_400, seed), SIGNALS))
+
+
+@pytest.mark.parametrize("name", [MOVED, "dead time, set points"])
+def test_the_plant_is_found_and_not_the_controller(name: str) -> None:
+    found, loop = learnt(name).metrics, LOOPS[name]
+    assert found["structure"]["noise"] in ("gain", "all")
+    assert found["structure"]["rows_ahead"] == 30
+    answer = found["proof"]["answers"]["y"]["u"]
+    rows = np.arange(1, answer["last"] + 1)
+    true = loop.answer(np.ones(answer["last"] + 1))[rows][answer["first"] - 1 :].mean()
+    # A free run of these records finds -1/kc, the controller read backwards.
+    assert answer["model"] == pytest.approx(true, rel=0.35)
+    # The measurement's noise, of a record whose loads are forty times as large.
+    assert found["outputs"]["y"]["noise_sd"] == pytest.approx(loop.noise, rel=0.25)
+
+
+def test_the_inputs_foresee_the_pv_only_where_something_else_moved_them() -> None:
+    moved, rest = (learnt(name).metrics["proof"]["one_step"]["y"] for name in (MOVED, AT_REST))
+    assert moved["nats"] > 20
+    assert rest["nats"] < 5
+    assert moved["with_inputs"] < moved["without"]
+    # No model is better than the regularized ARX of many lags by much, nor worse.
+    assert moved["model"] == pytest.approx(moved["with_inputs"], rel=0.05)
+
+
+def test_a_correction_that_is_given_keeps_the_search_by_free_runs() -> None:
+    part = replace(QUICK, correction=0.1, minutes=0.05)
+    found = part.learn(Source(LOOPS[MOVED].record(1_200, 0), SIGNALS)).metrics
+    assert found["structure"]["noise"] == "none"
+    assert found["structure"]["rows_ahead"] is None
+    assert "one_step" not in found["proof"]
