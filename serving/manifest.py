@@ -20,6 +20,7 @@ MAX_NAME = 200  # characters
 MAX_DEPTH = 20  # of lists and objects in each other
 MAX_STATE = 1_000_000
 SHORTEST_S, LONGEST_S = 1e-6, 1e9  # a period
+SENSITIVE = "sensitive_after_steps"  # in the provenance: steps after which loops on two machines part by rounding
 MOVE_ROUNDING = 1e-9  # share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, nan
 from typing import TypeAlias
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from serving.controller import Controller, Step
 from serving.errors import OutputError, SampleError
-from serving.manifest import Manifest, Signal
+from serving.manifest import SENSITIVE, Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -41,18 +41,27 @@ class Answer:
 
 
 def answered(controller: Controller) -> list[Answer]:
-    """All steps of the kit, as this runtime answers them; a refused step leaves the state as it was."""
+    """All steps of the kit, as this runtime answers them; a refused step leaves the state as it was.
+
+    A law that amplifies rounding starts from zeros again long before two right hosts part.
+    """
     state, last, answers = controller.cold_state(), _middle(controller.manifest.mv), []
+    parts_after = controller.manifest.provenance.get(SENSITIVE)
+    longest = max(int(parts_after) // 4, 1) if isinstance(parts_after, int) else None
+    since = 0
     drawn = _drawn(controller.manifest)
     choices = next(drawn)
     while True:
-        for given in choices:
+        again = longest is not None and since >= longest
+        for choice in choices:
+            given = replace(choice, cold=True) if again else choice
             answer = _answer(controller, given, state)
             if answer.step is not None and _inside(controller.manifest.mv, answer.step.mv):
                 break
         answers.append(answer)
         if answer.step is not None:
             state, last = answer.step.state, answer.step.mv
+            since = 1 if answer.given.cold else since + 1
         try:
             choices = drawn.send((answer.given, last))
         except StopIteration:
