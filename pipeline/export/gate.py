@@ -133,7 +133,7 @@ def parity_gate(
     courses = (_course(signals.sp, rng, 1 / 40), _course(signals.pv, rng), _course(signals.dv, rng))
     applied = own_applied = np.array([s.middle for s in signals.mv])
     state = own_state = np.zeros(law.n_state)
-    pairs, alone = [], []
+    pairs, alone = [], list[Array]()
     show = progress.steps("the exported file beside the law, step by step", steps)
     for k in range(steps):
         sp, pv, dv = (step() for step in courses)
@@ -167,8 +167,8 @@ def parity_gate(
         raise ExportError(
             f"law {law.name!r}: a step of the exported file and of the law differ by {relative[:, i].max():.1e} of the "
             f"largest value of {names[i]} within {steps} steps (allowed {allowed[i]:.0e}; at step {k}, the first "
-            f"beyond, torch has {torch_side[k, i]:.17g}, onnxruntime {onnx_side[k, i]:.17g}): the graph is not the law; "
-            "in a law of your own use float64 buffers for all constants, and no transposed constant in front of a "
+            f"beyond, torch has {torch_side[k, i]:.17g}, onnxruntime {onnx_side[k, i]:.17g}): the graph is not the "
+            "law; in a law of your own use float64 buffers for all constants, and no transposed constant in front of a "
             "vector product"
         )
     worst = float(relative[:, :n_fed].max())
