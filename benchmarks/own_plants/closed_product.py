@@ -152,6 +152,8 @@ def by_run(plant: ClosedPlant, file: Path, project: Path) -> Delivered:
         said += more
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
+    for package in ("pipeline", "serving"):  # runs of many states of the sources are kept side by side
+        shutil.rmtree(project / package)
     files = {path.stem: path for path in sorted((project / "artifacts" / plant.name).glob("*.onnx"))}
     (project / "said.txt").write_text("\n".join(said), encoding="utf-8")
     return Delivered({name: shipped(plant, path) for name, path in files.items()}, said, seconds, files)
