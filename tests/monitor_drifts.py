@@ -5,18 +5,12 @@ Two cases of different kinds are looked at with every change, all of them with a
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from functools import cache
-from pathlib import Path
-from types import ModuleType
-
 import pytest
+from benchmark_modules import benchmark_script
 
 from pipeline.cases import CASES
 from serving.monitor import monitor, pace
 
-FILE = Path(__file__).parents[1] / "benchmarks" / "monitor.py"
 # Of a chart. Fewer than 12 that are independent make it learn four times as long, as here the 10 of the first case do:
 # after 14 blocks of it another verdict would come first.
 BLOCKS = {"thiosulfate_cstr": 10}
@@ -35,18 +29,6 @@ DRIFTS = {
 }
 
 
-@cache
-def benchmark() -> ModuleType:
-    """The module of the benchmark, which is a script."""
-    spec = importlib.util.spec_from_file_location("benchmark_of_monitor", FILE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 def assert_found_and_quiet_without(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is normal is learnt in less time than on a plant, so that a run is short; batches are learnt in full."""
     monkeypatch.setattr(monitor, "LEARN_RESTS", 60)
@@ -55,14 +37,14 @@ def assert_found_and_quiet_without(name: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(pace, "FINE_S", 0.0)
     monkeypatch.setattr(pace, "LEARN_S", 0.0)
     # Looking takes a quarter of the time where it is done at every scan.
-    monkeypatch.setattr(benchmark(), "LOOK_S", 10 * CASES[name].plant.period_s)
+    monkeypatch.setattr(benchmark_script("monitor"), "LOOK_S", 10 * CASES[name].plant.period_s)
     parameter, share, verdicts, within = DRIFTS[name]
-    watched = benchmark().learnt(name, seed=7)
+    watched = benchmark_script("monitor").learnt(name, seed=7)
     assert [alarm for alarm in watched.alarms if alarm[2] == "retrain"] == []
     assert "watch" not in watched.levels.values()
     seeds = SEEDS.get(name, (8,))
     for seed in seeds:
-        found = benchmark().drifted(watched, (parameter, share), within, seed=seed)
+        found = benchmark_script("monitor").drifted(watched, (parameter, share), within, seed=seed)
         assert found is not None, f"seed {seed}: not within {within} periods"
         assert found[1] in verdicts, found
-    assert benchmark().drifted(watched, (parameter, 0.0), within, seed=seeds[0]) is None
+    assert benchmark_script("monitor").drifted(watched, (parameter, 0.0), within, seed=seeds[0]) is None

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pytest
-from monitor_drifts import DRIFTS, assert_found_and_quiet_without, benchmark
+from benchmark_modules import benchmark_script
+from monitor_drifts import DRIFTS, assert_found_and_quiet_without
 
 from pipeline.cases import CASES
 
 
 def test_every_case_is_among_them() -> None:
-    assert set(DRIFTS) == set(CASES) == set(benchmark().PLANS)
+    assert set(DRIFTS) == set(CASES) == set(benchmark_script("monitor").PLANS)
 
 
 @pytest.mark.parametrize("name", ["reversible_cstr", "batch_reactor"])

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import csv
-import importlib
-import sys
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from benchmark_modules import FOLDER, own_plants_modules
 
-FOLDER = Path(__file__).parents[2] / "benchmarks" / "own_plants"
 MODULES = (
     "plant", "loops", "record", "store", "closed_plant", "closed_development", "closed_untouched", "closed_record",
     "closed_product", "closed_benchmark", "closed_refused",
@@ -25,15 +22,7 @@ ROWS = 600
 
 @pytest.fixture(scope="module")
 def own() -> Any:
-    """The benchmark's modules by name; their short names are free again afterwards."""
-    sys.path.insert(0, str(FOLDER))
-    try:
-        loaded: dict[str, ModuleType] = {name: importlib.import_module(name) for name in MODULES}
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in MODULES:
-            sys.modules.pop(name, None)
-    return SimpleNamespace(**loaded)
+    return own_plants_modules(MODULES)
 
 
 def plants(own: Any) -> dict[str, Any]:
@@ -220,7 +209,7 @@ def test_what_moves_with_a_pv_and_moves_nothing_leaves_the_plant_to_its_loads(ow
 
 
 def test_a_shipped_file_steps_each_test_as_the_runtime_does(own: Any) -> None:
-    law = own.closed_product.Shipped(FOLDER.parents[1] / "artifacts" / "thiosulfate_cstr" / "pid.onnx")
+    law = own.closed_product.Shipped(FOLDER.parent / "artifacts" / "thiosulfate_cstr" / "pid.onnx")
     controller, rng = law.controller, np.random.default_rng(0)
     ranges = {role: controller.manifest.signals(role) for role in ("sp", "pv", "dv", "mv")}
     drawn = {

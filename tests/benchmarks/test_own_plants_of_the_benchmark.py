@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from benchmark_modules import own_plants_modules
 
 from pipeline.simulation.simulate import simulate_closed
 
-FOLDER = Path(__file__).parents[2] / "benchmarks" / "own_plants"
 MODULES = ("plant", "development", "untouched", "record", "loops")
 
 
 @pytest.fixture(scope="module")
 def own() -> Any:
-    """The benchmark's modules by name; their short names are free again afterwards."""
-    sys.path.insert(0, str(FOLDER))
-    try:
-        loaded: dict[str, ModuleType] = {name: importlib.import_module(name) for name in MODULES}
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in MODULES:
-            sys.modules.pop(name, None)
-    return SimpleNamespace(**loaded)
+    return own_plants_modules(MODULES)
 
 
 class Proportional(torch.nn.Module):

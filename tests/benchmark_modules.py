@@ -1,0 +1,37 @@
+"""The benchmarks as modules: they are scripts beside the packages. Not a test."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+
+
+@cache
+def benchmark_script(name: str) -> ModuleType:
+    """benchmarks/NAME.py as a module."""
+    spec = importlib.util.spec_from_file_location(f"benchmark_of_{name}", FOLDER / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def own_plants_modules(names: Sequence[str]) -> SimpleNamespace:
+    """Modules of benchmarks/own_plants by name; their short names are free again afterwards."""
+    folder = str(FOLDER / "own_plants")
+    sys.path.insert(0, folder)
+    try:
+        return SimpleNamespace(**{name: importlib.import_module(name) for name in names})
+    finally:
+        sys.path.remove(folder)
+        for name in names:
+            sys.modules.pop(name, None)
