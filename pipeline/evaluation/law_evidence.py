@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.evaluation.limit_cycle import Cycle
 from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 from pipeline.files import write_text
 
@@ -67,8 +68,9 @@ class LawMetrics:
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
     lowest and highest value in closed loops without noise, where these run on models of a record; ``replay``: MV ->
     figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end;
-    ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``poor``: why a law that
-    locked up nowhere is not shipped, a clause after its name, and what to do.
+    ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``cycles``: test -> the
+    worst limit cycle of the shipped file; ``poor``: why a law that locked up nowhere is not shipped, a clause after its
+    name, and what to do.
     """
 
     name: str
@@ -87,6 +89,7 @@ class LawMetrics:
     replay: Mapping[str, Row] = field(default_factory=dict)
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     at_rest: Mapping[str, float] = field(default_factory=dict)
+    cycles: Mapping[str, Cycle] = field(default_factory=dict)
     poor: str = ""
 
     def write(self, path: Path) -> None:
@@ -183,6 +186,16 @@ class LawEvidence:
         """
         start = f"{scenario}/{self.form_of(setting)}/{self.metrics.shipped_seed}/"
         return arrays(self.trajectories, start) or None
+
+    @property
+    def worst_cycle(self) -> str | None:
+        """The test with the worst limit cycle; None without one."""
+        cycles = self.metrics.cycles
+        return max(cycles, key=lambda test: cycles[test].times, default=None)
+
+    def cycling(self) -> Loop:
+        """Arrays of the loop with the worst limit cycle by name; empty where there is none."""
+        return arrays(self.trajectories, "cycling/")
 
     def replay(self) -> Loop:
         """Arrays of the replay over the plant's record by name; empty where there was none."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import left_limits, locked_up, swings
+from pipeline.evaluation.limit_cycle import Cycle, cycle_of
 from pipeline.evaluation.metric import mean_of_draws
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
@@ -39,6 +40,8 @@ class Trial:
     swings: dict[str, int]  # the same of closed loops that swing to the end
     curves: dict[str, Trajectory]
     reached: dict[str, tuple[float, float]]  # by closed loops without noise, PVs and MVs; of a case on models alone
+    cycles: dict[str, Cycle]  # test -> its worst limit cycle, without noise; of a case on models alone
+    cycling: Trajectory | None  # the loop with the worst of them
 
     @property
     def lock_ups(self) -> int:
@@ -55,13 +58,14 @@ class Trial:
 class Repeated:
     """One test, repeated with different noise where it is noisy: mean figures, the first loop.
 
-    And of all the lock-ups, and those that swing to the end.
+    And of all the lock-ups, and those that swing to the end; without noise, on models, the limit cycle.
     """
 
     metrics: Metrics
     first: Trajectory
     lock_ups: int
     swings: int
+    cycle: Cycle | None = None
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
@@ -70,7 +74,8 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     lock_ups, swing = (sum(of(case, test, loop) for loop in loops) for of in (stuck, swings_on))
-    return Repeated(mean_of_draws(rows), loops[0], lock_ups, swing)
+    cycle = cycle_of(case, test, loops[0]) if case.on_models and not noise and not test.replayed else None
+    return Repeated(mean_of_draws(rows), loops[0], lock_ups, max(swing, int(cycle is not None)), cycle)
 
 
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
@@ -115,8 +120,7 @@ def swings_on(case: Case, test: Scenario, loop: Trajectory) -> bool:
     """Whether a controlled variable swings about its set point to the end of the test; a replayed load may swing."""
     if test.replayed:
         return False
-    spans = np.array([s.high - s.low for s in case.plant.sp_signals])
-    return bool(swings(loop.sp, loop.pv[:, : test.sp.shape[1]], spans).any())
+    return bool(swings(loop.sp, loop.pv[:, : test.sp.shape[1]], case.spans).any())
 
 
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:
