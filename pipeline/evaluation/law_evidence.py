@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.limit_cycle import Cycle
 from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 from pipeline.files import write_text
 
@@ -56,6 +55,26 @@ class Form:
     info: tuple[str, ...]
     tests: Mapping[str, OverSeeds]
     analysis: Analysis | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """A CV that swings about its set point, or an MV about its mean, by +- ``amplitude`` [its unit].
+
+    ``times``: how many times the limit the amplitude is.
+    """
+
+    signal: str
+    unit: str
+    amplitude: float
+    period_s: float
+    times: float
+
+    @property
+    def words(self) -> str:
+        """``y0 swings by ± 0.3 m every 12 s``."""
+        unit = "" if self.unit in {"", "-"} else f" {self.unit}"
+        return f"{self.signal} swings by ± {self.amplitude:.2g}{unit} every {self.period_s:.3g} s"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,39 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.closed_loop import STEP_BAND, last_half, swings
+from pipeline.evaluation.law_evidence import Cycle
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import Trajectory
 from serving.manifest import Signal
 
 MV_SWING: Final = 0.05  # of an MV's range: a valve that swings farther to the end wears, whatever the CV does
 NOISES: Final = 5.0  # standard deviations of the noise: a smaller swing of a CV is lost in them
-
-
-@dataclass(frozen=True, slots=True)
-class Cycle:
-    """A CV that swings about its set point, or an MV about its mean, by +- ``amplitude`` [its unit].
-
-    ``times``: how many times the limit the amplitude is.
-    """
-
-    signal: str
-    unit: str
-    amplitude: float
-    period_s: float
-    times: float
-
-    @property
-    def words(self) -> str:
-        """``y0 swings by ± 0.3 m every 12 s``."""
-        unit = "" if self.unit in {"", "-"} else f" {self.unit}"
-        return f"{self.signal} swings by ± {self.amplitude:.2g}{unit} every {self.period_s:.3g} s"
 
 
 def cycle_of(case: Case, test: Scenario, loop: Trajectory) -> Cycle | None:

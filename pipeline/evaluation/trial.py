@@ -10,7 +10,8 @@ import numpy as np
 
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import left_limits, locked_up, swings
-from pipeline.evaluation.limit_cycle import Cycle, cycle_of
+from pipeline.evaluation.law_evidence import Cycle
+from pipeline.evaluation.limit_cycle import cycle_of
 from pipeline.evaluation.metric import mean_of_draws
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario

@@ -11,8 +11,7 @@ from typing import Literal
 
 from pipeline.engine.parallel import parallel_map
 from pipeline.evaluation.case import Case
-from pipeline.evaluation.law_evidence import BASE
-from pipeline.evaluation.limit_cycle import Cycle
+from pipeline.evaluation.law_evidence import BASE, Cycle
 from pipeline.evaluation.metric import together
 from pipeline.evaluation.reached import reached_by, widest
 from pipeline.evaluation.trial import DEVELOPED, DEVELOPMENT, Metrics, Trial, repeated

@@ -11,7 +11,8 @@ from own_cases import controllers_of_a_lag
 
 from pipeline.cases.own_plant import OwnCase
 from pipeline.evaluation.closed_loop import RANGE_BAND, STEP_BAND
-from pipeline.evaluation.limit_cycle import MV_SWING, NOISES, Cycle, cycle_of
+from pipeline.evaluation.law_evidence import Cycle
+from pipeline.evaluation.limit_cycle import MV_SWING, NOISES, cycle_of
 from pipeline.evaluation.trial import swings_on
 from pipeline.simulation.simulate import Trajectory, simulate_closed
 
