@@ -29,6 +29,7 @@ from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from serving.manifest import Signal
 
 LOAD_AT = 5  # sample at which a load or a step of a measured disturbance begins
+SPOILT = "spoilt"  # the test on models gone wrong
 LOADED = "load"  # the test with loads that nobody measures
 DAILY = "daily"  # the test with the record's own set points and loads
 MEASURED = "measured"  # the test with steps of the measured disturbances
@@ -50,6 +51,7 @@ class OwnCase(OwnEnsemble):
     on_models: ClassVar[bool] = True
     data_seeds: ClassVar[int] = 1
     unforeseen: ClassVar[bool] = True
+    gone_wrong: ClassVar[tuple[str, ...]] = (SPOILT,)
     test_words: ClassVar[Mapping[str, str]] = {DAILY: "daily work"}
 
     @property

@@ -95,6 +95,12 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "old_controllers": _old_controllers(evidence),
         "worst_pictures": of_kind("worst_").keys(),
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
+        "poor": [
+            {"law": name, "why": law.why_withheld}
+            for name, law in evidence.laws.items()
+            if case.on_models and law.withheld and not law.lock_ups
+        ],
+        "at_rest": any(evidence.at_rest(name) is not None for name in evidence.scenarios),
         "withheld": by_reason({law: why for law, why in evidence.withheld.items() if law != case.old_loop}),
         "gate_of": _gate_of(evidence),
         "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),
