@@ -66,7 +66,8 @@ class LawMetrics:
     reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
     lowest and highest value in closed loops without noise, where these run on models of a record; ``replay``: MV ->
-    figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end.
+    figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end;
+    ``beyond_reach``: the same of holds that count as no lock-up, because no control gets to their set point.
     """
 
     name: str
@@ -84,6 +85,7 @@ class LawMetrics:
     reached: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     replay: Mapping[str, Row] = field(default_factory=dict)
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    beyond_reach: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
         """Write the file; ValueError for NaN and infinity."""
