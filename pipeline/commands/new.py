@@ -17,7 +17,7 @@ from pipeline.commands.arguments import positive, whole
 from pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
 from pipeline.commands.new_exported import asked, given_tags, loop_lines, propose_tags
 from pipeline.commands.new_fmu import table_from, write_table
-from pipeline.commands.new_known import asked_of, signals_as_tags, stated_of
+from pipeline.commands.new_known import signals_as_tags, stated_of
 from pipeline.commands.new_printed import tell
 from pipeline.commands.new_replaced import REFUSED, check_replaceable, known_kept, limits_kept, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
@@ -30,6 +30,7 @@ from pipeline.files import draft_folder_of, write_json, write_text
 from pipeline.historian.excerpt import evenly
 from pipeline.historian.exported import screened_export, with_units
 from pipeline.historian.guessing import controlled_first
+from pipeline.historian.known_record import beside_record
 from pipeline.historian.refusal import Refusal, refusal
 from pipeline.historian.screening import Screened
 from pipeline.historian.step_test import planned
@@ -63,7 +64,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--max-move", metavar="TAG=CHANGE", action="append", default=[],
         help="largest change of an MV in a minute that the controller may make, in the MV's unit")  # fmt: skip
     add("--known", metavar="PV/INPUT=WORDS", action="append", default=[],
-        help="what you know of a PV's answer to an MV or DV: +, -, none, gain LOW..HIGH, dead FROM..TO (s)")  # fmt: skip
+        help="what you know of the answer to an MV or DV: +, -, none, gain LOW..HIGH, dead FROM..TO (s)")  # fmt: skip
     add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
     add("--period", metavar="S", type=positive("s"),
         help="sampling period of the record (default: the export's step, longer for a slow plant)")  # fmt: skip
@@ -177,7 +178,7 @@ def _write(
     signals = signals_as_tags(found.record, tags)
     said = stated_of(signals, options.known)
     known, more = known_kept(name, said, signals) if options.replace else (said.known, [])
-    questions = asked_of(known, found.record, verdict)
+    questions = [beside.question for beside in beside_record(known, found.record) if beside.question]
     unusable, lost = refusal(found, tags, options.anyway), list[str]()
     if unusable and folder.exists() and (name in sections("plants") or not _refused(folder)):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays

@@ -1,27 +1,21 @@
-"""``loopwright new``: what a person knows of pairs of PV and input, by ``--known`` and by column ``known`` of the table."""
+"""``loopwright new``: what a person knows of pairs of PV and input, by ``--known`` and by the table of tags."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-import numpy as np
-
-from pipeline.config.known import FORMS, NONE, NOTHING, Known, stated, together
+from pipeline.config.known import FORMS, Known, stated, together
 from pipeline.config.plants import mistake_of_known
 from pipeline.errors import RecordError, nearest
-from pipeline.historian.direct import DirectModel
-from pipeline.historian.findings import Verdict
-from pipeline.historian.tags import Tag, TableError
+from pipeline.historian.tags import TableError, Tag
 from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
-
-FEWEST, USUAL, MOST = 10, 40, 100  # rows after a step in which an answer is looked for; USUAL: the record does not say
 
 
 @dataclass(frozen=True, slots=True)
 class Stated:
-    """The statements, one a pair, and the pairs (PV, input) of which ``--known PV/INPUT=`` takes an earlier one back."""
+    """The statements, one a pair; ``--known PV/INPUT=`` takes those on the ``forgotten`` pairs back."""
 
     known: tuple[Known, ...] = ()
     forgotten: frozenset[tuple[str, str]] = field(default_factory=frozenset)
@@ -98,30 +92,3 @@ def _of_table(tags: Sequence[Tag], pvs: Sequence[Tag]) -> Iterator[Known]:
                     wrong.append(f"{where}: {error}")
     if wrong:
         raise TableError(wrong)
-
-
-def asked_of(known: Sequence[Known], record: Record, verdict: Verdict) -> list[str]:
-    """Questions, one for each statement that one-step predictions of the record are certain to contradict.
-
-    The answer is taken after the PV has settled, where the screening knows when that is; else its sign alone counts.
-    """
-    pvs, inputs = [s.name for s in record.pv_signals], [s.name for s in (*record.mv_signals, *record.dv_signals)]
-    moves, found = np.hstack([record.mv, record.dv]), []
-    for one in known:
-        i, j = pvs.index(one.pv), inputs.index(one.input)
-        settling_s = next((r.settling_s for r in verdict.inputs if r.name == one.input and one.pv in r.certain), 0.0)
-        rows = int(np.clip(round(settling_s / record.period_s), FEWEST, MOST)) if settling_s else USUAL
-        model = DirectModel.of(record.pv[:, i], moves, record.run, rows + rows // 2)
-        said = one if settling_s or one.sign == NONE else _sign_of(one)
-        if model is None or said is None:
-            continue
-        gain, sd = model.answer(j, rows, rows + rows // 2)
-        least = NOTHING * float(record.pv[:, i].std() / max(moves[:, j].std(), 1e-300)) if one.sign == NONE else 0.0
-        if said.excludes(gain, sd, least):
-            found.append(one.question(gain, sd))
-    return found
-
-
-def _sign_of(one: Known) -> Known | None:
-    """The statement without its gain and dead time; None where no sign is left."""
-    return replace(one, sign="+" if one.way > 0 else "-", gain=None, dead_s=None) if one.way else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 NONE = "none"
@@ -127,9 +127,13 @@ def together(statements: Sequence[Known]) -> tuple[Known, ...]:
         mine, theirs = one.to_dict(), {} if old is None else old.to_dict()
         if old is not None and any(mine[key] != theirs[key] for key in mine.keys() & theirs.keys()):
             raise ValueError(f"{one.pair}: {old.says!r} and {one.says!r} contradict each other; keep one")
-        both = {key: tuple(v) if isinstance(v, list) else v for key, v in {**theirs, **mine}.items()}
-        found[one.pair] = Known(**both)
+        found[one.pair] = one if old is None else _both(old, one)
     return tuple(found.values())
+
+
+def _both(first: Known, second: Known) -> Known:
+    more = {key: getattr(second, key) for key in ("sign", "gain", "dead_s") if getattr(second, key)}
+    return replace(first, **more)
 
 
 def _number(text: str, where: str) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from pipeline.evaluation.known import decides, known_of, question
 from pipeline.evaluation.model_evidence import Metrics, identified_part
 from pipeline.evaluation.validation import Statement
 
@@ -32,6 +33,8 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
 
     To go on a sentence: ``not proven: the model's gain is uncertain in sign ...``.
     """
+    if asked := question(models):
+        return asked
     rows = [(row, pair) for row, pair in _signs(identified_part(models).get("proof") or {}) if not row.holds]
     if not rows:
         return ""
@@ -75,15 +78,20 @@ def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[Statement, str]]:
     for pv, mvs in (proof.get("answers") or {}).items():
         shown = pv in one_step and one_step[pv]["nats"] >= FORESEEN
         for mv, found in mvs.items():
-            yield _sign(pv, mv, found, shown=shown), f"{pv} to {mv}"
+            yield _sign(pv, mv, found, known_of(proof, pv, mv), shown=shown), f"{pv} to {mv}"
 
 
-def _holds(found: Mapping[str, Any], *, shown: bool) -> bool:
+def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
     """Whether nothing speaks against an answer.
 
     Where the inputs are ``shown`` to foresee the PV over rows that no fit saw, and all models that are as likely have
-    one sign, one-step predictions need not be as certain of it by themselves.
+    one sign, one-step predictions need not be as certain of it by themselves. What an engineer says decides what the
+    record leaves uncertain; a model of another sign than said holds nowhere.
     """
+    if known and known["way"] * found["model"] < 0:
+        return False
+    if decides(known, found):
+        return True
     if found["verdict"] == "proven":
         return True
     if not shown or found["verdict"] != "uncertain" or found["direct"] is None:
@@ -92,20 +100,32 @@ def _holds(found: Mapping[str, Any], *, shown: bool) -> bool:
     return bool(of_one_sign and abs(found["direct"]) >= LIKELY * found["sd"])
 
 
-def _sign(pv: str, mv: str, found: Mapping[str, Any], *, shown: bool) -> Statement:
+def _sign(pv: str, mv: str, found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> Statement:
     direct = (
         "too few rows for one-step predictions"
         if found["direct"] is None
         else f"one-step predictions {found['direct']:.3g} ± {found['sd']:.2g}"
     )
+    holds = _holds(found, known, shown=shown)
     span = f"{found['low']:.3g} … {found['high']:.3g}"
     return Statement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         "certain in sign, the same in both halves of the record, and of the size that one-step predictions find",
         f"{found['model']:.3g} ({span}); {direct}",
-        _holds(found, shown=shown),
-        _why(pv, mv, found),
+        holds,
+        _word(found, known, holds=holds) or _why(pv, mv, found),
     )
+
+
+def _word(found: Mapping[str, Any], known: Mapping[str, Any], *, holds: bool) -> str:
+    """What an engineer's word has decided of an answer; empty where it has not."""
+    if known and known["way"] * found["model"] < 0:
+        return f"an engineer says {known['says']!r}, and the model has the other sign"
+    if decides(known, found):
+        return f"the record leaves it open: it holds by the word of an engineer, who says {known['says']!r}"
+    if known and not holds and found["verdict"] == "uncertain" and not known["size"]:
+        return f"an engineer says {known['says']!r}, and the record tells too little of the size: say the gain too"
+    return ""
 
 
 def _why(pv: str, mv: str, found: Mapping[str, Any]) -> str:
