@@ -17,6 +17,7 @@ from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
 from pipeline.cases.own_entries import OLD_LOOP
 from pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
+from pipeline.config.known import together
 from pipeline.config.params import sections_of
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.evaluation.case import Array, Case
@@ -264,6 +265,7 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "plant_class": type("OwnPlant", (Untrained,), described),
         "models": models,
         "data": params.data,
+        "known": together(params.known),
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
         "__module__": base.__module__,
         **({"gate": GATE_WITH_MEASURED} if dv else {}),

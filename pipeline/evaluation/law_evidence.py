@@ -68,7 +68,8 @@ class LawMetrics:
     lowest and highest value in closed loops without noise, where these run on models of a record; ``replay``: MV ->
     figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end;
     ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``poor``: why a law that
-    locked up nowhere is not shipped, a clause after its name, and what to do; ``beyond_reach``: the same of holds that count as no lock-up, because no control gets to their set point.
+    locked up nowhere is not shipped, a clause after its name, and what to do;
+    ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to their set point.
     """
 
     name: str

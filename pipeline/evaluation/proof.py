@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from pipeline.evaluation.known import decides, known_of, question
 from pipeline.evaluation.model_evidence import Metrics, identified_part
 from pipeline.evaluation.validation import Statement
 
@@ -34,6 +35,8 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
 
     To go on a sentence: ``not proven: the model's gain is uncertain in sign ...``.
     """
+    if asked := question(models):
+        return asked
     rows = [(row, pair) for row, pair in _signs(identified_part(models).get("proof") or {}) if not row.holds]
     if not rows:
         return ""
@@ -91,12 +94,17 @@ def _followed(proof: Mapping[str, Any], pv: str) -> bool:
     return missed is not None and share is not None and missed <= MISSED * of["motion"] and share <= SHARE
 
 
-def _holds(found: Mapping[str, Any], *, shown: bool) -> bool:
+def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
     """Whether nothing speaks against an answer.
 
     Where the inputs are ``shown`` to foresee the PV over rows that no fit saw, and all models that are as likely have
-    one sign, one-step predictions need not be as certain of it by themselves.
+    one sign, one-step predictions need not be as certain of it by themselves. What an engineer says decides what the
+    record leaves uncertain; a model of another sign than said holds nowhere.
     """
+    if known and known["way"] * found["model"] < 0:
+        return False
+    if decides(known, found):
+        return True
     if found["verdict"] == "proven":
         return True
     if not shown or found["verdict"] != "uncertain" or found["direct"] is None:
@@ -108,25 +116,27 @@ def _holds(found: Mapping[str, Any], *, shown: bool) -> bool:
 def _by_region(found: Mapping[str, Any], *, shown: bool) -> bool:
     """Whether an answer whose gain turns or fades holds: in each region where it is not small, the PV ``shown``."""
     told = [region for region in found.get("regions") or () if not region["small"]]
-    return shown and bool(told) and all(_holds(region, shown=True) for region in told)
+    return shown and bool(told) and all(_holds(region, {}, shown=True) for region in told)
 
 
 def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) -> Statement:
-    by_region = found["verdict"] in BY_REGION
+    known, by_region = known_of(proof, pv, mv), found["verdict"] in BY_REGION
     foreseen = _foreseen(proof, pv)
     shown = foreseen or _followed(proof, pv)
     if by_region:
         holds = _by_region(found, shown=shown)
         limit = "certain in sign in each region where it is not small, and of the size that one-step predictions find"
+        because = _by_regions_why(found, shown=shown, holds=holds)
     else:
-        holds = _holds(found, shown=foreseen)
+        holds = _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
+        because = _word(found, known, holds=holds) or _why(pv, mv, found)
     return Statement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
         "; ".join([*([] if by_region else [_measured(found)]), *_regions(mv, found)]),
         holds,
-        _by_regions_why(found, shown=shown, holds=holds) if by_region else _why(pv, mv, found),
+        because,
     )
 
 
@@ -156,6 +166,17 @@ def _by_regions_why(found: Mapping[str, Any], *, shown: bool, holds: bool) -> st
         "" if holds else ", and the record shows too little of it" if shown else ", and the model predicts too little"
     )
     return f"its gain {changes} within the range{against}"
+
+
+def _word(found: Mapping[str, Any], known: Mapping[str, Any], *, holds: bool) -> str:
+    """What an engineer's word has decided of an answer; empty where it has not."""
+    if known and known["way"] * found["model"] < 0:
+        return f"an engineer says {known['says']!r}, and the model has the other sign"
+    if decides(known, found):
+        return f"the record leaves it open: it holds by the word of an engineer, who says {known['says']!r}"
+    if known and not holds and found["verdict"] == "uncertain" and not known["size"]:
+        return f"an engineer says {known['says']!r}, and the record tells too little of the size: say the gain too"
+    return ""
 
 
 def _why(pv: str, mv: str, found: Mapping[str, Any]) -> str:

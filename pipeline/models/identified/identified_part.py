@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from pipeline.config.known import NONE
 from pipeline.models.base import Model
 from pipeline.models.identified.assembly import assembled, noise_of
 from pipeline.models.identified.candidates import on_all_rows, within_limits
@@ -15,6 +16,7 @@ from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.innovations import Innovations, innovations, noise_of_filter
+from pipeline.models.identified.known_answers import known_figures
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from pipeline.models.identified.proof import Answer, answers, foreseen, proof_figures
@@ -152,6 +154,11 @@ class IdentifiedPart(Part):
             for name in (s.name for s in pvs)
             if runs[name]["outside_training"] > OUTSIDE
         ]
+        gain_table = gain_figures(bands, rows, scales, pvs, inputs)
+        for pair in problem.known.pairs:
+            if pair.input in problem.known.silent:
+                gain_table[pvs[pair.output].name][inputs[pair.input].name]["sign"] = NONE
+        said = {"known": known_figures(searched.known, gain_table, record)} if searched.known else {}
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
             "n_train": sum(len(s) for s in whole),
@@ -159,9 +166,9 @@ class IdentifiedPart(Part):
             "member": self.member,
             "outputs": runs,
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
-            "gains": gain_figures(bands, rows, scales, pvs, inputs),
+            "gains": gain_table,
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
-            "proof": _proof(searched, record, proven, runs, noise * scales.y_scale),
+            "proof": _proof(searched, record, proven, runs, noise * scales.y_scale) | said,
             "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
@@ -246,6 +253,7 @@ def _bands(selection: Selection) -> tuple[list[Dynamics], Array]:
         t
         for t in selection.finalists
         if t.structure.delays == chosen.structure.delays
+        and t.against <= chosen.against
         and (t.structure.n_hidden > 0) == (chosen.structure.n_hidden > 0)
         and t.error <= (NEAR if selection.innovations is None else NEAR_BY_ROWS) * chosen.error
     ]

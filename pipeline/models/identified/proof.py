@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.config.known import SURE
 from pipeline.historian.direct import DirectModel
 from pipeline.historian.feedback import follows
 from pipeline.models.identified.innovations import innovations
@@ -28,7 +29,6 @@ from pipeline.records.record import Record
 
 PROVEN, UNCERTAIN, OPPOSITE, HALVES, SIZE = "proven", "uncertain", "opposite", "halves", "size"
 TURNS, FADES = "turns", "fades"  # what holds by its regions
-SURE = 3.0  # standard deviations from zero beyond which a sign is certain
 CONTRARY = 2.0  # of a half of the rows, from which it speaks for the other sign
 TIMES = 3.0  # the model's answer over the one-step prediction's, or the other way round, where both are certain
 USED = 0.25  # of a PV's strongest answer to an MV over its range: a weaker one decides nothing
