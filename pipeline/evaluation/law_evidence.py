@@ -89,7 +89,8 @@ class LawMetrics:
     figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end;
     ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``cycles``: test -> the
     worst limit cycle of the shipped file; ``poor``: why a law that locked up nowhere is not shipped, a clause after its
-    name, and what to do.
+    name, and what to do; ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to
+    their set point.
     """
 
     name: str
@@ -110,6 +111,7 @@ class LawMetrics:
     at_rest: Mapping[str, float] = field(default_factory=dict)
     cycles: Mapping[str, Cycle] = field(default_factory=dict)
     poor: str = ""
+    beyond_reach: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
         """Write the file; ValueError for NaN and infinity."""

@@ -24,7 +24,7 @@ from pipeline.report.law_tables import analyses, further_figures, law_row, scena
 from pipeline.report.own_acceptance import step_test_to_run
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
-from pipeline.report.worse import against, shipped_laws
+from pipeline.report.worse import against, beyond_reach, shipped_laws
 from pipeline.tuning.pid_forms import PidForms
 from pipeline.tuning.rules import PidSettings
 
@@ -93,6 +93,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "met": sum(row.holds is True for row in judged.acceptance),
         "statements": judged.statements,
         "against": against(evidence),
+        "beyond_reach": beyond_reach(evidence),
         "caveat": _caveat(evidence, judged),
         "operated": () if evidence.grounds is None else evidence.grounds.operated,
         "old_controllers": _old_controllers(evidence),

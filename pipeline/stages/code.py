@@ -125,7 +125,8 @@ def _plant_of(stage: str, case: str) -> dict[str, Any]:
     if stage not in BEFORE_LAWS:
         return plant
     mvs = [{key: value for key, value in mv.items() if key != "max_move_per_min"} for mv in plant.get("mv", ())]
-    return {**plant, "mv": mvs}
+    # What is known of pairs decides models, and no record.
+    return {key: value for key, value in {**plant, "mv": mvs}.items() if stage != "screen" or key != "known"}
 
 
 def modules(stage: str, case: str = "") -> set[str]:

@@ -20,6 +20,7 @@ from pipeline.engine.origin import commit
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import LawError, PipelineError, WithheldError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.known import question
 from pipeline.evaluation.law_evidence import BASE
 from pipeline.evaluation.model_evidence import IDENTIFIED
 from pipeline.evaluation.proof import sign_doubts
@@ -98,9 +99,11 @@ def _parts(models: Path, seed: int) -> dict[str, Model]:
 def _require_proof(law: type[ControlLaw], case: Case, fitted: Mapping[str, Any]) -> None:
     """Raise WithheldError where the record does not prove the sign of the model that the law rests on.
 
-    Its tests would run on models of the same record, wrong like this one, and find nothing.
+    Its tests would run on models of the same record, wrong like this one, and find nothing. A simulator of the plant
+    tells a wrong model itself; but what an engineer knows, and the record is certain to contradict, is asked first.
     """
-    if case.on_models and case.stand_in == IDENTIFIED and (why := sign_doubts({"": fitted})):
+    doubts = sign_doubts if case.stand_in == IDENTIFIED else question
+    if case.on_models and (why := doubts({"": fitted})):
         raise WithheldError(f"law {law.name!r} is withheld: it is {why}")
 
 

@@ -119,6 +119,8 @@ def validate(name: str) -> None:
     evidence["dead_time_periods"] = dead_times(case.plant)
     if metrics.swings:
         evidence["swings"] = metrics.swings
+    if metrics.beyond_reach:
+        evidence["beyond_reach"] = metrics.beyond_reach
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     target = ARTIFACTS / params.case / f"{params.name}.onnx"
@@ -144,9 +146,9 @@ def _why_poor(case: Case, metrics: LawMetrics, old: Trial | None) -> str:
     return why_poor(found, metrics.name)
 
 
-def _of_tests(base: list[Trial], what: Literal["locked_up", "swings"]) -> dict[str, dict[str, int]]:
-    """Test -> data seed -> closed loops that locked up or swing to the end, of those where any did."""
-    counts = {t.seed: t.locked_up if what == "locked_up" else t.swings for t in base}
+def _of_tests(base: list[Trial], what: Literal["locked_up", "swings", "beyond_reach"]) -> dict[str, dict[str, int]]:
+    """Test -> data seed -> closed loops that locked up or swing to the end, or holds beyond reach, if there are any."""
+    counts: dict[int, dict[str, int]] = {t.seed: getattr(t, what) for t in base}
     tests = dict.fromkeys(test for of in counts.values() for test in of)
     return {test: {str(seed): of[test] for seed, of in counts.items() if test in of} for test in tests}
 
@@ -209,6 +211,7 @@ def _metrics(
         reached=widest(t.reached for t in base),
         swings=_of_tests(base, "swings"),
         cycles=shipped.cycles,
+        beyond_reach=_of_tests(base, "beyond_reach"),
     )
 
 

@@ -58,7 +58,7 @@ class NoiseSearch:
         linears = LinearSearch.of(rounds)
         offered = list(dict.fromkeys(s.delays for s, _ in linears.starts))
         none = Structure("balanced", 0, (0, 0), offered[0])
-        later = [tuple(d + more for d in offered[-1]) for more in LATER]
+        later = [rounds.problem.known.delays([d + more for d in offered[-1]]) for more in LATER]
         return cls(
             rounds, replace(linears, starts=linears.starts | rounds.starts([replace(none, delays=d) for d in later]))
         )
@@ -101,18 +101,19 @@ class NoiseSearch:
         costs = np.cumsum([self.rounds.budget.of(t.structure, t.iterations) for t in tasks])
         affordable = [t for t, cost in zip(tasks, costs, strict=True) if cost <= self.rounds.budget.left()]
         trials, _ = self.rounds.trials(affordable, "neural networks with their noise")
-        return sorted((t for t in trials if t.folds == linear[0].folds), key=lambda t: t.error)
+        return sorted((t for t in trials if t.folds == linear[0].folds), key=lambda t: t.rank)
 
     def ranked(self, trials: Sequence[Trial]) -> list[Trial]:
-        """Best first, by the log-likelihood of the held-out rows less one nat a state.
+        """Best first, by the log-likelihood of the held-out rows less one nat a state; what is known comes before it.
 
         One-step errors hardly tell orders apart, and a state less is one less to mislead. A refined model goes before
         the ARX's response as it is, whose tail still holds what the prior made of noise.
         """
         best = min(trials, key=lambda t: t.error)
 
-        def cost(t: Trial) -> float:
-            return nats(self.rounds.problem, t, best) + t.structure.order + (t.structure.noise == "gain")
+        def cost(t: Trial) -> tuple[int, float]:
+            likely = nats(self.rounds.problem, t, best) + t.structure.order + (t.structure.noise == "gain")
+            return t.against, likely
 
         return sorted(trials, key=cost)
 
