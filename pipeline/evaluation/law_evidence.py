@@ -208,14 +208,8 @@ class LawEvidence:
         start = f"{scenario}/{self.form_of(setting)}/{self.metrics.shipped_seed}/"
         return arrays(self.trajectories, start) or None
 
-    @property
-    def worst_cycle(self) -> str | None:
-        """The test with the worst limit cycle; None without one."""
-        cycles = self.metrics.cycles
-        return max(cycles, key=lambda test: cycles[test].times, default=None)
-
     def cycling(self) -> Loop:
-        """Arrays of the loop with the worst limit cycle by name; empty where there is none."""
+        """Arrays of the loop with the worst limit cycle by name, see ``worst_cycle``; empty where there is none."""
         return arrays(self.trajectories, "cycling/")
 
     def replay(self) -> Loop:

@@ -55,10 +55,16 @@ def limit_cycle(evidence: Evidence, law: str) -> str:
 
     Models have no valve that sticks and no coarse reading, so that the law alone makes it.
     """
-    cycles = evidence.laws[law].metrics.cycles
-    own = {test: cycle for test, cycle in cycles.items() if test not in evidence.case.gone_wrong}
-    worst = max(own, key=lambda test: own[test].times, default=None)
-    return "" if worst is None else f"{own[worst].words} in {worst}"
+    worst = worst_cycle(evidence, law)
+    if worst is None or worst in evidence.case.gone_wrong:
+        return ""
+    return f"{evidence.laws[law].metrics.cycles[worst].words} in {worst}"
+
+
+def worst_cycle(evidence: Evidence, law: str) -> str | None:
+    """The test with the worst limit cycle of a law, on a plant gone wrong only where there is no other; None: none."""
+    cycles, wrong = evidence.laws[law].metrics.cycles, evidence.case.gone_wrong
+    return max(cycles, key=lambda test: (test not in wrong, cycles[test].times), default=None)
 
 
 def worse_than_before_everywhere(evidence: Evidence, law: str) -> str:

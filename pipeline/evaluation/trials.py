@@ -127,8 +127,11 @@ class Trials:
                 sequences[piece.test] = {str(t.seed): row for t, row in zip(tests, rows, strict=True)}
         developed = [r.metrics[self.case.metric] for p, r in found.items() if p.kind == DEVELOPED]
         first, ran = next(iter(found.items()))
-        # Of each test the worst comes last, and so of all.
-        cycles = sorted(((*r.cycle, p.key) for p, r in found.items() if r.cycle is not None), key=lambda c: c[0].times)
+        # Of each test the worst comes last; of all, on plants gone wrong where there is no other.
+        cycles = sorted(
+            ((*r.cycle, p.key) for p, r in found.items() if r.cycle is not None),
+            key=lambda c: (c[2] not in self.case.gone_wrong, c[0].times),
+        )
         return Trial(
             first.form,
             first.seed,

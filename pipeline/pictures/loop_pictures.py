@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.evaluation.case import Case, Curve, Figure
 from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.law_evidence import BASE, Array, Loop
+from pipeline.evaluation.poor_laws import worst_cycle
 from pipeline.pictures.drawing import (
     REFERENCE,
     SET_POINT,
@@ -383,18 +384,17 @@ def overview_picture(evidence: Evidence, law: str, test: str | None = None) -> C
     return _picture(evidence, scenario, title, drawn)
 
 
-def cycle_picture(evidence: Evidence, law: str) -> Canvas:
-    """The loop with the worst limit cycle of a law: what swings in it, how far and how fast."""
+def cycle_picture(evidence: Evidence, law: str) -> tuple[Canvas, str]:
+    """The loop with the worst limit cycle of a law; and what swings in it, how far and how fast, in words."""
     measured, case = evidence.laws[law], evidence.case
-    test, loop = measured.worst_cycle, measured.cycling()
+    test, loop = worst_cycle(evidence, law), measured.cycling()
     if test is None or not loop:
         raise NotMeasuredError
-    where = scenario_name(test, case.recipe, case.test_words)
-    title = f"{measured.title}, {where}\n{measured.metrics.cycles[test].words}"
+    where, words = scenario_name(test, case.recipe, case.test_words), measured.metrics.cycles[test].words
     name = law_name(law)
-    panels = LoopPanels(case, title, {name: loop})
+    panels = LoopPanels(case, f"{measured.title}, {where}\n{words}", {name: loop})
     panels.add(loop, name, colour_of(law, evidence.laws, case.baseline))
-    return panels.finish(loop)
+    return panels.finish(loop), f"{measured.title} on {where}: {words}"
 
 
 def disturbance_picture(evidence: Evidence, scenario: str) -> Canvas:

@@ -80,8 +80,7 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                     words = scenario_name(test, evidence.case.recipe, evidence.case.test_words)
                     keep(f"worst_{name}", overview_picture(evidence, name, test), f"{law.title} on {words}")
             with suppress(NotMeasuredError):
-                canvas = cycle_picture(evidence, name)
-                keep(f"cycle_{name}", canvas, f"{law.title}: {law.metrics.cycles[str(law.worst_cycle)].words}")
+                keep(f"cycle_{name}", *cycle_picture(evidence, name))
             with suppress(NotMeasuredError):
                 keep(f"replay_{name}", replay_picture(evidence, name), f"{law.title}, replayed over the record")
         for test, sequences in evidence.tests.items():

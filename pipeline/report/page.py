@@ -97,7 +97,10 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "caveat": _caveat(evidence, judged),
         "operated": () if evidence.grounds is None else evidence.grounds.operated,
         "old_controllers": _old_controllers(evidence),
-        "worst_pictures": of_kind("worst_").keys(),
+        "picture_against": {
+            law: next((name for kind in ("worst", "cycle") if (name := f"{kind}_{law}.png") in pictures), "")
+            for law in evidence.laws
+        },
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
         "poor": [
             {"law": name, "why": law.why_withheld}

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.law_evidence import lock_up_text
+from pipeline.evaluation.poor_laws import worst_cycle
 from pipeline.pictures.numbers import number
 from pipeline.pictures.words import law_name
 from pipeline.simulation.scenario import NOISE_SUFFIX
@@ -53,12 +54,17 @@ def shipped_laws(evidence: Evidence) -> list[str]:
 
 
 def worst_test(evidence: Evidence, law: str) -> str | None:
-    """The test whose picture says most against an own plant's law: where it is worst, or swings; None without one."""
+    """The test whose picture says most against an own plant's law: where it is worst, or swings; None without one.
+
+    A limit cycle has a picture of its own.
+    """
     if not evidence.case.on_models:
         return None
     worse = worse_tests(evidence, law)
     swinging = [t for t in evidence.laws[law].metrics.swings if t.removesuffix(NOISE_SUFFIX) in evidence.tests]
-    return worse[0].test if worse else next(iter(swinging), None)
+    if worse or evidence.laws[law].metrics.cycles:
+        return worse[0].test if worse else None
+    return next(iter(swinging), None)
 
 
 def against(evidence: Evidence) -> list[dict[str, str]]:
@@ -70,7 +76,7 @@ def against(evidence: Evidence) -> list[dict[str, str]]:
             each = ", ".join(_words(evidence, one) for one in worse)
             clauses.append(f"has a higher {case.criterion.short} than the {law_name(case.baseline)} in {each}")
         if swings := evidence.laws[law].metrics.swings:
-            worst = evidence.laws[law].worst_cycle
+            worst = worst_cycle(evidence, law)
             most = f": at worst {evidence.laws[law].metrics.cycles[worst].words} in {worst}" if worst else ""
             clauses.append(f"swings to the end in {lock_up_text(swings)}{most}")
         if clauses:
