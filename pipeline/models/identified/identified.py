@@ -52,7 +52,7 @@ class Identified(Model):
     rest_cov: Tensor  # (n_x, n_x)
     dead: Tensor  # (n_mv,) [periods]
 
-    def __init__(self, n_y: int, n_mv: int, n_dv: int, n_x: int, n_hidden: int = 0) -> None:
+    def __init__(self, n_y: int, n_mv: int, n_dv: int, n_x: int, n_hidden: int = 0, recorded: int = 0) -> None:
         super().__init__()
         sizes = {"n_y": n_y, "n_mv": n_mv, "n_dv": n_dv, "n_x": n_x, "n_hidden": n_hidden}
         if min(n_y, n_mv) < 1 or min(n_dv, n_hidden) < 0 or n_x < n_y:
@@ -65,6 +65,8 @@ class Identified(Model):
         self.reserve(y_center=(n_y,), y_scale=(n_y,), v_center=(n_v,), v_scale=(n_v,))
         self.reserve(noise=(n_y,), rest=(n_x, n_y + n_v + 1), rest_cov=(n_x, n_x), dead=(n_mv,))
         self.reserve(colour=(n_y,), gain_sd=(n_mv,), pace_sd=(1,), dead_sd=(1,))
+        self.recorded = recorded
+        self.reserve(load_moves=(recorded, n_y))
 
     @property
     def n_v(self) -> int:

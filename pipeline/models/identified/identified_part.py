@@ -14,7 +14,7 @@ from pipeline.models.identified.candidates import on_all_rows, within_limits
 from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.innovations import Innovations, innovations, noise_of_filter
+from pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from pipeline.models.identified.proof import answers, foreseen, proof_figures
@@ -45,6 +45,9 @@ Figures = Mapping[str, Mapping[str, Any]]
 
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
+
+LOAD_ROWS = 8_000
+"""Rows at most whose loads go with the model."""
 
 DRAWS = 12
 """Models drawn from the covariance of the parameters, for the bands."""
@@ -130,7 +133,7 @@ class IdentifiedPart(Part):
         curves = response_curves(bands, rows)
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
-        known = {"noise": noise, "colour": colour, **open_to}
+        known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
@@ -210,6 +213,13 @@ def _residuals(problem: Problem, structure: Structure, model: Dynamics) -> tuple
     elif isinstance(model, Innovations):
         return noise_of_filter(model, np.concatenate(found)), found, whole
     return noise_of(found), found, whole
+
+
+def _load_moves(model: Dynamics, whole: Sequence[Stretch]) -> Array:
+    """Changes (n, n_y) of the loads from row to row, scaled, over rows of a record in closed loop; none of another."""
+    if not isinstance(model, Innovations):
+        return np.empty((0, whole[0].y.shape[1]))
+    return load_moves(model, whole)[:LOAD_ROWS]
 
 
 def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> list[Array]:
