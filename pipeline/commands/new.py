@@ -15,10 +15,11 @@ import numpy as np
 from pipeline.cases.own_entries import entries_of
 from pipeline.commands.arguments import positive, whole
 from pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
-from pipeline.commands.new_exported import asked, given_tags, propose_tags
+from pipeline.commands.new_exported import asked, given_tags, loop_lines, propose_tags
 from pipeline.commands.new_fmu import table_from, write_table
+from pipeline.commands.new_known import signals_as_tags, stated_of
 from pipeline.commands.new_printed import tell
-from pipeline.commands.new_replaced import REFUSED, check_replaceable, limits_kept, wishes_lost
+from pipeline.commands.new_replaced import REFUSED, check_replaceable, known_kept, limits_kept, wishes_lost
 from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
 from pipeline.config.entries import add_entries
 from pipeline.config.exports import ExportParams
@@ -29,6 +30,7 @@ from pipeline.files import draft_folder_of, write_json, write_text
 from pipeline.historian.excerpt import evenly
 from pipeline.historian.exported import screened_export, with_units
 from pipeline.historian.guessing import controlled_first
+from pipeline.historian.known_record import beside_record
 from pipeline.historian.refusal import Refusal, refusal
 from pipeline.historian.screening import Screened
 from pipeline.historian.step_test import planned
@@ -37,6 +39,7 @@ from pipeline.plants.simulator_file import FileSimulator, is_fmu
 from pipeline.records.record import Record
 from pipeline.report.screening import write_page
 from pipeline.stages.paths import DATA, WORK
+from serving.words import plain
 
 LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
@@ -60,6 +63,8 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="range that the controller may command an MV over, within the range of its readings")  # fmt: skip
     add("--max-move", metavar="TAG=CHANGE", action="append", default=[],
         help="largest change of an MV in a minute that the controller may make, in the MV's unit")  # fmt: skip
+    add("--known", metavar="PV/INPUT=WORDS", action="append", default=[],
+        help="what you know of the answer to an MV or DV: +, -, none, gain LOW..HIGH, dead FROM..TO (s)")  # fmt: skip
     add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
     add("--period", metavar="S", type=positive("s"),
         help="sampling period of the record (default: the export's step, longer for a slow plant)")  # fmt: skip
@@ -99,13 +104,14 @@ def _run(options: argparse.Namespace) -> int:
     if not options.files:
         raise RecordError("no file is named; give one or more exports, or --simulator FILE")
     given, _ = given_tags(options)
-    if not given and (options.command or options.max_move):
-        raise RecordError("--command and --max-move are given and no mv is; name it with --mv, or give --tags")
+    if not given and (options.command or options.max_move or options.known):
+        raise RecordError("--command, --max-move or --known is given and no mv is; name it with --mv, or give --tags")
     if not given:
         propose_tags(name, options)
         return 0
     export = asked(options, given)
     tags = with_units(controlled_first(named(given)), export)
+    stated_of(tags, options.known)  # a mistake is said before the minutes of a screening
     found = screened_export(export, tags)
     period_s = found.report.period_s
     # The record that stage `screen` makes has the same one; that of longer files may differ in its last digits.
@@ -136,6 +142,7 @@ def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
     plant = FileSimulator(path, name, table=table)
     commands = named(tags) or limited(mvs_of(plant), options.command, options.max_move)
     check_start(plant, commands)  # before the minutes of an experiment
+    stated_of(signals_as_tags(plant, commands), options.known)
     made = simulated(plant, options.rows, options.period)
     return _write(name, folder, made.found, options, commands, made=made)
 
@@ -168,6 +175,10 @@ def _write(
     if options.replace:
         tags, limits = limits_kept(name, tags)
     check_commands(found.record.mv_signals, tags)
+    signals = signals_as_tags(found.record, tags)
+    said = stated_of(signals, options.known)
+    known, more = known_kept(name, said, signals) if options.replace else (said.known, [])
+    questions = [beside.question for beside in beside_record(known, found.record) if beside.question]
     unusable, lost = refusal(found, tags, options.anyway), list[str]()
     if unusable and folder.exists() and (name in sections("plants") or not _refused(folder)):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
@@ -182,6 +193,7 @@ def _write(
         if made and not unusable:
             found.record.write(draft / "record.parquet")
         plant = signals_of(found.record, tags)
+        plant |= {"known": [one.to_dict() for one in known]} if known else {}
         found.record = evenly(found.record)  # pages need no more, and a long record is large
         write_json(draft / "screening.json", report.to_dict())
         if made:
@@ -212,9 +224,16 @@ def _write(
     if not (made or report.operated):
         print("the old controller is not known, as no set point is named: with --sp TAG, and --mode TAG, it stands in "
               "every table")  # fmt: skip
+    if report.operated:
+        for line in loop_lines(tags):
+            print(plain(f"{line}; is it so? Column loop of the table of tags corrects it"))
     for line in confirmed(found.record.mv_signals, tags):
         print(line)
-    for limit in limits:
+    for line in (*(f"you know of {one.pair}: {one.says}" for one in known), *questions):
+        print(line)
+    if questions:
+        print("no controller is shipped before that is answered: change the statement, or the tags")
+    for limit in (*limits, *more):
         print(f"kept of the plant that was replaced: {limit}; give another, or edit params.yaml")
     for wish in lost:
         print(f"replaced, write it into params.yaml again if you want it: {wish}")

@@ -14,7 +14,7 @@ from pipeline.config.intervals import Interval
 from pipeline.errors import RecordError
 from pipeline.historian.exported import exported
 from pipeline.historian.findings import counted
-from pipeline.historian.guessing import guesses
+from pipeline.historian.guessing import guesses, loops_in
 from pipeline.historian.reading import read_export, tags_in, units_of
 from pipeline.historian.tags import (
     EXPLAINED,
@@ -69,6 +69,14 @@ def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
     )
 
 
+def loop_lines(tags: Sequence[Tag]) -> list[str]:
+    """Which tags belong together, a line a loop, for a person to correct."""
+    return [
+        f"loop {loop}: {', '.join(f'{role} {tag}' for role in ROLES for tag in roles.get(role, ()))}"
+        for loop, roles in loops_in(tags).items()
+    ]
+
+
 def propose_tags(name: str, options: argparse.Namespace) -> None:
     """Write the table of all tags with guessed roles, for a person to correct, and say so."""
     path = Path(f"{name}-tags.csv")
@@ -82,6 +90,8 @@ def propose_tags(name: str, options: argparse.Namespace) -> None:
     print(f"{path}: {counted(len(rows), 'tag')} with guessed roles; nothing else was written")
     for role, tags in roles.items():
         print(plain(f"  {role:5} {', '.join(tags) or '-'}"))
+    for line in loop_lines([g.tag for g in rows]):
+        print(plain(f"  {line}"))
     files = " ".join(map(str, options.files))
     how = (("--time", options.time), ("--time-format", options.time_format), ("--time-zone", options.time_zone))
     given = "".join(f" {option} {shlex.quote(value)}" for option, value in how if value)

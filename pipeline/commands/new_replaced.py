@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.cases import CASES
+from pipeline.commands.new_known import Stated, checked
 from pipeline.commands.new_simulated import SIMULATOR
+from pipeline.config.known import Known, together
 from pipeline.config.params import read_section, sections
+from pipeline.config.plants import PlantParams
 from pipeline.errors import RecordError
 from pipeline.historian.tags import COMMANDS, Tag
 
@@ -41,6 +44,20 @@ def limits_kept(plant: str, tags: Sequence[Tag]) -> tuple[tuple[Tag, ...], list[
         kept.append(replace(tag, **taken))
         words += [f"{tag.name}: {key}: {value:g}" for key, value in taken.items()]
     return tuple(kept), words
+
+
+def known_kept(plant: str, said: Stated, tags: Sequence[Tag]) -> tuple[tuple[Known, ...], list[str]]:
+    """What is known of pairs, with what params.yaml has of pairs that are still there, and the latter in words.
+
+    A statement on a pair that a person gives anew prevails as a whole.
+    """
+    if plant not in sections("plants"):
+        return said.known, []
+    old = together(PlantParams.read(plant).known)
+    names = {role: {t.name for t in tags if t.role in roles} for role, roles in (("pv", {"pv"}), ("in", {"mv", "dv"}))}
+    anew = {(one.pv, one.input) for one in said.known} | said.forgotten
+    kept = [k for k in old if (k.pv, k.input) not in anew and k.pv in names["pv"] and k.input in names["in"]]
+    return checked((*kept, *said.known), tags), [f"known: {k.pair}={k.says}" for k in kept]
 
 
 def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:

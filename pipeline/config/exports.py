@@ -22,6 +22,7 @@ class ExportedTag:
     Else the unit is the files', the range is what the readings show, and the name is the tag's own, made safe.
     ``unit_certain``: no reading is in another unit, so that none is left out for looking like it. ``between``: a line
     or a step from one reading to the next. ``ends``: rows at the lowest or highest value are kept or dropped.
+    ``loop``: tags with the same word belong together, ``-`` is none ("": by the tag's name).
     """
 
     tag: str
@@ -33,6 +34,7 @@ class ExportedTag:
     unit_certain: bool = False
     between: Literal["", "step", "line"] = ""
     ends: Literal["", "keep", "drop"] = ""
+    loop: str = ""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 from pipeline.config.exports import is_exported, screened_record
+from pipeline.config.known import NONE, Known, together
 from pipeline.config.params import PARAMS_FILE, parse, read_section, sections
-from pipeline.errors import ParamsError
+from pipeline.errors import ParamsError, nearest
 
 SECTION = "plants"
 NAME = re.compile(r"^[a-z][a-z0-9_]{0,63}$")
@@ -103,6 +105,31 @@ def mistakes_of_mv(mv: Commanded) -> list[str]:
     return wrong
 
 
+def mistake_of_known(
+    known: Sequence[Known], pvs: Sequence[str], mvs: Sequence[str], dvs: Sequence[str], controlled: int
+) -> str:
+    """What cannot be in the statements on pairs of a plant's signals, a sentence; empty where nothing is wrong.
+
+    A controlled PV needs an MV that moves it, and an MV that moves none of them is no MV.
+    """
+    for one in known:
+        for name, names, what in ((one.pv, pvs, "process variable"), (one.input, [*mvs, *dvs], "input")):
+            if name not in names:
+                return f"known: {one.says!r} is said of {one.pair}, and {name!r} is no {what}{nearest(name, names)}"
+    try:
+        joined = together(known)
+    except ValueError as error:
+        return f"known: {error}"
+    still = {(one.pv, one.input) for one in joined if one.sign == NONE}
+    for pv in pvs[:controlled]:
+        if all((pv, mv) in still for mv in mvs):
+            return f"known: no MV moves {pv}, so that none can hold it; take a `none` away, or give {pv} no role"
+    for mv in mvs:
+        if all((pv, mv) in still for pv in pvs[:controlled]):
+            return f"known: {mv} moves no controlled variable; take a `none` away, or let {mv} be no mv"
+    return ""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class RawFileParams:
     """A raw file that the record was made from."""
@@ -118,7 +145,8 @@ class PlantParams:
     ``data`` is left out where ``exports.<name>`` has the files of the record; else ``source`` has them.
     ``controlled`` is the number of PVs that have a set point, the first ones of ``pv``. None: all of them, and where
     there are more PVs than MVs, as many as there are MVs. The controllers are tested on ``simulator``, the file of the
-    plant's own simulator; None: on models of the record.
+    plant's own simulator; None: on models of the record. ``known`` is what an engineer knows of pairs of PV and input,
+    a statement a pair.
     """
 
     period_s: float
@@ -129,6 +157,7 @@ class PlantParams:
     source: tuple[RawFileParams, ...] = ()
     simulator: Path | None = None
     controlled: int | None = None
+    known: tuple[Known, ...] = ()
 
     @property
     def n_controlled(self) -> int:
@@ -151,6 +180,14 @@ class PlantParams:
         twice = [n for n in names if names.count(n) > 1]
         if twice:
             raise ValueError(f"signal {twice[0]!r} is there twice; give each its own name")
+        if wrong := mistake_of_known(
+            self.known,
+            [s.name for s in self.pv],
+            [s.name for s in self.mv],
+            [s.name for s in self.dv],
+            self.n_controlled,
+        ):
+            raise ValueError(wrong)
 
     @classmethod
     def read(cls, name: str, path: Path = PARAMS_FILE) -> PlantParams:

@@ -12,6 +12,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.config.known import Known
 from pipeline.errors import ParamsError, PlantError
 from pipeline.evaluation.closed_loop import closed_loop_metrics
 from pipeline.evaluation.effort import Effort
@@ -120,10 +121,12 @@ class Case(ABC):
     effort: ClassVar[Effort] = Effort()  # horizon and resolution of the bounds' search
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
+    known: ClassVar[tuple[Known, ...]] = ()  # of pairs of PV and input, by an engineer
     on_models: ClassVar[bool] = False  # the tests run on models of the plant's record
     stand_in: ClassVar[str] = "identified"  # what they run on in the plant's place: such models, or a simulator
     reads: ClassVar[tuple[Path, ...]] = ()  # files, beside the code, that the tests run
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
+    gone_wrong: ClassVar[tuple[str, ...]] = ()  # tests on plants that no law was told of: poor figures there are told
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # plant parameter -> where that of a real plant may lie
 
     def __post_init__(self) -> None:

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from pipeline.evaluation.known import decides, known_of, question
 from pipeline.evaluation.model_evidence import Metrics, identified_part
 from pipeline.evaluation.validation import Statement
 
 MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
+SHARE = 0.8  # free-run error over the PV's deviation, noise and all: a model that has more hardly needs its inputs
 FORESEEN = 10.0  # nats: odds of 20,000 to 1 for a model whose MVs move the PV
+COUPLED = 0.25  # of the model's own worth, that integral action of several loops keeps whatever open answers are
 LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
+BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
+LITTLE = "the record leaves its sign open; beside the other answers it decides nothing, and all loops stand either"
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
     "`loopwright new` lists them in step_test.csv, and give these rows too"
@@ -32,6 +37,8 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
 
     To go on a sentence: ``not proven: the model's gain is uncertain in sign ...``.
     """
+    if asked := question(models):
+        return asked
     rows = [(row, pair) for row, pair in _signs(identified_part(models).get("proof") or {}) if not row.holds]
     if not rows:
         return ""
@@ -71,19 +78,35 @@ def _predictions(proof: Mapping[str, Any]) -> dict[str, Statement]:
 
 def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[Statement, str]]:
     """The row of each answer, and PV and MV in words."""
-    one_step = proof.get("one_step") or {}
     for pv, mvs in (proof.get("answers") or {}).items():
-        shown = pv in one_step and one_step[pv]["nats"] >= FORESEEN
         for mv, found in mvs.items():
-            yield _sign(pv, mv, found, shown=shown), f"{pv} to {mv}"
+            yield _sign(pv, mv, found, proof), f"{pv} to {mv}"
 
 
-def _holds(found: Mapping[str, Any], *, shown: bool) -> bool:
+def _foreseen(proof: Mapping[str, Any], pv: str) -> bool:
+    """Whether the inputs foresee a PV of a closed loop one row ahead."""
+    one_step = proof.get("one_step") or {}
+    return pv in one_step and one_step[pv]["nats"] >= FORESEEN
+
+
+def _followed(proof: Mapping[str, Any], pv: str) -> bool:
+    """Whether the free run follows a PV, by its inputs: clearly better than a model without them."""
+    of = (proof.get("free_run") or {}).get(pv) or {}
+    missed, share = of.get("missed"), of.get("share")
+    return missed is not None and share is not None and missed <= MISSED * of["motion"] and share <= SHARE
+
+
+def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
     """Whether nothing speaks against an answer.
 
     Where the inputs are ``shown`` to foresee the PV over rows that no fit saw, and all models that are as likely have
-    one sign, one-step predictions need not be as certain of it by themselves.
+    one sign, one-step predictions need not be as certain of it by themselves. What an engineer says decides what the
+    record leaves uncertain; a model of another sign than said holds nowhere.
     """
+    if known and known["way"] * found["model"] < 0:
+        return False
+    if decides(known, found):
+        return True
     if found["verdict"] == "proven":
         return True
     if not shown or found["verdict"] != "uncertain" or found["direct"] is None:
@@ -92,20 +115,77 @@ def _holds(found: Mapping[str, Any], *, shown: bool) -> bool:
     return bool(of_one_sign and abs(found["direct"]) >= LIKELY * found["sd"])
 
 
-def _sign(pv: str, mv: str, found: Mapping[str, Any], *, shown: bool) -> Statement:
+def _by_region(found: Mapping[str, Any], *, shown: bool) -> bool:
+    """Whether an answer whose gain turns or fades holds: in each region where it is not small, the PV ``shown``."""
+    told = [region for region in found.get("regions") or () if not region["small"]]
+    return shown and bool(told) and all(_holds(region, {}, shown=True) for region in told)
+
+
+def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) -> Statement:
+    known, by_region = known_of(proof, pv, mv), found["verdict"] in BY_REGION
+    foreseen = _foreseen(proof, pv)
+    shown = foreseen or _followed(proof, pv)
+    if by_region:
+        holds = _by_region(found, shown=shown)
+        limit = "certain in sign in each region where it is not small, and of the size that one-step predictions find"
+        because = _by_regions_why(found, shown=shown, holds=holds)
+    else:
+        little = not known and _matters_little(found, proof, shown=shown)
+        holds = little or _holds(found, known, shown=foreseen)
+        limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
+        because = LITTLE if little else _word(found, known, holds=holds) or _why(pv, mv, found)
+    return Statement(
+        f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
+        limit,
+        "; ".join([*([] if by_region else [_measured(found)]), *_regions(mv, found)]),
+        holds,
+        because,
+    )
+
+
+def _matters_little(found: Mapping[str, Any], proof: Mapping[str, Any], *, shown: bool) -> bool:
+    """Whether an uncertain answer of several loops may be what it will: the PV ``shown``, the others hold the plant."""
+    margin = proof.get("sign_margin")
+    return shown and found["verdict"] == "uncertain" and margin is not None and margin >= COUPLED
+
+
+def _measured(found: Mapping[str, Any]) -> str:
+    """The models' answer and that of one-step predictions, in words."""
     direct = (
         "too few rows for one-step predictions"
         if found["direct"] is None
         else f"one-step predictions {found['direct']:.3g} ± {found['sd']:.2g}"
     )
-    span = f"{found['low']:.3g} … {found['high']:.3g}"
-    return Statement(
-        f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
-        "certain in sign, the same in both halves of the record, and of the size that one-step predictions find",
-        f"{found['model']:.3g} ({span}); {direct}",
-        _holds(found, shown=shown),
-        _why(pv, mv, found),
+    return f"{found['model']:.3g} ({found['low']:.3g} … {found['high']:.3g}); {direct}"
+
+
+def _regions(mv: str, found: Mapping[str, Any]) -> list[str]:
+    """The answer in each region of the MV, in words; empty where it is much the same in all of its range."""
+    return [
+        f"{mv} at {region['from']:.3g} … {region['to']:.3g}: "
+        + (f"{region['model']:.2g}, small" if region["small"] else _measured(region).replace(";", ","))
+        for region in found.get("regions") or ()
+    ]
+
+
+def _by_regions_why(found: Mapping[str, Any], *, shown: bool, holds: bool) -> str:
+    """What is so of a gain that changes within the range, and what speaks against it."""
+    changes = "turns its sign" if found["verdict"] == "turns" else "fades"
+    against = (
+        "" if holds else ", and the record shows too little of it" if shown else ", and the model predicts too little"
     )
+    return f"its gain {changes} within the range{against}"
+
+
+def _word(found: Mapping[str, Any], known: Mapping[str, Any], *, holds: bool) -> str:
+    """What an engineer's word has decided of an answer; empty where it has not."""
+    if known and known["way"] * found["model"] < 0:
+        return f"an engineer says {known['says']!r}, and the model has the other sign"
+    if decides(known, found):
+        return f"the record leaves it open: it holds by the word of an engineer, who says {known['says']!r}"
+    if known and not holds and found["verdict"] == "uncertain" and not known["size"]:
+        return f"an engineer says {known['says']!r}, and the record tells too little of the size: say the gain too"
+    return ""
 
 
 def _why(pv: str, mv: str, found: Mapping[str, Any]) -> str:

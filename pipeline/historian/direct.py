@@ -90,6 +90,11 @@ class DirectModel:
         low, high = np.quantile(found[1:], [0.16, 0.84])
         return float(found[0]), float(max(high / 2 - low / 2, 1e-300))
 
+    def answer_within(self, j: int, first: int, last: int, most: float) -> tuple[float, float] | None:
+        """``answer``; None where it goes beyond ``most``: coefficients under which a PV explodes say nothing."""
+        value, sd = self.answer(j, first, last)
+        return (value, sd) if abs(value) <= most else None
+
     def _steps(self, thetas: Array, j: int, rows: int) -> Array:
         """Answers (d, rows) to a unit step of input j under coefficients (d, p)."""
         m, longest = len(self.blocks), self.blocks[-1][1]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pipeline.config.exports import ExportedTag, ExportParams
-from pipeline.historian.guessing import controlled_first
+from pipeline.historian.guessing import controlled_first, loop_of
 from pipeline.historian.reading import read_export, units_of
 from pipeline.historian.screening import Screened, screened
 from pipeline.historian.tags import Tag, named, safe_name
@@ -15,7 +15,8 @@ from pipeline.historian.tags import Tag, named, safe_name
 def exported(tag: Tag) -> ExportedTag:
     """The entry of a tag that a person gave; what the controller may command stands with the plant."""
     name = "" if tag.name == safe_name(tag.tag) else tag.name
-    said = (tag.unit_certain, tag.between, tag.ends)
+    # What column loop says as the name does needs no word.
+    said = (tag.unit_certain, tag.between, tag.ends, "" if tag.loop == loop_of(tag.tag) else tag.loop)
     return ExportedTag(tag.tag, tag.role, tag.unit, tag.low, tag.high, name, *said)  # type: ignore[arg-type]
 
 
@@ -27,6 +28,7 @@ def signal_tags(tags: Sequence[ExportedTag]) -> tuple[Tag, ...]:
             unit_certain=t.unit_certain,
             between=t.between,
             ends=t.ends,
+            loop=t.loop,
         )
         for t in tags
     ]

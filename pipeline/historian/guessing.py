@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from pipeline.historian.linear import fitted
 from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import proposed_period
-from pipeline.historian.tags import GUESSED_PAD, Guess, Look, Tag
+from pipeline.historian.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag
 from pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
@@ -79,7 +80,7 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
         found = [g.as_role("pv") if g in own else g for g in found]
     # A variable that looks like a PV and answers to nothing may drift as the PVs do: no guess makes it a cause of them.
     taken = {g.tag.tag for g in found if g.tag.role == "pv"}
-    return disturbances(without_answers(found, export), export, taken)
+    return [_with_loop(g) for g in disturbances(without_answers(found, export), export, taken)]
 
 
 def _parameter(tag: str) -> str:
@@ -91,6 +92,17 @@ def loop_of(tag: str) -> str:
     """The loop that a tag belongs to by its name, as TIC-1 of TIC-1.SP and TIC-1/SP.CV; empty where it names none."""
     match = LOOP.match(_parameter(tag))
     return match["loop"] if match else ""
+
+
+def _with_loop(guess: Guess) -> Guess:
+    """The guess with the loop that its name says, for a person to correct; a disturbance is in none."""
+    role = guess.tag.role
+    return guess if role in {"", "dv"} else replace(guess, tag=replace(guess.tag, loop=loop_of(guess.tag.tag)))
+
+
+def loop_in(tag: Tag) -> str:
+    """The loop that a tag belongs to: as a person said, else by its name; empty where it belongs to none."""
+    return "" if tag.loop == NO_LOOP else tag.loop or loop_of(tag.tag)
 
 
 def _is_flow(guess: Guess) -> bool:
@@ -154,8 +166,17 @@ def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
 
 def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:
     """The tags, the PVs whose loop has a set point before the others."""
-    loops = {loop for t in tags if t.role == "sp" and (loop := loop_of(t.tag))}
-    return tuple(sorted(tags, key=lambda t: t.role == "pv" and loop_of(t.tag) not in loops)) if loops else tuple(tags)
+    loops = {loop for t in tags if t.role == "sp" and (loop := loop_in(t))}
+    return tuple(sorted(tags, key=lambda t: t.role == "pv" and loop_in(t) not in loops)) if loops else tuple(tags)
+
+
+def loops_in(tags: Sequence[Tag]) -> dict[str, dict[str, list[str]]]:
+    """Loop -> role -> its tags, of the loops with two tags or more that have a role."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for tag in tags:
+        if tag.role and tag.role != "dv" and (loop := loop_in(tag)):
+            found.setdefault(loop, {}).setdefault(tag.role, []).append(tag.tag)
+    return {loop: roles for loop, roles in found.items() if len(roles) > 1}
 
 
 def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] = ()) -> list[Guess]:

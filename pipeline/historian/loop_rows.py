@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.grid import Grid
-from pipeline.historian.guessing import loop_of
+from pipeline.historian.guessing import loop_in
 from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
 from pipeline.records.set_points import SetPoints
@@ -68,10 +68,10 @@ def set_points(
 
 
 def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:
-    """The tag of the same loop by its name; else the one at a place, -1: none."""
-    own = loop_of(sp.tag)
+    """The tag of the same loop, as a person or its name says; else the one at a place, -1: none."""
+    own = loop_in(sp)
     for tag in tags:
-        if own and loop_of(tag.tag) == own:
+        if own and loop_in(tag) == own:
             return tag
     return tags[place] if 0 <= place < len(tags) else None
 

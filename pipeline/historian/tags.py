@@ -27,7 +27,9 @@ GUESSED_PAD = 0.25  # of the usual span, beyond it, in the range that the table 
 KEEP = "write keep into column ends of the table of tags, which `loopwright new` without roles writes for --tags"
 CERTAIN = {"": False, "no": False, "yes": True}
 NUMBERS = ("low", "high", *COMMANDS)
-COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "step", "good_percent", "remark")
+READ_ONLY = ("step", "good_percent", "remark")
+COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "loop", "known", *READ_ONLY)
+NO_LOOP = "-"  # in column loop, of a tag whose name says another
 OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
 UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
 RANGES = """low, high: the range in which a reading can be true; of an mv it holds all that the valve did
@@ -43,6 +45,8 @@ between: line or step, how a tag that is stored by exception or compressed goes 
   guesses
 ends: keep or drop rows at the lowest or highest value, a limit of the plant or the end of the transmitter; empty
   drops them unless low and high, given by you, go beyond; keep of an mv says that no rest of it is a stop of the plant
+loop: tags with the same word belong together, a pv with its sp, mode and mv; - is none; empty goes by the tag's name
+known, of an mv or dv: what you know of each pv's answer, as in TIC-1.PV=+, gain 0.5..2, dead 30..60; TIC-2.PV=none
 step, good_percent, remark: the smallest difference of two readings, the share of good ones, what was seen; only to
   read. docs/tag_table.md says more"""
 
@@ -74,6 +78,8 @@ class Tag:
     unit_certain: bool = False  # no reading is in another unit
     between: Literal["", "step", "line"] = ""  # how it goes from one reading to the next; "" is guessed
     ends: Literal["", "keep", "drop"] = ""  # rows at its lowest or highest value; "" as its range says
+    loop: str = ""  # tags of one word are one loop; "" goes by the tag's name, NO_LOOP is none
+    known: str = ""  # of an input: PV=STATEMENT; PV=STATEMENT, as a person wrote it
 
     @property
     def commands(self) -> dict[str, float]:
@@ -221,9 +227,10 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
     """The table of all tags, for a person to correct; RecordError where the file is there already."""
     if path.exists():
         raise RecordError(f"{path} is there already; correct it and give --tags {path}, or remove it for a new one")
-    out = io.StringIO()
+    out, guesses = io.StringIO(), list(guesses)
     rows = csv.writer(out, lineterminator="\n")
     rows.writerow(COLUMNS)
+    pairs = "; ".join(f"{g.tag.tag}=" for g in guesses if g.tag.role == "pv")  # for a person to go on with
     for g in guesses:
         t = g.tag
         good = f"{100 * g.good:.2f}"
@@ -237,6 +244,8 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
                 "yes" if t.unit_certain else "",
                 *numbers,
                 *("" for _ in WORDS),
+                t.loop,
+                pairs if t.role in {"mv", "dv"} else "",
                 f"{g.step:.6g}" if g.step else "",
                 good,
                 g.remark,
@@ -292,6 +301,7 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
         ]
         unit, name = cells.get("unit", ""), cells.get("name", "")
         given = Tag(cells["tag"], role, unit, name=name, **numbers)  # type: ignore[arg-type]
+        given = replace(given, loop=cells.get("loop", ""), known=cells.get("known", ""))
         tag = widen(replace(given, unit_certain=CERTAIN.get(certain, False), **taken))  # type: ignore[arg-type]
         wrong += [f"{where}: {words}" for words in _wrong(tag)]
         found.append(tag)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 import numpy as np
 import torch
 
+from pipeline.config.known import Known
 from pipeline.config.params import choose
 from pipeline.errors import ModelError
 from pipeline.metrics import per_region, r2, rmse
@@ -31,7 +32,8 @@ class Source:
     """The data that a part is trained on.
 
     ``record`` is None for a set that is made from equations. ``regions`` are ranges of the controlled variable, for
-    the figures only. ``plant`` is for parts that are made from equations or compared with the plant.
+    the figures only. ``plant`` is for parts that are made from equations or compared with the plant. ``known`` is what
+    an engineer knows of pairs of PV and input.
     """
 
     record: Record | None
@@ -40,6 +42,7 @@ class Source:
     seed: int = 0
     plant: Simulator | None = None
     groundwork: Mapping[Groundwork[Any], Any] = field(default_factory=dict)  # what is done already, and its results
+    known: tuple[Known, ...] = ()
 
     def result(self, work: Groundwork[Result_co]) -> Result_co:
         """The result of a groundwork, which is done now where nobody has done it before."""

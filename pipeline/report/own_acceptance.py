@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from pipeline.evaluation.closed_loop import FAR
 from pipeline.evaluation.evidence import Evidence
+from pipeline.evaluation.known import known_rows
 from pipeline.evaluation.law_evidence import lock_up_text
 from pipeline.evaluation.model_evidence import IDENTIFIED
 from pipeline.evaluation.proof import statements
@@ -25,7 +26,8 @@ def own_acceptance(evidence: Evidence) -> list[Statement]:
     Every limit is a figure of the evidence, or the one by which a lock-up is told; its row says why.
     """
     on_models = evidence.case.stand_in == IDENTIFIED  # a simulator tells a wrong model itself
-    rows = [*(statements(evidence.models) if on_models else ()), *(_lock_ups(n, evidence) for n in evidence.laws)]
+    proof = (*(statements(evidence.models) if on_models else ()), *known_rows(evidence.models))
+    rows = [*proof, *(_lock_ups(n, evidence) for n in evidence.laws)]
     if evidence.best is None:
         return rows
     rows += [_settles(evidence, evidence.best), _in_range(evidence, evidence.best)]

@@ -105,11 +105,14 @@ def _data_of(stage: str, case: str) -> tuple[Path, ...]:
 def _read_of(stage: str, case: str) -> list[Any]:
     """What a stage reads of params.yaml beside its own section.
 
-    Of an own plant its signals; a report the case too, and which controllers and models it lists.
+    Of an own plant its signals; a design the loop that it was run by before, which stands beside each controller; a
+    report the case too, and which controllers and models it lists.
     """
     if not case:
         return []
     own = [_plant_of(stage, case)] if case in sections("plants") else []
+    if stage == "design" and (old := all_cases()[case].old_loop):
+        own.append(read_section("controllers", f"{case}-{old}"))
     if stage != "report":
         return own
     case_and_plant = [*([read_section("cases", case)] if case in sections("cases") else []), *own]
@@ -122,7 +125,8 @@ def _plant_of(stage: str, case: str) -> dict[str, Any]:
     if stage not in BEFORE_LAWS:
         return plant
     mvs = [{key: value for key, value in mv.items() if key != "max_move_per_min"} for mv in plant.get("mv", ())]
-    return {**plant, "mv": mvs}
+    # What is known of pairs decides models, and no record.
+    return {key: value for key, value in {**plant, "mv": mvs}.items() if stage != "screen" or key != "known"}
 
 
 def modules(stage: str, case: str = "") -> set[str]:

@@ -60,8 +60,8 @@ def find_start(problem: Problem, task: tuple[Structure, int]) -> Start | str:
     structure, fold = task
     try:
         train = problem.part(structure, problem.folds[fold].train)
-        response = high_order_arx(train).impulse_response(RESPONSE)
-        weight = train.v.std(axis=0)
+        response = problem.known.without(high_order_arx(train).impulse_response(RESPONSE))
+        weight = problem.known.weights(train.v.std(axis=0))
         return Start(Realizations.of(response, weight), tuple(dead_times(response, weight)))
     except ModelError as error:
         return str(error)
@@ -97,8 +97,16 @@ def fit(problem: Problem, task: Task) -> Fitted | str:
     except ModelError as error:
         return str(error)
     if network and problem.settles and wild(fitted.model.plant, problem.data.v, problem.data.y.shape[1]):
-        return replace(fitted, held_out=np.inf)
-    return fitted
+        fitted = replace(fitted, held_out=np.inf)
+    return _beside_what_is_known(problem, fitted)
+
+
+def _beside_what_is_known(problem: Problem, fitted: Fitted) -> Fitted:
+    """The fit without what is known not to act, and with what contradicts the rest; the fit where nothing is known."""
+    if not problem.known.pairs:
+        return fitted
+    model = problem.known.quiet(fitted.model)
+    return replace(fitted, model=model, against=problem.known.against(model.plant, problem.data))
 
 
 def _linear(problem: Problem, task: Task) -> Fitted:
@@ -107,7 +115,7 @@ def _linear(problem: Problem, task: Task) -> Fitted:
     if task.begun is not None:
         model, starts = task.begun.model, task.begun.starts
     elif s.start == "lagged":
-        model, starts = lagged_start(problem.part(s, problem.folds[task.fold].train), *s.lags), None
+        model, starts = _lagged(problem, s, task.fold), None
     else:
         if task.start is None:
             raise ModelError("the record shows no impulse response to start from")
@@ -116,6 +124,11 @@ def _linear(problem: Problem, task: Task) -> Fitted:
         model, starts = first.model, first.starts
     fitter = OutputError(iterations=task.iterations, correction=s.correction, judged=problem.judged)
     return fitter.fit(model, train, held, starts=starts)
+
+
+def _lagged(problem: Problem, structure: Structure, fold: int) -> Dynamics:
+    rows = problem.part(structure, problem.folds[fold].train)
+    return problem.known.lagged(lagged_start(rows, *structure.lags), structure.lags[0])
 
 
 def _network(problem: Problem, task: Task) -> Fitted:
@@ -133,7 +146,7 @@ def _network(problem: Problem, task: Task) -> Fitted:
         return fitter.fit(task.begun.model, train, held, starts=task.begun.starts)
     starts: Sequence[Array] | None = None
     if s.start == "lagged":
-        linear = lagged_start(problem.part(s, problem.folds[task.fold].train), *s.lags)
+        linear = _lagged(problem, s, task.fold)
     else:
         if task.base is None:
             raise ModelError("the linear model of this network could not be fitted")
@@ -199,7 +212,15 @@ def judged_beyond_drift(problem: Problem, rows: int, task: tuple[Structure, int,
 
 
 def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
-    """The fit gone on over all rows, by fewer iterations where more end in a network that does not settle."""
+    """The fit gone on over all rows, by fewer iterations where more end in a network that does not settle.
+
+    The fit as it is where it would come to contradict what is known of the plant.
+    """
+    found = _beside_what_is_known(problem, _on_all_rows(problem, structure, fitted))
+    return fitted if found.against - fitted.against else found
+
+
+def _on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
     whole = problem.whole(structure)
     if isinstance(fitted.model, Innovations):
         return _with_noise_on_all_rows(problem, structure, fitted, fitted.model)
@@ -219,8 +240,8 @@ def _with_noise_on_all_rows(problem: Problem, structure: Structure, fitted: Fitt
     if structure.noise == "gain":
         try:
             rows = problem.part(structure, slice(None))
-            response = high_order_arx(rows).impulse_response(RESPONSE)
-            plant = Realizations.of(response, rows.v.std(axis=0)).order(structure.order)
+            response = problem.known.without(high_order_arx(rows).impulse_response(RESPONSE))
+            plant = Realizations.of(response, problem.known.weights(rows.v.std(axis=0))).order(structure.order)
             model = begun(replace(plant, c=-plant.b @ rows.v.mean(axis=0)), whole)
         except ModelError:  # all rows together show no stable response, though a fold did
             return fitted

@@ -8,16 +8,24 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from pipeline.config.known import NONE
 from pipeline.models.base import Model
 from pipeline.models.identified.assembly import assembled, noise_of
 from pipeline.models.identified.candidates import on_all_rows, within_limits
+from pipeline.models.identified.coupling import sign_margin
 from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
+<<<<<<< HEAD
 from pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
+=======
+from pipeline.models.identified.innovations import Innovations, innovations, noise_of_filter
+from pipeline.models.identified.known_answers import known_figures
+>>>>>>> main
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
-from pipeline.models.identified.proof import answers, foreseen, proof_figures
+from pipeline.models.identified.proof import Answer, answers, foreseen, proof_figures
+from pipeline.models.identified.regions import Cells
 from pipeline.models.identified.residual_tests import residual_figures
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.selection import Selection
@@ -46,8 +54,16 @@ Figures = Mapping[str, Mapping[str, Any]]
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
 
+<<<<<<< HEAD
+LIKELY_SDS = 2.0
+"""Standard deviations of an open answer that a controller of several loops must stand."""
+
 LOAD_ROWS = 8_000
 """Rows at most whose loads go with the model."""
+=======
+PARTS = 40
+"""Parts of the held-out rows that are independent, for all that counts: neighbouring rows of a run err alike."""
+>>>>>>> main
 
 DRAWS = 12
 """Models drawn from the covariance of the parameters, for the bands."""
@@ -125,12 +141,21 @@ class IdentifiedPart(Part):
         fitted = within_limits(problem, structure, _member(problem, selection, self.member))
         noise, found, whole = _residuals(problem, structure, fitted.model)
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
-        bands = [*_bands(selection), *_as_likely(problem, structure, fitted.model, source.seed)]
+        fits, weights = _bands(selection)
+        drawn_ones = _as_likely(problem, structure, fitted.model, source.seed)
+        bands, weights = [*fits, *drawn_ones], np.r_[weights, np.ones(len(drawn_ones))]
         # The gains belong to the middle of the whole record, also where only a part of its rows is fitted.
         record = source.data(self.model.kind)
         rows, names = ScaledRecord.of(record, scales), [s.name for s in pvs]
         runs, predictions = free_run_figures(problem, selection.chosen, scales, names)
         curves = response_curves(bands, rows)
+        cells = Cells.of(bands, rows, n_mv, curves.shape[2]) if structure.n_hidden else None
+        size = STEP * rows.v.std(axis=0)
+        proven = answers(curves, structure, problem.data, size, n_mv, cells, weights)
+        # As much of the outputs as there are MVs is controlled.
+        last = np.median(curves[:, :n_mv, -1, :n_mv], axis=0).T / size[:n_mv]
+        controlled = {place: answer for place, answer in proven[0].items() if place[0] < n_mv}
+        margin = sign_margin(controlled, last, LIKELY_SDS) if n_mv > 1 else None
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
         known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
@@ -146,6 +171,11 @@ class IdentifiedPart(Part):
             for name in (s.name for s in pvs)
             if runs[name]["outside_training"] > OUTSIDE
         ]
+        gain_table = gain_figures(bands, rows, scales, pvs, inputs)
+        for pair in problem.known.pairs:
+            if pair.input in problem.known.silent:
+                gain_table[pvs[pair.output].name][inputs[pair.input].name]["sign"] = NONE
+        said = {"known": known_figures(searched.known, gain_table, record)} if searched.known else {}
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
             "n_train": sum(len(s) for s in whole),
@@ -153,9 +183,11 @@ class IdentifiedPart(Part):
             "member": self.member,
             "outputs": runs,
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
-            "gains": gain_figures(bands, rows, scales, pvs, inputs),
+            "gains": gain_table,
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
-            "proof": _proof(searched, record, rows, curves, runs, noise * scales.y_scale),
+            "proof": _proof(searched, record, proven, runs, noise * scales.y_scale)
+            | {"sign_margin": margin if margin is None or np.isfinite(margin) else None}
+            | said,
             "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
@@ -169,14 +201,16 @@ class IdentifiedPart(Part):
 
 
 def _proof(
-    searched: Searched, record: Record, rows: ScaledRecord, curves: Array, runs: Figures, noise: Array
+    searched: Searched, record: Record, found: tuple[dict[tuple[int, int], Answer], Array], runs: Figures, noise: Array
 ) -> dict[str, Any]:
-    """Whether the record proves the model; ``runs`` over the rows that the first fold held out, noise (n_y,)."""
+    """Whether the record proves the model; ``found`` of ``answers``, ``runs`` over the first fold's held-out rows.
+
+    noise (n_y,).
+    """
     problem, chosen, scales = searched.problem, searched.selection.chosen, searched.scales
-    found, surprise = answers(curves, chosen.structure, problem.data, STEP * rows.v.std(axis=0), problem.n_mv)
     second = [free_run_figures(problem, chosen, scales, list(runs), fold=1)[0]] if 1 in chosen.folds else []
     # What a wrong model misses at every row is no noise: the plant's own past foresees more of it.
-    figures = proof_figures(found, record, scales, [runs, *second], np.minimum(noise, surprise * scales.y_scale))
+    figures = proof_figures(found[0], record, scales, [runs, *second], np.minimum(noise, found[1] * scales.y_scale))
     if searched.selection.innovations is None:
         return figures
     # A free run of a closed loop holds the loads that the controller fought, and says nothing of the model.
@@ -234,19 +268,32 @@ def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> lis
     ]
 
 
-def _bands(selection: Selection) -> Sequence[Dynamics]:
-    """The fits that show how sure the figures are: those of the chosen structure, and of finalists as good as it."""
+def _bands(selection: Selection) -> tuple[list[Dynamics], Array]:
+    """The fits that show how sure the figures are: those of the chosen structure, and of finalists as good as it.
+
+    And how likely each is (fits,): by its held-out error over the least of the same rows, as ``PARTS`` independent ones
+    tell it.
+    """
     chosen = selection.chosen
     same = [
         t
         for t in selection.finalists
         if t.structure.delays == chosen.structure.delays
+        and t.against <= chosen.against
         and (t.structure.n_hidden > 0) == (chosen.structure.n_hidden > 0)
         and t.error <= (NEAR if selection.innovations is None else NEAR_BY_ROWS) * chosen.error
     ]
-    fits = [f for t in (chosen, *(t for t in same if t is not chosen)) for f in t.fits.values()]
-    finite = [f.model.plant for f in fits if np.isfinite(f.held_out)]
-    return finite or [chosen.of_fold(0)[0].model.plant]
+    fits = [
+        (fold, f)
+        for t in (chosen, *(t for t in same if t is not chosen))
+        for (fold, _), f in t.fits.items()
+        if np.isfinite(f.held_out)
+    ]
+    if not fits:
+        return [chosen.of_fold(0)[0].model.plant], np.ones(1)
+    least = {k: min(f.held_out for fold, f in fits if fold == k) for k, _ in fits}
+    weights = np.array([(least[k] / f.held_out) ** PARTS if f.held_out > 0 else 1.0 for k, f in fits])
+    return [f.model.plant for _, f in fits], weights
 
 
 def _as_likely(problem: Problem, structure: Structure, model: Dynamics, seed: int) -> list[Dynamics]:

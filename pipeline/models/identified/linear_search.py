@@ -43,12 +43,18 @@ class LinearSearch:
 
     @classmethod
     def of(cls, rounds: Rounds) -> LinearSearch:
-        """With the impulse responses without dead time, and with the one that the first fold shows."""
-        none = Structure("balanced", 0, (0, 0), (0,) * rounds.problem.data.v.shape[1])
+        """With the impulse responses without dead time, and with the one that the first fold shows.
+
+        Where a dead time is known, with the least and the nearest one that it may be.
+        """
+        known = rounds.problem.known
+        none = Structure("balanced", 0, (0, 0), known.delays((0,) * rounds.problem.data.v.shape[1]))
         starts = rounds.starts([none])
         first = starts[none, 0]
         if isinstance(first, Start) and max(first.dead_times) > 0:
-            starts |= rounds.starts([replace(none, delays=first.dead_times)])
+            # The dead times that are seen lie beyond the delays that the response was taken with.
+            seen = known.delays([d + more for d, more in zip(none.delays, first.dead_times, strict=True)])
+            starts |= rounds.starts([replace(none, delays=seen)])
         return cls(rounds, starts)
 
     def first_round(self, orders: Sequence[int], correction: float, lagged: bool = True) -> list[Trial]:
@@ -70,8 +76,10 @@ class LinearSearch:
         if not finite:
             why = reasons[0] if reasons else "every free run over held-out rows explodes"
             raise ModelError(f"no linear model fits the record: {why}")
-        limit = NEARLY * min(t.error for t in finite)
-        return sorted(finite, key=lambda t: (t.error, 0) if t.error > limit else (0.0, t.structure.order))
+        limit = NEARLY * min(finite, key=lambda t: t.rank).error
+        return sorted(
+            finite, key=lambda t: (t.against, t.error, 0) if t.error > limit else (t.against, 0.0, t.structure.order)
+        )
 
     def finish(self, shortlist: Sequence[Trial]) -> list[Trial]:
         """The best of a short list and its smallest models, both starts among them, trained to the end on all folds.
@@ -80,7 +88,7 @@ class LinearSearch:
         """
         kept = list(shortlist[:FINISHED])
         balanced, lagged = ([t for t in shortlist if t.structure.start == s] for s in ("balanced", "lagged"))
-        small = [min(of, key=lambda t: t.error) for of in _by_order(balanced)[:SMALLEST]]
+        small = [min(of, key=lambda t: t.rank) for of in _by_order(balanced)[:SMALLEST]]
         kept.extend(t for t in (*balanced[:2], *lagged[:2], *small) if t not in kept)
         folds = range(len(self.rounds.problem.folds))
         tasks = [
@@ -151,10 +159,11 @@ def inside(model: Dynamics) -> Dynamics:
 def smallest_first(trials: Sequence[Trial]) -> list[Trial]:
     """Best first, those of fewer folds last; of those within 1 % of the best the smallest leads.
 
-    A state less is one less to mislead.
+    A state less is one less to mislead. Those that contradict what is known of the plant come after all others.
     """
     most = max((len(t.fits) for t in trials), default=0)
-    ranked = sorted(trials, key=lambda t: (len(t.fits) < most, t.error))
+    ranked = sorted(trials, key=lambda t: (t.against, len(t.fits) < most, t.error))
     near = [t for t in ranked if t.error <= 1.01 * ranked[0].error and len(t.fits) == len(ranked[0].fits)]
+    near = [t for t in near if t.against == ranked[0].against]
     first = min(near, key=lambda t: (t.structure.order + sum(t.structure.delays), t.error), default=None)
     return [] if first is None else [first, *(t for t in ranked if t is not first)]

@@ -62,7 +62,7 @@ class NetworkSearch:
             if self.rounds.budget.left(0.5) > 0
             else []
         )
-        ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.error) or quick
+        ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.rank) or quick
         return self.last_round(ranked[:LAST])
 
     def last_round(self, trials: Sequence[Trial]) -> list[Trial]:
@@ -102,7 +102,7 @@ class NetworkSearch:
 def _ranked(trials: Sequence[Trial]) -> list[Trial]:
     """Trials of the first fold by their better seed, exploded ones left out."""
     finite = [t for t in trials if np.isfinite(t.of_fold(0)[0].held_out)]
-    return sorted(finite, key=lambda t: t.of_fold(0)[0].held_out)
+    return sorted(finite, key=lambda t: (t.against, t.of_fold(0)[0].held_out))
 
 
 def _seed(trial: Trial) -> int:

@@ -59,7 +59,7 @@ class NoiseSearch:
         linears = LinearSearch.of(rounds)
         offered = list(dict.fromkeys(s.delays for s, _ in linears.starts))
         none = Structure("balanced", 0, (0, 0), offered[0])
-        later = [tuple(d + more for d in offered[-1]) for more in LATER]
+        later = [rounds.problem.known.delays([d + more for d in offered[-1]]) for more in LATER]
         return cls(
             rounds, replace(linears, starts=linears.starts | rounds.starts([replace(none, delays=d) for d in later]))
         )
@@ -104,7 +104,7 @@ class NoiseSearch:
         affordable = [t for t, cost in zip(tasks, costs, strict=True) if cost <= self.rounds.budget.left()]
         trials, _ = self.rounds.trials(affordable, "neural networks with their noise")
         whole = [t for t in self.following(trials) if t.folds == linear[0].folds]
-        return sorted(whole, key=lambda t: t.error)
+        return sorted(whole, key=lambda t: t.rank)
 
     def following(self, trials: Sequence[Trial]) -> list[Trial]:
         """The trials without the fits whose filter explodes over the whole record, and without those of no other fits.
@@ -117,19 +117,20 @@ class NoiseSearch:
             rows = problem.whole(t.structure)
             fits = {key: f for key, f in t.fits.items() if innovations(f.model, rows) is not None}
             if {fold for fold, _ in fits} == set(t.folds):
-                kept.append(Trial(t.structure, fits))
+                kept.append(replace(t, fits=fits))
         return kept
 
     def ranked(self, trials: Sequence[Trial]) -> list[Trial]:
-        """Best first, by the log-likelihood of the held-out rows less one nat a state.
+        """Best first, by the log-likelihood of the held-out rows less one nat a state; what is known comes before it.
 
         One-step errors hardly tell orders apart, and a state less is one less to mislead. A refined model goes before
         the ARX's response as it is, whose tail still holds what the prior made of noise.
         """
         best = min(trials, key=lambda t: t.error)
 
-        def cost(t: Trial) -> float:
-            return nats(self.rounds.problem, t, best) + t.structure.order + (t.structure.noise == "gain")
+        def cost(t: Trial) -> tuple[int, float]:
+            likely = nats(self.rounds.problem, t, best) + t.structure.order + (t.structure.noise == "gain")
+            return t.against, likely
 
         return sorted(trials, key=cost)
 

@@ -107,13 +107,17 @@ def overall(errors: Array) -> float:
 # ---------------------------------------------------------------------- the fit
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A fitted model, the initial states of its training stretches, and its errors (scaled, over all outputs)."""
+    """A fitted model, the initial states of its training stretches, and its errors (scaled, over all outputs).
+
+    ``against`` are the pairs of output and input whose gain contradicts what is known of them, see ``Knowledge``.
+    """
 
     model: Dynamics
     starts: list[Array]
     trained: float
     held_out: float
     work: int  # iterations that led here
+    against: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True, kw_only=True)

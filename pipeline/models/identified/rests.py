@@ -10,6 +10,12 @@ from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.scaled_record import ScaledRecord
 from pipeline.plants.simulator import Array
 
+INTEGRATES = 0.999
+"""Pole of a model beyond which it counts as one that integrates."""
+
+STEP, LONG = 1e-3, 300
+"""Step of an input, scaled, and the periods after it, in which a model that integrates shows which way it goes."""
+
 RESTS = 200
 SETTLE = 3000
 """Rests that the map is fitted to, and the most periods in which one is reached."""
@@ -104,3 +110,25 @@ def steady_gain(model: Dynamics, x: Array, v: Array) -> tuple[Array, Array]:
     safe = np.where(singular[..., None, None], np.eye(model.n_x), gap)
     gain = np.linalg.solve(safe, push)
     return np.where(singular[..., None, None], np.inf, gain), radius
+
+
+def middle_rest(model: Dynamics, data: ScaledRecord) -> Array:
+    """The state (n_x,) in which the model rests under the median inputs of the data, or is near to it."""
+    middle = np.median(data.v, axis=0)
+    start = central_map(model, data) @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
+    x, still = settle(model, middle[None], start[None])
+    return x[0] if still[0] else start
+
+
+def central_gain(model: Dynamics, data: ScaledRecord) -> tuple[Array, bool]:
+    """(steady gain (n_y, n_v) under the median inputs of the data, scaled; whether the model integrates there).
+
+    Where it does, what a step of each input has moved after ``LONG`` periods stands in place of the gain.
+    """
+    n_y, middle, x = data.y.shape[1], np.median(data.v, axis=0), middle_rest(model, data)
+    gain, radius = steady_gain(model, x[None], middle[None])
+    if radius[0] <= INTEGRATES and np.all(np.isfinite(gain)):
+        return gain[0, :n_y], False
+    inputs = np.concatenate([middle + STEP * np.eye(len(middle)), middle[None]])
+    ends, _ = model.hold(np.tile(x, (len(inputs), 1)), inputs, LONG)
+    return np.asarray((ends[:-1] - ends[-1])[:, :n_y].T / STEP), True

@@ -13,13 +13,11 @@ from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
 from pipeline.models.identified.noise_search import NATS, NoiseSearch, nats
+from pipeline.models.identified.rests import INTEGRATES
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.row_convention import may_act_in_its_row
 from pipeline.models.identified.structure import Problem
 from pipeline.models.identified.trial import Trial, best_of
-
-INTEGRATES = 0.999
-"""Pole of the linear model beyond which a slow correction of the training run is tried, as for drift."""
 
 NEARLY = 1.02
 """Relative error up to which a linear model that settles stands in for one that integrates."""
@@ -58,6 +56,8 @@ class Selection:
         """
         if self.network is None:
             return False
+        if self.network.against != self.linear.against:  # what is known of the plant decides before any error
+            return self.network.against < self.linear.against
         if self.innovations is not None:
             return self.innovations > NATS
         uncertain = 0.0 if self.drifts else self.network.spread / np.sqrt(self.network.seeds)
@@ -99,11 +99,11 @@ def select(
     search = LinearSearch.of(rounds)
     linear = search.finish(search.first_round(orders, given, lagged))
     if _integrates(linear[0]):
-        settling = [t for t in search.settling(linear) if not _integrates(t) and t.error <= NEARLY * linear[0].error]
+        settling = [t for t in search.settling(linear) if not _integrates(t) and _nearly(t, linear[0])]
         linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear
     if correction is None and _integrates(linear[0]):
         corrected = search.corrected(linear, SLOW)
-        linear = corrected if corrected and corrected[0].error < linear[0].error else linear
+        linear = corrected if corrected and corrected[0].rank < linear[0].rank else linear
     if may_act_in_its_row(rounds.problem.part(linear[0].structure, rounds.problem.folds[0].train), rounds.problem.n_mv):
         # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
         linear = smallest_first([*linear, *search.in_the_same_row(linear)])
@@ -144,6 +144,10 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     best = best_of(networks)
     gained = 0.0 if best is None else nats(rounds.problem, linear[0], best)
     return Selection(linear[0], best, [*linear, *networks], rounds.budget.spent, settles, False, gained)
+
+
+def _nearly(trial: Trial, best: Trial) -> bool:
+    return trial.against <= best.against and trial.error <= NEARLY * best.error
 
 
 def _trained(trial: Trial) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from pipeline.models.identified.dynamics import Stretch
+from pipeline.models.identified.knowledge import NOTHING_KNOWN, Knowledge
 from pipeline.models.identified.scaled_record import Fold, ScaledRecord
 
 
@@ -48,7 +49,7 @@ class Problem:
 
     ``judged`` is the correction of the free runs over held-out rows, the same for all candidates. ``settles`` says
     that the plant comes to rest by itself, as its linear model does; a network that does not is rejected. ``fed_back``
-    says that the MVs follow the outputs.
+    says that the MVs follow the outputs. ``known`` is what an engineer knows of pairs of output and input.
     """
 
     data: ScaledRecord
@@ -58,11 +59,12 @@ class Problem:
     judged: float = 0.0
     settles: bool = False
     fed_back: bool = False
+    known: Knowledge = NOTHING_KNOWN
 
     def part(self, structure: Structure, rows: slice) -> ScaledRecord:
-        """Some rows, the inputs shifted to where they act in this structure."""
+        """Some rows, the inputs shifted to where they act in this structure, those at 0 that are known not to act."""
         shift = [d - int(structure.same_row and j < self.n_mv) for j, d in enumerate(structure.delays)]
-        return self.data.delayed(shift).rows(rows)
+        return self.known.heard(self.data.delayed(shift).rows(rows))
 
     def train(self, structure: Structure, fold: int) -> list[Stretch]:
         """Training stretches of a fold."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from pipeline.historian.feedback import fed_back
+from pipeline.historian.known_record import Beside, beside_record
+from pipeline.models.identified.knowledge import Knowledge
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative
 from pipeline.models.identified.selection import Selection, select
@@ -20,11 +23,12 @@ MORE = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Searched:
-    """The problem that was searched, its outcome, and the scales of its record."""
+    """The problem that was searched, its outcome, the scales of its record, and what is known beside that record."""
 
     problem: Problem
     selection: Selection
     scales: Scales
+    known: Sequence[Beside] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +52,16 @@ class StructureSearch(Groundwork[Searched]):
         record = informative(seen, MORE * self.rows if back else self.rows)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
-        problem = Problem(data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back)
+        signals = source.signals
+        inputs, outputs = [s.name for s in (*signals.mv, *signals.dv)], [s.name for s in signals.pv[:n_y]]
+        # No model is bent to what the record is certain to contradict: that is asked, and answered by a person.
+        beside = beside_record(source.known, record)
+        used = [one.known for one in beside if not one.question]
+        known = Knowledge.of(used, outputs, inputs, scales, signals.period_s)
+        problem = Problem(data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back, known=known)
         budget = Budget(60 * (MINUTES * n_y if self.minutes is None else self.minutes), len(data), n_y)
         least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction, lagged=self.lagged)
-        return Searched(replace(problem, settles=selection.settles), selection, scales)
+        return Searched(replace(problem, settles=selection.settles), selection, scales, beside)

@@ -22,9 +22,24 @@ class Trial:
     def of_fold(self, fold: int) -> list[Fitted]:
         """The fits of one fold, the best first.
 
-        Held-out and training rows count alike: few held-out rows flatter a seed that missed others.
+        Held-out and training rows count alike: few held-out rows flatter a seed that missed others. Those that
+        contradict what is known of the plant come last.
         """
-        return sorted((f for (of, _), f in self.fits.items() if of == fold), key=lambda f: f.held_out**2 + f.trained**2)
+        own = (f for (of, _), f in self.fits.items() if of == fold)
+        return sorted(own, key=lambda f: (bool(f.against), f.held_out**2 + f.trained**2))
+
+    @property
+    def against(self) -> int:
+        """The folds of which every fit contradicts what is known of the plant.
+
+        Between none and all of them the candidate is uncertain of it.
+        """
+        return sum(all(f.against for f in self.of_fold(k)) for k in self.folds)
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """What candidates are sorted by: the less they contradict what is known the better, then the error."""
+        return self.against, self.error
 
     @property
     def error(self) -> float:
@@ -59,4 +74,4 @@ class Trial:
 def best_of(trials: Sequence[Trial]) -> Trial | None:
     """The trial of the least error that is finite; None without one."""
     finite = [t for t in trials if np.isfinite(t.error)]
-    return min(finite, key=lambda t: t.error) if finite else None
+    return min(finite, key=lambda t: t.rank) if finite else None

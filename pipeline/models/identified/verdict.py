@@ -13,9 +13,9 @@ from pipeline.models.identified.assembly import dead_periods, step_responses
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.innovations import AHEAD, Innovations, ahead
 from pipeline.models.identified.output_error import fit_starts
-from pipeline.models.identified.rests import central_map, settle, steady_gain
+from pipeline.models.identified.rests import INTEGRATES, central_map, middle_rest, settle, steady_gain
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.selection import INTEGRATES, Selection
+from pipeline.models.identified.selection import Selection
 from pipeline.models.identified.structure import Problem
 from pipeline.models.identified.trial import Trial
 from pipeline.plants.simulator import Array
@@ -203,7 +203,7 @@ def response_curves(members: Sequence[Dynamics], data: ScaledRecord) -> Array:
     A step of input j is ``STEP`` times its standard deviation in the data, from the rest under the medians.
     """
     middle, size, n_y = np.median(data.v, axis=0), STEP * data.v.std(axis=0), data.y.shape[1]
-    length, rests = 2 * POINTS, [_middle_rest(m, data) for m in members]
+    length, rests = 2 * POINTS, [middle_rest(m, data) for m in members]
     while True:
         runs = [step_responses(m, x, middle, size, length)[..., :n_y] for m, x in zip(members, rests, strict=True)]
         found = np.array(runs)
@@ -246,10 +246,3 @@ def dead_times(
     """Dead time of each input [periods], the median over the members."""
     dead = np.median([dead_periods(m, data) for m in members], axis=0) + np.asarray(delays)
     return {signal.name: float(d) for signal, d in zip(inputs, dead, strict=True)}
-
-
-def _middle_rest(model: Dynamics, data: ScaledRecord) -> Array:
-    middle = np.median(data.v, axis=0)
-    start = central_map(model, data) @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
-    x, still = settle(model, middle[None], start[None])
-    return x[0] if still[0] else start

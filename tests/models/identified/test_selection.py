@@ -17,6 +17,7 @@ class Judged:
     error: float
     spread: float = 0.0
     seeds: int = 3
+    against: int = 0
 
 
 def selection(linear: float, network: Judged | None, *, drifts: bool = False) -> Selection:

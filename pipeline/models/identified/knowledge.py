@@ -1,0 +1,151 @@
+"""What an engineer knows of pairs of output and input, as the search for a model uses it: scaled, in periods."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from pipeline.config.known import NONE, NOTHING, Known
+from pipeline.models.identified.dynamics import Dynamics
+from pipeline.models.identified.rests import central_gain
+from pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from pipeline.plants.simulator import Array
+
+ROUNDING = 1e-6
+"""Of a period: a dead time of whole periods in seconds is that many periods."""
+
+Model = TypeVar("Model", bound=Dynamics)
+Against = frozenset[int]
+"""Numbers of the pairs of which a model contradicts what is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A statement on ``output`` and ``input``: gains from ``low`` to ``high`` in scaled numbers, delays in periods.
+
+    ``none``: the input does not move the output. ``delays`` None: nothing is known of the dead time.
+    """
+
+    output: int
+    input: int
+    low: float
+    high: float
+    none: bool = False
+    delays: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Knowledge:
+    """The statements on the ``n_y`` outputs of a model; empty where nothing is known, and then nothing is done."""
+
+    pairs: tuple[Pair, ...] = ()
+    n_y: int = 0
+
+    @classmethod
+    def of(
+        cls, known: Sequence[Known], pvs: Sequence[str], inputs: Sequence[str], scales: Scales, period_s: float
+    ) -> Knowledge:
+        """Of statements on signals by name; those on PVs that are no output of the model say nothing of it."""
+        pairs = []
+        for one in (k for k in known if k.pv in pvs):
+            i, j = pvs.index(one.pv), inputs.index(one.input)
+            low, high = (end * float(scales.v_scale[j] / scales.y_scale[i]) for end in one.gains)
+            delays = None
+            if one.dead_s is not None:
+                first, last = (int(np.floor(s / period_s + ROUNDING)) for s in one.dead_s)
+                delays = first, last
+            pairs.append(Pair(i, j, low, high, one.sign == NONE, delays))
+        return cls(tuple(pairs), len(pvs))
+
+    def delays(self, offered: Sequence[int]) -> tuple[int, ...]:
+        """Delays (n_v,) moved into what is known of the dead times.
+
+        An input has one delay for all outputs: no output may answer later than it is known to, and where the dead time
+        of one is not known, it may answer at once.
+        """
+        found = list(offered)
+        for j in range(len(found)):
+            pairs = [p for p in self.pairs if p.input == j]
+            spans = [p.delays for p in pairs if p.delays is not None]
+            if spans:
+                least = min(first for first, _ in spans) if len(spans) + sum(p.none for p in pairs) == self.n_y else 0
+                found[j] = min(max(found[j], least), min(last for _, last in spans))
+        return tuple(found)
+
+    @property
+    def silent(self) -> list[int]:
+        """Inputs that move no output."""
+        none = [p.input for p in self.pairs if p.none]
+        return [j for j in dict.fromkeys(none) if none.count(j) == self.n_y]
+
+    def heard(self, data: ScaledRecord) -> ScaledRecord:
+        """The rows, inputs that move no output at 0: no fit can make use of them."""
+        if not self.silent:
+            return data
+        v = data.v.copy()
+        v[:, self.silent] = 0.0
+        return replace(data, v=v)
+
+    def weights(self, sd: Array) -> Array:
+        """Deviations (n_v,) of the inputs as weights of an impulse response: 1 of those that move no output."""
+        if not self.silent:
+            return sd
+        found = sd.copy()
+        found[self.silent] = 1.0
+        return found
+
+    def without(self, response: Array) -> Array:
+        """An impulse response (length, n_y, n_v), 0 of the pairs without an effect."""
+        if not any(p.none for p in self.pairs):
+            return response
+        found = response.copy()
+        for p in self.pairs:
+            if p.none:
+                found[:, p.output, p.input] = 0.0
+        return found
+
+    def lagged(self, model: Dynamics, y_lags: int) -> Dynamics:
+        """A model in companion form without the coefficients of the pairs that have no effect."""
+        if not any(p.none for p in self.pairs):
+            return model
+        a, b = model.a.copy(), model.b.copy()
+        for p in self.pairs:
+            if p.none:
+                b[p.output, p.input] = 0.0
+                a[p.output, y_lags * self.n_y + p.input :: model.n_v] = 0.0
+        return replace(model, a=a, b=b)
+
+    def quiet(self, model: Model) -> Model:
+        """The model without what inputs that move no output could do in it."""
+        if not self.silent:
+            return model
+        b, w1 = model.b.copy(), model.w1.copy()
+        b[:, self.silent] = 0.0
+        w1[:, [model.n_x + j for j in self.silent]] = 0.0
+        return replace(model, b=b, w1=w1)
+
+    def against(self, model: Dynamics, data: ScaledRecord) -> Against:
+        """The pairs whose steady gain at the middle of the data contradicts what is known.
+
+        Of an output that integrates its slope stands for the gain, and its sign alone is compared.
+        """
+        if not self.pairs:
+            return frozenset()
+        gain, integrates = central_gain(model, data)
+        size, found = data.v.std(axis=0), set[int]()
+        for k, p in enumerate(self.pairs):
+            low, high = p.low, p.high
+            if p.none:
+                low, high = -NOTHING / max(size[p.input], 1e-300), NOTHING / max(size[p.input], 1e-300)
+            elif integrates:
+                low, high = (0.0 if low >= 0 else -np.inf), (0.0 if high <= 0 else np.inf)
+            value = gain[p.output, p.input]
+            if value < low or value > high:
+                found.add(k)
+        return frozenset(found)
+
+
+NOTHING_KNOWN = Knowledge()
