@@ -102,7 +102,7 @@ class Trials:
                 load[:, LOOPS + i, :n_cv] = LOAD / horizon * course[:, i, :n_cv]
             else:
                 bias[:, LOOPS + i] = BIAS * half * course[:, i, :n_mv]
-        if len(model.load_moves):
+        if model.recorded:
             own = [*range(LOOPS), *(LOOPS + i for i in AT_OUTPUT if i in WALKS)]
             load[:, own] = _replayed(model, n, horizon, len(own))
         colour = model.colour.numpy()

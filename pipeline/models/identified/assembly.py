@@ -54,7 +54,7 @@ def assembled(
 ) -> Identified:
     """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,).
 
-    ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour``, ``load_moves`` (n, n_y) of the record's loads, and
+    ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour``, the ``load_moves`` (n, n_y) of the record, and
     what the record leaves open: ``gain_sd``, ``pace_sd``, ``dead_sd``.
     """
     whole, n_y, n_v = remembering(model, delays), data.y.shape[1], data.v.shape[1]

@@ -16,12 +16,8 @@ from pipeline.models.identified.coupling import sign_margin
 from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
-<<<<<<< HEAD
 from pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
-=======
-from pipeline.models.identified.innovations import Innovations, innovations, noise_of_filter
 from pipeline.models.identified.known_answers import known_figures
->>>>>>> main
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from pipeline.models.identified.proof import Answer, answers, foreseen, proof_figures
@@ -54,16 +50,14 @@ Figures = Mapping[str, Mapping[str, Any]]
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
 
-<<<<<<< HEAD
 LIKELY_SDS = 2.0
 """Standard deviations of an open answer that a controller of several loops must stand."""
 
 LOAD_ROWS = 8_000
 """Rows at most whose loads go with the model."""
-=======
+
 PARTS = 40
 """Parts of the held-out rows that are independent, for all that counts: neighbouring rows of a run err alike."""
->>>>>>> main
 
 DRAWS = 12
 """Models drawn from the covariance of the parameters, for the bands."""

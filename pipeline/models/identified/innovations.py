@@ -158,9 +158,9 @@ def ahead(model: Innovations, stretch: Stretch, rows: int = AHEAD) -> tuple[Arra
 
 
 def load_moves(model: Innovations, data: Sequence[Stretch]) -> Array:
-    """Changes (n, n_y) of the loads from row to row, as the filter sees them, over the rows of all stretches that count.
+    """Changes (n, n_y) of the loads from row to row, as the filter sees them, over all rows that count.
 
-    None where a stretch ends and the next begins. Empty where the filter explodes.
+    No change stands for the step from one stretch to the next. Empty where the filter explodes.
     """
     found = [np.empty((0, model.n_loads))]
     for stretch in data:
