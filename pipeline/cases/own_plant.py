@@ -17,11 +17,12 @@ from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
 from pipeline.cases.own_entries import OLD_LOOP
 from pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
+from pipeline.cases.reach import TIMES
 from pipeline.config.known import together
 from pipeline.config.params import sections_of
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.closed_loop import closed_loop_metrics
+from pipeline.evaluation.closed_loop import RANGE_BAND, closed_loop_metrics
 from pipeline.evaluation.knowing_control import gets_there
 from pipeline.evaluation.metric import METRICS, Metric
 from pipeline.metrics import mae
@@ -74,6 +75,21 @@ class OwnCase(OwnEnsemble):
         return self.signals.sp[0].unit if len(self.signals.sp) == 1 else PERCENT
 
     @property
+    def settling_s(self) -> float:
+        """A set point lasts so many times as long, within limits."""
+        return self.hold / TIMES * self.signals.period_s
+
+    @cached_property
+    def asked(self) -> Array:
+        """How far the set points of test ``held_out`` go, (n_cv,)."""
+        return np.asarray(np.ptp(np.concatenate([test.sp for test in self._held_out]), axis=0))
+
+    @cached_property
+    def spans(self) -> Array:
+        """The same, or so much that an error of ``RANGE_BAND`` of it is the noise: the range says nothing of a loop."""
+        return np.maximum(self.asked, self.noise_std[: len(self.asked)] / RANGE_BAND)
+
+    @property
     def hold(self) -> int:
         """Samples of a set point."""
         return self.reach.hold
@@ -86,7 +102,8 @@ class OwnCase(OwnEnsemble):
             return super().score(test, pv, mv)
         spans, moves = _spans(signals), _spans(self.signals.mv)
         shares = (100 * test.sp / spans, 100 * pv[:, :n] / spans, 100 * mv / moves)
-        figures = closed_loop_metrics(*shares, test.hold, self.signals.period_s, 100.0, test.late_from)
+        small = 100 * self.spans / spans
+        figures = closed_loop_metrics(*shares, test.hold, self.signals.period_s, small, test.late_from)
         return figures | {mae_of(s): mae(test.sp[:, i], pv[:, i]) for i, s in enumerate(signals)}
 
     def _test(
@@ -115,11 +132,19 @@ class OwnCase(OwnEnsemble):
         """
         return dict(self._scenarios)
 
+    @property
+    def _pairs(self) -> list[tuple[int, OwnPlant, int]]:
+        """Each held-out seed with its plant, and by turns with one of the errors that a plant may have."""
+        return [(seed, self.members[i % len(self.members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
+
+    @cached_property
+    def _held_out(self) -> tuple[Scenario, ...]:
+        title = "Set points, on models identified from the record"
+        return tuple(self._test("held_out", title, self.reach.set_points(p, s), p, s, {}) for s, p, _ in self._pairs)
+
     @cached_property
     def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
-        members, reach = self.members, self.reach
-        pairs = [(seed, members[i % len(members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
-        held_out = "Set points, on models identified from the record"
+        members, pairs = self.members, self._pairs
         errors = errors_of(self._nominal)
         spoilt = [self._spoilt(p, s, errors[i]) for s, p, i in pairs]
         less = sorted({share for _, share in spoilt if share < 1})
@@ -130,8 +155,8 @@ class OwnCase(OwnEnsemble):
                 f"; in {count} of {len(pairs)}, where no control gets to the set points, by {_shares(less)} of that"
             )
         return {
-            "held_out": tuple(self._test("held_out", held_out, reach.set_points(p, s), p, s, {}) for s, p, _ in pairs),
-            "spoilt": tuple(replace(test, title=title) for test, _ in spoilt),
+            "held_out": self._held_out,
+            SPOILT: tuple(replace(test, title=title) for test, _ in spoilt),
             **self._loads([(p, i == 0) for _, p, i in pairs]),
             **self._measured([(p, i == 0) for _, p, i in pairs]),
             **self._daily(members),
@@ -227,7 +252,8 @@ class OwnCase(OwnEnsemble):
             for plant, upwards in pairs:
                 level = level_of(plant, self.record, j, upwards)
                 dv = course(plant.dv_nominal, j, level, samples, LOAD_AT)
-                found.append(self._test(MEASURED, f"{title}, and back", self._resting_at(plant), plant, None, {}, dv))
+                test = self._test(MEASURED, f"{title}, and back", self._resting_at(plant), plant, None, {}, dv)
+                found.append(replace(test, hold=self.hold))  # each of its moves settles for itself
                 moved.append(level != plant.dv_nominal[j])
         # One at rest stands for all where the record has none that moves: the gate counts on the test.
         kept = [test for test, moves in zip(found, moved, strict=True) if moves] or found[:1]

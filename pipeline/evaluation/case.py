@@ -183,6 +183,21 @@ class Case(ABC):
         return np.array([self.noise[s.name] for s in self.plant_class.pv_signals])
 
     @property
+    def settling_s(self) -> float | None:
+        """About how long [s] the plant takes to settle, as a record shows it; None without one."""
+        return None
+
+    @property
+    def asked(self) -> Array:
+        """How far set points go from one to another, (n_cv,): the ranges, or less where a case states it."""
+        return np.array([s.high - s.low for s in self.plant.sp_signals])
+
+    @property
+    def spans(self) -> Array:
+        """What small errors of each CV are shares of, (n_cv,): of settling, of swings, of steps too small to count."""
+        return self.asked
+
+    @property
     def noise_level(self) -> float:
         """The measurement noise in the unit that the laws' errors have, as a standard deviation."""
         return float(self.noise_std[0])
@@ -259,8 +274,8 @@ class Case(ABC):
 
         A case with more figures than ``closed_loop_metrics`` adds its own.
         """
-        sp = self.plant.sp_signals[0]
-        figures = closed_loop_metrics(test.sp, pv, mv, test.hold, self.plant.period_s, sp.high - sp.low, test.late_from)
+        span = self.spans[0]
+        figures = closed_loop_metrics(test.sp, pv, mv, test.hold, self.plant.period_s, span, test.late_from)
         if test.reference is not None:
             figures["tracking"] = rmse(test.reference, pv[:, : test.reference.shape[1]])
         return figures

@@ -25,7 +25,7 @@ SMALLEST_STEP = 0.02  # of the CV's range: a smaller move of the set point has n
 STEP_BAND = 0.02  # settled: within this fraction of the step ...
 RANGE_BAND = 0.002  # ... or of the CV's range, whichever is wider (a disturbance test has no step)
 FAR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
-SWING, CROSSINGS = 0.01, 3  # of the CV's range, changes of side: a loop that swings to the end
+SWING, CROSSINGS = 0.01, 3  # of ``span``, the CV's range or its set points', changes of side: it swings to the end
 LEFT = 0.25  # of the CV's range: farther beyond its ends no overshoot leads
 
 
@@ -149,24 +149,29 @@ def left_limits(pv: ArrayLike, *, low: ArrayLike, high: ArrayLike) -> bool:
     return bool(np.any((y < bottom - room) | (y > top + room)))
 
 
-def swings(sp: Array, cv: Array, span: Array) -> NDArray[np.bool_]:
-    """Which controlled variables (n, n_cv) still swing about their set points as the course ends.
-
-    Over the last half of the last hold (the samples since a set point last moved) the error goes from one side to the
-    other at least CROSSINGS times, each time beyond SWING of the range ``span`` (n_cv,).
-    """
+def last_half(sp: Array) -> slice:
+    """The last half of the last hold of set points (n, n_cv): of the samples since one of them last moved."""
     moved = np.flatnonzero(np.any(np.diff(sp, axis=0) != 0, axis=1))
     start = int(moved[-1]) + 1 if len(moved) else 0
-    error = (cv - sp)[(start + len(sp)) // 2 :] / span
+    return slice((start + len(sp)) // 2, len(sp))
+
+
+def swings(sp: Array, cv: Array, span: Array, share: float = SWING, *, whole: bool = False) -> NDArray[np.bool_]:
+    """Which controlled variables (n, n_cv) still swing about their set points as the course ends.
+
+    Over the last half of the last hold, or over the ``whole`` course, the error goes from one side to the
+    other at least CROSSINGS times, each time beyond a ``share`` of ``span`` (n_cv,).
+    """
+    error = (cv - sp)[slice(None) if whole else last_half(sp)] / span
     found = np.zeros(error.shape[1], dtype=bool)
     for i, course in enumerate(error.T):
-        sides = np.sign(course[np.abs(course) > SWING])
+        sides = np.sign(course[np.abs(course) > share])
         found[i] = np.count_nonzero(np.diff(sides)) >= CROSSINGS
     return found
 
 
 def closed_loop_metrics(
-    sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, period_s: float, span: float = 1.0, late_from: int = 0
+    sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, period_s: float, span: ArrayLike = 1.0, late_from: int = 0
 ) -> dict[str, float]:
     """The figures of one closed-loop test, ready for JSON.
 
@@ -184,7 +189,7 @@ def closed_loop_metrics(
     period_s
         Sampling period [s].
     span
-        The CV's range; it scales the smallest step and the settling band.
+        The CV's range, or one of each; it scales the smallest step and the settling band.
     late_from
         Sample from which ``sse_late`` counts; 0: there is no such figure.
 
@@ -209,14 +214,17 @@ def closed_loop_metrics(
         if len(values) != len(r) or not np.all(np.isfinite(values)):
             raise ValueError(f"{name} has {len(values)} samples, or some not finite; give {len(r)} finite ones")
     pairs = list(zip(r.T, y.T, strict=True))
-    over = [overshoots(a, b, hold, span) for a, b in pairs]
+    spans = np.broadcast_to(np.asarray(span, dtype=np.float64), (len(pairs),)).tolist()
+    over = [overshoots(a, b, hold, s) for (a, b), s in zip(pairs, spans, strict=True)]
     loops = {
         **{m.name: [m.of(a, b) for a, b in pairs] for m in METRICS.values() if m.of},
         "ise": [ise(a, b, period_s) for a, b in pairs],
         "masse": [masse(a, b, hold) for a, b in pairs],
         "max_asse": [max_asse(a, b, hold) for a, b in pairs],
         "overshoot": [float(np.mean(steps)) if steps.size else 0.0 for steps in over],
-        "settling": [period_s * float(np.median(settling_samples(a, b, hold, span))) for a, b in pairs],
+        "settling": [
+            period_s * float(np.median(settling_samples(a, b, hold, s))) for (a, b), s in zip(pairs, spans, strict=True)
+        ],
     }
     figures = {name: float(np.max(v) if METRICS[name].together == "max" else np.mean(v)) for name, v in loops.items()}
     figures["mv_travel"] = mv_travel(u)

@@ -264,7 +264,7 @@ class Evidence:
         """
         errors = {n: law.development for n, law in self.laws.items() if not self._withheld(n)}
         if all(error is None for error in errors.values()):
-            errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
+            errors = {n: self.score(n) for n, law in self.laws.items() if not (law.lock_ups or self._withheld(n))}
         scores = {n: e for n, e in errors.items() if e is not None}
         limit = scores.pop(self.case.old_loop, math.inf)
         better = [n for n in scores if scores[n] < limit and not self.worse_than_before(n)]

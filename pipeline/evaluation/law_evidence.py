@@ -58,6 +58,26 @@ class Form:
 
 
 @dataclass(frozen=True, slots=True)
+class Cycle:
+    """A CV that swings about its set point, or an MV about its mean, by +- ``amplitude`` [its unit].
+
+    ``times``: how many times the limit the amplitude is.
+    """
+
+    signal: str
+    unit: str
+    amplitude: float
+    period_s: float
+    times: float
+
+    @property
+    def words(self) -> str:
+        """``y0 swings by ± 0.3 m every 12 s``."""
+        unit = "" if self.unit in {"", "-"} else f" {self.unit}"
+        return f"{self.signal} swings by ± {self.amplitude:.2g}{unit} every {self.period_s:.3g} s"
+
+
+@dataclass(frozen=True, slots=True)
 class LawMetrics:
     """metrics.json of one law, ``controllers.<case>-<name>``; this class alone writes and reads it.
 
@@ -67,9 +87,10 @@ class LawMetrics:
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
     lowest and highest value in closed loops without noise, where these run on models of a record; ``replay``: MV ->
     figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end;
-    ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``poor``: why a law that
-    locked up nowhere is not shipped, a clause after its name, and what to do;
-    ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to their set point.
+    ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``cycles``: test -> the
+    worst limit cycle of the shipped file; ``poor``: why a law that locked up nowhere is not shipped, a clause after its
+    name, and what to do; ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to
+    their set point.
     """
 
     name: str
@@ -88,6 +109,7 @@ class LawMetrics:
     replay: Mapping[str, Row] = field(default_factory=dict)
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     at_rest: Mapping[str, float] = field(default_factory=dict)
+    cycles: Mapping[str, Cycle] = field(default_factory=dict)
     poor: str = ""
     beyond_reach: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
@@ -185,6 +207,16 @@ class LawEvidence:
         """
         start = f"{scenario}/{self.form_of(setting)}/{self.metrics.shipped_seed}/"
         return arrays(self.trajectories, start) or None
+
+    @property
+    def worst_cycle(self) -> str | None:
+        """The test with the worst limit cycle; None without one."""
+        cycles = self.metrics.cycles
+        return max(cycles, key=lambda test: cycles[test].times, default=None)
+
+    def cycling(self) -> Loop:
+        """Arrays of the loop with the worst limit cycle by name; empty where there is none."""
+        return arrays(self.trajectories, "cycling/")
 
     def replay(self) -> Loop:
         """Arrays of the replay over the plant's record by name; empty where there was none."""

@@ -17,13 +17,15 @@ CLEARLY: Final = 0.9  # of the error without control: a law that leaves more of 
 def why_poor(evidence: Evidence, law: str) -> str:
     """Why a law is not shipped although it locked up nowhere, and what to do; empty where nothing speaks against it.
 
-    The first of: it controls no better than no control; it is worse than the old loop in every test. The evidence
-    needs the figures of both laws alone.
+    The first of: it ends in a limit cycle on a model that did not go wrong; it controls no better than no control; it
+    is worse than the old loop in every test. The evidence needs the figures of both laws alone.
     """
+    if figures := limit_cycle(evidence, law):
+        return f"ends in a limit cycle ({figures}); give it calmer numbers, or its model better data"
     if figures := no_better_than_no_control(evidence, law):
         return f"controls no better than no control ({figures}); give it other numbers, or its MVs more room"
     if figures := worse_than_before_everywhere(evidence, law):
-        return f"is worse than the old loop in every test ({figures}); keep the old loop, or give the law other numbers"
+        return f"is worse than the old loop in every test ({figures}); give it other numbers"
     return ""
 
 
@@ -46,6 +48,17 @@ def no_better_than_no_control(evidence: Evidence, law: str) -> str:
     if not found and len(ratios) == len(weights) and sum(w * r for w, r in ratios.values()) >= sum(weights.values()):
         found = [test for test, (_, ratio) in ratios.items() if ratio >= 1]
     return _figures(evidence, law, ((test, evidence.at_rest(test)) for test in found), "with the MVs at rest")
+
+
+def limit_cycle(evidence: Evidence, law: str) -> str:
+    """The worst limit cycle of a law on models that did not go wrong, in words; empty where there is none.
+
+    Models have no valve that sticks and no coarse reading, so that the law alone makes it.
+    """
+    cycles = evidence.laws[law].metrics.cycles
+    own = {test: cycle for test, cycle in cycles.items() if test not in evidence.case.gone_wrong}
+    worst = max(own, key=lambda test: own[test].times, default=None)
+    return "" if worst is None else f"{own[worst].words} in {worst}"
 
 
 def worse_than_before_everywhere(evidence: Evidence, law: str) -> str:

@@ -11,6 +11,8 @@ import numpy as np
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.closed_loop import left_limits, lock_ups, swings
 from pipeline.evaluation.knowing_control import reached
+from pipeline.evaluation.law_evidence import Cycle
+from pipeline.evaluation.limit_cycle import cycle_of
 from pipeline.evaluation.metric import mean_of_draws
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Array
@@ -42,6 +44,8 @@ class Trial:
     beyond_reach: dict[str, int]  # test -> holds that count as no lock-up, because no control gets to the set point
     curves: dict[str, Trajectory]
     reached: dict[str, tuple[float, float]]  # by closed loops without noise, PVs and MVs; of a case on models alone
+    cycles: dict[str, Cycle]  # test -> its worst limit cycle, without noise; of a case on models alone
+    cycling: Trajectory | None  # the loop with the worst of them
 
     @property
     def lock_ups(self) -> int:
@@ -58,7 +62,8 @@ class Trial:
 class Repeated:
     """One test, repeated with different noise where it is noisy: mean figures, the first loop.
 
-    And of all the lock-ups, those that swing to the end, and the holds whose set point is beyond reach.
+    And of all the lock-ups, those that swing to the end, and the holds whose set point is beyond reach; without noise,
+    on models, the limit cycle.
     """
 
     metrics: Metrics
@@ -66,6 +71,7 @@ class Repeated:
     lock_ups: int
     swings: int
     beyond_reach: int = 0
+    cycle: Cycle | None = None
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
@@ -75,8 +81,14 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     found = [seized(case, test, loop) for loop in loops]
     swing = sum(swings_on(case, test, loop) for loop in loops)
+    cycle = cycle_of(case, test, loops[0]) if case.on_models and not noise and not test.replayed else None
     return Repeated(
-        mean_of_draws(rows), loops[0], sum(jammed for jammed, _ in found), swing, sum(holds for _, holds in found)
+        mean_of_draws(rows),
+        loops[0],
+        sum(jammed for jammed, _ in found),
+        max(swing, int(cycle is not None)),
+        sum(holds for _, holds in found),
+        cycle,
     )
 
 
@@ -135,8 +147,7 @@ def swings_on(case: Case, test: Scenario, loop: Trajectory) -> bool:
     """Whether a controlled variable swings about its set point to the end of the test; a replayed load may swing."""
     if test.replayed:
         return False
-    spans = np.array([s.high - s.low for s in case.plant.sp_signals])
-    return bool(swings(loop.sp, loop.pv[:, : test.sp.shape[1]], spans).any())
+    return bool(swings(loop.sp, loop.pv[:, : test.sp.shape[1]], case.spans).any())
 
 
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:

@@ -11,7 +11,7 @@ from typing import Literal
 
 from pipeline.engine.parallel import parallel_map
 from pipeline.evaluation.case import Case
-from pipeline.evaluation.law_evidence import BASE
+from pipeline.evaluation.law_evidence import BASE, Cycle
 from pipeline.evaluation.metric import together
 from pipeline.evaluation.reached import reached_by, widest
 from pipeline.evaluation.trial import DEVELOPED, DEVELOPMENT, Metrics, Trial, repeated
@@ -51,6 +51,7 @@ class Ran:
     beyond_reach: int
     curve: Trajectory | None
     reached: dict[str, tuple[float, float]] | None
+    cycle: tuple[Cycle, Trajectory] | None  # of a scored test
 
 
 class Trials:
@@ -99,7 +100,8 @@ class Trials:
         )
         kept = piece.kind != DEVELOPED and piece.place == 0
         counts = one.lock_ups, one.swings, one.beyond_reach
-        return Ran(controller.manifest.info, one.metrics, *counts, one.first if kept else None, reached)
+        cycle = (one.cycle, one.first) if one.cycle is not None and piece.kind == "scored" else None
+        return Ran(controller.manifest.info, one.metrics, *counts, one.first if kept else None, reached, cycle)
 
     def weight(self, piece: Piece) -> float:
         """What a piece costs beside others: its samples."""
@@ -125,6 +127,8 @@ class Trials:
                 sequences[piece.test] = {str(t.seed): row for t, row in zip(tests, rows, strict=True)}
         developed = [r.metrics[self.case.metric] for p, r in found.items() if p.kind == DEVELOPED]
         first, ran = next(iter(found.items()))
+        # Of each test the worst comes last, and so of all.
+        cycles = sorted(((*r.cycle, p.key) for p, r in found.items() if r.cycle is not None), key=lambda c: c[0].times)
         return Trial(
             first.form,
             first.seed,
@@ -137,6 +141,8 @@ class Trials:
             {name: count for name, count in beyond.items() if count},
             curves,
             widest(r.reached for r in found.values() if r.reached is not None),
+            {key: cycle for cycle, _, key in cycles},
+            cycles[-1][1] if cycles else None,
         )
 
     def _controller(self, path: Path) -> Controller:

@@ -383,6 +383,20 @@ def overview_picture(evidence: Evidence, law: str, test: str | None = None) -> C
     return _picture(evidence, scenario, title, drawn)
 
 
+def cycle_picture(evidence: Evidence, law: str) -> Canvas:
+    """The loop with the worst limit cycle of a law: what swings in it, how far and how fast."""
+    measured, case = evidence.laws[law], evidence.case
+    test, loop = measured.worst_cycle, measured.cycling()
+    if test is None or not loop:
+        raise NotMeasuredError
+    where = scenario_name(test, case.recipe, case.test_words)
+    title = f"{measured.title}, {where}\n{measured.metrics.cycles[test].words}"
+    name = law_name(law)
+    panels = LoopPanels(case, title, {name: loop})
+    panels.add(loop, name, colour_of(law, evidence.laws, case.baseline))
+    return panels.finish(loop)
+
+
 def disturbance_picture(evidence: Evidence, scenario: str) -> Canvas:
     """The first sequence of a test that moves a measured disturbance, under the best law and the baseline.
 

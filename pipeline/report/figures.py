@@ -16,7 +16,13 @@ from pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from pipeline.evaluation.model_evidence import candidates, identified_part
 from pipeline.pictures.drawing import STYLE, CasePicture, Draw
 from pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
-from pipeline.pictures.loop_pictures import disturbance_picture, info_picture, loops_picture, overview_picture
+from pipeline.pictures.loop_pictures import (
+    cycle_picture,
+    disturbance_picture,
+    info_picture,
+    loops_picture,
+    overview_picture,
+)
 from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
 from pipeline.pictures.png import save
 from pipeline.pictures.replay_pictures import replay_picture
@@ -41,9 +47,9 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
 
     The case's own figures are ``figure_05.png`` and so on, with the best controller added;
     ``closed_loop_<law>.png`` shows each law beside the case's baseline on the test that weighs most, and
-    ``closed_loop.png`` the best one; ``worst_<law>.png`` the test that says most against it;
-    ``candidates_<set>_<part>.png`` the search over a model's size; ``closed_loop_test_<test>.png`` a test that moves
-    measured disturbances; ``own`` are the pictures that only this case has.
+    ``closed_loop.png`` the best one; ``worst_<law>.png`` the test that says most against it, ``cycle_<law>.png`` its
+    worst limit cycle; ``candidates_<set>_<part>.png`` the search over a model's size; ``closed_loop_test_<test>.png`` a
+    test that moves measured disturbances; ``own`` are the pictures that only this case has.
     Raises ReportError where two pictures have the same file name.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -73,6 +79,9 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                 if name in shipped and (test := worst_test(evidence, name)) is not None:
                     words = scenario_name(test, evidence.case.recipe, evidence.case.test_words)
                     keep(f"worst_{name}", overview_picture(evidence, name, test), f"{law.title} on {words}")
+            with suppress(NotMeasuredError):
+                canvas = cycle_picture(evidence, name)
+                keep(f"cycle_{name}", canvas, f"{law.title}: {law.metrics.cycles[str(law.worst_cycle)].words}")
             with suppress(NotMeasuredError):
                 keep(f"replay_{name}", replay_picture(evidence, name), f"{law.title}, replayed over the record")
         for test, sequences in evidence.tests.items():

@@ -8,13 +8,16 @@ from pipeline.evaluation.closed_loop import FAR
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.known import known_rows
 from pipeline.evaluation.law_evidence import lock_up_text
+from pipeline.evaluation.metric import NO_UNIT
 from pipeline.evaluation.model_evidence import IDENTIFIED
 from pipeline.evaluation.proof import statements
 from pipeline.evaluation.validation import Statement
+from pipeline.historian.pace import in_words
+from pipeline.historian.step_test import ALONE, HOLDS, LARGEST, MOVES
 from pipeline.pictures.drawing import axis_label
 from pipeline.pictures.numbers import number, times
 from pipeline.pictures.words import law_name, scenario_name
-from pipeline.report.worse import limit_of
+from pipeline.report.worse import limit_of, shipped_laws
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 UNMEASURED = "not measured"
@@ -37,6 +40,28 @@ def own_acceptance(evidence: Evidence) -> list[Statement]:
     if evidence.best != baseline and baseline in evidence.laws and not evidence.no_baseline:
         rows += [*_beside(evidence, evidence.best, baseline), _score(evidence, evidence.best, baseline)]
     return rows
+
+
+def step_test_to_run(evidence: Evidence) -> str:
+    """What to do where laws were tested and none is shipped: the step test for a better model; else empty.
+
+    Laws that were not designed, because the record does not prove the model, have it among their reasons.
+    """
+    case = evidence.case
+    if case.settling_s is None or not evidence.laws or shipped_laws(evidence):
+        return ""
+    units = {s.name: "" if s.unit in NO_UNIT else f" {s.unit.replace('deg', '°')}" for s in case.record_signals.mv}
+    steps = [f"{s.name} by {number(LARGEST * (s.high - s.low))}{units[s.name]}" for s in case.record_signals.mv]
+    alone, least, most = (share * case.settling_s for share in (ALONE, min(HOLDS), max(HOLDS)))
+    whole = 3 * len(steps) * alone + MOVES * sum(HOLDS) / len(HOLDS) * case.settling_s
+    old = "Keep the old loop until then. " if evidence.old_loop else ""
+    each, them = (", each alone", "all of them") if steps[1:] else ("", "it")
+    return (
+        f"{old}A step test gives a better model: move in manual {', '.join(steps)} to each side, or as much more as "
+        f"the plant bears{each}: up, down and back, each held for {in_words(alone)}. Then move {them} {MOVES} times at "
+        f"random within that, held for {in_words(least)} to {in_words(most)}; {in_words(whole)} in all. Give its rows "
+        f"with the old ones: loopwright new {case.name} OLD NEW --replace."
+    )
 
 
 def _lock_ups(name: str, evidence: Evidence) -> Statement:

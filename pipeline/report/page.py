@@ -21,6 +21,7 @@ from pipeline.report.figures import draw_all, main_words
 from pipeline.report.for_programs import validation
 from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
+from pipeline.report.own_acceptance import step_test_to_run
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
 from pipeline.report.worse import against, beyond_reach, shipped_laws
@@ -65,6 +66,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "best": best,
         "old_loop_stands": bool(evidence.old_loop and shipped) and best is None,
         "nothing_shipped": bool(evidence.withheld or evidence.laws) and not shipped,
+        "to_do": step_test_to_run(evidence),
         "shown_law": evidence.best or next(iter(shipped), None),
         "seeds": "" if best is None else _seeds(best.seeds),
         "headline": headline(evidence),
@@ -74,6 +76,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "further_pictures": [
             *_loops(evidence, of_kind("closed_loop_")),
             *([("Tests that say most against a law", worst)] if (worst := of_kind("worst_")) else ()),
+            *([("Limit cycles", cycles)] if (cycles := of_kind("cycle_")) else ()),
         ],
         "sweeps": of_kind("sweep_") | of_kind("candidates_"),
         # A search over models has no offline optimum: its column would stand empty.

@@ -70,7 +70,9 @@ def against(evidence: Evidence) -> list[dict[str, str]]:
             each = ", ".join(_words(evidence, one) for one in worse)
             clauses.append(f"has a higher {case.criterion.short} than the {law_name(case.baseline)} in {each}")
         if swings := evidence.laws[law].metrics.swings:
-            clauses.append(f"swings to the end in {lock_up_text(swings)}")
+            worst = evidence.laws[law].worst_cycle
+            most = f": at worst {evidence.laws[law].metrics.cycles[worst].words} in {worst}" if worst else ""
+            clauses.append(f"swings to the end in {lock_up_text(swings)}{most}")
         if clauses:
             rows.append({"law": law, "words": "; it ".join(clauses)})
     return rows

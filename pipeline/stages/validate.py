@@ -108,6 +108,8 @@ def validate(name: str) -> None:
     write_json(step_time_file(params.case, params.name), took)
     print(f"validate {name}: one step takes {took['p50']:.0f} us (median)", file=sys.stderr)
     curves = {f"{s}/{t.form}/{t.seed}": c for t in trials if t.seed == shipped.seed for s, c in t.curves.items()}
+    if shipped.cycling is not None:
+        curves["cycling"] = shipped.cycling
     arrays = {f"{key}/{field}": getattr(c, field) for key, c in curves.items() for field in FIELDS}
     np.savez_compressed(folder / "trajectories.npz", **arrays)
     _keep_analysis(params, shipped.seed, folder / "analysis.npz")
@@ -208,6 +210,7 @@ def _metrics(
         },
         reached=widest(t.reached for t in base),
         swings=_of_tests(base, "swings"),
+        cycles=shipped.cycles,
         beyond_reach=_of_tests(base, "beyond_reach"),
     )
 

@@ -96,6 +96,7 @@ def test_a_law_that_is_worse_in_every_test_is_not_shipped() -> None:
     assert "**No controller is shipped:**" in page
     assert terminal.count("it is worse than the old loop in every test") == 1
     assert "| MVs at rest |" in page
+    assert page.count("Keep the old loop until then.") == 1
 
 
 def test_where_the_old_loop_gets_stuck_a_law_need_not_beat_it() -> None:

@@ -65,6 +65,47 @@ def test_a_law_that_controls_no_better_than_mvs_at_rest_is_not_shipped() -> None
     assert f"| {own.at_rest['held_out']:.3g} |" in page
 
 
+def test_a_law_in_a_limit_cycle_on_a_model_as_it_is_is_not_shipped_and_its_loop_is_drawn() -> None:
+    controllers_of_a_lag({"pid": PI, "hard": PI | {"kc": 2.0}})
+    found = validated("pid", "hard")
+    assert not (ARTIFACTS / "hard.onnx").exists()
+    assert withheld("hard").startswith("controllers.it-hard ends in a limit cycle (y0 swings by ± ")
+    own = LawMetrics.read(Path("work/it/validation/hard/metrics.json"))
+    cycle = own.cycles["held_out"]
+    assert (cycle.signal, cycle.unit) == ("y0", "m")
+    assert cycle.times > 1
+    assert cycle.period_s == pytest.approx(2.0)  # the MV goes from one end to the other with each sample
+    assert found.laws["hard"].withheld == own.poor
+    page = (ARTIFACTS / "report.md").read_text()
+    assert "**What to do:**" not in page  # another law is shipped
+    assert "figures/cycle_hard.png" in page
+    assert "figures/cycle_pid.png" not in page
+    assert own.lock_ups == 0
+
+
+def test_a_limit_cycle_on_models_gone_wrong_alone_is_told() -> None:
+    controllers_of_a_lag({"pid": PI | {"kc": 0.9}})
+    found = validated("pid")
+    assert found.best == "pid"
+    assert set(LawMetrics.read(Path("work/it/validation/pid/metrics.json")).cycles) == {"spoilt"}
+    page = (ARTIFACTS / "report.md").read_text()
+    assert ": at worst y0 swings by ± " in page
+    assert "figures/cycle_pid.png" in page
+
+
+def test_where_nothing_is_shipped_the_report_says_once_which_step_test_helps() -> None:
+    case = controllers_of_a_lag({"pid": HARDLY, "hard": PI | {"kc": 2.0}})
+    found = validated("pid", "hard")
+    assert found.best is None
+    for name in ("report.md", "report.html"):
+        page = (ARTIFACTS / name).read_text()
+        assert page.count("A step test gives a better model") == 1
+        assert "u0 by 0.24 V" in page  # of a range of 2 V
+        assert case.settling_s == 10.0  # a third of the shortest hold
+        assert "each held for 15 s." in page
+        assert "Keep the old loop" not in page  # which nobody knows
+
+
 def test_the_error_at_rest_is_that_of_the_plant_where_it_stands() -> None:
     case = controllers_of_a_lag({})
     found = errors_at_rest(case)
