@@ -17,6 +17,7 @@ SHOWN = {
     "locked_up",
     "as_printed",
     "swings",
+    "beyond_reach",
 }  # entries of the evidence that have a place of their own
 
 
@@ -33,7 +34,7 @@ def card(controller: Controller) -> str:
     if signed := signer(controller):
         lines[3:3] = [f"  signed    by {signed.words}", *(f"            {words}" for words in ending(controller))]
     first = _locked_up(m.evidence) or [f"  NOT PROVEN: {why}" for why in filter(None, [judged(m).why])]
-    lines[1:1] = [*first, *_swings(m.evidence), *_doubtful(m.evidence)]
+    lines[1:1] = [*first, *_swings(m.evidence), *_beyond_reach(m.evidence), *_doubtful(m.evidence)]
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         idle = " (this law does not take them)" * (name == "dv" and "dv" not in m.inputs)
         lines += _signals(title + idle, m.signals(name))
@@ -81,6 +82,14 @@ def _locked_up(evidence: dict[str, Any]) -> list[str]:
     if evidence.get("as_printed") is True:
         lines.append("    shipped as printed, to reproduce a paper")
     return lines
+
+
+def _beyond_reach(evidence: dict[str, Any]) -> list[str]:
+    """Tests with holds that count as no lock-up, because no control gets to their set point in time."""
+    tests = evidence.get("beyond_reach")
+    if not isinstance(tests, dict) or not tests:
+        return []
+    return ["  holds at an end of the MVs whose set point no control gets to in time, no lock-ups", *_by_test(tests)]
 
 
 def _swings(evidence: dict[str, Any]) -> list[str]:

@@ -90,6 +90,11 @@ def errors_of(plant: OwnPlant) -> list[dict[str, float]]:
     ]
 
 
+def lessened(errors: Mapping[str, float], share: float) -> dict[str, float]:
+    """Parameters of a plant that is spoilt by a share of these errors: factors to its power, dead times times it."""
+    return {name: value * share if name == "dead_time" else value**share for name, value in errors.items()}
+
+
 def doubted(plant: OwnPlant, doubts: Doubts) -> dict[str, tuple[float, float]]:
     """Parameter -> range within which the plant may lie: from 1 / (1 + error) to 1 + error, dead time from 0 on."""
     gains = {f"gain_{s.name}": (1 / (1 + e), 1 + e) for s, e in zip(plant.mv_signals, doubts.gain, strict=True)}

@@ -125,16 +125,26 @@ class Reach:
 
     def set_points(self, plant: Simulator, seed: int, p: Array | None = None) -> Array:
         """Set points (LEVELS * hold, n_cv) that a plant can hold under its parameters p (n_p,), each held."""
+        return self.drawn(plant, seed, p)[0]
+
+    def drawn(self, plant: Simulator, seed: int, p: Array | None = None) -> tuple[Array, bool]:
+        """(``set_points``, whether the plant rests at each: else where it starts stands in for one)."""
         rng = np.random.default_rng(seed)
         draws = rng.uniform(self.mv[0], self.mv[2], (LEVELS, self.mv.shape[1]))
         if self.integrates:
-            levels = self._balances(plant, draws, rng, p)
+            levels, rests = self._balances(plant, draws, rng, p)
         else:
             levels, good = self._rests(plant, draws, p)
-            wanted = rng.uniform(self.cv[0], self.cv[2], levels.shape)
+            wanted, rests = rng.uniform(self.cv[0], self.cv[2], levels.shape), True
             for k in np.flatnonzero(~good):
-                levels[k] = self._held(plant, wanted[k], p)
-        return np.repeat(np.clip(levels, self.cv[0], self.cv[2]), self.hold, axis=0)
+                held = self._held(plant, wanted[k], p)
+                rests &= held is not None
+                levels[k] = self._begin(plant) if held is None else held
+        return np.repeat(np.clip(levels, self.cv[0], self.cv[2]), self.hold, axis=0), rests
+
+    def _begin(self, plant: Simulator) -> Array:
+        """CVs (n_cv,) where a plant starts, within the visited range."""
+        return np.clip(plant.measure(plant.start[0])[: self.cv.shape[1]], self.cv[0], self.cv[2])
 
     def _rests(self, plant: Simulator, draws: Array, p: Array | None) -> tuple[Array, NDArray[np.bool_]]:
         """CVs (LEVELS, n_cv) of rests within the visited range, of each draw the farthest from the medians.
@@ -147,18 +157,20 @@ class Reach:
         good = inside(cvs, self.cv[0], self.cv[2])
         return np.asarray(cvs[good.argmax(axis=0), np.arange(len(draws))]), np.asarray(good.any(axis=0))
 
-    def _held(self, plant: Simulator, wanted: Array, p: Array | None) -> Array:
-        """CVs (n_cv,) of a rest on the way from where the plant starts to ``wanted`` (n_cv,), as far as MVs reach."""
-        start = np.clip(plant.measure(plant.start[0])[: len(wanted)], self.cv[0], self.cv[2])
+    def _held(self, plant: Simulator, wanted: Array, p: Array | None) -> Array | None:
+        """CVs (n_cv,) of a rest on the way from where the plant starts to ``wanted`` (n_cv,); None without one."""
+        start = self._begin(plant)
         levels = [start + scale * (wanted - start) for scale in SCALES]
         can = (at for at in levels if held_at(plant, plant.start, at, self.model.mv_signals, p) is not None)
-        return np.asarray(next(can, start))
+        return next(can, None)
 
-    def _balances(self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None) -> Array:
-        """CVs (LEVELS, n_cv) of rests: those that integrate at levels drawn over their visited range."""
+    def _balances(
+        self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None
+    ) -> tuple[Array, bool]:
+        """CVs (LEVELS, n_cv) of rests, with levels drawn for those that integrate; and whether all are rests."""
         which, (start, mv0) = list(self.integrates), plant.start
         wanted = rng.uniform(self.cv[0, which], self.cv[2, which], (len(draws), len(which)))
-        found = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1))
+        found, rests = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1)), True
         for k, (draw, levels) in enumerate(zip(draws, wanted, strict=True)):
             found[k, which] = levels
             for scale in SCALES:
@@ -168,7 +180,9 @@ class Reach:
                 if away < BALANCED and visited and can_command(self.model.mv_signals, mv):
                     found[k] = cvs
                     break
-        return found
+            else:
+                rests = False
+        return found, rests
 
 
 def can_command(mvs: Sequence[Signal], values: Array, room: float = 0.0) -> bool:

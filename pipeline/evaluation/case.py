@@ -126,6 +126,7 @@ class Case(ABC):
     stand_in: ClassVar[str] = "identified"  # what they run on in the plant's place: such models, or a simulator
     reads: ClassVar[tuple[Path, ...]] = ()  # files, beside the code, that the tests run
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
+    gone_wrong: ClassVar[tuple[str, ...]] = ()  # tests on plants that no law was told of: poor figures there are told
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # plant parameter -> where that of a real plant may lie
 
     def __post_init__(self) -> None:

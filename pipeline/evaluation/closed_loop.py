@@ -107,10 +107,10 @@ def settling_samples(sp: ArrayLike, pv: ArrayLike, hold: int, span: float = 1.0)
     return np.array(settled)
 
 
-def locked_up(
+def lock_ups(
     sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike, span: ArrayLike
-) -> bool:
-    """Whether the loop locks up in some hold: it stays saturated and far from a set point.
+) -> list[slice]:
+    """The holds in which the loop locks up: it stays saturated and far from a set point.
 
     In the whole second half of such a hold one MV is at one end of [low, high], and |r - y| of one CV is more
     than ``FAR`` of its ``span``, the CV's range. A slow plant or the heating of a batch may saturate for a
@@ -123,12 +123,20 @@ def locked_up(
     u = np.asarray(mv, dtype=np.float64).reshape(len(e), -1)
     bottom, top, wide = (np.asarray(values, dtype=np.float64) for values in (low, high, span))
     near = 1e-6 * (top - bottom)
+    found = []
     for part in holds(len(e), hold):
         half = slice(part.start + (part.stop - part.start) // 2, part.stop)
         stuck = np.all(u[half] <= bottom + near, axis=0) | np.all(u[half] >= top - near, axis=0)
         if stuck.any() and np.all(e[half] > FAR * wide, axis=0).any():
-            return True
-    return False
+            found.append(part)
+    return found
+
+
+def locked_up(
+    sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike, span: ArrayLike
+) -> bool:
+    """Whether the loop locks up in some hold, as ``lock_ups`` finds them."""
+    return bool(lock_ups(sp, pv, mv, hold, low=low, high=high, span=span))
 
 
 def left_limits(pv: ArrayLike, *, low: ArrayLike, high: ArrayLike) -> bool:

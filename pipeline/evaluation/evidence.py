@@ -13,7 +13,7 @@ from typing import Any, Self
 from pipeline.errors import PipelineError, ReportError
 from pipeline.evaluation.case import Case, Curve
 from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays, lock_up_text
+from pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays
 from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from pipeline.evaluation.model_evidence import model_figure
 from pipeline.evaluation.reached import grounds_of
@@ -203,6 +203,11 @@ class Evidence:
         """Error below which a loop of this test, with noise or without, is as good as perfect."""
         return self.floors[scenario.removesuffix(NOISE_SUFFIX)]
 
+    def at_rest(self, scenario: str) -> float | None:
+        """The error of a test with the MVs left where they stand; None where that was not measured."""
+        known = (law.metrics.at_rest.get(scenario.removesuffix(NOISE_SUFFIX)) for law in self.laws.values())
+        return next((error for error in known if error is not None), None)
+
     def ratio(self, law: str, scenario: str, kind: str = "nmpc") -> float | None:
         """Error of the law over that of the bound; None also where the bound lies below ``floor``."""
         own, bound = self.figure(law, scenario), self.bound(scenario, None, kind)
@@ -239,8 +244,7 @@ class Evidence:
             return ""
         if name not in self.laws:
             return self.withheld.get(name, f"params.yaml has no controller {name!r} for this plant")
-        tests = lock_up_text(self.laws[name].metrics.locked_up)
-        return f"it locked up or left its limits on {tests}" if self._withheld(name) else ""
+        return f"it {self.laws[name].why_withheld}" if self._withheld(name) else ""
 
     def score(self, law: str) -> float | None:
         """Gate score: weighted mean of ``gate_ratio`` over the gate's scenarios; lower is better."""
@@ -263,19 +267,27 @@ class Evidence:
             errors = {n: self.score(n) for n, law in self.laws.items() if law.lock_ups == 0}
         scores = {n: e for n, e in errors.items() if e is not None}
         limit = scores.pop(self.case.old_loop, math.inf)
-        better = [n for n in scores if scores[n] < limit and self._as_good_as_before(n)]
+        better = [n for n in scores if scores[n] < limit and not self.worse_than_before(n)]
         return min(better, key=lambda n: scores[n], default=None)
 
-    def _as_good_as_before(self, law: str) -> bool:
-        """Whether no test of the gate, and no replay of the record, has a larger error than under the old loop.
+    def beside_before(self, law: str) -> dict[str, tuple[float, float]]:
+        """Tests of the gate, and replays of the record -> errors of the law and of the old loop, where both are known.
 
-        Errors that noise can hide are equal. True where there is no old loop, or it got stuck.
+        Errors that noise can hide count as equal to it. Empty where there is no old loop, or it got stuck.
         """
-        if not self.old_loop or self._withheld(self.old_loop):
-            return True
+        if not self.old_loop or law == self.old_loop or self._withheld(self.old_loop):
+            return {}
         tests = (*self.case.weights, *self.daily)
-        figures = [(self.figure(law, test), self.figure(self.old_loop, test), self.floor(test)) for test in tests]
-        return all(own is None or old is None or own <= max(old, floor) for own, old, floor in figures)
+        figures = {test: (self.figure(law, test), self.figure(self.old_loop, test), self.floor(test)) for test in tests}
+        return {
+            test: (max(own, floor), max(old, floor))
+            for test, (own, old, floor) in figures.items()
+            if own is not None and old is not None
+        }
+
+    def worse_than_before(self, law: str) -> tuple[str, ...]:
+        """The tests of ``beside_before`` in which the law has the larger error."""
+        return tuple(test for test, (own, old) in self.beside_before(law).items() if own > old)
 
     @property
     def old_loop(self) -> str:

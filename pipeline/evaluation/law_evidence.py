@@ -66,7 +66,10 @@ class LawMetrics:
     reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
     lowest and highest value in closed loops without noise, where these run on models of a record; ``replay``: MV ->
-    figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end.
+    figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end;
+    ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``poor``: why a law that
+    locked up nowhere is not shipped, a clause after its name, and what to do;
+    ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to their set point.
     """
 
     name: str
@@ -84,6 +87,9 @@ class LawMetrics:
     reached: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     replay: Mapping[str, Row] = field(default_factory=dict)
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    at_rest: Mapping[str, float] = field(default_factory=dict)
+    poor: str = ""
+    beyond_reach: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
         """Write the file; ValueError for NaN and infinity."""
@@ -132,8 +138,15 @@ class LawEvidence:
 
     @property
     def withheld(self) -> bool:
-        """Whether it is not shipped: it locked up, and reproduces no paper."""
-        return self.lock_ups > 0 and not self.metrics.as_printed
+        """Whether it is not shipped: it locked up, and reproduces no paper, or its tests show it to be poor."""
+        return bool(self.why_withheld)
+
+    @property
+    def why_withheld(self) -> str:
+        """Why it is not shipped, a clause after its name; empty where it is."""
+        if self.lock_ups > 0 and not self.metrics.as_printed:
+            return f"locked up or left its limits on {lock_up_text(self.metrics.locked_up)}"
+        return self.metrics.poor
 
     @property
     def development(self) -> float | None:

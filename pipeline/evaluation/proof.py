@@ -10,9 +10,12 @@ from pipeline.evaluation.model_evidence import Metrics, identified_part
 from pipeline.evaluation.validation import Statement
 
 MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
+SHARE = 0.8  # free-run error over the PV's deviation, noise and all: a model that has more hardly needs its inputs
 FORESEEN = 10.0  # nats: odds of 20,000 to 1 for a model whose MVs move the PV
 LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
+BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
+NOTHING: Mapping[str, Any] = {}  # is known of a pair
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
     "`loopwright new` lists them in step_test.csv, and give these rows too"
@@ -74,14 +77,25 @@ def _predictions(proof: Mapping[str, Any]) -> dict[str, Statement]:
 
 def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[Statement, str]]:
     """The row of each answer, and PV and MV in words."""
-    one_step = proof.get("one_step") or {}
     for pv, mvs in (proof.get("answers") or {}).items():
-        shown = pv in one_step and one_step[pv]["nats"] >= FORESEEN
         for mv, found in mvs.items():
-            yield _sign(pv, mv, found, known_of(proof, pv, mv), shown=shown), f"{pv} to {mv}"
+            yield _sign(pv, mv, found, proof), f"{pv} to {mv}"
 
 
-def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
+def _foreseen(proof: Mapping[str, Any], pv: str) -> bool:
+    """Whether the inputs foresee a PV of a closed loop one row ahead."""
+    one_step = proof.get("one_step") or {}
+    return pv in one_step and one_step[pv]["nats"] >= FORESEEN
+
+
+def _followed(proof: Mapping[str, Any], pv: str) -> bool:
+    """Whether the free run follows a PV, by its inputs: clearly better than a model without them."""
+    of = (proof.get("free_run") or {}).get(pv) or {}
+    missed, share = of.get("missed"), of.get("share")
+    return missed is not None and share is not None and missed <= MISSED * of["motion"] and share <= SHARE
+
+
+def _holds(found: Mapping[str, Any], known: Mapping[str, Any] = NOTHING, *, shown: bool) -> bool:
     """Whether nothing speaks against an answer.
 
     Where the inputs are ``shown`` to foresee the PV over rows that no fit saw, and all models that are as likely have
@@ -100,21 +114,59 @@ def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -
     return bool(of_one_sign and abs(found["direct"]) >= LIKELY * found["sd"])
 
 
-def _sign(pv: str, mv: str, found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> Statement:
+def _by_region(found: Mapping[str, Any], *, shown: bool) -> bool:
+    """Whether an answer whose gain turns or fades holds: in each region where it is not small, the PV ``shown``."""
+    told = [region for region in found.get("regions") or () if not region["small"]]
+    return shown and bool(told) and all(_holds(region, shown=True) for region in told)
+
+
+def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) -> Statement:
+    by_region, known = found["verdict"] in BY_REGION, known_of(proof, pv, mv)
+    foreseen = _foreseen(proof, pv)
+    shown = foreseen or _followed(proof, pv)
+    if by_region:
+        holds = _by_region(found, shown=shown)
+        limit = "certain in sign in each region where it is not small, and of the size that one-step predictions find"
+    else:
+        holds = _holds(found, known, shown=foreseen)
+        limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
+    return Statement(
+        f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
+        limit,
+        "; ".join([*([] if by_region else [_measured(found)]), *_regions(mv, found)]),
+        holds,
+        _by_regions_why(found, shown=shown, holds=holds)
+        if by_region
+        else _word(found, known, holds=holds) or _why(pv, mv, found),
+    )
+
+
+def _measured(found: Mapping[str, Any]) -> str:
+    """The models' answer and that of one-step predictions, in words."""
     direct = (
         "too few rows for one-step predictions"
         if found["direct"] is None
         else f"one-step predictions {found['direct']:.3g} ± {found['sd']:.2g}"
     )
-    holds = _holds(found, known, shown=shown)
-    span = f"{found['low']:.3g} … {found['high']:.3g}"
-    return Statement(
-        f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
-        "certain in sign, the same in both halves of the record, and of the size that one-step predictions find",
-        f"{found['model']:.3g} ({span}); {direct}",
-        holds,
-        _word(found, known, holds=holds) or _why(pv, mv, found),
+    return f"{found['model']:.3g} ({found['low']:.3g} … {found['high']:.3g}); {direct}"
+
+
+def _regions(mv: str, found: Mapping[str, Any]) -> list[str]:
+    """The answer in each region of the MV, in words; empty where it is much the same in all of its range."""
+    return [
+        f"{mv} at {region['from']:.3g} … {region['to']:.3g}: "
+        + (f"{region['model']:.2g}, small" if region["small"] else _measured(region).replace(";", ","))
+        for region in found.get("regions") or ()
+    ]
+
+
+def _by_regions_why(found: Mapping[str, Any], *, shown: bool, holds: bool) -> str:
+    """What is so of a gain that changes within the range, and what speaks against it."""
+    changes = "turns its sign" if found["verdict"] == "turns" else "fades"
+    against = (
+        "" if holds else ", and the record shows too little of it" if shown else ", and the model predicts too little"
     )
+    return f"its gain {changes} within the range{against}"
 
 
 def _word(found: Mapping[str, Any], known: Mapping[str, Any], *, holds: bool) -> str:

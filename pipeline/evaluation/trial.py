@@ -9,8 +9,10 @@ from typing import Final
 import numpy as np
 
 from pipeline.evaluation.case import Case
-from pipeline.evaluation.closed_loop import left_limits, locked_up, swings
+from pipeline.evaluation.closed_loop import left_limits, lock_ups, swings
+from pipeline.evaluation.knowing_control import reached
 from pipeline.evaluation.metric import mean_of_draws
+from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import Trajectory, simulate_closed
@@ -37,6 +39,7 @@ class Trial:
     development: float  # the case's metric, mean over the development sequences
     locked_up: dict[str, int]  # test -> closed loops that locked up, of those where any did; DEVELOPED: development
     swings: dict[str, int]  # the same of closed loops that swing to the end
+    beyond_reach: dict[str, int]  # test -> holds that count as no lock-up, because no control gets to the set point
     curves: dict[str, Trajectory]
     reached: dict[str, tuple[float, float]]  # by closed loops without noise, PVs and MVs; of a case on models alone
 
@@ -55,13 +58,14 @@ class Trial:
 class Repeated:
     """One test, repeated with different noise where it is noisy: mean figures, the first loop.
 
-    And of all the lock-ups, and those that swing to the end.
+    And of all the lock-ups, those that swing to the end, and the holds whose set point is beyond reach.
     """
 
     metrics: Metrics
     first: Trajectory
     lock_ups: int
     swings: int
+    beyond_reach: int = 0
 
 
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
@@ -69,8 +73,11 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     draws = range(case.noise_draws if noise else 1)
     loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
-    lock_ups, swing = (sum(of(case, test, loop) for loop in loops) for of in (stuck, swings_on))
-    return Repeated(mean_of_draws(rows), loops[0], lock_ups, swing)
+    found = [seized(case, test, loop) for loop in loops]
+    swing = sum(swings_on(case, test, loop) for loop in loops)
+    return Repeated(
+        mean_of_draws(rows), loops[0], sum(jammed for jammed, _ in found), swing, sum(holds for _, holds in found)
+    )
 
 
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
@@ -101,14 +108,27 @@ def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
     A controller refuses to give an MV beyond its range. Where the tests run on models, a CV far beyond its range counts
     too: equations hold far from where they were meant, a model of a record does not.
     """
+    return seized(case, test, loop)[0]
+
+
+def seized(case: Case, test: Scenario, loop: Trajectory) -> tuple[bool, int]:
+    """(whether the loop is ``stuck``, holds in which it is at an end because its set point is beyond reach).
+
+    On a model of a record a hold counts only where a control that knows the model comes near the set point within the
+    hold, from the same state: a plant gone wrong may not get there at all.
+    """
     n = test.sp.shape[1]
     # As many MVs as set points; a further one may have a part that rests at an end.
     mvs, spans = case.plant.mv_signals[:n], [s.high - s.low for s in case.plant.sp_signals]
     limits = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
-    jammed = locked_up(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=spans)
+    jammed = lock_ups(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=spans)
+    plant, beyond = test.plant or case.plant, list[slice]()
+    if case.on_models and isinstance(plant, IdentifiedPlant):
+        before = np.vstack([test.mv0, loop.mv])  # the MVs at the beginning of each sample
+        beyond = [of for of in jammed if not reached(plant, test, of, loop.x[of.start], before[of.start]).near]
     ends = {end: [getattr(s, end) for s in case.plant.sp_signals] for end in ("low", "high")}
     left = case.on_models and left_limits(loop.pv[:, :n], **ends)
-    return jammed or left or bool(loop.info[:, -1].any())
+    return len(jammed) > len(beyond) or left or bool(loop.info[:, -1].any()), len(beyond)
 
 
 def swings_on(case: Case, test: Scenario, loop: Trajectory) -> bool:

@@ -48,6 +48,7 @@ class Ran:
     metrics: Metrics
     lock_ups: int
     swings: int
+    beyond_reach: int
     curve: Trajectory | None
     reached: dict[str, tuple[float, float]] | None
 
@@ -97,9 +98,8 @@ class Trials:
             reached_by([one.first], case) if case.on_models and piece.kind == "scored" and not piece.noise else None
         )
         kept = piece.kind != DEVELOPED and piece.place == 0
-        return Ran(
-            controller.manifest.info, one.metrics, one.lock_ups, one.swings, one.first if kept else None, reached
-        )
+        counts = one.lock_ups, one.swings, one.beyond_reach
+        return Ran(controller.manifest.info, one.metrics, *counts, one.first if kept else None, reached)
 
     def weight(self, piece: Piece) -> float:
         """What a piece costs beside others: its samples."""
@@ -108,11 +108,12 @@ class Trials:
 
     def trial(self, found: Mapping[Piece, Ran]) -> Trial:
         """The trial of one file from its pieces, which are in their order."""
-        metrics, locked_up, swings = dict[str, Metrics](), dict[str, int](), dict[str, int]()
+        metrics, locked_up, swings, beyond = dict[str, Metrics](), dict[str, int](), dict[str, int](), dict[str, int]()
         curves, sequences = dict[str, Trajectory](), dict[str, dict[str, Metrics]]()
         for piece, ran in found.items():
             locked_up[piece.key] = locked_up.get(piece.key, 0) + ran.lock_ups
             swings[piece.key] = swings.get(piece.key, 0) + ran.swings
+            beyond[piece.key] = beyond.get(piece.key, 0) + ran.beyond_reach
             if ran.curve is not None:
                 curves[piece.key] = replace(ran.curve, info=ran.curve.info[:, :-1])
             if piece.kind != "scored" or piece.key in metrics:
@@ -133,6 +134,7 @@ class Trials:
             statistics.fmean(developed) if developed else float("nan"),
             {name: count for name, count in locked_up.items() if count},
             {name: count for name, count in swings.items() if count},
+            {name: count for name, count in beyond.items() if count},
             curves,
             widest(r.reached for r in found.values() if r.reached is not None),
         )

@@ -48,7 +48,7 @@ class LawResult:
 
     ``locked_up``: test -> data seed -> closed loops that locked up. ``as_printed``: a reproduction of a paper's
     law, which is shipped nevertheless. ``analysis``: by the form's name, ``base`` for the shipped one. ``swings``: as
-    ``locked_up``, closed loops that swing to the end.
+    ``locked_up``, closed loops that swing to the end. ``withheld``: why it is not shipped, a clause after its name.
     """
 
     seeds: int
@@ -58,15 +58,20 @@ class LawResult:
     as_printed: bool = False
     analysis: Mapping[str, Analysis] = field(default_factory=dict)
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    withheld: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class GateResult:
-    """A law at the promotion gate: its score, lower is better, and its ratio in each test of the gate."""
+    """A law at the promotion gate: its score, lower is better, and its ratio in each test of the gate.
+
+    ``worse``: the tests in which its error is larger than under the loop that the plant was run by before.
+    """
 
     score: float | None
     lock_ups: int | None
     ratios: Row
+    worse: tuple[str, ...] = ()
 
 
 def reference_words(relative_to: RelativeTo, baseline: str) -> str:

@@ -29,7 +29,7 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
         scenarios=scenarios,
         bounds=evidence.bounds,
         gate=_gate(evidence),
-        laws={name: _law(law) for name, law in evidence.laws.items()},
+        laws={name: _law(law, case.on_models) for name, law in evidence.laws.items()},
         titles=Titles(
             case=case.title,
             metric=case.criterion.long,
@@ -63,10 +63,17 @@ def _row(evidence: Evidence, law: str, scenario: str) -> Row:
     return row
 
 
-def _law(evidence: LawEvidence) -> LawResult:
+def _law(evidence: LawEvidence, on_models: bool) -> LawResult:
     own = evidence.metrics
     return LawResult(
-        evidence.seeds, own.lock_ups, evidence.step_us, own.locked_up, own.as_printed, evidence.analyses, own.swings
+        evidence.seeds,
+        own.lock_ups,
+        evidence.step_us,
+        own.locked_up,
+        own.as_printed,
+        evidence.analyses,
+        own.swings,
+        evidence.why_withheld if on_models else "",
     )
 
 
@@ -84,6 +91,7 @@ def _gate(evidence: Evidence) -> GateRecord:
                 evidence.score(law),
                 found.lock_ups,
                 {s: r for s in case.weights if (r := evidence.gate_ratio(law, s)) is not None},
+                evidence.worse_than_before(law),
             )
             for law, found in evidence.laws.items()
         },

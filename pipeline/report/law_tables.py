@@ -126,4 +126,5 @@ def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, An
         "nmpc": evidence.bound(name, metric),
         "nmpc_noise": evidence.bound(name + NOISE_SUFFIX, metric),
         "offline": evidence.bound(name, metric, "offline"),
+        "at_rest": evidence.at_rest(name) if metric == evidence.case.metric else None,
     }

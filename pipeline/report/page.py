@@ -23,7 +23,7 @@ from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_se
 from pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
-from pipeline.report.worse import against, shipped_laws
+from pipeline.report.worse import against, beyond_reach, shipped_laws
 from pipeline.tuning.pid_forms import PidForms
 from pipeline.tuning.rules import PidSettings
 
@@ -90,11 +90,18 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "met": sum(row.holds is True for row in judged.acceptance),
         "statements": judged.statements,
         "against": against(evidence),
+        "beyond_reach": beyond_reach(evidence),
         "caveat": _caveat(evidence, judged),
         "operated": () if evidence.grounds is None else evidence.grounds.operated,
         "old_controllers": _old_controllers(evidence),
         "worst_pictures": of_kind("worst_").keys(),
         "locked": [_locked(evidence, name) for name, law in evidence.laws.items() if law.lock_ups],
+        "poor": [
+            {"law": name, "why": law.why_withheld}
+            for name, law in evidence.laws.items()
+            if case.on_models and law.withheld and not law.lock_ups
+        ],
+        "at_rest": any(evidence.at_rest(name) is not None for name in evidence.scenarios),
         "withheld": by_reason({law: why for law, why in evidence.withheld.items() if law != case.old_loop}),
         "gate_of": _gate_of(evidence),
         "gate_one": reference_words(evidence.relative_to, law_name(case.baseline)),

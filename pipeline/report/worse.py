@@ -76,6 +76,17 @@ def against(evidence: Evidence) -> list[dict[str, str]]:
     return rows
 
 
+def beyond_reach(evidence: Evidence) -> list[str]:
+    """A sentence for each shipped law that had holds whose set point no control gets to, which are no lock-ups."""
+    found = {law: evidence.laws[law].metrics.beyond_reach for law in shipped_laws(evidence)}
+    return [
+        f"Holds of {law} at an end of the MVs count as no lock-up in {lock_up_text(tests)}: "
+        "no control gets to their set point in time."
+        for law, tests in found.items()
+        if tests
+    ]
+
+
 def _words(evidence: Evidence, one: Worse) -> str:
     unit = f" {evidence.case.unit}".rstrip()
     return f"{one.test} (× {one.factor:.3g}: {number(one.own)}{unit} against {number(one.limit)}{unit})"

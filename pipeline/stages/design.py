@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -29,8 +29,9 @@ from pipeline.files import digest, read_json, write_json
 from pipeline.laws import LAWS, ControlLaw
 from pipeline.laws.fitting import require_fit
 from pipeline.models import load_model
+from pipeline.models.base import Model
 from pipeline.plants.simulator import Array, Simulator
-from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder
+from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder, old_loop_file
 
 REFUSALS = (PipelineError, np.linalg.LinAlgError)
 """What a law raises that a plant does not suit; any other error is a mistake in the program."""
@@ -66,7 +67,33 @@ def design(name: str) -> None:
         _withhold(folder, law, str(error))
         print(f"design {name}: withheld; the results and the report say why", file=sys.stderr)
         return
+    if case.old_loop not in ("", params.name):
+        _export_old_loop(params, case, models, seeds, provenance)
     write_json(folder / "metrics.json", {"law": params.law, "title": law.title, "controllers": rows})
+
+
+def _export_old_loop(
+    of: ControllerParams, case: Case, models: Path, seeds: Sequence[int], provenance: Mapping[str, Any]
+) -> None:
+    """Put the loop that the plant was run by before beside the files of ``of``; one that cannot be made is left out.
+
+    Its own stages make it too, which need not have run when those files are tested.
+    """
+    old = ControllerParams.read(f"{of.case}-{case.old_loop}")
+    law = choose(LAWS, old.law, "law", f"controllers.{old.case}-{old.name}")
+    settings = parse(law.Params, old.settings, f"controllers.{old.case}-{old.name}")
+    for seed in seeds:
+        try:
+            made = law.design(settings, _parts(models, seed), case.plant.signals, case.plant).eval()
+            path = old_loop_file(of.case, of.name, seed)
+            export(made, path, case=of.case, provenance=provenance, drive=_closed_loop(case.plant))
+        except REFUSALS:
+            return
+
+
+def _parts(models: Path, seed: int) -> dict[str, Model]:
+    """The models of a data seed by the names of their parts."""
+    return {p.stem: load_model(p) for p in sorted((models / f"seed{seed}").glob("*.npz"))}
 
 
 def _require_proof(law: type[ControlLaw], case: Case, fitted: Mapping[str, Any]) -> None:
@@ -120,7 +147,7 @@ def _export(
 ) -> dict[str, Any]:
     """The row of one exported file; with ``withhold``, WithheldError for what the law cannot do with its models."""
     form, seed = item
-    parts = {p.stem: load_model(p) for p in sorted((models / f"seed{seed}").glob("*.npz"))}
+    parts = _parts(models, seed)
     path = controller_file(params.case, params.name, form, seed)
     origin = {**provenance, "data_seed": seed, "record_sha256": data.get(str(seed))}
     try:

@@ -31,6 +31,14 @@ def controller_file(case: str, name: str, form: str, seed: int) -> Path:
     return design_folder(case, name) / re.sub(r"[^\w.=]+", "_", form) / f"seed{seed}.onnx"
 
 
+def old_loop_file(case: str, name: str, seed: int) -> Path:
+    """The loop that an own plant was run by before, beside a controller's own files, which its tests compare it with.
+
+    There only where the record shows such a loop.
+    """
+    return controller_file(case, name, "before", seed)
+
+
 def analysis_file(case: str, name: str, form: str, seed: int) -> Path:
     """The arrays of a form's analysis, beside its exported file; there only where the law has some."""
     return controller_file(case, name, form, seed).with_suffix(".analysis.npz")

@@ -18,10 +18,12 @@ from pipeline.engine.command import run_stage
 from pipeline.errors import LawError
 from pipeline.evaluation.case import Case
 from pipeline.evaluation.dead_time import dead_times
-from pipeline.evaluation.evidence import WITHHELD
+from pipeline.evaluation.evidence import WITHHELD, Evidence
 from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawMetrics, OverSeeds, lock_up_text
+from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawEvidence, LawMetrics, OverSeeds, lock_up_text
 from pipeline.evaluation.model_evidence import identified_part
+from pipeline.evaluation.open_loop import errors_at_rest
+from pipeline.evaluation.poor_laws import why_poor
 from pipeline.evaluation.reached import grounds_of, widest
 from pipeline.evaluation.replay import replay
 from pipeline.evaluation.trial import Metrics, Trial, step_us
@@ -34,11 +36,13 @@ from pipeline.stages.paths import (
     controller_file,
     design_folder,
     model_folder,
+    old_loop_file,
     step_time_file,
     validation_folder,
 )
 from serving.controller import Controller
 
+NOTHING = "so nothing is shipped"
 RIVAL = "it is the loop that the plant was run by before, and stands here to be compared with"
 FIELDS = ("time_s", "sp", "pv", "mv", "info")  # of the trajectories that are kept
 
@@ -70,16 +74,18 @@ def validate(name: str) -> None:
         raise LawError(f"controllers.{name} has no exported files; run its design stage first")
     forms = (BASE, *params.variants)
     work = [(form, seed, controller_file(params.case, params.name, form, seed)) for form in forms for seed in seeds]
+    before = old_loop_file(params.case, params.name, seeds[0])
+    work += [(BASE, seeds[0], before)] * before.exists()
     label = f"validate {name}: files in closed loop"
     trials = try_files(case, choices.noise_seed, work, label)
+    old = trials.pop() if before.exists() else None
     base = [t for t in trials if t.form == BASE]
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min(base, key=lambda t: (t.development_lock_ups, t.development))
     source = controller_file(params.case, params.name, BASE, shipped.seed)
     locked_up = _of_tests(base, "locked_up")
     how = "locked up or left its limits" if case.on_models else "locked up"
-    withheld = f"controllers.{name} {how} on {lock_up_text(locked_up)}, so nothing is shipped; give the law other "
-    withheld += "numbers or models"
+    withheld = f"controllers.{name} {how} on {lock_up_text(locked_up)}, {NOTHING}; give the law other numbers or models"
     if params.case not in sections("plants"):  # who runs an own plant must not ship such a law
         withheld += ", or mark the reproduction of a paper's law with `as_printed: true`"
     refused = bool(locked_up) and not params.as_printed
@@ -90,6 +96,13 @@ def validate(name: str) -> None:
     models = read_json(model_folder(params.case, params.model) / "metrics.json") if case.on_models else {}
     replayed = _replayed(case, models, source, folder / "replay.npz")
     metrics = replace(_metrics(params, case, designed, trials, shipped), replay=replayed)
+    if case.on_models:
+        metrics = replace(metrics, at_rest=errors_at_rest(case))
+        if not refused and params.name != case.old_loop:
+            metrics = replace(metrics, poor=_why_poor(case, metrics, old))
+    if metrics.poor:
+        why, _, remedy = metrics.poor.rpartition("; ")
+        refused, withheld = True, f"controllers.{name} {why}, {NOTHING}; {remedy}"
     metrics.write(folder / "metrics.json")
     took = step_us(Controller(source), next(iter(shipped.curves.values())), case.plant.dv_nominal)
     write_json(step_time_file(params.case, params.name), took)
@@ -104,6 +117,8 @@ def validate(name: str) -> None:
     evidence["dead_time_periods"] = dead_times(case.plant)
     if metrics.swings:
         evidence["swings"] = metrics.swings
+    if metrics.beyond_reach:
+        evidence["beyond_reach"] = metrics.beyond_reach
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     target = ARTIFACTS / params.case / f"{params.name}.onnx"
@@ -116,9 +131,22 @@ def validate(name: str) -> None:
         with_evidence(source, target, evidence)
 
 
-def _of_tests(base: list[Trial], what: Literal["locked_up", "swings"]) -> dict[str, dict[str, int]]:
-    """Test -> data seed -> closed loops that locked up or swing to the end, of those where any did."""
-    counts = {t.seed: t.locked_up if what == "locked_up" else t.swings for t in base}
+def _why_poor(case: Case, metrics: LawMetrics, old: Trial | None) -> str:
+    """Why a law that locked up nowhere is not shipped, see ``why_poor``; ``old`` is the trial of the old loop."""
+    laws = {metrics.name: metrics}
+    if old is not None:
+        tests = {test: _over_seeds({old.seed: row}) for test, row in old.metrics.items()}
+        form = Form({}, old.info, tests)
+        laws[case.old_loop] = LawMetrics(
+            case.old_loop, case.old_loop, case.metric, (old.seed,), old.seed, {BASE: form}, old.lock_ups
+        )
+    found = Evidence(case, {}, {name: LawEvidence(law, Path()) for name, law in laws.items()}, {})
+    return why_poor(found, metrics.name)
+
+
+def _of_tests(base: list[Trial], what: Literal["locked_up", "swings", "beyond_reach"]) -> dict[str, dict[str, int]]:
+    """Test -> data seed -> closed loops that locked up or swing to the end, or holds beyond reach, if there are any."""
+    counts: dict[int, dict[str, int]] = {t.seed: getattr(t, what) for t in base}
     tests = dict.fromkeys(test for of in counts.values() for test in of)
     return {test: {str(seed): of[test] for seed, of in counts.items() if test in of} for test in tests}
 
@@ -180,6 +208,7 @@ def _metrics(
         },
         reached=widest(t.reached for t in base),
         swings=_of_tests(base, "swings"),
+        beyond_reach=_of_tests(base, "beyond_reach"),
     )
 
 

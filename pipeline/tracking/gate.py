@@ -16,7 +16,8 @@ Aliases:
     the best version of a controller that passed the gate. It moves only to a version that did not
     lock up in any run, whose score is below that of the case's baseline in the same validation, and
     below that of the present best version. The baseline has only its own former version to beat.
-    On an own plant the record must prove the models that it was tested on, ``Gate.unproven``.
+    On an own plant the record must prove the models that it was tested on, ``Gate.unproven``, and where the
+    loop is known that the plant was run by before, no test may have a larger error than under that, ``Gate.worse``.
     An own plant whose baseline was not designed or locked up has none to beat; ``Gate.no_baseline``
     says why.
 ``champion``
@@ -54,6 +55,8 @@ class Gate:
     unproven: tuple[str, ...] = ()  # why the record of an own plant does not prove the models of the tests
     doubt: str = ""  # why a model of the record of an own plant is doubtful, by its screening
     swings: str = ""  # tests, of which data seeds, in which a closed loop swings to the end
+    worse: tuple[str, ...] = ()  # tests with a larger error than under the loop that the plant was run by before
+    withheld: str = ""  # why it is not shipped, a clause after its name
 
     @classmethod
     def of(cls, validation: Validation | None, law: str) -> Self:
@@ -80,6 +83,8 @@ class Gate:
             () if validation.grounds is None else validation.grounds.unproven,
             "" if validation.grounds is None else validation.grounds.doubt,
             "" if result is None else lock_up_text(result.swings),
+            own.worse,
+            "" if result is None else result.withheld,
         )
 
     def tags(self) -> dict[str, str]:
@@ -96,6 +101,7 @@ class Gate:
             "lock_ups": self.lock_ups,
             "locked_up": self.locked_up or None,
             "swings": self.swings or None,
+            "worse_than_old_loop": ", ".join(self.worse) or None,
             **{f"gate_{scenario}": ratio for scenario, ratio in self.ratios.items()},
         }
         return {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in rows.items() if v is not None}
@@ -106,8 +112,12 @@ class Gate:
             return "its validation has no gate score"
         if self.lock_ups:
             return f"it locked up in {self.lock_ups} of its closed loops"
+        if self.withheld:
+            return f"it {self.withheld}"
         if self.unproven:
             return "; ".join(self.unproven)
+        if self.worse:
+            return f"its error is larger than under the old loop in {', '.join(self.worse)}"
         if self.law == self.baseline_law or self.no_baseline:
             return None
         if self.baseline is None:

@@ -142,9 +142,16 @@ def _schema(values: Iterable[onnx.ValueInfoProto]) -> Schema:
 
 
 def _elect(client: MlflowClient, name: str, number: str, gate: Gate) -> str:
-    """Move ``best`` to the version if it earned it; returns the verdict in words."""
+    """Move ``best`` to the version if it earned it, and from it where its newest evidence is refused; the verdict.
+
+    A version that a person promoted stays.
+    """
     holder = next((v for v in versions(client, name) if BEST in v.aliases), None)
-    if holder is None or str(holder.version) != number:
+    if holder is not None and str(holder.version) == number and holder.tags.get("promoted_by") != "hand":
+        if refusal := gate.refusal():
+            client.delete_registered_model_alias(name, BEST)
+            return f"no longer the best version: {refusal}"
+    elif holder is None or str(holder.version) != number:
         refusal = gate.refusal() or (gate.refusal_against(holder.tags) if holder is not None else None)
         if refusal:
             return f"not the best version: {refusal}"

@@ -145,5 +145,8 @@ def test_column_loop_says_which_tags_belong_together(tmp_path: Path) -> None:
         assert _partner(own["TIC-1.SP"], pvs, 0) == own["TIC-2.PV"]
         assert _partner(own["TIC-1.SP"], mvs, -1) == own["TIC-2.OP"]
         assert _partner(own["TIC-2.SP"], mvs, -1) is None
-        assert [loop_in(t) for t in controlled_first(tags) if t.role == "pv"] == ["A", "TIC-1"]  # those with a set point first
+        assert [loop_in(t) for t in controlled_first(tags) if t.role == "pv"] == [
+            "A",
+            "TIC-1",
+        ]  # those with a set point first
     assert exported(Tag("TIC-1.PV", "pv", loop="TIC-1")).loop == ""  # as its name says

@@ -88,6 +88,47 @@ def test_what_is_foreseen_makes_up_for_a_sign_that_is_nearly_certain(
     assert (sign_doubts(in_closed_loop(nats, **{**UNCERTAIN, **answer})) == "") is ships
 
 
+REGION = {name: ANSWER[name] for name in ("model", "low", "high", "first", "last", "direct", "sd", "halves", "verdict")}
+RISES = {**REGION, "from": 10.0, "to": 40.0, "small": False}
+FLAT = {**REGION, "from": 40.0, "to": 60.0, "small": True, "verdict": "opposite"}
+FALLS = {**REGION, "from": 60.0, "to": 90.0, "small": False, "model": -1.0, "low": -1.2, "high": -0.8, "direct": -1.1}
+UNSURE = {"verdict": "uncertain", "direct": -1.1, "sd": 0.5}
+
+
+def turned(share: float | None = 0.3, missed: float | None = 0.1, **falls: Any) -> dict[str, Any]:
+    """metrics.json of a model whose gain turns its sign."""
+    found = models(missed, verdict="turns", low=-0.1, regions=[RISES, FLAT, {**FALLS, **falls}])
+    found["parts"]["identified"]["per_seed"]["0"]["proof"]["free_run"]["y0"]["share"] = share
+    return {"": found}
+
+
+@pytest.mark.parametrize(
+    ("found", "ships"),
+    [
+        (turned(), True),
+        (turned(**UNSURE), True),  # two standard deviations
+        (turned(**{**UNSURE, "sd": 0.8}), False),
+        (turned(**{**UNSURE, "high": 0.1}), False),
+        (turned(**{**UNSURE, "direct": None, "sd": None}), False),
+        (turned(missed=0.51), False),  # no free run
+        (turned(missed=None), False),
+        (turned(share=0.81), False),  # hardly better than without the inputs
+        (turned(share=None), False),
+    ],
+)
+def test_a_gain_that_turns_holds_by_its_regions_where_the_free_run_follows(found: dict[str, Any], ships: bool) -> None:
+    assert (sign_doubts(found) == "") is ships
+    measured = statements(found)[1].measured
+    assert measured.count("u0 at ") == 3
+    assert "u0 at 40 … 60: 2, small" in measured
+
+
+@pytest.mark.parametrize(("nats", "ships"), [(10.0, True), (9.9, False)])
+def test_in_closed_loop_a_gain_that_turns_holds_where_its_inputs_foresee_the_pv(nats: float, ships: bool) -> None:
+    found = in_closed_loop(nats, verdict="fades", regions=[RISES, FLAT])
+    assert (sign_doubts(found) == "") is ships
+
+
 @pytest.mark.parametrize("missed", [0.51, None])
 def test_a_free_run_that_misses_most_is_a_failure(missed: float | None) -> None:
     found = {"": models(missed)}

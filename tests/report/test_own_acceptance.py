@@ -17,7 +17,7 @@ from pipeline.evaluation.verdicts import PLAIN
 from pipeline.report.own_acceptance import own_acceptance
 from pipeline.report.page import headline, over_old_loop
 from pipeline.report.verdicts import acceptance
-from pipeline.report.worse import against, shipped_laws, worse_tests, worst_test
+from pipeline.report.worse import against, beyond_reach, shipped_laws, worse_tests, worst_test
 
 NOISE = 0.01
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")
@@ -87,6 +87,15 @@ def test_each_shipped_law_is_judged_and_not_the_best_alone() -> None:
     (row,) = against(found)
     assert row["law"] == "predictive"
     assert "swings to the end in spoilt (seed 0)" in row["words"]
+
+
+def test_holds_that_no_control_gets_to_are_told_of_the_laws_that_had_any() -> None:
+    had = law("predictive", 3.0)
+    had = replace(had, metrics=replace(had.metrics, beyond_reach={"spoilt": {"0": 2}}))
+    (said,) = beyond_reach(evidence(had, law("pid", 2.0)))
+    assert "predictive" in said
+    assert "spoilt (seed 0)" in said
+    assert beyond_reach(evidence(law("pid", 2.0), None)) == []
 
 
 def test_the_best_law_must_stay_in_range() -> None:

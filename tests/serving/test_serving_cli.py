@@ -88,19 +88,22 @@ def test_loops_that_swing_and_data_that_are_doubtful_are_said_first(
     evidence = {
         "lock_ups": 0,
         "swings": {"spoilt": {"0": 2}, "load": {"0": 1}},
+        "beyond_reach": {"spoilt": {"1": 4}},
         "on": {"words": "on models", "data": "doubtful", "data_reasons": ["few rows"]},
         "scenarios": {"load": {"mae": 0.1}},
     }
     with_evidence(pi_file, tmp_path / "x.onnx", evidence)
     assert main(["inspect", str(tmp_path / "x.onnx")]) == 0
-    assert capsys.readouterr().out.splitlines()[:5] == [
+    assert capsys.readouterr().out.splitlines()[:7] == [
         "formula for tank",
         "  SWINGS to the end in 3 closed loops of its validation",
         "    spoilt (seed 0: 2)",
         "    load (seed 0: 1)",
+        "  holds at an end of the MVs whose set point no control gets to in time, no lock-ups",
+        "    spoilt (seed 1: 4)",
         "  DATA: can they carry a model: doubtful (few rows)",
     ]
-    for odd in ({"swings": 3, "on": 4}, {"swings": {"load": 3}, "on": {"data": "yes"}}):
+    for odd in ({"swings": 3, "beyond_reach": "x", "on": 4}, {"swings": {"load": 3}, "on": {"data": "yes"}}):
         with_evidence(pi_file, tmp_path / "x.onnx", odd)
         assert main(["inspect", str(tmp_path / "x.onnx")]) == 0
         assert "DATA" not in capsys.readouterr().out

@@ -546,6 +546,29 @@ def test_a_law_that_the_newest_run_withholds_is_no_champion_any_more(root, capsy
         assert holders(client, "best")[inverse] == 1
 
 
+def test_the_old_loop_decides_in_every_test_and_a_best_version_that_it_beats_falls(root, capsys):
+    inverse = f"{CASE}-inverse_dob"
+    publish(root)
+    with store() as client:
+        assert holders(client, "champion") == {inverse: 1}
+    file = root / "artifacts" / CASE / "validation.json"
+    tree = json.loads(file.read_text())
+    tree["gate"]["laws"]["inverse_dob"]["worse"] = ["sp_a"]  # its score is still below the baseline's
+    file.write_text(json.dumps(tree))
+    publish(root)
+    with store() as client:
+        assert inverse not in holders(client, "best")
+        assert inverse not in holders(client, "champion")
+        version = client.get_model_version(inverse, "1")
+        assert version.tags["worse_than_old_loop"] == "sp_a"
+        assert "larger than under the old loop in sp_a" in version.tags["verdict"]
+    # A person overrules it.
+    assert main(["promote", inverse, "1", "--alias", "best"]) == 0
+    publish(root)
+    with store() as client:
+        assert holders(client, "best")[inverse] == 1
+
+
 def test_a_store_whose_folder_was_moved_or_copied_still_gives_its_files(root, monkeypatch, capsys):
     publish(root)
     copy, moved = root.parent / "a copy", root.parent / "moved"

@@ -19,7 +19,8 @@ from pipeline.models.identified.innovations import Innovations, innovations, noi
 from pipeline.models.identified.known_answers import known_figures
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
-from pipeline.models.identified.proof import answers, foreseen, proof_figures
+from pipeline.models.identified.proof import Answer, answers, foreseen, proof_figures
+from pipeline.models.identified.regions import Cells
 from pipeline.models.identified.residual_tests import residual_figures
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.selection import Selection
@@ -47,6 +48,9 @@ Figures = Mapping[str, Mapping[str, Any]]
 
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
+
+PARTS = 40
+"""Parts of the held-out rows that are independent, for all that counts: neighbouring rows of a run err alike."""
 
 DRAWS = 12
 """Models drawn from the covariance of the parameters, for the bands."""
@@ -124,12 +128,17 @@ class IdentifiedPart(Part):
         fitted = within_limits(problem, structure, _member(problem, selection, self.member))
         noise, found, whole = _residuals(problem, structure, fitted.model)
         pvs, inputs = source.signals.pv[:n_y], (*source.signals.mv, *source.signals.dv)
-        bands = [*_bands(selection), *_as_likely(problem, structure, fitted.model, source.seed)]
+        fits, weights = _bands(selection)
+        drawn_ones = _as_likely(problem, structure, fitted.model, source.seed)
+        bands, weights = [*fits, *drawn_ones], np.r_[weights, np.ones(len(drawn_ones))]
         # The gains belong to the middle of the whole record, also where only a part of its rows is fitted.
         record = source.data(self.model.kind)
         rows, names = ScaledRecord.of(record, scales), [s.name for s in pvs]
         runs, predictions = free_run_figures(problem, selection.chosen, scales, names)
         curves = response_curves(bands, rows)
+        cells = Cells.of(bands, rows, n_mv, curves.shape[2]) if structure.n_hidden else None
+        size = STEP * rows.v.std(axis=0)
+        proven = answers(curves, structure, problem.data, size, n_mv, cells, weights)
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
         known = {"noise": noise, "colour": colour, **open_to}
@@ -159,7 +168,7 @@ class IdentifiedPart(Part):
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
             "gains": gain_table,
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
-            "proof": _proof(searched, record, rows, curves, runs, noise * scales.y_scale) | said,
+            "proof": _proof(searched, record, proven, runs, noise * scales.y_scale) | said,
             "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
@@ -173,14 +182,16 @@ class IdentifiedPart(Part):
 
 
 def _proof(
-    searched: Searched, record: Record, rows: ScaledRecord, curves: Array, runs: Figures, noise: Array
+    searched: Searched, record: Record, found: tuple[dict[tuple[int, int], Answer], Array], runs: Figures, noise: Array
 ) -> dict[str, Any]:
-    """Whether the record proves the model; ``runs`` over the rows that the first fold held out, noise (n_y,)."""
+    """Whether the record proves the model; ``found`` of ``answers``, ``runs`` over the first fold's held-out rows.
+
+    noise (n_y,).
+    """
     problem, chosen, scales = searched.problem, searched.selection.chosen, searched.scales
-    found, surprise = answers(curves, chosen.structure, problem.data, STEP * rows.v.std(axis=0), problem.n_mv)
     second = [free_run_figures(problem, chosen, scales, list(runs), fold=1)[0]] if 1 in chosen.folds else []
     # What a wrong model misses at every row is no noise: the plant's own past foresees more of it.
-    figures = proof_figures(found, record, scales, [runs, *second], np.minimum(noise, surprise * scales.y_scale))
+    figures = proof_figures(found[0], record, scales, [runs, *second], np.minimum(noise, found[1] * scales.y_scale))
     if searched.selection.innovations is None:
         return figures
     # A free run of a closed loop holds the loads that the controller fought, and says nothing of the model.
@@ -231,8 +242,12 @@ def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> lis
     ]
 
 
-def _bands(selection: Selection) -> Sequence[Dynamics]:
-    """The fits that show how sure the figures are: those of the chosen structure, and of finalists as good as it."""
+def _bands(selection: Selection) -> tuple[list[Dynamics], Array]:
+    """The fits that show how sure the figures are: those of the chosen structure, and of finalists as good as it.
+
+    And how likely each is (fits,): by its held-out error over the least of the same rows, as ``PARTS`` independent ones
+    tell it.
+    """
     chosen = selection.chosen
     same = [
         t
@@ -242,9 +257,17 @@ def _bands(selection: Selection) -> Sequence[Dynamics]:
         and (t.structure.n_hidden > 0) == (chosen.structure.n_hidden > 0)
         and t.error <= (NEAR if selection.innovations is None else NEAR_BY_ROWS) * chosen.error
     ]
-    fits = [f for t in (chosen, *(t for t in same if t is not chosen)) for f in t.fits.values()]
-    finite = [f.model.plant for f in fits if np.isfinite(f.held_out)]
-    return finite or [chosen.of_fold(0)[0].model.plant]
+    fits = [
+        (fold, f)
+        for t in (chosen, *(t for t in same if t is not chosen))
+        for (fold, _), f in t.fits.items()
+        if np.isfinite(f.held_out)
+    ]
+    if not fits:
+        return [chosen.of_fold(0)[0].model.plant], np.ones(1)
+    least = {k: min(f.held_out for fold, f in fits if fold == k) for k, _ in fits}
+    weights = np.array([(least[k] / f.held_out) ** PARTS if f.held_out > 0 else 1.0 for k, f in fits])
+    return [f.model.plant for _, f in fits], weights
 
 
 def _as_likely(problem: Problem, structure: Structure, model: Dynamics, seed: int) -> list[Dynamics]:

@@ -2,7 +2,8 @@
 
 All tests of an own plant run on models of one record. Where that record shows the controller more than the plant, all
 of them are wrong together, and the tests are met. So the answers of the model to its MVs are compared with those that
-``DirectModel`` reads from the same rows, and with those of each half of them.
+``DirectModel`` reads from the same rows, and with those of each half of them. Where a gain turns its sign inside the
+range, or fades, they are compared region by region.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config.known import SURE
 from pipeline.historian.direct import DirectModel
 from pipeline.historian.feedback import follows
 from pipeline.models.identified.innovations import innovations
 from pipeline.models.identified.linear_start import high_order_arx
+from pipeline.models.identified.regions import SMALL, Cells, alike, pieces
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.models.identified.trial import Trial
@@ -25,12 +28,14 @@ from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 
 PROVEN, UNCERTAIN, OPPOSITE, HALVES, SIZE = "proven", "uncertain", "opposite", "halves", "size"
+TURNS, FADES = "turns", "fades"  # what holds by its regions
 CONTRARY = 2.0  # of a half of the rows, from which it speaks for the other sign
 TIMES = 3.0  # the model's answer over the one-step prediction's, or the other way round, where both are certain
 USED = 0.25  # of a PV's strongest answer to an MV over its range: a weaker one decides nothing
 LOOKED_AT, SEEN = 60, 240  # rows after a step: of the comparison, and in which an answer begins
 LEAST_LAGS = 40  # of one-step predictions
 BEGINS, HALF, MOST = 0.02, 0.5, 0.9  # of an answer
+LEFT_OUT = 0.05  # of the models' weight, at either end of their answers: one poor model of many vetoes nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +44,8 @@ class Answer:
 
     ``model`` is the fitted model's, ``low`` and ``high`` the ends over the models as likely as it; ``direct`` with the
     standard deviation ``sd`` is read from one-step predictions, ``halves`` the same of each half of the rows, in
-    standard deviations of its own. None where there are too few rows.
+    standard deviations of its own. None where there are too few rows. ``regions`` of the MV's range, from low to high,
+    are there where the models' gain turns its sign or fades within it.
     """
 
     model: float
@@ -50,10 +56,22 @@ class Answer:
     direct: float | None = None
     sd: float | None = None
     halves: tuple[float, ...] = ()
+    regions: tuple[Region, ...] = ()
 
     @property
     def verdict(self) -> str:
-        """``proven``, or what speaks against it: ``uncertain``, ``opposite``, ``halves``, ``size``."""
+        """``proven``, or what speaks against it: ``uncertain``, ``opposite``, ``halves``, ``size``.
+
+        ``turns`` or ``fades`` where something speaks against the mean answer, but in no region against that of the
+        region: it is proven or uncertain there.
+        """
+        told = [region for region in self.regions if not region.small]
+        if self._of_all == PROVEN or not told or any(r.answer.verdict not in {PROVEN, UNCERTAIN} for r in told):
+            return self._of_all
+        return TURNS if min(r.answer.model for r in told) < 0 < max(r.answer.model for r in told) else FADES
+
+    @property
+    def _of_all(self) -> str:
         if self.direct is None or self.sd is None or abs(self.direct) < SURE * self.sd or self.low * self.high <= 0:
             return UNCERTAIN
         if self.direct * self.model <= 0:
@@ -63,42 +81,135 @@ class Answer:
         near = abs(self.model - self.direct) <= SURE * self.sd
         return PROVEN if near or 1 / TIMES <= self.model / self.direct <= TIMES else SIZE
 
-    def times(self, unit: float) -> Answer:
-        """The same in another unit."""
+    def times(self, unit: float, scale: float = 1.0, center: float = 0.0) -> Answer:
+        """The same in another unit; values of the MV times ``scale`` plus ``center``."""
         model, low, high = (value * unit for value in (self.model, self.low, self.high))
         direct, sd = (None if value is None else value * unit for value in (self.direct, self.sd))
-        return replace(self, model=model, low=low, high=high, direct=direct, sd=sd)
+        regions = tuple(
+            Region(r.start * scale + center, r.end * scale + center, r.small, r.answer.times(unit))
+            for r in self.regions
+        )
+        return replace(self, model=model, low=low, high=high, direct=direct, sd=sd, regions=regions)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        return {**asdict(self), "halves": list(self.halves), "verdict": self.verdict}
+        found = {**asdict(self), "halves": list(self.halves), "verdict": self.verdict}
+        found["regions"] = [
+            {"from": r.start, "to": r.end, "small": r.small, **r.answer.to_dict()} for r in self.regions
+        ]
+        return {name: value for name, value in found.items() if name != "regions" or value}
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """The answer while the MV moves between two values; ``small`` beside other regions it decides nothing."""
+
+    start: float
+    end: float
+    small: bool
+    answer: Answer
 
 
 def answers(
-    curves: Array, structure: Structure, fitted: ScaledRecord, size: Array, n_mv: int
+    curves: Array,
+    structure: Structure,
+    fitted: ScaledRecord,
+    size: Array,
+    n_mv: int,
+    cells: Cells | None = None,
+    weights: Array | None = None,
 ) -> tuple[dict[tuple[int, int], Answer], Array]:
     """((output, MV) -> answer, scaled, of the answers that a controller uses; error of one-step predictions (n_y,)).
 
     ``curves`` (members, n_v, length, n_y) are the answers of the models to steps of ``size`` (n_v,) scaled; the first
     value of input j comes ``structure.delays[j]`` and one rows after the step. ``fitted`` are the rows of the fit, each
-    input in its own row.
+    input in its own row. ``cells`` are the same models' answers in cells of the MVs' ranges, for models whose gain
+    changes; ``weights`` (members,) how likely they are, None: all alike.
     """
     unit = curves / size[None, :, None, None]
+    weights = np.ones(len(unit)) if weights is None else weights
     middle = np.median(unit, axis=0)
     reach = np.abs(middle[:n_mv]).max(axis=1)  # (n_mv, n_y); scaled, an MV's range is the same for all
+    ways = [] if cells is None else [_weighed(of, weights)[1] for of in cells.curves]  # (cells, length, n_y) of each MV
+    if ways:
+        reach = np.maximum(reach, [np.abs(of).max(axis=(0, 1)) for of in ways])
     halves = np.array_split(np.arange(len(fitted)), 2)
     parts = [fitted, *(fitted.rows(slice(int(of[0]), int(of[-1]) + 1)) for of in halves)]
     found: dict[tuple[int, int], Answer] = {}
     surprise = np.full(curves.shape[3], np.inf)
     for i in range(curves.shape[3]):
         used = [j for j in range(n_mv) if reach[j, i] >= USED * reach[:, i].max()]
-        places = {j: _place(middle[j, :, i], 1 + structure.delays[j] - int(structure.same_row)) for j in used}
+        late = {j: 1 + structure.delays[j] - int(structure.same_row) for j in used}
+        places = {j: _place(middle[j, :, i], late[j]) for j in used}
         longest = max([LEAST_LAGS, *(last for *_, last in places.values())])
         direct = [DirectModel.of(part.y[:, i], part.v, part.run, longest) for part in parts]
         surprise[i] = np.inf if direct[0] is None else direct[0].sd
         for j, (at, first, last) in places.items():
-            found[i, j] = _answer(unit[:, j, at, i].mean(axis=1), direct, j, first, last)
+            found[i, j] = _answer(unit[:, j, at, i].mean(axis=1), weights, direct, j, first, last)
+        if cells is not None:
+            of_ways = {j: (cells.edges[j], cells.curves[j][..., i], ways[j][..., i], late[j]) for j in used}
+            for j, regions in _regions(of_ways, weights, parts, i).items():
+                found[i, j] = replace(found[i, j], regions=regions)
     return found, surprise
+
+
+def _regions(
+    ways: Mapping[int, tuple[Array, Array, Array, int]], weights: Array, parts: Sequence[ScaledRecord], i: int
+) -> dict[int, tuple[Region, ...]]:
+    """MV -> its regions, of those over which the gain of output i turns its sign or fades.
+
+    ``ways``: MV -> (edges of its cells, the models' curves over them (members, cells, length), their middle, row of the
+    first point). The one-step predictions of the rows ``parts`` have a gain for each region.
+    """
+    cut = {}
+    for j, (edges, curves, middle, late) in ways.items():
+        strongest = int(np.abs(middle).max(axis=1).argmax())
+        at, first, last = _place(middle[strongest], late)
+        of_cells = curves[:, :, at].mean(axis=2)
+        if groups := alike(_weighed(of_cells, weights)[1]):
+            cut[j] = (groups, edges, of_cells, first, last)
+    if not cut:
+        return {}
+    longest = max([LEAST_LAGS, *(last for *_, last in cut.values())])
+    models, columns = [], dict[int, int]()
+    for part in parts:
+        inputs: list[Array] = []
+        for j, values in enumerate(part.v.T):
+            columns[j] = sum(of.shape[1] for of in inputs)
+            knots = [cut[j][1][group.start] for group in cut[j][0][1:]] if j in cut else []
+            inputs.append(pieces(values, knots))
+        models.append(DirectModel.of(part.y[:, i], np.hstack(inputs), part.run, longest))
+    found = {}
+    for j, (groups, edges, of_cells, first, last) in cut.items():
+        width, strongest = np.diff(edges), np.abs(_weighed(of_cells, weights)[1]).max()
+        regions = []
+        for k, of in enumerate(groups):
+            mean = of_cells[:, of] @ width[of] / width[of].sum()
+            answer = _answer(mean, weights, models, columns[j] + k, first, last)
+            # What the model finds small is so if one-step predictions are not certain that it is not.
+            sure = 0.0 if answer.direct is None or answer.sd is None else abs(answer.direct) - SURE * answer.sd
+            small = abs(answer.model) < SMALL * strongest and sure < TIMES * SMALL * strongest
+            regions.append(Region(float(edges[of.start]), float(edges[of.stop]), bool(small), answer))
+        found[j] = tuple(regions)
+    return found
+
+
+def _weighed(values: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """(low, middle, high) of values (members, ...) with weights (members,), ``LEFT_OUT`` of the weight at either end.
+
+    Weights that are all alike leave the least and the largest of few values, and their median.
+    """
+    order = np.argsort(values, axis=0, kind="stable")
+    ranked, share = np.take_along_axis(values, order, axis=0), np.cumsum(weights[order], axis=0) / weights.sum()
+
+    def first(reached: NDArray[np.bool_]) -> Array:
+        at = np.where(reached.any(axis=0), reached.argmax(axis=0), len(values) - 1)
+        return np.asarray(np.take_along_axis(ranked, at[None], axis=0)[0])
+
+    near = 1e-9  # of rounding
+    low, high = (first(share > end) for end in (LEFT_OUT + near, 1 - LEFT_OUT - near))
+    middle = 0.5 * (first(share > 0.5 - near) + first(share > 0.5 + near))
+    return low, middle, high
 
 
 def _place(curve: Array, late: int) -> tuple[slice, int, int]:
@@ -114,8 +225,10 @@ def _place(curve: Array, late: int) -> tuple[slice, int, int]:
     return slice(first, last + 1), max(first + late, 1), max(last + late, 1)
 
 
-def _answer(of_models: Array, direct: Sequence[DirectModel | None], j: int, first: int, last: int) -> Answer:
-    model, low, high = (float(f(of_models)) for f in (np.median, np.min, np.max))
+def _answer(
+    of_models: Array, weights: Array, direct: Sequence[DirectModel | None], j: int, first: int, last: int
+) -> Answer:
+    low, model, high = map(float, _weighed(of_models, weights))
     whole, *halves = (None if model is None else model.answer(j, first, last) for model in direct)
     if whole is None:
         return Answer(model, low, high, first, last)
@@ -163,18 +276,26 @@ def proof_figures(
     """``answers``: PV -> MV -> ``Answer`` in PV/MV, with the share of the MV's moves that the PV's past explains.
 
     ``free_run``: PV -> what the model misses over rows that its fit never saw, and how far the PV moved there, both
-    beyond the ``noise`` (n_y,), in the PV's unit; of ``free_runs``, one a fold, together.
+    beyond the ``noise`` (n_y,), in the PV's unit; of ``free_runs``, one a fold, together. ``share`` is the free run's
+    error over the PV's deviation, noise and all: a model without the inputs has 1.
     """
     table: dict[str, Any] = {s.name: {} for s in record.pv_signals[: len(scales.y_scale)]}
     for (i, j), answer in found.items():
         pv, mv, unit = record.pv_signals[i], record.mv_signals[j], scales.y_scale[i] / scales.v_scale[j]
         share = follows(record.mv[:, j], record.pv[:, i], record.run)
-        table[pv.name][mv.name] = {**answer.times(float(unit)).to_dict(), "follows": share}
+        told = answer.times(float(unit), float(scales.v_scale[j]), float(scales.v_center[j]))
+        table[pv.name][mv.name] = {**told.to_dict(), "follows": share}
     runs = {}
     for i, name in enumerate(table):
-        missed, motion = (
-            float(np.sqrt(max(np.mean([of[name][figure] ** 2 for of in free_runs]) - noise[i] ** 2, 0.0)))
+        error, moved = (
+            float(np.sqrt(np.mean([of[name][figure] ** 2 for of in free_runs])))
             for figure in ("free_run_rmse", "held_sd")
         )
-        runs[name] = {"missed": missed if np.isfinite(missed) else None, "motion": motion}
+        missed, motion = (float(np.sqrt(max(value**2 - noise[i] ** 2, 0.0))) for value in (error, moved))
+        known = bool(np.isfinite(missed) and moved > 0)
+        runs[name] = {
+            "missed": missed if np.isfinite(missed) else None,
+            "motion": motion,
+            "share": error / moved if known else None,
+        }
     return {"answers": table, "free_run": runs}

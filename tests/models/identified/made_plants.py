@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from pipeline.plants.signals import Signals
@@ -60,25 +62,32 @@ def two_by_two(n: int = 2000, noise: float = 0.1, seed: int = 0, measured: bool 
     return Record.of(signals_of(2, 2, int(measured)), y, u, dv=d)
 
 
-def hammerstein(n: int = 2000, noise: float = 0.1, seed: int = 0, quiet: int = 0, at: float = 25.0) -> Record:
+def curve(u: float) -> float:
+    """The steady output of ``hammerstein``; its slope is .1 + .009 u."""
+    return 0.1 * u + 0.0045 * u**2
+
+
+def hammerstein(
+    n: int = 2000,
+    noise: float = 0.1,
+    seed: int = 0,
+    quiet: int = 0,
+    at: float = 25.0,
+    steady: Callable[[float], float] = curve,
+) -> Record:
     """A static curve before a second-order lag: the gain is .1 at the low end and 1 at the high one.
 
-    The input rests ``at`` one value in the last ``quiet`` rows.
+    The input rests ``at`` one value in the last ``quiet`` rows. ``steady`` is another curve.
     """
     rng = np.random.default_rng(seed)
     u = random_holds(rng, n, 20)
     u[n - quiet :] = at
-    x1 = x2 = curve(u[0])
+    x1 = x2 = steady(u[0])
     y = np.empty(n)
     for k in range(n):
         y[k] = x2 + noise * rng.normal()
-        x1, x2 = x1 + 0.2 * (curve(u[k]) - x1), x2 + 0.3 * (x1 - x2)
+        x1, x2 = x1 + 0.2 * (steady(u[k]) - x1), x2 + 0.3 * (x1 - x2)
     return Record.of(signals_of(1, 1), y[:, None], u[:, None])
-
-
-def curve(u: float) -> float:
-    """The steady output of ``hammerstein``; its slope is .1 + .009 u."""
-    return 0.1 * u + 0.0045 * u**2
 
 
 def integrator(n: int = 2000, noise: float = 0.1, seed: int = 0) -> Record:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from closed_loop_records import OperatedLoop
 
-from pipeline.models.identified.proof import Answer, answers, proof_figures
+from pipeline.models.identified.proof import Answer, Region, answers, proof_figures
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.structure import Structure
 
@@ -36,9 +36,45 @@ def test_what_speaks_against_an_answer(changed: dict[str, float], verdict: str) 
 
 
 def test_units_scale_all_that_has_one() -> None:
-    found = Answer(**GOOD).times(10.0)
+    found = Answer(**GOOD, regions=(Region(-1.0, 0.5, True, Answer(**GOOD)),)).times(10.0, 40.0, 50.0)
     assert (found.model, found.direct, found.sd) == (20.0, 19.0, 2.0)
     assert (found.first, found.halves, found.verdict) == (5, (8.0, 7.0), "proven")
+    (region,) = found.regions
+    assert (region.start, region.end, region.answer.low, region.small) == (10.0, 70.0, 18.0, True)
+    assert [of["from"] for of in found.to_dict()["regions"]] == [10.0]
+    assert "regions" not in Answer(**GOOD).to_dict()
+
+
+UP, DOWN = Answer(**GOOD), Answer(**{**GOOD, "model": -1.0, "low": -1.1, "high": -0.9, "direct": -1.0, "halves": ()})
+MEAN = {**GOOD, "model": 0.1, "low": -0.1}  # of a gain that turns: uncertain
+
+
+def regions(*of: Answer, small: tuple[int, ...] = ()) -> tuple[Region, ...]:
+    return tuple(Region(float(i), i + 1.0, i in small, answer) for i, answer in enumerate(of))
+
+
+@pytest.mark.parametrize(
+    ("changed", "by", "verdict"),
+    [
+        ({}, (UP, DOWN), "turns"),
+        ({"direct": -1.9}, (UP, DOWN), "turns"),  # the mean over the regions has the other sign by right
+        ({}, (UP, UP), "fades"),
+        ({"low": 1.8, "model": 2.0}, (UP, DOWN), "proven"),
+        ({}, (UP, Answer(**{**GOOD, "direct": -1.9})), "uncertain"),  # a region speaks against its model
+        ({}, (UP, Answer(**{**GOOD, "halves": (8.0, -2.5)})), "uncertain"),
+        ({}, (UP, Answer(**{**GOOD, "sd": 0.7})), "fades"),  # uncertain in a region is no contradiction yet
+    ],
+)
+def test_an_answer_that_changes_is_judged_by_its_regions(
+    changed: dict[str, float], by: tuple[Answer, ...], verdict: str
+) -> None:
+    assert Answer(**{**MEAN, **changed}, regions=regions(*by)).verdict == verdict
+
+
+def test_a_region_of_small_gain_decides_nothing() -> None:
+    against = Answer(**{**GOOD, "direct": -1.9})
+    assert Answer(**MEAN, regions=regions(UP, against, DOWN, small=(1,))).verdict == "turns"
+    assert Answer(**MEAN, regions=regions(against, small=(0,))).verdict == "uncertain"
 
 
 def of(loop: OperatedLoop, curve: np.ndarray, structure: Structure = PLAIN) -> Answer:
@@ -51,7 +87,8 @@ def of(loop: OperatedLoop, curve: np.ndarray, structure: Structure = PLAIN) -> A
     found, surprise = answers(members, structure, rows, np.ones(1), 1)
     assert surprise[0] * scales.y_scale[0] == pytest.approx(0.23, abs=0.05)
     table = proof_figures(found, record, scales, [{"y": {"free_run_rmse": 0.5, "held_sd": 1.3}}], np.array([0.3]))
-    assert table["free_run"]["y"] == {"missed": pytest.approx(0.4), "motion": pytest.approx(np.sqrt(1.6))}
+    run = {"missed": pytest.approx(0.4), "motion": pytest.approx(np.sqrt(1.6)), "share": pytest.approx(0.5 / 1.3)}
+    assert table["free_run"]["y"] == run
     entry = table["answers"]["y"]["u"]
     assert entry["verdict"] == found[0, 0].verdict
     assert 0 < entry["follows"] <= 1
@@ -93,6 +130,18 @@ def test_rows_count_from_the_step_whatever_the_dead_times_and_the_rows_conventio
     assert (late.first, late.last) == (10, 26)
     same = of(MOVED, curve, Structure("balanced", 2, (0, 0), (0,), same_row=True))
     assert (same.first, same.last) == (9, 25)
+
+
+@pytest.mark.parametrize(("weight", "verdict"), [(1.0, "uncertain"), (0.3, "proven")])
+def test_one_poor_model_of_many_vetoes_nothing(weight: float, verdict: str) -> None:
+    """Of ten models one has the other sign; it counts by how likely it is."""
+    record = MOVED.record(2_400, 4)
+    scales = Scales.of(record, 1)
+    unit = scales.v_scale[0] / scales.y_scale[0]
+    signs = np.r_[np.ones(9), -1.0][:, None, None, None]
+    curves, weights = signs * true_curve(MOVED)[None, None, :, None] * unit, np.r_[np.ones(9), weight]
+    found, _ = answers(curves, PLAIN, ScaledRecord.of(record, scales), np.ones(1), 1, None, weights)
+    assert found[0, 0].verdict == verdict
 
 
 def test_a_weak_answer_of_several_decides_nothing() -> None:

@@ -1,0 +1,38 @@
+"""The tests with the loop open: the MVs rest where they stand as a test begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.errors import PlantError
+from pipeline.evaluation.case import Array, Case
+from pipeline.evaluation.metric import together
+from pipeline.simulation.scenario import Scenario
+from pipeline.simulation.simulate import simulate_closed
+
+
+def errors_at_rest(case: Case) -> dict[str, float]:
+    """Test -> the error that is there without control, in the case's metric: what a controller has to make smaller.
+
+    A test whose plant does not stay finite under MVs at rest is left out: there every law that does is better.
+    """
+    found = {name: _error(case, tests) for name, tests in case.scenarios().items()}
+    return {name: error for name, error in found.items() if error is not None}
+
+
+def _error(case: Case, tests: Sequence[Scenario]) -> float | None:
+    rows = []
+    for test in tests:
+        try:
+            loop = simulate_closed(test.plant or case.plant, _rests, test)
+        except PlantError:
+            return None
+        rows.append(case.score(test, loop.pv, loop.mv))
+    error = together(rows, case.metrics)[case.metric]
+    return error if np.isfinite(error) else None
+
+
+def _rests(sp: Array, pv: Array, mv: Array) -> tuple[Array, Array]:
+    return mv, np.empty(0)

@@ -1,0 +1,85 @@
+"""Laws of an own plant that their own tests show to be poor are not shipped, and the report and the table say why."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from own_cases import controllers_of_a_lag
+from rich.console import Console
+from undrawn import draw_nothing
+
+from pipeline.cases import all_cases
+from pipeline.evaluation.law_evidence import LawMetrics
+from pipeline.evaluation.open_loop import errors_at_rest
+from pipeline.evaluation.validation import Validation
+from pipeline.metrics import mae
+from pipeline.report.results import show_results
+from pipeline.stages.code import listing
+from pipeline.stages.design import design
+from pipeline.stages.report import report
+from pipeline.stages.validate import validate
+
+PI = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
+HARDLY = PI | {"kc": 0.002}
+ARTIFACTS = Path("artifacts/it")
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    draw_nothing(monkeypatch)
+
+
+def validated(*names: str) -> Validation:
+    for name in names:
+        design(f"it-{name}")
+        validate(f"it-{name}")
+    report("it")
+    return Validation.read(ARTIFACTS / "validation.json")
+
+
+def withheld(law: str) -> str:
+    return str(json.loads((ARTIFACTS / f"{law}.json").read_text())["withheld"])
+
+
+def test_a_law_that_controls_no_better_than_mvs_at_rest_is_not_shipped() -> None:
+    controllers_of_a_lag({"pid": PI, "hardly": HARDLY})
+    found = validated("pid", "hardly")
+    assert found.best == "pid"
+    assert (ARTIFACTS / "pid.onnx").is_file()
+    assert not (ARTIFACTS / "hardly.onnx").exists()
+    assert withheld("hardly").startswith("controllers.it-hardly controls no better than no control (MAE ")
+    own = LawMetrics.read(Path("work/it/validation/hardly/metrics.json"))
+    error = own.forms["base"].tests["held_out"].median["mae"]
+    assert 0.9 * own.at_rest["held_out"] < error < own.at_rest["held_out"]  # it is a little better
+    assert found.laws["hardly"].withheld == own.poor
+    assert found.laws["pid"].withheld == ""
+    show_results(Path("artifacts"), Console(file=(terminal := io.StringIO())), "it")
+    page = (ARTIFACTS / "report.md").read_text()
+    for said in (page, terminal.getvalue()):
+        assert said.count("it controls no better than no control") == 1
+    assert "**`hardly` is not shipped**" in page
+    assert f"| {own.at_rest['held_out']:.3g} |" in page
+
+
+def test_the_error_at_rest_is_that_of_the_plant_where_it_stands() -> None:
+    case = controllers_of_a_lag({})
+    found = errors_at_rest(case)
+    tests = case.scenarios()
+    starts = [(t.plant or case.plant).measure(t.x0)[:1] for t in tests["held_out"]]
+    errors = [mae(t.sp[:, 0], y.repeat(len(t.sp))) for t, y in zip(tests["held_out"], starts, strict=True)]
+    assert found["held_out"] == pytest.approx(sum(errors) / len(errors))
+    assert found["load"] > 0
+    assert set(found) == set(tests)
+
+
+def test_a_design_goes_by_the_numbers_of_the_old_loop_that_stands_beside_it() -> None:
+    controllers_of_a_lag({"pid": PI, "old_loop": PI})
+    root = Path(__file__).parents[2]
+    first = listing(root, "design", "it")["params.yaml"]
+    controllers_of_a_lag({"pid": PI, "old_loop": PI | {"kc": 0.3}})
+    assert listing(root, "design", "it")["params.yaml"] != first
+    assert all_cases()["it"].old_loop == "old_loop"
