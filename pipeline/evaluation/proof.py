@@ -15,7 +15,6 @@ FORESEEN = 10.0  # nats: odds of 20,000 to 1 for a model whose MVs move the PV
 LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
 BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
-NOTHING: Mapping[str, Any] = {}  # is known of a pair
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
     "`loopwright new` lists them in step_test.csv, and give these rows too"
@@ -95,7 +94,7 @@ def _followed(proof: Mapping[str, Any], pv: str) -> bool:
     return missed is not None and share is not None and missed <= MISSED * of["motion"] and share <= SHARE
 
 
-def _holds(found: Mapping[str, Any], known: Mapping[str, Any] = NOTHING, *, shown: bool) -> bool:
+def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
     """Whether nothing speaks against an answer.
 
     Where the inputs are ``shown`` to foresee the PV over rows that no fit saw, and all models that are as likely have
@@ -117,27 +116,27 @@ def _holds(found: Mapping[str, Any], known: Mapping[str, Any] = NOTHING, *, show
 def _by_region(found: Mapping[str, Any], *, shown: bool) -> bool:
     """Whether an answer whose gain turns or fades holds: in each region where it is not small, the PV ``shown``."""
     told = [region for region in found.get("regions") or () if not region["small"]]
-    return shown and bool(told) and all(_holds(region, shown=True) for region in told)
+    return shown and bool(told) and all(_holds(region, {}, shown=True) for region in told)
 
 
 def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) -> Statement:
-    by_region, known = found["verdict"] in BY_REGION, known_of(proof, pv, mv)
+    known, by_region = known_of(proof, pv, mv), found["verdict"] in BY_REGION
     foreseen = _foreseen(proof, pv)
     shown = foreseen or _followed(proof, pv)
     if by_region:
         holds = _by_region(found, shown=shown)
         limit = "certain in sign in each region where it is not small, and of the size that one-step predictions find"
+        because = _by_regions_why(found, shown=shown, holds=holds)
     else:
         holds = _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
+        because = _word(found, known, holds=holds) or _why(pv, mv, found)
     return Statement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
         "; ".join([*([] if by_region else [_measured(found)]), *_regions(mv, found)]),
         holds,
-        _by_regions_why(found, shown=shown, holds=holds)
-        if by_region
-        else _word(found, known, holds=holds) or _why(pv, mv, found),
+        because,
     )
 
 
