@@ -19,6 +19,7 @@ from pipeline.historian.exported import exported, signal_tags
 from pipeline.historian.guessing import controlled_first, loop_in
 from pipeline.historian.loop_rows import _partner
 from pipeline.historian.tags import Tag, read_tags
+from pipeline.stages.fit import _source
 
 ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]"]
 NEW = ["new", "tank", "x.csv", *ROLES]
@@ -49,7 +50,8 @@ def test_statements_stand_in_params_yaml_and_reach_the_fit(capsys: pytest.Captur
         Known("TIC-101.PV", "FI-7", "none"),
     )
     assert known() == wanted
-    assert all_cases()["tank"].known == wanted
+    case = all_cases()["tank"]
+    assert _source({0: None}, case, 0).known == case.known == wanted
     out = capsys.readouterr().out
     assert all(one.says in out for one in wanted)
     assert "turned round" not in out
